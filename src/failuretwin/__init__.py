@@ -1,0 +1,33 @@
+"""failuretwin: a digital failure twin for robot arms.
+
+Says from commands and the path of the tool alone which motor failed, how, since when and how
+surely. Names are loaded when first used, so that importing the package costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from failuretwin.digital_model.robot import load_robot
+    from failuretwin.digital_model.twin import DigitalTwin
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "DigitalTwin": "digital_model.twin",
+    "load_robot": "digital_model.robot",
+}
+
+__all__ = ["DigitalTwin", "__version__", "load_robot"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'failuretwin' has no attribute {name!r}")
+    return getattr(import_module(f"failuretwin.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,100 @@
+"""Tables from TOML files into frozen dataclasses: a wrong key or type is an error, never ignored."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+import types
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from failuretwin.core.errors import InputError, unknown_name
+
+T = TypeVar("T")
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the table in a TOML file.
+
+    Raises:
+        InputError: If the file cannot be read or is not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error}).") from error
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not a TOML file: {error}.") from error
+
+
+def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
+    """Build the dataclass `cls` from `table`, checking keys and types all the way down.
+
+    Args:
+        cls: A dataclass; fields may be numbers, text, booleans, tuples, dictionaries of text to
+            numbers, dataclasses, tuples of dataclasses, or any of these or None.
+        table: Keys and values as read from TOML.
+        where: Name of the file and table for error texts.
+
+    Raises:
+        InputError: For an unknown key, a missing key or a value of the wrong type.
+    """
+    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
+    for key in table:
+        if key not in fields:
+            raise InputError(f"{where}: {unknown_name('key', key, fields)}")
+    hints = get_type_hints(cls)
+    values = {}
+    for name, field in fields.items():
+        if name in table:
+            values[name] = _convert(hints[name], table[name], f"{where}: {name}")
+        elif _required(field):
+            raise InputError(f"{where}: key {name!r} is missing. Add it.")
+    return cls(**values)
+
+
+def _required(field: dataclasses.Field[Any]) -> bool:
+    missing = dataclasses.MISSING
+    return field.default is missing and field.default_factory is missing
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    origin, args = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        return _convert(next(a for a in args if a is not type(None)), value, where)
+    if dataclasses.is_dataclass(hint):
+        if not isinstance(value, dict):
+            raise _wrong(where, value, "a table")
+        return from_table(hint, value, where)  # type: ignore[arg-type]
+    if origin is tuple:
+        return _convert_tuple(args, value, where)
+    if origin is dict:
+        if not isinstance(value, dict):
+            raise _wrong(where, value, "a table")
+        return {key: _convert(args[1], item, f"{where}.{key}") for key, item in value.items()}
+    return _convert_plain(hint, value, where)
+
+
+def _convert_tuple(args: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+    if not isinstance(value, list):
+        raise _wrong(where, value, "a list")
+    if args[-1] is Ellipsis:
+        return tuple(_convert(args[0], v, f"{where}[{i}]") for i, v in enumerate(value))
+    if len(value) != len(args):
+        raise _wrong(where, value, f"{len(args)} values")
+    return tuple(_convert(a, v, where) for a, v in zip(args, value, strict=True))
+
+
+def _convert_plain(hint: Any, value: Any, where: str) -> Any:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if hint is float and is_number:
+        return float(value)
+    if hint in (str, bool, int) and type(value) is hint:
+        return value
+    names = {float: "a number", str: "text", bool: "true or false", int: "a whole number"}
+    raise _wrong(where, value, names[hint])
+
+
+def _wrong(where: str, value: Any, expected: str) -> InputError:
+    return InputError(f"{where} is {value!r}, expected {expected}.")

@@ -1,0 +1,134 @@
+"""What may be wrong: a fault of one motor, and hypotheses made of such faults.
+
+The text form is the contract with files and the command line: ``healthy``, ``unknown``,
+``motor_1:stuck`` or several faults joined by ``+`` in chain order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from failuretwin.core.errors import InputError, unknown_name
+
+MAGNITUDE_UNITS: dict[str, str] = {
+    "stuck": "rad",
+    "steady_state_error": "rad",
+    "slow": "ratio",
+    "lag": "s",
+    "backlash": "rad",
+    "drift": "rad/s",
+    "intermittent": "ratio",
+    "torque_loss": "ratio",
+    "encoder_bias": "rad",
+    "encoder_scale": "ratio",
+    "lost_commands": "ratio",
+}
+"""Unit of the magnitude of every fault mode, by mode id."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault mode of one motor, without its size or onset."""
+
+    motor: str
+    mode: str
+
+    def __post_init__(self) -> None:
+        if self.mode not in MAGNITUDE_UNITS:
+            raise unknown_name("fault mode", self.mode, MAGNITUDE_UNITS)
+
+    def __str__(self) -> str:
+        return f"{self.motor}:{self.mode}"
+
+    @property
+    def magnitude_unit(self) -> str:
+        """Unit of the magnitude of this fault's mode."""
+        return MAGNITUDE_UNITS[self.mode]
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A state of the robot: no fault, one or several faults, or none that we know."""
+
+    faults: tuple[Fault, ...] = ()
+    known: bool = True
+
+    def __str__(self) -> str:
+        if not self.known:
+            return "unknown"
+        return "+".join(str(fault) for fault in self.faults) or "healthy"
+
+    @property
+    def is_healthy(self) -> bool:
+        """True for the hypothesis without any fault."""
+        return self.known and not self.faults
+
+    @classmethod
+    def parse(cls, text: str, motors: Sequence[str]) -> Hypothesis:
+        """Read the text form.
+
+        Args:
+            text: Such as ``"motor_1:stuck+motor_3:drift"``.
+            motors: Names of the robot's motors in chain order.
+
+        Raises:
+            InputError: If the text does not follow the form or names an unknown motor or mode.
+        """
+        if text in ("healthy", "unknown"):
+            return cls(known=text == "healthy")
+        faults = tuple(_parse_fault(part, motors) for part in text.split("+"))
+        order = [motors.index(fault.motor) for fault in faults]
+        if order != sorted(set(order)):
+            raise InputError(
+                f"hypothesis {text!r} names its motors out of chain order or twice. "
+                f"Expected each motor once, in the order {', '.join(motors)}."
+            )
+        return cls(faults)
+
+
+HEALTHY = Hypothesis()
+UNKNOWN = Hypothesis(known=False)
+
+
+def _parse_fault(text: str, motors: Sequence[str]) -> Fault:
+    motor, separator, mode = text.partition(":")
+    if not separator:
+        raise InputError(
+            f"hypothesis {text!r} is not of the form MOTOR:MODE. "
+            f"Expected 'healthy' or, for example, '{motors[0]}:stuck'."
+        )
+    if motor not in motors:
+        raise unknown_name("motor", motor, motors)
+    return Fault(motor, mode)
+
+
+def single_faults(motors: Sequence[str], modes: Iterable[str]) -> tuple[Hypothesis, ...]:
+    """Return healthy and every single fault, mode by mode and motor by motor.
+
+    With modes ``stuck`` and ``steady_state_error`` and four motors these are the paper's nine
+    classes in the order of its labels 0 to 8.
+    """
+    return (HEALTHY, *(Hypothesis((Fault(motor, mode),)) for mode in modes for motor in motors))
+
+
+PAPER_MODES = ("stuck", "steady_state_error")
+
+
+def paper_hypotheses(motors: Sequence[str]) -> tuple[Hypothesis, ...]:
+    """Return the paper's classes for `motors`: healthy, stuck 1..n, steady-state error 1..n."""
+    return single_faults(motors, PAPER_MODES)
+
+
+def parse_hypotheses(texts: Iterable[str], motors: Sequence[str]) -> tuple[Hypothesis, ...]:
+    """Read several hypotheses; refuses an empty list and repeats.
+
+    Raises:
+        InputError: If a text cannot be read, is given twice, or none is given.
+    """
+    hypotheses = tuple(Hypothesis.parse(text.strip(), motors) for text in texts)
+    if not hypotheses:
+        raise InputError("no hypotheses given. Expected at least one, such as 'healthy'.")
+    if len(set(hypotheses)) < len(hypotheses):
+        raise InputError("a hypothesis is given twice. Give each of them once.")
+    return hypotheses

@@ -1,0 +1,250 @@
+"""The run set: an `xarray.Dataset` of commands and tool paths on one uniform time grid.
+
+Shorter runs are padded: `measured` NaN, `command` held. Variables, dimensions and units are those
+of `VARIABLES`; only `command` and `measured` are required.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.movements import Movements
+from failuretwin.core.types import FloatArray, as_floats
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+AXES = ("x", "y", "z")
+
+VARIABLES: dict[str, tuple[tuple[str, ...], str]] = {
+    "command": (("run", "time", "motor"), "rad"),
+    "measured": (("run", "time", "axis"), "m"),
+    "duration": (("run",), "s"),
+    "target": (("run", "movement", "motor"), "rad"),
+    "ramp_duration": (("run", "movement", "motor"), "s"),
+    "movement_start": (("run", "movement"), "s"),
+    "fault": (("run",), ""),
+    "fault_detail": (("run",), "JSON"),
+    "onset": (("run",), "s"),
+    "magnitude": (("run",), "unit of the fault mode"),
+    "position": (("run", "time", "motor"), "rad"),
+    "temperature": (("run", "time", "motor"), "degC"),
+    "voltage": (("run", "time", "motor"), "V"),
+}
+"""Dimensions and unit of every variable that a run set may hold."""
+
+REQUIRED = ("command", "measured")
+COMPONENT_LEVEL = ("position", "temperature", "voltage")
+"""Readings from inside the motors; a system-level diagnosis never looks at them."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What was wrong with each run: arrays over runs, as in the run set."""
+
+    fault: Sequence[str]
+    detail: Sequence[Mapping[str, Any]]
+    onset: FloatArray
+    magnitude: FloatArray
+
+
+@dataclass(frozen=True)
+class RunTable:
+    """The plain arrays behind a run set, before they get names.
+
+    Attributes:
+        run: Unique name of each run.
+        motor: Names of the motors in chain order.
+        time: Uniform grid from 0, (time,) [s].
+        command: (run, time, motor) [rad].
+        measured: (run, time, axis) [m]; NaN = no sample.
+        measured_rate_hz: True rate of the tool sensor [Hz].
+        duration: True length of each run, (run,) [s]; None: the whole grid.
+        movements: The movements commanded, where known.
+        truth: What was wrong, where known.
+        position: Motor readings, (run, time, motor) [rad], where known.
+    """
+
+    run: Sequence[str]
+    motor: Sequence[str]
+    time: FloatArray
+    command: FloatArray
+    measured: FloatArray
+    measured_rate_hz: float
+    duration: FloatArray | None = None
+    movements: Movements | None = None
+    truth: Truth | None = None
+    position: FloatArray | None = None
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_dataset(self) -> xr.Dataset:
+        """Return the run set; checks it on the way.
+
+        Raises:
+            InputError: If shapes or coordinates do not fit together.
+        """
+        import xarray as xr
+
+        values: dict[str, Any] = {"command": self.command, "measured": self.measured}
+        values["duration"] = (
+            np.full(len(self.run), self.time[-1]) if self.duration is None else self.duration
+        )
+        if self.movements is not None:
+            values |= {
+                "target": self.movements.target,
+                "ramp_duration": self.movements.ramp_duration,
+                "movement_start": self.movements.start,
+            }
+        if self.truth is not None:
+            values |= {
+                "fault": np.asarray(self.truth.fault, dtype=object),
+                "fault_detail": np.array([json.dumps(d) for d in self.truth.detail], dtype=object),
+                "onset": self.truth.onset,
+                "magnitude": self.truth.magnitude,
+            }
+        if self.position is not None:
+            values["position"] = self.position
+        runs = xr.Dataset(
+            {name: (VARIABLES[name][0], value) for name, value in values.items()},
+            coords={
+                "run": np.asarray(self.run, dtype=object),
+                "time": self.time,
+                "motor": np.asarray(self.motor, dtype=object),
+                "axis": np.asarray(AXES, dtype=object),
+            },
+            attrs={**self.attributes, "measured_rate_hz": float(self.measured_rate_hz)},
+        )
+        for name in runs.data_vars:
+            runs[name].attrs["units"] = VARIABLES[str(name)][1]
+        return check_runs(runs, "the run set")
+
+
+def check_runs(runs: xr.Dataset, where: str) -> xr.Dataset:
+    """Return `runs` if it keeps the contract of a run set.
+
+    Args:
+        runs: The dataset to check.
+        where: What to call it in an error, such as its path.
+
+    Raises:
+        InputError: Naming the first thing that is missing or wrong, and what is expected.
+    """
+    for name in REQUIRED:
+        if name not in runs:
+            present = ", ".join(sorted(map(str, runs.data_vars))) or "nothing"
+            raise InputError(
+                f"{where}: no variable `{name}`; it holds {present}. A run set needs "
+                f"`command` (run, time, motor) [rad] and `measured` (run, time, axis) [m]."
+            )
+    for name, (dims, _) in VARIABLES.items():
+        if name in runs and runs[name].dims != dims:
+            raise InputError(
+                f"{where}: `{name}` has dimensions {runs[name].dims}, expected {dims}."
+            )
+    if runs.sizes["run"] == 0:
+        raise InputError(f"{where}: holds no runs. Expected at least one.")
+    if tuple(map(str, runs["axis"].values)) != AXES:
+        raise InputError(f"{where}: coordinate `axis` is {runs['axis'].values}, expected x, y, z.")
+    for name in REQUIRED:
+        if runs[name].dtype.kind not in "fiu":
+            raise InputError(f"{where}: `{name}` holds {runs[name].dtype}, expected numbers.")
+    _check_time(as_floats(runs["time"].values), where)
+    names = [str(name) for name in runs["run"].values]
+    if len(set(names)) < len(names):
+        raise InputError(f"{where}: run names are not unique. Rename the runs that repeat.")
+    return runs
+
+
+def _check_time(time: FloatArray, where: str) -> None:
+    if len(time) < 2:
+        raise InputError(f"{where}: `time` has {len(time)} samples, expected at least two.")
+    steps = np.diff(time)
+    if not np.all(np.isfinite(time)) or steps.min() <= 0:
+        raise InputError(f"{where}: `time` does not increase. Expected a uniform grid from 0 [s].")
+    if abs(time[0]) > 1e-9 or np.ptp(steps) > 1e-6 * steps.mean() + 1e-9:
+        raise InputError(
+            f"{where}: `time` is not a uniform grid from 0 (it starts at {time[0]:g} s with steps "
+            f"of {steps.min():g} to {steps.max():g} s). Resample onto one, with NaN in `measured` "
+            f"where there is no sample."
+        )
+
+
+def time_step(runs: xr.Dataset) -> float:
+    """Return the step of the time grid [s]."""
+    time = runs["time"].values
+    return float((time[-1] - time[0]) / (len(time) - 1))
+
+
+def measured_rate(runs: xr.Dataset) -> float:
+    """Return the true rate of the tool sensor [Hz]; without the attribute, the grid's own."""
+    return float(runs.attrs.get("measured_rate_hz", 1.0 / time_step(runs)))
+
+
+def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Return one run set of all runs in `parts`, padded to the longest, with unique names.
+
+    Only variables that every part holds are kept. Run names that repeat get a number.
+
+    Raises:
+        InputError: If the parts differ in motors, time step or sensor rate.
+    """
+    import xarray as xr
+
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    for part in parts[1:]:
+        _check_same_kind(first, part)
+    length = max(part.sizes["time"] for part in parts)
+    longest = next(part for part in parts if part.sizes["time"] == length)
+    shared = [n for n in first.data_vars if all(n in part for part in parts)]
+    movements = max((part.sizes.get("movement", 0) for part in parts), default=0)
+    padded = [_pad(part[shared], longest["time"].values, movements) for part in parts]
+    whole = xr.concat(
+        padded, "run", data_vars="minimal", join="exact", compat="override", combine_attrs="override"
+    )
+    return whole.assign_coords(run=np.asarray(_unique(whole["run"].values), dtype=object))
+
+
+def _check_same_kind(first: xr.Dataset, other: xr.Dataset) -> None:
+    motors = [list(map(str, part["motor"].values)) for part in (first, other)]
+    if motors[0] != motors[1]:
+        raise InputError(f"runs with motors {motors[0]} and {motors[1]} cannot form one run set.")
+    for name, value in (("time step", time_step), ("measured_rate_hz", measured_rate)):
+        a, b = value(first), value(other)
+        if not np.isclose(a, b, rtol=1e-6):
+            raise InputError(
+                f"runs with a {name} of {a:g} and {b:g} cannot form one run set. "
+                "Read or diagnose them separately."
+            )
+
+
+def _pad(part: xr.Dataset, time: FloatArray, movements: int) -> xr.Dataset:
+    """Return `part` on the longer grid `time`: command held, everything else NaN."""
+    if part.sizes["time"] < len(time):
+        held = part["command"].pad(time=(0, len(time) - part.sizes["time"]), mode="edge")
+        part = part.drop_vars("command").pad(time=(0, len(time) - part.sizes["time"]))
+        part = part.assign(command=held.drop_vars("time", errors="ignore"))
+    if 0 < part.sizes.get("movement", 0) < movements:
+        part = part.pad(movement=(0, movements - part.sizes["movement"]))
+    return part.assign_coords(time=time)
+
+
+def _unique(names: Sequence[str]) -> list[str]:
+    seen: dict[str, int] = {}
+    unique = []
+    for name in map(str, names):
+        seen[name] = seen.get(name, 0) + 1
+        unique.append(name if seen[name] == 1 else f"{name}#{seen[name]}")
+    return unique
+
+
+def truth_of(runs: xr.Dataset) -> list[str] | None:
+    """Return the true hypothesis of every run, or None where the run set does not say."""
+    return [str(f) for f in runs["fault"].values] if "fault" in runs else None

@@ -1,0 +1,206 @@
+"""Serial chains out of URDF files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.types import FloatArray
+from failuretwin.digital_model.chain import Joint, SerialChain, rotation_to_z
+
+MOVING_TYPES = ("revolute", "continuous", "prismatic")
+HELD_TYPES = ("fixed", "floating", "planar")
+
+
+@dataclass(frozen=True)
+class UrdfJoint:
+    """One joint as the file states it.
+
+    Attributes:
+        name: Name of the joint.
+        type: URDF joint type.
+        parent: Link nearer to the base.
+        child: Link nearer to the tool.
+        T_pc: Pose of the joint frame in the parent link, (4, 4).
+        axis: Unit vector in the joint frame.
+        low: Lower limit [rad or m].
+        high: Upper limit [rad or m].
+    """
+
+    name: str
+    type: str
+    parent: str
+    child: str
+    T_pc: FloatArray
+    axis: tuple[float, float, float]
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Urdf:
+    """The joints and links of a URDF file."""
+
+    source: str
+    links: tuple[str, ...]
+    joints: tuple[UrdfJoint, ...]
+
+    def path(self, base_link: str, tool_link: str) -> tuple[UrdfJoint, ...]:
+        """Return the joints from `base_link` to `tool_link`, in that order.
+
+        Raises:
+            InputError: If a link does not exist or the tool does not hang from the base.
+        """
+        for link in (base_link, tool_link):
+            if link not in self.links:
+                raise InputError(f"{self.source}: {unknown_name('link', link, self.links)}")
+        by_child = {joint.child: joint for joint in self.joints}
+        path: list[UrdfJoint] = []
+        link = tool_link
+        while link != base_link:
+            if link not in by_child or len(path) > len(self.joints):
+                raise InputError(
+                    f"{self.source}: no chain of joints leads from {base_link!r} to {tool_link!r}; "
+                    f"it ends at {link!r}. Name a base link that carries the tool."
+                )
+            path.append(by_child[link])
+            link = path[-1].parent
+        return tuple(reversed(path))
+
+    def chain(self, base_link: str, tool_link: str, moving: Collection[str]) -> SerialChain:
+        """Return the chain to the tool link in which the joints `moving` move.
+
+        Joints of the path that are not named stay at zero.
+
+        Raises:
+            InputError: If a named joint is not on the path or of a type that cannot move.
+        """
+        path = self.path(base_link, tool_link)
+        for name in moving:
+            self._check_movable(name, path)
+        T = np.eye(4)
+        joints = []
+        for joint in path:
+            T = T @ joint.T_pc
+            if joint.name in moving:
+                turn = np.eye(4)
+                turn[:3, :3] = rotation_to_z(joint.axis)
+                joints.append(
+                    Joint(
+                        joint.name, joint.type == "prismatic", _snap(T @ turn), joint.low, joint.high
+                    )
+                )
+                T = turn.T
+        return SerialChain(tuple(joints), _snap(T))
+
+    def _check_movable(self, name: str, path: tuple[UrdfJoint, ...]) -> None:
+        names = [joint.name for joint in path]
+        if name not in names:
+            raise InputError(f"{self.source}: {unknown_name('joint on the way to the tool', name, names)}")
+        joint = path[names.index(name)]
+        if joint.type not in MOVING_TYPES:
+            raise InputError(
+                f"{self.source}: joint {name!r} is {joint.type}, so no motor can move it. "
+                f"Expected one of {', '.join(MOVING_TYPES)}."
+            )
+
+
+def _snap(T: FloatArray) -> FloatArray:
+    """Return `T` with rotation entries within rounding of 0, 1 or -1 put exactly there."""
+    T = T.copy()
+    near = np.abs(T[:3, :3] - np.round(T[:3, :3])) < 1e-15
+    T[:3, :3][near] = np.round(T[:3, :3][near])
+    T.setflags(write=False)
+    return T
+
+
+def read_urdf(path: Path) -> Urdf:
+    """Read links and joints of a URDF file; meshes and inertias are not needed here.
+
+    Raises:
+        InputError: If the file is missing, not XML, not a URDF, or a joint is malformed.
+    """
+    try:
+        root = ElementTree.fromstring(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
+    except ElementTree.ParseError as error:
+        raise InputError(f"{path}: not an XML file ({error}). Expected a URDF.") from error
+    if root.tag != "robot":
+        raise InputError(f"{path}: the top element is <{root.tag}>, a URDF has <robot>.")
+    links = tuple(link.get("name", "") for link in root.findall("link"))
+    joints = tuple(_read_joint(joint, path) for joint in root.findall("joint"))
+    return Urdf(str(path), links, joints)
+
+
+def _read_joint(element: ElementTree.Element, path: Path) -> UrdfJoint:
+    name = element.get("name", "")
+    where = f"{path}: joint {name!r}"
+    parent, child = element.find("parent"), element.find("child")
+    if parent is None or child is None:
+        raise InputError(f"{where} has no <parent> or no <child>. Add the missing link.")
+    type_ = element.get("type", "")
+    if type_ not in MOVING_TYPES + HELD_TYPES:
+        raise InputError(f"{where}: {unknown_name('joint type', type_, MOVING_TYPES + HELD_TYPES)}")
+    origin, limit = element.find("origin"), element.find("limit")
+    axis = _triple(element.find("axis"), "xyz", (1.0, 0.0, 0.0), where)
+    length = math.hypot(*axis)
+    if length == 0.0:
+        raise InputError(f"{where} has a zero axis. Expected a direction such as '0 0 1'.")
+    unlimited = limit is None or type_ == "continuous"
+    return UrdfJoint(
+        name=name,
+        type=type_,
+        parent=parent.get("link", ""),
+        child=child.get("link", ""),
+        T_pc=transform(
+            _triple(origin, "xyz", (0.0, 0.0, 0.0), where),
+            _triple(origin, "rpy", (0.0, 0.0, 0.0), where),
+        ),
+        axis=(axis[0] / length, axis[1] / length, axis[2] / length),
+        low=-np.inf if unlimited else _number(limit, "lower", where),
+        high=np.inf if unlimited else _number(limit, "upper", where),
+    )
+
+
+def _triple(
+    element: ElementTree.Element | None,
+    key: str,
+    default: tuple[float, float, float],
+    where: str,
+) -> tuple[float, float, float]:
+    text = None if element is None else element.get(key)
+    if text is None:
+        return default
+    try:
+        x, y, z = (float(part) for part in text.split())
+    except ValueError:
+        raise InputError(f"{where}: {key}={text!r}, expected three numbers.") from None
+    return x, y, z
+
+
+def _number(element: ElementTree.Element | None, key: str, where: str) -> float:
+    text = "0" if element is None else element.get(key, "0")
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"{where}: {key}={text!r}, expected a number.") from None
+
+
+def transform(xyz: tuple[float, float, float], rpy: tuple[float, float, float]) -> FloatArray:
+    """Return the pose (4, 4) with offset `xyz` [m], turned by roll, pitch, yaw [rad] (URDF order)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    T = np.eye(4)
+    T[:3, :3] = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    T[:3, 3] = xyz
+    return T

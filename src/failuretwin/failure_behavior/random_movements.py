@@ -1,0 +1,75 @@
+"""The paper's random movements: targets anywhere in the range, ramps of three lengths, plateaus."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from failuretwin.core.movements import Movements
+from failuretwin.core.types import FloatArray
+from failuretwin.digital_model.imperfections import Schedule
+from failuretwin.digital_model.robot import Robot
+
+SPEED_CAP_RAD_S = np.deg2rad(272.0)
+"""The published generator moves a reference by at most 2.72 deg in 10 ms [rad/s]."""
+
+
+@dataclass(frozen=True)
+class RandomMovements:
+    """How random movements are drawn.
+
+    Attributes:
+        count: Movements in a run.
+        period_s: Nominal time from one movement to the next [s].
+        ramp_shares: Shares of the nominal period that a ramp may take.
+    """
+
+    count: int = 5
+    period_s: float = 2.0
+    ramp_shares: tuple[float, ...] = (0.3, 0.4, 0.5)
+
+    @property
+    def duration_s(self) -> float:
+        """Nominal length of a run [s]."""
+        return self.count * self.period_s
+
+    def draw(self, robot: Robot, schedule: Schedule, rng: np.random.Generator) -> Movements:
+        """Return the movements of one run, with a leading run axis of 1.
+
+        The arm starts at its zero pose; ramps that would exceed the speed cap take longer.
+        """
+        low, high = np.array([motor.movement_range for motor in robot.motors]).T
+        target = rng.uniform(low, high, (self.count, len(low)))
+        if schedule.whole_counts:
+            units = robot.servo_units
+            target = units.to_rad(np.round(units.to_counts(target)))
+        ramp = rng.choice(self.ramp_shares, (self.count, len(low))) * self.period_s
+        initial = np.zeros(len(low))
+        return Movements(
+            initial=initial[None],
+            target=target[None],
+            ramp_duration=_cap_speed(initial, target, ramp)[None],
+            start=self._starts(schedule, rng)[None],
+        )
+
+    def _starts(self, schedule: Schedule, rng: np.random.Generator) -> FloatArray:
+        first = rng.uniform(*schedule.first_start_s)
+        periods = rng.uniform(*schedule.period_s, self.count - 1)
+        return np.concatenate([[first], first + np.cumsum(periods)])
+
+
+def _cap_speed(initial: FloatArray, target: FloatArray, ramp: FloatArray) -> FloatArray:
+    travel = np.abs(np.diff(target, axis=0, prepend=initial[None]))
+    return np.maximum(ramp, travel / SPEED_CAP_RAD_S)
+
+
+def stack_movements(parts: Sequence[Movements]) -> Movements:
+    """Return the movements of all `parts` along the run axis; they must be equally many."""
+    return Movements(
+        *(
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("initial", "target", "ramp_duration", "start")
+        )
+    )
