@@ -55,8 +55,9 @@ class Movements:
         if m + 1 == self.start.shape[1]:
             return np.ones_like(self.initial)
         available = (self.start[:, m + 1] - self.start[:, m])[:, None]
-        share = np.clip(available / self.ramp_duration[:, m], 0.0, 1.0)
-        return np.where(np.isfinite(share), share, 1.0)
+        needed = self.ramp_duration[:, m]
+        share = np.divide(available, needed, out=np.ones_like(needed), where=needed > 0.0)
+        return np.clip(share, 0.0, 1.0)
 
     def reference(self, time: FloatArray) -> FloatArray:
         """Return the reference of every motor at `time` (time,) [s]: (run, time, motor) [rad]."""

@@ -207,7 +207,7 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     movements = max((part.sizes.get("movement", 0) for part in parts), default=0)
     padded = [_pad(part[shared], longest["time"].values, movements) for part in parts]
     whole = xr.concat(
-        padded, "run", data_vars="minimal", join="exact", compat="override", combine_attrs="override"
+        padded, "run", data_vars="minimal", coords="minimal", join="exact", compat="override", combine_attrs="override"
     )
     return whole.assign_coords(run=np.asarray(_unique(whole["run"].values), dtype=object))
 

@@ -1,0 +1,106 @@
+"""What a run says at system level: where the tool settled after each movement.
+
+Only `command` and `measured` of the run set are looked at, here and in everything that follows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from failuretwin.core.movements import Movements, find_movements
+from failuretwin.core.runs import measured_rate
+from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+SETTLING_S = 0.15
+"""Time after the end of a ramp before the tool counts as settled [s]: lag of 0.06 s, twice over."""
+WINDOW_S = 0.6
+"""Longest stretch at the end of a plateau that is averaged [s]; outlasts late starts."""
+STILL_M = 0.004
+"""Spread of the readings above which the tool is still moving [m]; one count moves it 1 mm."""
+
+
+@dataclass(frozen=True)
+class SettledEvidence:
+    """Settled tool positions of many runs.
+
+    Attributes:
+        movements: Movements found in `command`.
+        point: Median of the readings at the end of each plateau, (run, movement, axis) [m]; 0 where
+            there is none.
+        count: Independent readings behind it, (run, movement).
+        usable: Movements with a settled point, (run, movement).
+        moving: Movements whose readings do not come to rest, (run, movement).
+        end: End of each plateau, (run, movement) [s].
+    """
+
+    movements: Movements
+    point: FloatArray
+    count: IntArray
+    usable: BoolArray
+    moving: BoolArray
+    end: FloatArray
+
+    def __getitem__(self, runs: slice) -> SettledEvidence:
+        """Return the evidence of some of the runs."""
+        m = self.movements
+        return SettledEvidence(
+            Movements(m.initial[runs], m.target[runs], m.ramp_duration[runs], m.start[runs]),
+            self.point[runs],
+            self.count[runs],
+            self.usable[runs],
+            self.moving[runs],
+            self.end[runs],
+        )
+
+
+def settled_evidence(runs: xr.Dataset) -> SettledEvidence:
+    """Return where the tool settled after each movement of each run.
+
+    Args:
+        runs: A run set; `command` (run, time, motor) and `measured` (run, time, axis) are read.
+    """
+    time = as_floats(runs["time"].values)
+    measured = as_floats(runs["measured"].values)
+    movements = find_movements(as_floats(runs["command"].values), time)
+    end = _plateau_ends(movements, measured, time)
+    begin = np.maximum(
+        movements.start + movements.ramp_duration.max(axis=-1, initial=0.0) + SETTLING_S,
+        end - WINDOW_S,
+    )
+    shape = movements.start.shape
+    point, count = np.zeros((*shape, 3)), np.zeros(shape, dtype=np.int64)
+    moving = np.zeros(shape, dtype=bool)
+    rate = measured_rate(runs)
+    for run, movement in np.argwhere(movements.exists & (begin < end)):
+        first, stop = np.searchsorted(time, [begin[run, movement], end[run, movement] - 1e-9])
+        samples = measured[run, first:stop]
+        samples = samples[np.isfinite(samples).all(axis=1)]
+        if len(samples) == 0:
+            continue
+        point[run, movement] = np.median(samples, axis=0)
+        independent = int((end - begin)[run, movement] * rate) + 1
+        count[run, movement] = min(len(samples), independent)
+        moving[run, movement] = _spread(samples) > STILL_M
+    return SettledEvidence(movements, point, count, (count > 0) & ~moving, moving, end)
+
+
+def _plateau_ends(movements: Movements, measured: FloatArray, time: FloatArray) -> FloatArray:
+    """Return when each plateau ends: with the next movement or the last reading of the run."""
+    seen = np.isfinite(measured).all(axis=-1)
+    last = len(time) - 1 - np.argmax(seen[:, ::-1], axis=1)
+    step = time[1] - time[0]
+    stop = np.where(seen.any(axis=1), time[last] + step, 0.0)
+    following = np.full_like(movements.start, np.nan)
+    following[:, :-1] = movements.start[:, 1:]
+    return np.fmin(following, stop[:, None])
+
+
+def _spread(samples: FloatArray) -> float:
+    """Return how far readings (reading, axis) lie from their median, typically [m]."""
+    return float(np.median(np.linalg.norm(samples - np.median(samples, axis=0), axis=1)))

@@ -1,0 +1,161 @@
+"""Where a robot settles that has no fault, how surely, and what else chance may do to a movement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import gammaln
+
+from failuretwin.core.movements import Movements
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.decision.quadrature import log_of
+from failuretwin.digital_model.imperfections import Imperfections
+from failuretwin.digital_model.settling import Settling
+from failuretwin.digital_model.twin import DigitalTwin
+
+PATH_NOISE_M = 0.001
+"""Noise of a settled tool position [m]: one count of rounding in each motor moves it about 1 mm."""
+OUTLIER_RATE = 0.01
+"""Share of movements after which the tool may be anywhere in its workspace [-]."""
+LATE_MARGIN_S = 0.15
+"""A movement that lasts this much longer than the schedule allows started late [s]."""
+
+
+@dataclass(frozen=True)
+class Alternatives:
+    """What may become of each movement: every set of motors that may lose its command.
+
+    Attributes:
+        base: Angles that the motors then go for, (run, movement, alternative, motor) [rad].
+        direction: Sign of their last travel, (run, movement, alternative, motor).
+        log_weight: Log probability of each, (run, movement, alternative).
+    """
+
+    base: FloatArray
+    direction: FloatArray
+    log_weight: FloatArray
+
+
+@dataclass(frozen=True)
+class HealthyModel:
+    """Distribution of settled tool positions of the healthy robot.
+
+    Attributes:
+        twin: Kinematics.
+        imperfections: Offsets, scatter and rates of lost commands.
+    """
+
+    twin: DigitalTwin
+    imperfections: Imperfections
+
+    @cached_property
+    def settling(self) -> Settling:
+        """Settled offsets; of ideal motors where the imperfections have none."""
+        return self.imperfections.settling or Settling.ideal(len(self.twin.robot.motors))
+
+    @cached_property
+    def scatter(self) -> FloatArray:
+        """Scale of the settled scatter, (motor,) [rad]."""
+        return np.asarray(self.settling.scatter)
+
+    @cached_property
+    def outlier_log_density(self) -> float:
+        """Log of the outlier rate times the density of "anywhere within reach" [1/m3]."""
+        chain = self.twin.robot.chain
+        reach = sum(np.linalg.norm(joint.T_pj[:3, 3]) for joint in chain.joints)
+        reach += np.linalg.norm(chain.T_jt[:3, 3])
+        return float(np.log(OUTLIER_RATE) - np.log(4.0 / 3.0 * np.pi * reach**3))
+
+    def alternatives(self, movements: Movements) -> Alternatives:
+        """Return what may become of each movement; the first is that every command arrives.
+
+        Padding is filled with zeros; no evidence belongs to it.
+        """
+        robot, entries = self.twin.robot, self.imperfections.lost_commands
+        late = self._late(movements)
+        lost = np.zeros((1 + len(entries), len(robot.motors)), dtype=bool)
+        rates = np.zeros((*late.shape, 1 + len(entries)))
+        for i, entry in enumerate(entries, start=1):
+            lost[i, [robot.motor_names.index(motor) for motor in entry.motors]] = True
+            rates[..., i] = entry.rate + (entry.rate_when_late - entry.rate) * late
+        rates[..., 0] = 1.0 - rates.sum(axis=-1)
+        origin, target = np.nan_to_num(movements.origin()), np.nan_to_num(movements.target)
+        travel = np.sign(target - origin)
+        before = np.concatenate([np.zeros_like(travel[:, :1]), travel[:, :-1]], axis=1)
+        return Alternatives(
+            base=np.where(lost, origin[:, :, None], target[:, :, None]),
+            direction=np.where(lost, before[:, :, None], travel[:, :, None]),
+            log_weight=log_of(rates * (1.0 - OUTLIER_RATE)),
+        )
+
+    def _late(self, movements: Movements) -> FloatArray:
+        """Return the probability that each movement started late, (run, movement).
+
+        A late start holds up the next command, so the time between commands betrays it; for the
+        last movement of a run only the rate is known.
+        """
+        late = np.full(movements.start.shape, self.imperfections.timing.late_rate)
+        longest = self.imperfections.schedule.period_s[1] + LATE_MARGIN_S
+        known = movements.exists[:, 1:]
+        lasted = np.diff(movements.start, axis=1)
+        late[:, :-1] = np.where(known, lasted > longest, late[:, :-1])
+        return late
+
+    def settle(self, base: FloatArray, direction: FloatArray, held: BoolArray) -> FloatArray:
+        """Return the angles at which the motors settle, (..., motor) [rad].
+
+        Args:
+            base: Angles that they go for, (..., motor) [rad].
+            direction: Sign of their last travel, (..., motor).
+            held: Motors that stay exactly at `base`, (motor,).
+        """
+        robot = self.twin.robot
+        offset = self.settling.offset(robot.chain, robot.sense, base, direction)
+        return base + np.where(held, 0.0, offset)
+
+    def log_density(self, point: FloatArray, pose: FloatArray, held: BoolArray) -> FloatArray:
+        """Return the log density of settled tool positions, Student t about the predicted pose.
+
+        Args:
+            point: Measured positions, (..., axis) [m].
+            pose: Predicted settled angles, (..., motor) [rad]; broadcasts against `point`.
+            held: Motors that do not scatter, (motor,).
+
+        Returns:
+            (...) [log 1/m3].
+        """
+        predicted, jacobian = self.twin.path_and_jacobian(pose)
+        scaled = jacobian * np.where(held, 0.0, self.scatter)
+        return log_student(point - predicted, scaled, PATH_NOISE_M**2, self.settling.tail_dof)
+
+
+def log_student(
+    error: FloatArray, scaled_jacobian: FloatArray, noise: float, dof: float
+) -> FloatArray:
+    """Return log densities of a 3-variate Student t distribution with S = A A^T + noise I.
+
+    Args:
+        error: Deviations, (..., 3).
+        scaled_jacobian: A, the Jacobian times the scale of each motor, (..., 3, motor).
+        noise: Variance added on each axis.
+        dof: Degrees of freedom; infinite: normal.
+
+    Returns:
+        (...).
+    """
+    ax, ay, az = (scaled_jacobian[..., axis, :] for axis in range(3))
+    dot = "...i,...i->..."
+    xx, yy, zz = (np.einsum(dot, a, a) + noise for a in (ax, ay, az))
+    xy, xz, yz = np.einsum(dot, ax, ay), np.einsum(dot, ax, az), np.einsum(dot, ay, az)
+    cxx, cyy, czz = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
+    cxy, cxz, cyz = xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz
+    det = xx * cxx + xy * cxy + xz * cxz
+    x, y, z = error[..., 0], error[..., 1], error[..., 2]
+    square = cxx * x * x + cyy * y * y + czz * z * z
+    square = (square + 2.0 * (cxy * x * y + cxz * x * z + cyz * y * z)) / det
+    if np.isinf(dof):
+        return -0.5 * (3.0 * np.log(2.0 * np.pi) + np.log(det) + square)
+    constant = gammaln((dof + 3.0) / 2.0) - gammaln(dof / 2.0) - 1.5 * np.log(dof * np.pi)
+    return constant - 0.5 * np.log(det) - 0.5 * (dof + 3.0) * np.log1p(square / dof)
