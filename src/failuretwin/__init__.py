@@ -10,17 +10,31 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from failuretwin.data_knowledge.reading import ReadOptions, read_runs
+    from failuretwin.decision.bayes import BayesDiagnoser, Priors
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.twin import DigitalTwin
 
 __version__ = "0.1.0"
 
 _HOME = {
+    "BayesDiagnoser": "decision.bayes",
     "DigitalTwin": "digital_model.twin",
+    "Priors": "decision.bayes",
+    "ReadOptions": "data_knowledge.reading",
     "load_robot": "digital_model.robot",
+    "read_runs": "data_knowledge.reading",
 }
 
-__all__ = ["DigitalTwin", "__version__", "load_robot"]
+__all__ = [
+    "BayesDiagnoser",
+    "DigitalTwin",
+    "Priors",
+    "ReadOptions",
+    "__version__",
+    "load_robot",
+    "read_runs",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -117,6 +117,24 @@ class Imperfections:
 
 NO_IMPERFECTIONS = Imperfections("none", "the published twin")
 
+GENERIC_SCATTER_RAD = 0.01
+"""Settled scatter assumed of a robot of which nothing is known [rad], about half a degree."""
+
+
+def generic_imperfections(robot: Robot) -> Imperfections:
+    """Return wide healthy offsets for a robot whose own have not been measured."""
+    zero = (0.0,) * len(robot.motors)
+    scatter = (GENERIC_SCATTER_RAD,) * len(robot.motors)
+    settling = Settling(zero, zero, zero, scatter, 4.0, "assumed, no calibration")
+    return Imperfections("generic, not calibrated", "assumed", settling=settling)
+
+
+def default_imperfections(robot: Robot) -> Imperfections:
+    """Return those that the robot's profile names, or generic ones."""
+    if robot.imperfections_file is None:
+        return generic_imperfections(robot)
+    return load_imperfections(robot.name, robot)
+
 
 def load_imperfections(name_or_path: str, robot: Robot) -> Imperfections:
     """Load imperfections.

@@ -28,6 +28,8 @@ class Injection:
 
     def on_targets(self, movements: Movements) -> Movements:
         """Return the movements that the faulty motors follow; the given ones stay as they are."""
+        if not any(value.offset.any() for values in self.faults for value in values):
+            return movements
         target = movements.target.copy()
         for run, values in enumerate(self.faults):
             for value in values:

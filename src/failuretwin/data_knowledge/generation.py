@@ -1,0 +1,241 @@
+"""Runs made by the twin: any hypotheses, any imperfections, as many as wanted.
+
+Every run has its own random generator, seeded by the plan's seed and the run's number, so a run
+is the same whoever makes it and whatever is made beside it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from failuretwin import __version__
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.movements import Movements
+from failuretwin.core.runs import RunTable, Truth, concatenate
+from failuretwin.core.types import FloatArray
+from failuretwin.digital_model.imperfect import (
+    Disturbances,
+    actual_movements,
+    delay_commands,
+    draw_disturbances,
+    sag,
+    sense,
+    stack,
+)
+from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, Imperfections
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.failure_behavior.injection import Injection
+from failuretwin.failure_behavior.modes import MODES, FaultMode, FaultValue
+from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+STEP_S = 0.01
+"""Step of the time grid [s], as published."""
+CHUNK_RUNS = 100
+"""Runs computed at a time: about 30 MB of work."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to simulate.
+
+    Attributes:
+        robot: The robot.
+        hypotheses: States of the robot, in the order in which their runs come.
+        runs_per_class: Runs of each.
+        seed: Seed of all chance.
+        imperfections: What the healthy robot does that its twin does not.
+        movements: How movements are drawn.
+        modes: Fault modes with their distributions, by id.
+    """
+
+    robot: Robot
+    hypotheses: Sequence[Hypothesis]
+    runs_per_class: int
+    seed: int = 0
+    imperfections: Imperfections = NO_IMPERFECTIONS
+    movements: RandomMovements = field(default_factory=RandomMovements)
+    modes: Mapping[str, FaultMode] = field(default_factory=lambda: MODES)
+
+    def __post_init__(self) -> None:
+        if self.runs_per_class < 1:
+            raise InputError(f"runs per class is {self.runs_per_class}, expected 1 or more.")
+        for hypothesis in self.hypotheses:
+            if not hypothesis.known:
+                raise InputError("'unknown' cannot be simulated. Name the faults to simulate.")
+            for fault in hypothesis.faults:
+                if fault.mode not in self.modes:
+                    raise InputError(
+                        f"fault mode {fault.mode!r} cannot be simulated. "
+                        f"Expected one of {', '.join(self.modes)}."
+                    )
+
+    @property
+    def size(self) -> int:
+        """Number of runs."""
+        return len(self.hypotheses) * self.runs_per_class
+
+    @property
+    def time(self) -> FloatArray:
+        """Time grid of every run, (time,) [s]."""
+        return np.arange(round(self.movements.duration_s / STEP_S)) * STEP_S
+
+    def hypothesis_of(self, run: int) -> Hypothesis:
+        """Return the true state of a run."""
+        return self.hypotheses[run // self.runs_per_class]
+
+    def attributes(self) -> dict[str, str | int]:
+        """Return what a run set says of where it comes from."""
+        configuration = {
+            "hypotheses": [str(h) for h in self.hypotheses],
+            "runs_per_class": self.runs_per_class,
+            "imperfections": self.imperfections.name,
+            "movements": vars(self.movements),
+            "modes": {name: vars(mode) for name, mode in self.modes.items()},
+        }
+        return {
+            "robot": self.robot.name,
+            "source": "simulated by the servo engine",
+            "seed": self.seed,
+            "failuretwin_version": __version__,
+            "configuration": json.dumps(configuration),
+        }
+
+
+@dataclass(frozen=True)
+class _Draw:
+    """All chance of one run."""
+
+    movements: Movements
+    faults: tuple[FaultValue, ...]
+    chance: Disturbances
+
+
+def _draw(plan: Plan, run: int) -> _Draw:
+    rng = np.random.default_rng([plan.seed, run])
+    movements = plan.movements.draw(plan.robot, plan.imperfections.schedule, rng)
+    duration = float(plan.time[-1])
+    chance = draw_disturbances(plan.imperfections, plan.robot, plan.movements.count, duration, rng)
+    faults = tuple(
+        plan.modes[fault.mode].draw(fault.motor, plan.movements.count, duration, rng)
+        for fault in plan.hypothesis_of(run).faults
+    )
+    return _Draw(movements, faults, chance)
+
+
+def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
+    """Simulate some of a plan's runs.
+
+    Args:
+        plan: What to simulate.
+        runs: Numbers of the runs, each below `plan.size`.
+    """
+    draws = [_draw(plan, run) for run in runs]
+    chance = stack([draw.chance for draw in draws])
+    commanded = delay_commands(stack_movements([draw.movements for draw in draws]), chance.late)
+    injection = Injection([draw.faults for draw in draws], plan.robot.motor_names, plan.modes)
+    command, time = commanded.reference(plan.time), plan.time
+    position = _motor_angles(plan, commanded, command, injection, chance)
+    measured = sense(
+        DigitalTwin(plan.robot),
+        plan.imperfections.readings,
+        position,
+        time,
+        commanded.start,
+        chance,
+    )
+    readings = plan.imperfections.readings
+    return RunTable(
+        run=[_run_name(plan, run) for run in runs],
+        motor=plan.robot.motor_names,
+        time=time,
+        command=command,
+        measured=measured,
+        measured_rate_hz=1.0 / STEP_S if readings is None else readings.rate_hz,
+        movements=commanded,
+        truth=_truth(plan, runs, draws, injection.magnitudes(position)),
+        position=position,
+        attributes=plan.attributes(),
+    )
+
+
+def _motor_angles(
+    plan: Plan,
+    commanded: Movements,
+    command: FloatArray,
+    injection: Injection,
+    chance: Disturbances,
+) -> FloatArray:
+    """Return the true angles of the motors, (run, time, motor) [rad].
+
+    A fault acts on targets, then on angles; gravity pulls at the pose that the arm is really in,
+    and a motor that holds its angle does not give way.
+    """
+    faulty = injection.on_targets(commanded)
+    if plan.imperfections is NO_IMPERFECTIONS:
+        followed = command if faulty is commanded else faulty.reference(plan.time)
+    else:
+        followed = actual_movements(faulty, plan.imperfections, chance).reference(plan.time)
+    moved = DigitalTwin(plan.robot).respond(followed, plan.time)
+    held = injection.on_angles(moved, plan.time)
+    if plan.imperfections.settling is None:
+        return held
+    return injection.on_angles(moved + sag(plan.imperfections, plan.robot, held), plan.time)
+
+
+def _run_name(plan: Plan, run: int) -> str:
+    return f"{plan.hypothesis_of(run)}/{run % plan.runs_per_class:05d}"
+
+
+def _truth(
+    plan: Plan, runs: Sequence[int], draws: Sequence[_Draw], magnitude: FloatArray
+) -> Truth:
+    onset = [min((v.onset_s for v in draw.faults), default=np.nan) for draw in draws]
+    return Truth(
+        fault=[str(plan.hypothesis_of(run)) for run in runs],
+        detail=[{"faults": [value.detail() for value in draw.faults]} for draw in draws],
+        onset=np.array(onset),
+        magnitude=magnitude,
+    )
+
+
+def simulate(
+    plan: Plan, workers: int = 1, on_progress: Callable[[int], None] | None = None
+) -> xr.Dataset:
+    """Simulate all runs of a plan.
+
+    Args:
+        plan: What to simulate.
+        workers: Processes to spread the work over; the result does not depend on it.
+        on_progress: Called with the number of runs that have just been finished.
+    """
+    if workers < 1:
+        raise InputError(f"workers is {workers}, expected 1 or more.")
+    chunks = [
+        range(first, min(first + CHUNK_RUNS, plan.size))
+        for first in range(0, plan.size, CHUNK_RUNS)
+    ]
+    tables = []
+    for table in _tables(plan, chunks, workers):
+        tables.append(table)
+        if on_progress is not None:
+            on_progress(len(table.run))
+    return concatenate([table.to_dataset() for table in tables])
+
+
+def _tables(plan: Plan, chunks: Sequence[range], workers: int) -> Iterator[RunTable]:
+    if workers == 1:
+        yield from (simulate_runs(plan, chunk) for chunk in chunks)
+        return
+    with ProcessPoolExecutor(workers) as pool:
+        yield from pool.map(simulate_runs, [plan] * len(chunks), chunks)
