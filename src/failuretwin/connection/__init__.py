@@ -1,0 +1,1 @@
+"""Connection and updating: links to robots, live shadow, calibration."""

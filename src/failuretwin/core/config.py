@@ -1,4 +1,4 @@
-"""Tables from TOML files into frozen dataclasses: a wrong key or type is an error, never ignored."""
+"""Tables from TOML files into frozen dataclasses: a wrong key or type is always an error."""
 
 from __future__ import annotations
 

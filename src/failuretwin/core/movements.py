@@ -61,8 +61,10 @@ class Movements:
 
     def reference(self, time: FloatArray) -> FloatArray:
         """Return the reference of every motor at `time` (time,) [s]: (run, time, motor) [rad]."""
-        knot_time, knot_value = self._knots()
         runs, motors = self.initial.shape
+        if self.start.shape[1] == 0:
+            return np.repeat(self.initial[:, None], len(time), axis=1)
+        knot_time, knot_value = self._knots()
         reference = np.empty((runs, motors, len(time)))
         for run in range(runs):
             for motor in range(motors):
@@ -144,7 +146,7 @@ def _movements_of_run(
     moving = np.abs(np.diff(command, axis=0)) > CORNER_TOLERANCE_RAD
     rest = np.zeros((1, command.shape[1]), dtype=bool)
     leaves = moving & ~np.concatenate([rest, moving[:-1]])
-    first = _merge_starts(np.flatnonzero(leaves.any(axis=1)), int(round(SAME_MOVEMENT_S / step)))
+    first = _merge_starts(np.flatnonzero(leaves.any(axis=1)), round(SAME_MOVEMENT_S / step))
     if len(first) == 0:
         return np.empty(0), np.empty((0, command.shape[1])), np.empty((0, command.shape[1]))
     last = np.append(first[1:], len(time) - 1)

@@ -110,16 +110,20 @@ class RunTable:
             }
         if self.position is not None:
             values["position"] = self.position
-        runs = xr.Dataset(
-            {name: (VARIABLES[name][0], value) for name, value in values.items()},
-            coords={
-                "run": np.asarray(self.run, dtype=object),
-                "time": self.time,
-                "motor": np.asarray(self.motor, dtype=object),
-                "axis": np.asarray(AXES, dtype=object),
-            },
-            attrs={**self.attributes, "measured_rate_hz": float(self.measured_rate_hz)},
-        )
+        coordinates = {
+            "run": np.asarray(self.run, dtype=object),
+            "time": self.time,
+            "motor": np.asarray(self.motor, dtype=object),
+            "axis": np.asarray(AXES, dtype=object),
+        }
+        try:
+            runs = xr.Dataset(
+                {name: (VARIABLES[name][0], value) for name, value in values.items()},
+                coords=coordinates,
+                attrs={**self.attributes, "measured_rate_hz": float(self.measured_rate_hz)},
+            )
+        except ValueError as error:
+            raise InputError(f"the arrays of the run set do not fit together: {error}.") from error
         for name in runs.data_vars:
             runs[name].attrs["units"] = VARIABLES[str(name)][1]
         return check_runs(runs, "the run set")
@@ -135,6 +139,19 @@ def check_runs(runs: xr.Dataset, where: str) -> xr.Dataset:
     Raises:
         InputError: Naming the first thing that is missing or wrong, and what is expected.
     """
+    _check_variables(runs, where)
+    if runs.sizes["run"] == 0:
+        raise InputError(f"{where}: holds no runs. Expected at least one.")
+    if tuple(map(str, runs["axis"].values)) != AXES:
+        raise InputError(f"{where}: coordinate `axis` is {runs['axis'].values}, expected x, y, z.")
+    _check_time(as_floats(runs["time"].values), where)
+    names = [str(name) for name in runs["run"].values]
+    if len(set(names)) < len(names):
+        raise InputError(f"{where}: run names are not unique. Rename the runs that repeat.")
+    return runs
+
+
+def _check_variables(runs: xr.Dataset, where: str) -> None:
     for name in REQUIRED:
         if name not in runs:
             present = ", ".join(sorted(map(str, runs.data_vars))) or "nothing"
@@ -142,23 +159,17 @@ def check_runs(runs: xr.Dataset, where: str) -> xr.Dataset:
                 f"{where}: no variable `{name}`; it holds {present}. A run set needs "
                 f"`command` (run, time, motor) [rad] and `measured` (run, time, axis) [m]."
             )
+    for name in ("run", "time", "motor", "axis"):
+        if name not in runs.coords:
+            raise InputError(f"{where}: no coordinate `{name}`. A run set names every {name}.")
     for name, (dims, _) in VARIABLES.items():
         if name in runs and runs[name].dims != dims:
             raise InputError(
                 f"{where}: `{name}` has dimensions {runs[name].dims}, expected {dims}."
             )
-    if runs.sizes["run"] == 0:
-        raise InputError(f"{where}: holds no runs. Expected at least one.")
-    if tuple(map(str, runs["axis"].values)) != AXES:
-        raise InputError(f"{where}: coordinate `axis` is {runs['axis'].values}, expected x, y, z.")
     for name in REQUIRED:
         if runs[name].dtype.kind not in "fiu":
             raise InputError(f"{where}: `{name}` holds {runs[name].dtype}, expected numbers.")
-    _check_time(as_floats(runs["time"].values), where)
-    names = [str(name) for name in runs["run"].values]
-    if len(set(names)) < len(names):
-        raise InputError(f"{where}: run names are not unique. Rename the runs that repeat.")
-    return runs
 
 
 def _check_time(time: FloatArray, where: str) -> None:
@@ -207,9 +218,17 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     movements = max((part.sizes.get("movement", 0) for part in parts), default=0)
     padded = [_pad(part[shared], longest["time"].values, movements) for part in parts]
     whole = xr.concat(
-        padded, "run", data_vars="minimal", coords="minimal", join="exact", compat="override", combine_attrs="override"
+        padded,
+        "run",
+        data_vars="minimal",
+        coords="minimal",
+        join="exact",
+        compat="override",
+        combine_attrs="override",
     )
-    return whole.assign_coords(run=np.asarray(_unique(whole["run"].values), dtype=object))
+    return whole.assign_coords(
+        run=np.asarray(_unique([str(name) for name in whole["run"].values]), dtype=object)
+    )
 
 
 def _check_same_kind(first: xr.Dataset, other: xr.Dataset) -> None:
@@ -237,11 +256,14 @@ def _pad(part: xr.Dataset, time: FloatArray, movements: int) -> xr.Dataset:
 
 
 def _unique(names: Sequence[str]) -> list[str]:
-    seen: dict[str, int] = {}
-    unique = []
-    for name in map(str, names):
-        seen[name] = seen.get(name, 0) + 1
-        unique.append(name if seen[name] == 1 else f"{name}#{seen[name]}")
+    """Return `names` with a number behind each that was there before."""
+    given, used, unique = set(names), set[str](), []
+    for name in names:
+        number, candidate = 2, name
+        while candidate in used or (candidate != name and candidate in given):
+            candidate, number = f"{name}#{number}", number + 1
+        used.add(candidate)
+        unique.append(candidate)
     return unique
 
 

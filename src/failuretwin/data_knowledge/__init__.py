@@ -1,0 +1,1 @@
+"""Data and knowledge: run sets, readers, storage, generation."""

@@ -19,7 +19,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable, Truth, concatenate
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.imperfect import (
     Disturbances,
     actual_movements,
@@ -88,7 +88,7 @@ class Plan:
     @property
     def time(self) -> FloatArray:
         """Time grid of every run, (time,) [s]."""
-        return np.arange(round(self.movements.duration_s / STEP_S)) * STEP_S
+        return as_floats(np.arange(round(self.movements.duration_s / STEP_S)) * STEP_S)
 
     def hypothesis_of(self, run: int) -> Hypothesis:
         """Return the true state of a run."""
@@ -197,9 +197,7 @@ def _run_name(plan: Plan, run: int) -> str:
     return f"{plan.hypothesis_of(run)}/{run % plan.runs_per_class:05d}"
 
 
-def _truth(
-    plan: Plan, runs: Sequence[int], draws: Sequence[_Draw], magnitude: FloatArray
-) -> Truth:
+def _truth(plan: Plan, runs: Sequence[int], draws: Sequence[_Draw], magnitude: FloatArray) -> Truth:
     onset = [min((v.onset_s for v in draw.faults), default=np.nan) for draw in draws]
     return Truth(
         fault=[str(plan.hypothesis_of(run)) for run in runs],

@@ -84,7 +84,9 @@ def read_session(folder: Path, robot: Robot) -> RawSession:
             f"{len(duration)}. Expected a duration for every command."
         )
     if len(reading) < 2:
-        raise InputError(f"{folder / POSITION_FILE}: has {len(reading)} readings, expected two at least.")
+        raise InputError(
+            f"{folder / POSITION_FILE}: has {len(reading)} readings, expected two at least."
+        )
     if not robot.servo_units.valid(reading[:, 1:]).all(axis=1).any():
         raise InputError(
             f"{folder / POSITION_FILE}: no reading lies within the servo's range of "
@@ -114,7 +116,9 @@ def _read_table(path: Path, columns: Sequence[str]) -> FloatArray:
     wanted = ["timestamp", *columns]
     for column in wanted:
         if column not in table:
-            raise InputError(f"{path}: missing a column: {unknown_name('column', column, table)}")
+            raise InputError(
+                f"{path}: missing a column: {unknown_name('column', column, map(str, table))}"
+            )
     if table.empty:
         raise InputError(f"{path}: has a header but no rows.")
     numbers = table[wanted].apply(pd.to_numeric, errors="coerce").to_numpy(dtype=np.float64)

@@ -81,9 +81,7 @@ def _read_source(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Data
 
 def _session_dataset(folder: Path, robot: Robot, options: ReadOptions) -> xr.Dataset:
     session = read_session(folder, robot)
-    table = session_runs(
-        session, robot, options.how, published_labels=options.published_labels
-    )
+    table = session_runs(session, robot, options.how, published_labels=options.published_labels)
     runs = table.to_dataset()
     runs.attrs |= {
         "robot": robot.name,

@@ -17,7 +17,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable, Truth
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.raw_session import COMMAND_FILE, RawSession
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
@@ -138,7 +138,7 @@ class _Run:
 def _measured_run(session: RawSession, robot: Robot, span: RowSpan, label: int | None) -> _Run:
     units = robot.servo_units
     begin, end = _measured_window(session, span)
-    time = np.arange(int(np.floor((end - begin) / GRID_STEP_S)) + 1) * GRID_STEP_S
+    time = as_floats(np.arange(int(np.floor((end - begin) / GRID_STEP_S)) + 1) * GRID_STEP_S)
     movements = _movements(session, robot, span, begin, _initial_counts(session, span, begin))
     inside = (session.reading_time >= begin) & (session.reading_time <= end)
     kept = inside & ~_before_gap(session)
@@ -200,8 +200,8 @@ def _measured_window(session: RawSession, span: RowSpan) -> tuple[float, float]:
         rows = f"rows {span.first + 2} to {span.stop + 1} of {COMMAND_FILE}"
         if span.stop - span.first == 1 or end <= session.command_time[span.first]:
             raise InputError(
-                f"{session.folder}: the readings end before the movements of {rows} do; a run needs "
-                "one whole movement at least. Log for longer."
+                f"{session.folder}: the readings end before the movements of {rows} do; a run "
+                "needs one whole movement at least. Log for longer."
             )
     return begin, end
 

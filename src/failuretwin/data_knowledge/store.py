@@ -27,7 +27,7 @@ def load_run_set(path: Path) -> xr.Dataset:
     """
     import xarray as xr
 
-    opener = {".nc": _open_netcdf, ".zarr": xr.open_zarr}[path.suffix]
+    opener = _open_netcdf if path.suffix == ".nc" else xr.open_zarr
     try:
         with opener(path) as stored:
             runs = stored.load()

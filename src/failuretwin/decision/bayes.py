@@ -25,6 +25,7 @@ from failuretwin.decision.steady_state_error import (
 from failuretwin.decision.stuck import OnsetPrior, StuckEvidence, stuck_evidence
 from failuretwin.decision.wording import quality_of, verdict
 from failuretwin.digital_model.imperfections import Imperfections, default_imperfections
+from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
 if TYPE_CHECKING:
@@ -47,6 +48,33 @@ class Priors:
 
     onset: OnsetPrior = field(default_factory=OnsetPrior)
     error_ranges: Sequence[Range] = ERROR_RANGES
+
+
+def priors_of(
+    robot: Robot, error_range_counts: tuple[float, float] | None, onset_s: float | None
+) -> Priors:
+    """Return priors with what is known of the faults, the default for what is not.
+
+    Args:
+        robot: The robot, for its servo units.
+        error_range_counts: Range of steady-state errors [servo units].
+        onset_s: Onset of stuck faults [s].
+
+    Raises:
+        InputError: If the range is not 0 <= low < high or the onset is negative.
+    """
+    priors = Priors()
+    if error_range_counts is not None:
+        low, high = error_range_counts
+        if not 0.0 <= low < high:
+            raise InputError(f"--sse-range is {low:g} {high:g}, expected 0 <= LOW < HIGH.")
+        count = robot.servo_units.rad_per_count
+        priors = replace(priors, error_ranges=((low * count, high * count),))
+    if onset_s is not None:
+        if not onset_s >= 0.0:
+            raise InputError(f"--onset is {onset_s:g} s, expected 0 or more.")
+        priors = replace(priors, onset=replace(priors.onset, known_s=onset_s))
+    return priors
 
 
 @dataclass(frozen=True)
@@ -102,7 +130,8 @@ class BayesDiagnoser:
                 "of one movement at least."
             )
         names = [str(name) for name in runs["run"].values]
-        truth = truth_of(runs) or [None] * len(names)
+        known = truth_of(runs)
+        truth: list[str | None] = [None] * len(names) if known is None else list(known)
         results = []
         for first in range(0, len(names), CHUNK_RUNS):
             part = slice(first, first + CHUNK_RUNS)
@@ -150,9 +179,7 @@ class BayesDiagnoser:
         fault = hypothesis.faults[0]
         motor = self.twin.robot.motor_names.index(fault.motor)
         if fault.mode == "stuck":
-            return stuck_evidence(
-                evidence, model, alternatives, healthy, motor, self.priors.onset
-            )
+            return stuck_evidence(evidence, model, alternatives, healthy, motor, self.priors.onset)
         return error_evidence(evidence, model, alternatives, motor, self.priors.error_ranges)
 
     def _conclude(
@@ -169,9 +196,7 @@ class BayesDiagnoser:
         diagnosis = Diagnosis(
             run=name,
             truth=truth,
-            posterior={
-                str(h): float(p) for h, p in zip(self._hypotheses, posterior, strict=True)
-            },
+            posterior={str(h): float(p) for h, p in zip(self._hypotheses, posterior, strict=True)},
             quality=quality_of(evidence, run),
             protocol=imperfections.protocol,
             method=f"bayes, settled poses; healthy behaviour: {imperfections.name}",

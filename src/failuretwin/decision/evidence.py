@@ -92,7 +92,7 @@ def settled_evidence(runs: xr.Dataset) -> SettledEvidence:
 
 def _plateau_ends(movements: Movements, measured: FloatArray, time: FloatArray) -> FloatArray:
     """Return when each plateau ends: with the next movement or the last reading of the run."""
-    seen = np.isfinite(measured).all(axis=-1)
+    seen = np.asarray(np.isfinite(measured).all(axis=-1))
     last = len(time) - 1 - np.argmax(seen[:, ::-1], axis=1)
     step = time[1] - time[0]
     stop = np.where(seen.any(axis=1), time[last] + step, 0.0)

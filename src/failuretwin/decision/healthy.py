@@ -1,4 +1,4 @@
-"""Where a robot settles that has no fault, how surely, and what else chance may do to a movement."""
+"""Where a robot without a fault settles, how surely, and what chance may do to a movement."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ def _log_density(
     motor: int,
     offset: FloatArray,
 ) -> FloatArray:
-    """Return the log density of each point with `motor` off by `offset`, (run, movement, offset)."""
+    """Return log densities with `motor` off by `offset`, (run, movement, offset)."""
     held = np.zeros(len(model.scatter), dtype=bool)
     pose = model.settle(alternatives.base, alternatives.direction, held)[:, :, None]
     pose = np.repeat(pose, len(offset), axis=2)

@@ -102,7 +102,9 @@ def _angle_nodes(
 ) -> FloatArray:
     """Return angles to integrate over, sorted, (run, node) [rad]."""
     low, high = _range(model, motor)
-    coarse = np.broadcast_to(np.linspace(low, high, COARSE_NODES), (len(evidence.point), COARSE_NODES))
+    coarse = np.broadcast_to(
+        np.linspace(low, high, COARSE_NODES), (len(evidence.point), COARSE_NODES)
+    )
     best, width = _best_angle(evidence, model, alternatives, motor)
     local = best[..., None] + width[..., None] * LOCAL_STEPS
     local = np.where(np.isfinite(local), local, low).reshape(len(coarse), -1)
@@ -270,4 +272,3 @@ def _onset_quantiles(
     )
     values, weights = (np.nan_to_num(v.reshape(len(v), -1)) for v in (values, weights))
     return weighted_quantiles(values, weights, (0.05, 0.5, 0.95))
-

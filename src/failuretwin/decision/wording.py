@@ -35,7 +35,9 @@ def verdict(diagnosis: Diagnosis, *, enough: bool) -> str:
         text += f" at {np.rad2deg(diagnosis.magnitude or 0.0):.0f} deg {_since(diagnosis.onset_s)}"
     elif name.endswith(":steady_state_error"):
         motor = plain_name(name.partition(":")[0])
-        text = f"{motor} misses its targets by about {np.rad2deg(diagnosis.magnitude or 0.0):.1f} deg"
+        text = (
+            f"{motor} misses its targets by about {np.rad2deg(diagnosis.magnitude or 0.0):.1f} deg"
+        )
     text += f", {percent(diagnosis.probability)} sure"
     if diagnosis.probability < 0.9 and diagnosis.runner_up is not None:
         share = percent(diagnosis.posterior[diagnosis.runner_up])

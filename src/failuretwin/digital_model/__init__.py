@@ -1,0 +1,1 @@
+"""The digital model: a robot, its kinematics and servo loops, and how a healthy one errs."""

@@ -149,9 +149,7 @@ def _sum(a: Scalar, b: Scalar) -> Scalar:
 def _turn(T: FloatArray, v: Vector) -> Vector:
     """Return the direction `v` turned by the constant transform `T`."""
     rows = T[:3, :3].tolist()
-    x, y, z = (
-        _sum(_sum(_scale(r[0], v[0]), _scale(r[1], v[1])), _scale(r[2], v[2])) for r in rows
-    )
+    x, y, z = (_sum(_sum(_scale(r[0], v[0]), _scale(r[1], v[1])), _scale(r[2], v[2])) for r in rows)
     return x, y, z
 
 

@@ -29,7 +29,7 @@ class Disturbances:
         delay: Dead time, () [s].
         shortening: Share by which ramps end early, ().
         late: Late start, (movement,) [s].
-        gap_start: Readings stop this long after a movement whose successor is late, (movement,) [s].
+        gap_start: Readings stop this long after a movement before a late one, (movement,) [s].
         reading_time: Times of the readings, (reading,) [s].
         glitch: Raw counts of spoilt readings, NaN where sound, (reading, motor).
         noise: Noise of the tool sensor, (reading, axis) [m].
@@ -125,7 +125,9 @@ def _draw_readings(
     times[1:] += rng.normal(0.0, readings.jitter_s, count - 1) if readings.jitter_s else 0.0
     spoilt = rng.random((count, motors)) < np.asarray(readings.glitch_rate or [0.0] * motors)
     glitch = np.where(spoilt, rng.integers(-32768, 32768, (count, motors)), np.nan)
-    noise = rng.normal(0.0, readings.noise_m, (count, 3)) if readings.noise_m else np.zeros((count, 3))
+    noise = (
+        rng.normal(0.0, readings.noise_m, (count, 3)) if readings.noise_m else np.zeros((count, 3))
+    )
     return np.maximum.accumulate(times), glitch, noise
 
 
@@ -272,4 +274,3 @@ def _draw_out(
                 time, chance.reading_time[run, kept], counts[run, kept, motor]
             )
     return twin.path(units.to_rad(filled))
-

@@ -37,8 +37,9 @@ class ServoLoop:
         from scipy.signal import cont2discrete
 
         tau = self.filter_s
-        denominator = [tau * tau, 2.0 * tau, 1.0 + self.P, self.I]
-        b, a, _ = cont2discrete(([self.P, self.I], denominator), step, method="foh")
+        numerator = np.array([self.P, self.I])
+        denominator = np.array([tau * tau, 2.0 * tau, 1.0 + self.P, self.I])
+        b, a, _ = cont2discrete((numerator, denominator), step, method="foh")
         return np.ravel(b), np.ravel(a)
 
 

@@ -81,5 +81,7 @@ class DigitalTwin:
 def _uniform_step(time: FloatArray) -> float:
     steps = np.diff(time)
     if len(steps) == 0 or steps.min() <= 0 or np.ptp(steps) > 1e-6 * steps.mean():
-        raise InputError("`time` is not a uniform, increasing grid. Resample the commands onto one.")
+        raise InputError(
+            "`time` is not a uniform, increasing grid. Resample the commands onto one."
+        )
     return float((time[-1] - time[0]) / len(steps))

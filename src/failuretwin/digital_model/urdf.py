@@ -93,7 +93,11 @@ class Urdf:
                 turn[:3, :3] = rotation_to_z(joint.axis)
                 joints.append(
                     Joint(
-                        joint.name, joint.type == "prismatic", _snap(T @ turn), joint.low, joint.high
+                        joint.name,
+                        joint.type == "prismatic",
+                        _snap(T @ turn),
+                        joint.low,
+                        joint.high,
                     )
                 )
                 T = turn.T
@@ -102,7 +106,9 @@ class Urdf:
     def _check_movable(self, name: str, path: tuple[UrdfJoint, ...]) -> None:
         names = [joint.name for joint in path]
         if name not in names:
-            raise InputError(f"{self.source}: {unknown_name('joint on the way to the tool', name, names)}")
+            raise InputError(
+                f"{self.source}: {unknown_name('joint on the way to the tool', name, names)}"
+            )
         joint = path[names.index(name)]
         if joint.type not in MOVING_TYPES:
             raise InputError(
@@ -194,7 +200,7 @@ def _number(element: ElementTree.Element | None, key: str, where: str) -> float:
 
 
 def transform(xyz: tuple[float, float, float], rpy: tuple[float, float, float]) -> FloatArray:
-    """Return the pose (4, 4) with offset `xyz` [m], turned by roll, pitch, yaw [rad] (URDF order)."""
+    """Return the pose (4, 4) at `xyz` [m], turned by roll, pitch and yaw `rpy` [rad]."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
     T = np.eye(4)
     T[:3, :3] = [

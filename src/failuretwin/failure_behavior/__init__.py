@@ -1,0 +1,1 @@
+"""The failure behaviour model: fault modes, their injection, random movements."""

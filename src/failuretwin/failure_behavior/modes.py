@@ -51,7 +51,10 @@ class FaultValue:
 class FaultMode(Protocol):
     """A fault mode with the distributions of its parameters."""
 
-    mode: str
+    @property
+    def mode(self) -> str:
+        """Id of the mode."""
+        ...
 
     def draw(
         self, motor: str, movements: int, duration: float, rng: np.random.Generator
@@ -105,7 +108,9 @@ class SteadyStateError:
     def __post_init__(self) -> None:
         low, high = self.bounds
         if not 0.0 <= low <= high:
-            raise InputError(f"error bounds are {low:g} and {high:g} rad, expected 0 <= low <= high.")
+            raise InputError(
+                f"error bounds are {low:g} and {high:g} rad, expected 0 <= low <= high."
+            )
 
     def draw(
         self, motor: str, movements: int, duration: float, rng: np.random.Generator
@@ -121,5 +126,8 @@ class SteadyStateError:
         return position
 
 
-MODES: dict[str, FaultMode] = {mode.mode: mode for mode in (Stuck(), SteadyStateError())}
+MODES: dict[str, FaultMode] = {
+    "stuck": Stuck(),
+    "steady_state_error": SteadyStateError(),
+}
 """The fault modes that can be simulated, with the paper's distributions."""

@@ -1,0 +1,78 @@
+"""Speed of the main jobs on one core, in seconds and relative to a fixed piece of numpy work.
+
+The ratio holds when the machine's speed drifts: the reference is timed in the same run.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
+from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.data_knowledge.generation import Plan, simulate
+from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, load_imperfections
+
+PUBLISHED_GENERATION_S = 8.0 * 3600.0
+"""Time that the authors' generation of 3600 runs took [s]."""
+
+
+def best_of(work: Callable[[], object], times: int = 3) -> float:
+    """Return the shortest of a few timings of `work` [s]."""
+    timings = []
+    for _ in range(times):
+        start = time.perf_counter()
+        work()
+        timings.append(time.perf_counter() - start)
+    return min(timings)
+
+
+def main() -> None:
+    """Time everything and print a table."""
+    robot = load_robot("armpi_fpv")
+    twin = DigitalTwin(robot)
+    imperfect = load_imperfections("armpi_fpv", robot)
+    rng = np.random.default_rng(0)
+    poses = rng.uniform(-1.5, 1.5, (3_600_000, 4))
+    classes = paper_hypotheses(robot.motor_names)
+    runs = simulate(Plan(robot, classes, 10, imperfections=imperfect))
+    published = simulate(Plan(robot, classes, 400))
+    command, grid = published["command"].values, published["time"].values
+    del published
+    diagnoser = BayesDiagnoser(twin)
+
+    reference = best_of(lambda: np.sin(poses) + np.cos(poses))
+    jobs: list[tuple[str, Callable[[], object]]] = [
+        ("forward kinematics, 3.6 million poses", lambda: twin.path(poses)),
+        (
+            "position and Jacobian, 3.6 million poses",
+            lambda: robot.chain.position_and_jacobian(poses),
+        ),
+        (
+            "twin, 3600 runs of 1000 samples: responses and path",
+            lambda: twin.path(twin.respond(command, grid)),
+        ),
+        (
+            "generation, 3600 runs, no imperfections",
+            lambda: simulate(Plan(robot, classes, 400, imperfections=NO_IMPERFECTIONS)),
+        ),
+        (
+            "generation, 3600 runs, all imperfections",
+            lambda: simulate(Plan(robot, classes, 400, imperfections=imperfect)),
+        ),
+        ("diagnosis, 90 runs, nine hypotheses", lambda: diagnoser.diagnose(runs)),
+    ]
+    print(f"reference: sine and cosine of 14.4 million numbers, {reference:.3f} s = 1\n")
+    print(f"{'job':55s} {'seconds':>8s} {'ratio':>7s}")
+    for name, work in jobs:
+        seconds = best_of(work)
+        note = ""
+        if name.startswith("generation"):
+            note = f"  {PUBLISHED_GENERATION_S / seconds:.0f} times the published 8.0 h"
+        print(f"{name:55s} {seconds:8.3f} {seconds / reference:7.2f}{note}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,48 @@
+"""Nine robots, one for each state of the paper, diagnosed from commands and tool path alone.
+
+The robots are simulated with the imperfections of a real ArmPi FPV: they sag, stick, lag, lose
+commands and glitch. Run with `make demo`.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
+from failuretwin.app.plots import run_figure
+from failuretwin.app.progress import progress_bar
+from failuretwin.app.tables import print_diagnoses, print_scores
+from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.data_knowledge.generation import Plan, simulate
+from failuretwin.digital_model.imperfections import load_imperfections
+
+RUNS_PER_CLASS = 10
+PICTURE = Path(__file__).parents[1] / "docs" / "images" / "demo.png"
+
+robot = load_robot("armpi_fpv")
+plan = Plan(
+    robot=robot,
+    hypotheses=paper_hypotheses(robot.motor_names),
+    runs_per_class=RUNS_PER_CLASS,
+    seed=3,
+    imperfections=load_imperfections("armpi_fpv", robot),
+)
+with progress_bar("simulating", plan.size) as advance:
+    runs = simulate(plan, on_progress=advance)
+
+twin = DigitalTwin(robot)
+diagnoses = BayesDiagnoser(twin).diagnose(runs)
+print_diagnoses(diagnoses)
+print_scores([diagnosis.to_record() for diagnosis in diagnoses])
+
+shown = next(i for i, d in enumerate(diagnoses) if d.truth == d.diagnosis == "motor_3:stuck")
+run = runs.isel(run=shown)
+figure = run_figure(
+    run["time"].values,
+    twin.path(run["command"].values),
+    np.asarray(run["measured"].values),
+    diagnoses[shown],
+)
+PICTURE.parent.mkdir(parents=True, exist_ok=True)
+figure.savefig(PICTURE, dpi=110)
+print(f"\npicture of run {diagnoses[shown].run}: {PICTURE}")

@@ -1,0 +1,5 @@
+"""`python -m failuretwin`."""
+
+from failuretwin.app.cli import main
+
+main()

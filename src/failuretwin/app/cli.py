@@ -1,0 +1,42 @@
+"""The command line: `failuretwin VERB ...`.
+
+Verbs import what they need when they run, so that `--help` answers at once. Errors meant for
+users end in one line and exit code 2.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import click
+
+from failuretwin import __version__
+from failuretwin.app.commands.diagnose import diagnose
+from failuretwin.app.commands.evaluate import evaluate
+from failuretwin.app.commands.import_ import import_
+from failuretwin.app.commands.simulate import simulate
+from failuretwin.core.errors import FailureTwinError
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(__version__, prog_name="failuretwin")
+def cli() -> None:
+    """Tell from commands and the tool path alone which motor of a robot arm failed, and how."""
+
+
+for command in (import_, simulate, diagnose, evaluate):
+    cli.add_command(command)
+
+
+def main() -> None:
+    """Run the command line."""
+    try:
+        cli(standalone_mode=False)
+    except click.exceptions.Abort:
+        sys.exit("interrupted")
+    except click.ClickException as error:
+        error.show()
+        sys.exit(2)
+    except FailureTwinError as error:
+        click.echo(f"error: {error}", err=True)
+        sys.exit(2)

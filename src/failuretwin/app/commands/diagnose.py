@@ -1,0 +1,80 @@
+"""`failuretwin diagnose`: which motor failed, how, since when and how surely."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from failuretwin.app.commands.options import PATH, common_options, reading_options
+
+
+@click.command()
+@click.argument("inputs", nargs=-1, required=True, type=PATH, metavar="INPUT...")
+@click.option(
+    "--hypotheses",
+    metavar="H,...",
+    help="What may be the case, such as healthy,motor_2:stuck. Default: the paper's nine classes.",
+)
+@click.option(
+    "--sse-range",
+    nargs=2,
+    type=float,
+    metavar="LOW HIGH",
+    help="Known range of steady-state errors [servo units]. Default: several, weighed.",
+)
+@click.option("--onset", type=float, metavar="SECONDS", help="Onset of stuck faults, where known.")
+@click.option("--json", "json_file", type=PATH, help="Write an object a line, a line a run.")
+@click.option("--csv", "csv_file", type=PATH, help="Write a table, a row a run.")
+@click.option("--plot", type=PATH, metavar="DIR", help="Write a picture of each run.")
+@reading_options
+@common_options
+def diagnose(
+    inputs: tuple[Path, ...],
+    hypotheses: str | None,
+    sse_range: tuple[float, float] | None,
+    onset: float | None,
+    json_file: Path | None,
+    csv_file: Path | None,
+    plot: Path | None,
+    how: str,
+    published_labels: bool,
+    robot: str,
+    seed: int,
+) -> None:
+    """Diagnose runs from commands and tool path alone.
+
+    INPUT is a run set (.nc, .zarr) or a folder with raw sessions, which is searched downwards.
+    """
+    del seed  # nothing here is drawn by chance
+    from failuretwin.app.inputs import read_inputs
+    from failuretwin.app.results import write_csv, write_json_lines
+    from failuretwin.app.tables import print_diagnoses, print_scores
+    from failuretwin.core.hypothesis import parse_hypotheses
+    from failuretwin.decision.bayes import BayesDiagnoser, priors_of
+    from failuretwin.digital_model.robot import load_robot
+    from failuretwin.digital_model.twin import DigitalTwin
+
+    model = load_robot(robot)
+    twin = DigitalTwin(model)
+    diagnoser = BayesDiagnoser(
+        twin,
+        hypotheses=(
+            None
+            if hypotheses is None
+            else parse_hypotheses(hypotheses.split(","), model.motor_names)
+        ),
+        priors=priors_of(model, sse_range, onset),
+    )
+    runs = read_inputs(inputs, model, how, published_labels)
+    diagnoses = diagnoser.diagnose(runs)
+    if json_file is not None:
+        write_json_lines([diagnosis.to_record() for diagnosis in diagnoses], json_file)
+    if csv_file is not None:
+        write_csv([diagnosis.to_record() for diagnosis in diagnoses], csv_file)
+    if plot is not None:
+        from failuretwin.app.plots import plot_runs
+
+        plot_runs(runs, diagnoses, twin, plot)
+    print_diagnoses(diagnoses)
+    print_scores([diagnosis.to_record() for diagnosis in diagnoses])

@@ -1,0 +1,96 @@
+"""Results of a diagnosis as files: JSON lines and CSV."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.runs import truth_of
+from failuretwin.data_knowledge.store import load_run_set, replacing
+
+Record = dict[str, Any]
+"""One diagnosis as the JSON object of the contract."""
+
+NEEDED = ("run", "truth", "diagnosis", "posterior")
+
+
+def write_json_lines(records: Sequence[Record], path: Path) -> None:
+    """Write an object a line; the file appears whole or not at all."""
+    with replacing(path) as partial:
+        text = "".join(json.dumps(record) + "\n" for record in records)
+        partial.write_text(text, encoding="utf-8")
+
+
+def read_json_lines(path: Path) -> list[Record]:
+    """Read what `write_json_lines` wrote.
+
+    Raises:
+        InputError: If the file cannot be read or a line is not a diagnosis.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error}).") from error
+    records = []
+    for number, line in enumerate(lines, start=1):
+        if line.strip():
+            records.append(_read_record(line, f"{path}: line {number}"))
+    if not records:
+        raise InputError(f"{path}: is empty. Expected the output of diagnose --json.")
+    return records
+
+
+def _read_record(line: str, where: str) -> Record:
+    try:
+        record = json.loads(line)
+    except json.JSONDecodeError as error:
+        raise InputError(
+            f"{where}: not JSON ({error}). Expected diagnose --json output."
+        ) from error
+    missing = [key for key in NEEDED if not isinstance(record, dict) or key not in record]
+    if missing:
+        raise InputError(f"{where}: no {', '.join(missing)}. Expected diagnose --json output.")
+    return dict(record)
+
+
+def with_truth(records: Sequence[Record], path: Path) -> list[Record]:
+    """Return the records with the truth that a run set knows, matched by run name.
+
+    Raises:
+        InputError: If the run set knows no truth or not of every run.
+    """
+    runs = load_run_set(path)
+    faults = truth_of(runs)
+    if faults is None:
+        raise InputError(f"{path}: has no variable `fault`, so it does not know the truth.")
+    known = dict(zip(map(str, runs["run"].values), faults, strict=True))
+    for record in records:
+        if record["run"] not in known:
+            raise InputError(f"{path}: holds no run {record['run']!r} of the results.")
+    return [{**record, "truth": known[record["run"]]} for record in records]
+
+
+def write_csv(records: Sequence[Record], path: Path) -> None:
+    """Write a row a run: plain columns, then the probability of each hypothesis."""
+    with replacing(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        rows = [_csv_row(record) for record in records]
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _csv_row(record: Record) -> Record:
+    row: Record = {}
+    for key, value in record.items():
+        if key == "posterior":
+            continue
+        if key.endswith("_90"):
+            low, high = value or (None, None)
+            row |= {f"{key}_low": low, f"{key}_high": high}
+        else:
+            row[key] = "; ".join(value) if key == "quality" else value
+    return row | {f"p({name})": p for name, p in record["posterior"].items()}

@@ -1,0 +1,78 @@
+"""What the command line prints: a table of runs, scores, a confusion matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.table import Table
+
+from failuretwin.app.results import Record
+from failuretwin.core.diagnosis import Diagnosis
+from failuretwin.decision.metrics import Scores, score
+
+PIPE_WIDTH = 160
+"""Columns when the output is not a terminal, so that sentences stay whole."""
+
+
+def _console() -> Console:
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=PIPE_WIDTH)
+
+
+def print_diagnoses(diagnoses: Sequence[Diagnosis]) -> None:
+    """Print a row a run."""
+    known = any(d.truth is not None for d in diagnoses)
+    table = Table(box=None, pad_edge=False)
+    for column in ("run", *(["truth", ""] if known else []), "verdict", "log"):
+        table.add_column(column, overflow="fold")
+    for d in diagnoses:
+        mark = "" if d.truth is None else ("right" if d.truth == d.diagnosis else "WRONG")
+        truth = [d.truth or "", mark] if known else []
+        unused = len(d.quality)
+        quality = f"{unused} movement{'s' * (unused > 1)} unused" if unused else ""
+        table.add_row(d.run, *truth, d.verdict, quality)
+    _console().print(table)
+
+
+def print_scores(records: Sequence[Record]) -> None:
+    """Print how good the diagnoses are, if the truth of any run is known."""
+    judged = [record for record in records if record["truth"]]
+    if not judged:
+        return
+    scores = score(
+        [record["truth"] for record in judged],
+        [record["diagnosis"] for record in judged],
+        [record["posterior"] for record in judged],
+    )
+    console = _console()
+    low, high = scores.interval
+    protocols = "/".join(sorted({record.get("protocol") or "?" for record in judged}))
+    console.print(
+        f"\n{scores.right} of {scores.runs} runs right: accuracy {100 * scores.accuracy:.1f} % "
+        f"(95 % interval {100 * low:.1f} to {100 * high:.1f} %), protocol {protocols}, "
+        f"log score {scores.log_score:.3f} nats a run\n"
+    )
+    console.print(_class_table(scores))
+    console.print("\nconfusion matrix: a row for each truth, a column for each diagnosis")
+    console.print(_confusion_table(scores))
+
+
+def _class_table(scores: Scores) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for column in ("class", "runs", "precision", "recall", "F1"):
+        table.add_column(column, justify="left" if column == "class" else "right")
+    for row in scores.by_class():
+        ratios = (f"{value:.3f}" for value in (row.precision, row.recall, row.f1))
+        table.add_row(row.name, str(row.runs), *ratios)
+    return table
+
+
+def _confusion_table(scores: Scores) -> Table:
+    table = Table(box=None, pad_edge=False)
+    table.add_column("truth")
+    for i in range(len(scores.classes)):
+        table.add_column(f"({i})", justify="right")
+    for i, (name, row) in enumerate(zip(scores.classes, scores.confusion, strict=True)):
+        table.add_row(f"({i}) {name}", *(str(count) if count else "." for count in row))
+    return table
