@@ -11,10 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.core.types import BoolArray, FloatArray
 
 CORNER_TOLERANCE_RAD = 1e-7
-"""Change of slope times step [rad] below which two segments of a reference are one line."""
+"""Change of a reference from one step to the next [rad] that is rounding and no corner."""
+SAME_MOVEMENT_S = 0.1
+"""Motors that start within this time [s] move together; a bus serves six servos in about 0.02 s."""
 
 
 @dataclass(frozen=True)
@@ -105,9 +107,10 @@ def _hold_padding(
 def find_movements(command: FloatArray, time: FloatArray) -> Movements:
     """Find the movements in references from the corners of the piecewise linear `command`.
 
-    A movement starts where a motor leaves a plateau; motors that leave within 0.1 s of each
-    other belong to the same movement. Start and end of a ramp are placed between the samples,
-    where its line meets the plateaus.
+    A movement starts where a motor sets out, or changes its speed; motors that do so within
+    0.1 s of each other belong to the same movement. Corners are placed between the samples, where
+    the lines before and after them meet. The target of a ramp that is interrupted is the
+    angle it has come to.
 
     Args:
         command: Reference angles, (run, time, motor) [rad].
@@ -134,54 +137,80 @@ def find_movements(command: FloatArray, time: FloatArray) -> Movements:
     return Movements(np.array(command[:, 0]), target, ramp, start)
 
 
-SAME_MOVEMENT_S = 0.1
-"""Motors that start within this time [s] move together; a bus serves six servos in about 0.02 s."""
+@dataclass(frozen=True)
+class _Corners:
+    """Corners of one motor's reference: times [s], angles [rad] and speeds after them [rad/s]."""
+
+    time: FloatArray
+    angle: FloatArray
+    speed: FloatArray
 
 
 def _movements_of_run(
     command: FloatArray, time: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return start (movement,), target and ramp duration (movement, motor) of one run."""
+    motors = [_corners(reference, time) for reference in command.T]
+    start = _merge_starts(np.sort(np.concatenate([c.time[c.speed != 0.0] for c in motors])))
+    end = np.append(start[1:], time[-1])
+    target, ramp = np.empty((2, len(start), len(motors)))
+    for k, corners in enumerate(motors):
+        target[:, k], ramp[:, k] = _ramps(corners, start, end)
+    return start, target, ramp
+
+
+def _corners(reference: FloatArray, time: FloatArray) -> _Corners:
+    """Return the corners of one motor's reference (time,), the first being its start at rest."""
     step = time[1] - time[0]
-    moving = np.abs(np.diff(command, axis=0)) > CORNER_TOLERANCE_RAD
-    rest = np.zeros((1, command.shape[1]), dtype=bool)
-    leaves = moving & ~np.concatenate([rest, moving[:-1]])
-    first = _merge_starts(np.flatnonzero(leaves.any(axis=1)), round(SAME_MOVEMENT_S / step))
-    if len(first) == 0:
-        return np.empty(0), np.empty((0, command.shape[1])), np.empty((0, command.shape[1]))
-    last = np.append(first[1:], len(time) - 1)
-    target = command[last]
-    starts, ramps = zip(
-        *(_ramp_times(command[a : b + 1], step) for a, b in zip(first, last, strict=True)),
-        strict=True,
-    )
-    return time[first] + np.array(starts), target, np.array(ramps)
+    times, angles, speeds = [time[0]], [reference[0]], [0.0]
+    for first, last in _lines(reference):
+        speed = (reference[last] - reference[first]) / (time[last] - time[first])
+        if abs(speed) * step <= CORNER_TOLERANCE_RAD:
+            speed = 0.0
+        if abs(speed - speeds[-1]) * step <= CORNER_TOLERANCE_RAD:
+            continue
+        # Where this line meets the one before it; at its own start, if there was a jump between.
+        meets = angles[-1] - reference[first] + speeds[-1] * (time[first] - times[-1])
+        corner = time[first] + meets / (speed - speeds[-1])
+        if not -1.001 * step <= corner - time[first] <= 0.001 * step:
+            before = first - 1 if first > 0 else first
+            gap = max(time[first] - time[before], 1e-9)
+            jump = (reference[first] - reference[before]) / gap
+            times.append(time[before])
+            angles.append(reference[before])
+            speeds.append(jump)
+            corner = time[first]
+        angles.append(angles[-1] + speeds[-1] * (corner - times[-1]))
+        times.append(corner)
+        speeds.append(speed)
+    return _Corners(np.array(times), np.array(angles), np.array(speeds))
 
 
-def _merge_starts(samples: IntArray, together: int) -> IntArray:
-    """Return the samples that begin a movement: each later than the one before by `together`."""
-    kept: list[int] = []
-    for sample in samples:
-        if not kept or sample - kept[-1] > together:
-            kept.append(int(sample))
-    return np.array(kept, dtype=np.int64)
+def _lines(reference: FloatArray) -> list[tuple[int, int]]:
+    """Return first and last sample of every straight stretch of two steps or more."""
+    straight = np.abs(np.diff(reference, 2)) <= CORNER_TOLERANCE_RAD
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], straight.astype(int), [0]])))
+    return [(int(first), int(last) + 1) for first, last in edges.reshape(-1, 2)]
 
 
-def _ramp_times(segment: FloatArray, step: float) -> tuple[float, FloatArray]:
-    """Return the start within the first step [s] and the ramp durations (motor,) [s].
+def _merge_starts(starts: FloatArray) -> FloatArray:
+    """Return the first of each group of starts that lie within `SAME_MOVEMENT_S`."""
+    kept: list[float] = []
+    for start in starts:
+        if not kept or start - kept[-1] > SAME_MOVEMENT_S:
+            kept.append(float(start))
+    return np.array(kept)
 
-    `segment` is (sample, motor) from the last sample before the movement to its end. The slope
-    of a ramp is its largest step, since the first and last are shared with a plateau.
-    """
-    travel = segment[-1] - segment[0]
-    steps = np.abs(np.diff(segment, axis=0))
-    slope = steps.max(axis=0)
-    moves = slope > CORNER_TOLERANCE_RAD
-    if not moves.any():
-        return 0.0, np.zeros(segment.shape[1])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        duration = np.where(moves, np.abs(travel) / slope, 0.0)
-        delay = np.where(moves & (steps[0] > CORNER_TOLERANCE_RAD), 1.0 - steps[0] / slope, np.inf)
-    delay = np.where(np.isfinite(delay), delay, np.inf)
-    start = float(delay.min()) if np.isfinite(delay.min()) else 0.0
-    return start * step, duration * step
+
+def _ramps(corners: _Corners, start: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return target [rad] and ramp duration [s] of one motor in each movement, (movement,)."""
+    target, duration = np.empty((2, len(start)))
+    origin = corners.angle[0]
+    for m in range(len(start)):
+        last = int(np.searchsorted(corners.time, end[m] - 1e-9)) - 1
+        target[m] = corners.angle[last] + corners.speed[last] * (end[m] - corners.time[last])
+        inside = (corners.time >= start[m] - 1e-9) & (corners.time < end[m] - 1e-9)
+        speed = np.abs(corners.speed[inside]).max(initial=0.0)
+        duration[m] = abs(target[m] - origin) / speed if speed > 0.0 else 0.0
+        origin = target[m]
+    return target, duration

@@ -145,9 +145,15 @@ def check_runs(runs: xr.Dataset, where: str) -> xr.Dataset:
     if tuple(map(str, runs["axis"].values)) != AXES:
         raise InputError(f"{where}: coordinate `axis` is {runs['axis'].values}, expected x, y, z.")
     _check_time(as_floats(runs["time"].values), where)
-    names = [str(name) for name in runs["run"].values]
-    if len(set(names)) < len(names):
-        raise InputError(f"{where}: run names are not unique. Rename the runs that repeat.")
+    for coordinate in ("run", "motor"):
+        names = [str(name) for name in runs[coordinate].values]
+        if len(set(names)) < len(names):
+            raise InputError(
+                f"{where}: {coordinate} names are not unique. Rename those that repeat."
+            )
+    rate = runs.attrs.get("measured_rate_hz", 1.0)
+    if not (isinstance(rate, int | float | np.number) and 0.0 < rate < np.inf):
+        raise InputError(f"{where}: `measured_rate_hz` is {rate!r}, expected a rate above 0 [Hz].")
     return runs
 
 
@@ -203,10 +209,12 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     Only variables that every part holds are kept. Run names that repeat get a number.
 
     Raises:
-        InputError: If the parts differ in motors, time step or sensor rate.
+        InputError: If there are no parts or they differ in motors, time step or sensor rate.
     """
     import xarray as xr
 
+    if not parts:
+        raise InputError("there are no runs to put together. Expected one run set at least.")
     first = parts[0]
     if len(parts) == 1:
         return first

@@ -55,8 +55,6 @@ def read_runs(
         sources = [sources]
     options = options or ReadOptions()
     parts = [part for source in sources for part in _read_source(Path(source), robot, options)]
-    if not parts:
-        raise InputError("no inputs given. Expected run sets or folders with raw sessions.")
     return concatenate(parts)
 
 

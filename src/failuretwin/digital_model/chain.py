@@ -48,11 +48,15 @@ class SerialChain:
 
     Attributes:
         joints: Moving joints from base to tool.
-        T_jt: Pose of the tool frame in the frame of the last joint (the base if there is none).
+        T_jt: Pose of the tool frame in the frame of the last joint.
     """
 
     joints: tuple[Joint, ...]
     T_jt: FloatArray
+
+    def __post_init__(self) -> None:
+        if not self.joints:
+            raise InputError("a chain needs one moving joint at least; this one has none.")
 
     def position(self, q: FloatArray) -> FloatArray:
         """Return tool positions in the base frame.

@@ -46,6 +46,15 @@ class Motor:
     def __post_init__(self) -> None:
         if self.sense not in (1.0, -1.0):
             raise InputError(f"motor {self.name!r}: sense is {self.sense}, expected 1 or -1.")
+        if not self.movement_range[0] < self.movement_range[1]:
+            raise InputError(
+                f"motor {self.name!r}: movement_range is {list(self.movement_range)}, expected the "
+                "lowest and the highest target [rad]."
+            )
+        if set(self.name) & set(":+,") or not self.name:
+            raise InputError(
+                f"motor name {self.name!r} cannot stand in hypotheses. Leave out ':', '+', ','."
+            )
 
 
 @dataclass(frozen=True)

@@ -187,7 +187,9 @@ def _triple(
     try:
         x, y, z = (float(part) for part in text.split())
     except ValueError:
-        raise InputError(f"{where}: {key}={text!r}, expected three numbers.") from None
+        x = y = z = math.nan
+    if not math.isfinite(x + y + z):
+        raise InputError(f"{where}: {key}={text!r}, expected three finite numbers.")
     return x, y, z
 
 

@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import (
+    HEALTHY,
+    MAGNITUDE_UNITS,
+    UNKNOWN,
+    Fault,
+    Hypothesis,
+    paper_hypotheses,
+    parse_hypotheses,
+)
+
+MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
+
+
+@st.composite
+def hypotheses(draw):
+    faulty = draw(st.lists(st.sampled_from(MOTORS), unique=True))
+    modes = st.sampled_from(list(MAGNITUDE_UNITS))
+    faults = tuple(Fault(motor, draw(modes)) for motor in sorted(faulty))
+    return Hypothesis(faults) if faults else draw(st.sampled_from([HEALTHY, UNKNOWN]))
+
+
+@given(hypotheses())
+def test_text_form_is_read_back(hypothesis):
+    assert Hypothesis.parse(str(hypothesis), MOTORS) == hypothesis
+
+
+def test_text_form_is_the_contract():
+    several = Hypothesis((Fault("motor_1", "stuck"), Fault("motor_3", "drift")))
+    assert str(several) == "motor_1:stuck+motor_3:drift"
+    assert (str(HEALTHY), str(UNKNOWN)) == ("healthy", "unknown")
+
+
+def test_only_healthy_is_healthy():
+    assert HEALTHY.is_healthy
+    assert not UNKNOWN.is_healthy
+    assert not Hypothesis((Fault("motor_1", "stuck"),)).is_healthy
+
+
+def test_paper_classes_are_in_the_order_of_the_labels():
+    assert [str(h) for h in paper_hypotheses(MOTORS)] == [
+        "healthy",
+        "motor_1:stuck",
+        "motor_2:stuck",
+        "motor_3:stuck",
+        "motor_4:stuck",
+        "motor_1:steady_state_error",
+        "motor_2:steady_state_error",
+        "motor_3:steady_state_error",
+        "motor_4:steady_state_error",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("mode", "unit"),
+    [
+        ("stuck", "rad"),
+        ("steady_state_error", "rad"),
+        ("slow", "ratio"),
+        ("lag", "s"),
+        ("backlash", "rad"),
+        ("drift", "rad/s"),
+        ("intermittent", "ratio"),
+        ("torque_loss", "ratio"),
+        ("encoder_bias", "rad"),
+        ("encoder_scale", "ratio"),
+        ("lost_commands", "ratio"),
+    ],
+)
+def test_every_mode_has_its_unit(mode, unit):
+    assert Fault("motor_1", mode).magnitude_unit == unit
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "motor_9:stuck",
+            "unknown motor 'motor_9'. Did you mean 'motor_4'? "
+            "Valid: motor_1, motor_2, motor_3, motor_4.",
+        ),
+        (
+            "helthy",
+            "hypothesis 'helthy' is not of the form MOTOR:MODE. "
+            "Expected 'healthy' or, for example, 'motor_1:stuck'.",
+        ),
+        (
+            "motor_3:drift+motor_1:stuck",
+            "hypothesis 'motor_3:drift+motor_1:stuck' names its motors out of chain order or "
+            "twice. Expected each motor once, in the order motor_1, motor_2, motor_3, motor_4.",
+        ),
+        (
+            "motor_1:drift+motor_1:stuck",
+            "hypothesis 'motor_1:drift+motor_1:stuck' names its motors out of chain order or "
+            "twice. Expected each motor once, in the order motor_1, motor_2, motor_3, motor_4.",
+        ),
+    ],
+)
+def test_text_that_cannot_be_read_says_what_is_expected(text, message):
+    with pytest.raises(InputError) as error:
+        Hypothesis.parse(text, MOTORS)
+    assert str(error.value) == message
+
+
+@pytest.mark.parametrize("text", ["motor_1:stuk", "motor_1:stuck:"])
+def test_misspelt_mode_names_the_nearest(text):
+    with pytest.raises(InputError, match=r"unknown fault mode .* Did you mean 'stuck'\?"):
+        Hypothesis.parse(text, MOTORS)
+
+
+@pytest.mark.parametrize("text", ["", "motor_1:stuck+", "+", "healthy+motor_1:stuck", "Healthy"])
+def test_text_without_motor_and_mode_is_refused(text):
+    with pytest.raises(InputError, match="not of the form MOTOR:MODE"):
+        Hypothesis.parse(text, MOTORS)
+
+
+def test_list_of_hypotheses_may_have_spaces():
+    assert parse_hypotheses(["healthy", " motor_2:stuck "], MOTORS) == (
+        HEALTHY,
+        Hypothesis((Fault("motor_2", "stuck"),)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"), [([], "no hypotheses given"), (["healthy", "healthy "], "given twice")]
+)
+def test_empty_list_and_repeats_are_refused(texts, message):
+    with pytest.raises(InputError, match=message):
+        parse_hypotheses(texts, MOTORS)

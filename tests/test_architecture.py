@@ -1,0 +1,204 @@
+from __future__ import annotations
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import failuretwin
+
+PACKAGE = Path(failuretwin.__file__).parent
+ROOMS = (
+    "core",
+    "digital_model",
+    "failure_behavior",
+    "data_knowledge",
+    "connection",
+    "decision",
+    "app",
+)
+"""From left to right; a room may import itself and those to its left."""
+
+EXTRAS = {"dask", "matplotlib", "mujoco", "rosbags", "sklearn", "torch"}
+
+HELP_CPU_S = 0.5
+
+
+def imported_modules(module: str, source: str) -> list[str]:
+    """Return every name that `source` imports, wherever it does so, or writes out as text."""
+    names = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = _absolute(module, node)
+            names += [f"{base}.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.Constant) and re.fullmatch(r"failuretwin[.\w]+", str(node.value)):
+            names.append(node.value)
+    return names
+
+
+def _absolute(module: str, node: ast.ImportFrom) -> str:
+    if node.level == 0:
+        return node.module or ""
+    parents = module.split(".")[: -node.level]
+    return ".".join([*parents, node.module] if node.module else parents)
+
+
+def wrong_arrows(module: str, source: str) -> list[str]:
+    """Return the imports of `module` that point to the right."""
+    room = _room(module)
+    if room is None:
+        return []
+    targets = {name: _room(name) for name in imported_modules(module, source)}
+    return [
+        f"{module} imports {name}"
+        for name, target in targets.items()
+        if target is not None and ROOMS.index(target) > ROOMS.index(room)
+    ]
+
+
+def _room(name: str) -> str | None:
+    """Return the room that `name` belongs to; None for the root and for other packages."""
+    root, _, rest = name.partition(".")
+    part = rest.partition(".")[0]
+    if root != "failuretwin" or part in ROOMS:
+        return part if root == "failuretwin" else None
+    home = getattr(getattr(failuretwin, part, None), "__module__", "failuretwin")
+    return None if home == "failuretwin" else _room(home)
+
+
+def source_files() -> list[Path]:
+    return sorted(PACKAGE.rglob("*.py"))
+
+
+def module_name(path: Path) -> str:
+    """Return the dotted name, with ``__init__`` kept so that relative imports count from it."""
+    return ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
+
+
+def test_imports_point_left():
+    found = [w for p in source_files() for w in wrong_arrows(module_name(p), p.read_text("utf-8"))]
+    assert found == []
+
+
+def test_all_code_is_in_a_room():
+    homes = {path.relative_to(PACKAGE).parts[0] for path in source_files()}
+    assert homes - {"__main__.py"} == {"__init__.py", *ROOMS}
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import failuretwin.decision.bayes",
+        "import numpy, failuretwin.decision as d",
+        "from failuretwin.decision.bayes import BayesDiagnoser",
+        "from failuretwin import decision",
+        "from failuretwin import DigitalTwin",
+        "from ..decision import bayes",
+        "from .. import decision",
+        "def f():\n    from failuretwin.decision import bayes",
+        "class A:\n    def f(self):\n        import failuretwin.app.cli",
+        "if TYPE_CHECKING:\n    from failuretwin.digital_model.robot import Robot",
+        "import_module('failuretwin.decision.bayes')",
+        "try:\n    import os\nexcept ImportError:\n    import failuretwin.connection",
+    ],
+)
+def test_an_arrow_to_the_right_is_caught(source):
+    assert len(wrong_arrows("failuretwin.core.runs", source)) == 1
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("failuretwin.core.runs", "from failuretwin.core.errors import InputError"),
+        ("failuretwin.core.runs", "from .errors import InputError"),
+        ("failuretwin.core.runs", "from . import errors"),
+        ("failuretwin.core.__init__", "from . import errors"),
+        ("failuretwin.core.runs", "from failuretwin import __version__"),
+        ("failuretwin.core.runs", "import numpy, xarray.decision"),
+        ("failuretwin.decision.bayes", "from failuretwin import DigitalTwin"),
+        ("failuretwin.decision.bayes", "from ..core import runs"),
+        ("failuretwin.app.cli", "from failuretwin.decision.bayes import BayesDiagnoser"),
+        ("failuretwin.__init__", "from failuretwin.decision.bayes import BayesDiagnoser"),
+    ],
+)
+def test_other_arrows_are_allowed(module, source):
+    assert wrong_arrows(module, source) == []
+
+
+def run_python(code: str) -> list[str]:
+    """Return the words that `code` prints in a process of its own."""
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=True, stdout=subprocess.PIPE, text=True, timeout=60
+    )
+    return done.stdout.split()
+
+
+EVERYTHING_IN_CORE = """
+import importlib, pkgutil, failuretwin, failuretwin.core
+for module in pkgutil.iter_modules(failuretwin.core.__path__, "failuretwin.core."):
+    importlib.import_module(module.name)
+"""
+PRINT_MODULES = "\nimport sys; print(*sys.modules)"
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import failuretwin",
+        EVERYTHING_IN_CORE,
+        "from failuretwin import DigitalTwin, load_robot; DigitalTwin(load_robot('armpi_fpv'))",
+    ],
+    ids=["failuretwin", "core", "twin"],
+)
+def test_importing_loads_no_extras(code):
+    loaded = set(run_python(code + PRINT_MODULES))
+    assert "failuretwin" in loaded
+    assert loaded & EXTRAS == set()
+
+
+def test_an_extra_that_is_loaded_is_seen():
+    pytest.importorskip("mujoco")
+    assert "mujoco" in run_python("import mujoco" + PRINT_MODULES)
+
+
+def test_importing_changes_nothing_in_the_process():
+    code = f"""
+import logging, os, random, signal, warnings
+import numpy
+def settings():
+    return repr((
+        dict(os.environ), os.getcwd(), numpy.geterr(), numpy.get_printoptions(), warnings.filters,
+        logging.root.level, logging.root.handlers, signal.getsignal(signal.SIGINT),
+        random.getstate(), numpy.random.get_state()[1].tolist(),
+    ))
+before = settings()
+{EVERYTHING_IN_CORE}
+from failuretwin import DigitalTwin, load_robot
+print(settings() == before)
+"""
+    assert run_python(code) == ["True"]
+
+
+def cpu_seconds(*command: str) -> float:
+    """Return user and system time [s] of a process that must succeed."""
+    silent = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
+    child = os.posix_spawn(command[0], command, os.environ, file_actions=silent)
+    _, status, usage = os.wait4(child, 0)
+    assert os.waitstatus_to_exitcode(status) == 0
+    return usage.ru_utime + usage.ru_stime
+
+
+def test_help_is_quick():
+    program = Path(sys.executable).with_name("failuretwin")
+    assert min(cpu_seconds(str(program), "--help") for _ in range(3)) < HELP_CPU_S
+
+
+def test_a_slow_program_is_seen():
+    work = "import time\nwhile time.process_time() < 0.3: pass"
+    assert cpu_seconds(sys.executable, "-c", work) > 0.3
