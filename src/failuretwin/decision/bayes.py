@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -104,11 +105,11 @@ class BayesDiagnoser:
                         "stuck or steady_state_error."
                     )
 
-    @property
+    @cached_property
     def _hypotheses(self) -> Sequence[Hypothesis]:
         return self.hypotheses or paper_hypotheses(self.twin.robot.motor_names)
 
-    @property
+    @cached_property
     def healthy_model(self) -> HealthyModel:
         """What a healthy run looks like."""
         imperfections = self.imperfections or default_imperfections(self.twin.robot)
@@ -152,7 +153,7 @@ class BayesDiagnoser:
     ) -> list[Diagnosis]:
         model = self.healthy_model
         alternatives = model.alternatives(evidence.movements)
-        healthy = log_healthy(evidence, model, alternatives)
+        healthy = model.log_healthy(evidence, alternatives)
         found: dict[Hypothesis, FaultEvidence] = {}
         columns = []
         for hypothesis in self._hypotheses:
@@ -206,18 +207,6 @@ class BayesDiagnoser:
         return replace(
             diagnosis, verdict=verdict(diagnosis, enough=bool(evidence.usable[run].any()))
         )
-
-
-def log_healthy(
-    evidence: SettledEvidence, model: HealthyModel, alternatives: Alternatives
-) -> FloatArray:
-    """Return the log density of each settled position if no motor is faulty, (run, movement)."""
-    held = np.zeros(len(model.scatter), dtype=bool)
-    pose = model.settle(alternatives.base, alternatives.direction, held)
-    density = model.log_density(evidence.point[:, :, None], pose, held)
-    density = log_sum(density + alternatives.log_weight, axis=-1)
-    density = np.logaddexp(density, model.outlier_log_density)
-    return np.where(evidence.usable, density, 0.0)
 
 
 def _estimate(

@@ -10,7 +10,8 @@ from scipy.special import gammaln
 
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.decision.quadrature import log_of
+from failuretwin.decision.evidence import SettledEvidence
+from failuretwin.decision.quadrature import log_of, log_sum
 from failuretwin.digital_model.imperfections import Imperfections
 from failuretwin.digital_model.settling import Settling
 from failuretwin.digital_model.twin import DigitalTwin
@@ -59,6 +60,11 @@ class HealthyModel:
     def scatter(self) -> FloatArray:
         """Scale of the settled scatter, (motor,) [rad]."""
         return np.asarray(self.settling.scatter)
+
+    @cached_property
+    def none_held(self) -> BoolArray:
+        """The mask that holds no motor, (motor,)."""
+        return np.zeros(len(self.scatter), dtype=bool)
 
     @cached_property
     def outlier_log_density(self) -> float:
@@ -115,20 +121,37 @@ class HealthyModel:
         offset = self.settling.offset(robot.chain, robot.sense, base, direction)
         return base + np.where(held, 0.0, offset)
 
-    def log_density(self, point: FloatArray, pose: FloatArray, held: BoolArray) -> FloatArray:
-        """Return the log density of settled tool positions, Student t about the predicted pose.
+    def log_density(
+        self,
+        evidence: SettledEvidence,
+        alternatives: Alternatives,
+        pose: FloatArray,
+        held: BoolArray,
+    ) -> FloatArray:
+        """Return the log density of each settled position, whatever became of the commands.
 
         Args:
-            point: Measured positions, (..., axis) [m].
-            pose: Predicted settled angles, (..., motor) [rad]; broadcasts against `point`.
+            evidence: Settled positions.
+            alternatives: What may become of each movement.
+            pose: Predicted settled angles, (run, movement, node, alternative, motor) [rad], for
+                as many nodes of some unknown as are wanted.
             held: Motors that do not scatter, (motor,).
 
         Returns:
-            (...) [log 1/m3].
+            (run, movement, node) [log 1/m3]; 0 for movements that are not usable.
         """
         predicted, jacobian = self.twin.path_and_jacobian(pose)
         scaled = jacobian * np.where(held, 0.0, self.scatter)
-        return log_student(point - predicted, scaled, PATH_NOISE_M**2, self.settling.tail_dof)
+        error = evidence.point[:, :, None, None] - predicted
+        density = log_student(error, scaled, PATH_NOISE_M**2, self.settling.tail_dof)
+        mixed = log_sum(density + alternatives.log_weight[:, :, None], axis=-1)
+        mixed = np.logaddexp(mixed, self.outlier_log_density)
+        return np.where(evidence.usable[..., None], mixed, 0.0)
+
+    def log_healthy(self, evidence: SettledEvidence, alternatives: Alternatives) -> FloatArray:
+        """Return the log density of each position if no motor is faulty, (run, movement)."""
+        pose = self.settle(alternatives.base, alternatives.direction, self.none_held)
+        return self.log_density(evidence, alternatives, pose[:, :, None], self.none_held)[..., 0]
 
 
 def log_student(

@@ -95,14 +95,10 @@ def _log_density(
     offset: FloatArray,
 ) -> FloatArray:
     """Return log densities with `motor` off by `offset`, (run, movement, offset)."""
-    held = np.zeros(len(model.scatter), dtype=bool)
-    pose = model.settle(alternatives.base, alternatives.direction, held)[:, :, None]
+    pose = model.settle(alternatives.base, alternatives.direction, model.none_held)[:, :, None]
     pose = np.repeat(pose, len(offset), axis=2)
     pose[..., motor] += offset[:, None]
-    density = model.log_density(evidence.point[:, :, None, None], pose, held)
-    density = log_sum(density + alternatives.log_weight[:, :, None], axis=-1)
-    density = np.logaddexp(density, model.outlier_log_density)
-    return np.where(evidence.usable[..., None], density, 0.0)
+    return model.log_density(evidence, alternatives, pose, model.none_held)
 
 
 def _size(

@@ -126,8 +126,9 @@ def _best_angle(
     As one joint moves, the tool runs on a circle (a line, if the joint slides), so three poses
     say where all the others are. Both results are (run, movement) [rad].
     """
-    held = np.zeros(len(model.scatter), dtype=bool)
-    pose = model.settle(alternatives.base[:, :, 0], alternatives.direction[:, :, 0], held)
+    pose = model.settle(
+        alternatives.base[:, :, 0], alternatives.direction[:, :, 0], model.none_held
+    )
     turns = np.array([0.0, 0.5 * np.pi, np.pi])
     poses = np.repeat(pose[..., None, :], 3, axis=-2)
     poses[..., motor] = turns
@@ -155,17 +156,14 @@ def _log_density(
     angle: FloatArray,
 ) -> FloatArray:
     """Return the log density of each point with `motor` held, (run, movement, node)."""
-    held = np.zeros(len(model.scatter), dtype=bool)
+    held = model.none_held.copy()
     held[motor] = True
     nodes = angle.shape[1]
     shape = (*alternatives.base.shape[:2], nodes, *alternatives.base.shape[2:])
     base = np.broadcast_to(alternatives.base[:, :, None], shape).copy()
     base[..., motor] = angle[:, None, :, None]
     pose = model.settle(base, alternatives.direction[:, :, None], held)
-    density = model.log_density(evidence.point[:, :, None, None], pose, held)
-    density = log_sum(density + alternatives.log_weight[:, :, None], axis=-1)
-    density = np.logaddexp(density, model.outlier_log_density)
-    return np.where(evidence.usable[..., None], density, 0.0)
+    return model.log_density(evidence, alternatives, pose, held)
 
 
 def _log_prior(
