@@ -36,6 +36,8 @@ def test_record_is_the_contract():
         "magnitude_unit": None,
         "magnitude_90": None,
         "verdict": "",
+        "explanation": [],
+        "evidence": [],
         "quality": [],
         "protocol": "P0",
         "method": "",

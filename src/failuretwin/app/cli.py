@@ -6,6 +6,7 @@ users end in one line and exit code 2.
 
 from __future__ import annotations
 
+import os
 import sys
 
 import click
@@ -14,6 +15,7 @@ from failuretwin import __version__
 from failuretwin.app.commands.diagnose import diagnose
 from failuretwin.app.commands.evaluate import evaluate
 from failuretwin.app.commands.import_ import import_
+from failuretwin.app.commands.robot import robot
 from failuretwin.app.commands.simulate import simulate
 from failuretwin.core.errors import FailureTwinError
 
@@ -24,7 +26,7 @@ def cli() -> None:
     """Tell from commands and the tool path alone which motor of a robot arm failed, and how."""
 
 
-for command in (import_, simulate, diagnose, evaluate):
+for command in (import_, simulate, diagnose, evaluate, robot):
     cli.add_command(command)
 
 
@@ -32,6 +34,7 @@ def main() -> None:
     """Run the command line."""
     try:
         cli(standalone_mode=False)
+        sys.stdout.flush()
     except click.exceptions.Abort:
         sys.exit("interrupted")
     except click.ClickException as error:
@@ -39,4 +42,9 @@ def main() -> None:
         sys.exit(2)
     except FailureTwinError as error:
         click.echo(f"error: {error}", err=True)
+        sys.exit(2)
+    except OSError as error:  # the output itself: a full disk, or a reader that has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            click.echo(f"error: output could not be written ({error.strerror}).", err=True)
         sys.exit(2)

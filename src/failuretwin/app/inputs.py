@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+import click
+
+from failuretwin.core.config import from_table, read_toml
+from failuretwin.core.errors import InputError
+from failuretwin.data_knowledge.bags import BagTopics
+from failuretwin.data_knowledge.column_guess import column_map_text, guess_columns
+from failuretwin.data_knowledge.column_map import read_column_map
 from failuretwin.data_knowledge.reading import ReadOptions, read_runs
 from failuretwin.data_knowledge.session_runs import As
+from failuretwin.data_knowledge.store import replacing
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:
@@ -15,7 +24,41 @@ if TYPE_CHECKING:
 
 
 def read_inputs(
-    sources: Sequence[Path], robot: Robot, how: str, published_labels: bool
+    sources: Sequence[Path],
+    robot: Robot,
+    how: str,
+    published_labels: bool,
+    columns: Path | None,
+    approximate: bool,
 ) -> xr.Dataset:
     """Return the runs of all inputs as one run set."""
-    return read_runs(list(sources), robot, ReadOptions(cast(As, how), published_labels))
+    options = ReadOptions(cast(As, how), published_labels, approximate=approximate)
+    if columns is not None:
+        options = _with_map(options, columns, sources, robot)
+    return read_runs(list(sources), robot, options)
+
+
+def _with_map(
+    options: ReadOptions, path: Path, sources: Sequence[Path], robot: Robot
+) -> ReadOptions:
+    """Return the options with a map of columns or topics.
+
+    Where there is no such file yet, a guess is written and shown, and the work stops.
+    """
+    if path.exists():
+        table = read_toml(path)
+        if "topics" in table:
+            topics = from_table(BagTopics, table["topics"], f"{path}: topics")
+            return replace(options, topics=topics)
+        return replace(options, columns=read_column_map(path, robot))
+    log = next((s for s in sources if s.is_file() and s.suffix == ".csv"), None)
+    if log is None:
+        raise InputError(f"{path}: does not exist, and no CSV file is given to guess it from.")
+    text = column_map_text(guess_columns(log, robot), log.name, robot)
+    with replacing(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+    click.echo(text)
+    raise InputError(
+        f"{path} did not exist. The guess above has been written there and nothing was read: check "
+        "every line, correct it, and run the same command again."
+    )

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from failuretwin.core.diagnosis import Diagnosis
-from failuretwin.core.errors import InputError, OutputError
-from failuretwin.core.runs import AXES
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.runs import AXES, unique_names
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.store import replacing
-from failuretwin.decision.wording import plain_name
+from failuretwin.data_knowledge.knowledge import plain_name
 from failuretwin.digital_model.twin import DigitalTwin
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def _figure_class() -> Any:
 def plot_runs(
     runs: xr.Dataset, diagnoses: Sequence[Diagnosis], twin: DigitalTwin, folder: Path
 ) -> list[Path]:
-    """Write a picture of each run into `folder`, which is made if need be.
+    """Write a picture of each run into `folder`.
 
     Args:
         runs: The run set.
@@ -49,21 +49,15 @@ def plot_runs(
 
     Raises:
         InputError: If matplotlib is missing.
-        OutputError: If a picture cannot be written.
     """
-    _figure_class()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be made ({error.strerror}).") from error
     time = as_floats(runs["time"].values)
     written = []
-    for i, diagnosis in enumerate(diagnoses):
+    stems = unique_names([re.sub(r"[^\w.+-]+", "_", diagnosis.run) for diagnosis in diagnoses])
+    for i, (diagnosis, stem) in enumerate(zip(diagnoses, stems, strict=True)):
         desired = twin.path(as_floats(runs["command"].values[i]))
         figure = run_figure(time, desired, as_floats(runs["measured"].values[i]), diagnosis)
-        path = folder / (re.sub(r"[^\w.+-]+", "_", diagnosis.run) + ".png")
-        with replacing(path) as partial:
-            figure.savefig(partial, dpi=110)
+        path = folder / f"{stem}.png"
+        figure.savefig(path, dpi=110)
         written.append(path)
     return written
 
@@ -92,7 +86,7 @@ def run_figure(
             )
     _plot_residual(figure.add_subplot(grid[3, 0]), time, desired, measured, diagnosis, style)
     _plot_posterior(figure.add_subplot(grid[:, 1]), diagnosis)
-    truth = "" if diagnosis.truth is None else f"   (truth: {plain_name(diagnosis.truth)})"
+    truth = "" if diagnosis.truth is None else f"   (truth: {_plain(diagnosis.truth)})"
     figure.suptitle(f"{diagnosis.verdict}{truth}", fontsize=13, fontweight="bold")
     return figure
 
@@ -141,7 +135,7 @@ def _plot_posterior(panel: Axes, diagnosis: Diagnosis) -> None:
     values = [100.0 * diagnosis.posterior[name] for name in names]
     colours = [BLUE if name == diagnosis.diagnosis else GREY for name in names]
     panel.barh(range(len(names)), values, color=colours)
-    panel.set_yticks(range(len(names)), [plain_name(name) for name in names], fontsize=9)
+    panel.set_yticks(range(len(names)), [_plain(name) for name in names], fontsize=9)
     panel.set_xlim(0.0, 115.0)
     panel.set_xticks([0, 50, 100])
     panel.set_xlabel("probability [%]")
@@ -149,6 +143,10 @@ def _plot_posterior(panel: Axes, diagnosis: Diagnosis) -> None:
         panel.annotate(f"{value:.1f}", (value + 1.5, y), va="center", fontsize=8)
     panel.set_title("what is wrong?", fontsize=10)
     _clean(panel)
+
+
+def _plain(hypothesis: str) -> str:
+    return plain_name(Hypothesis.parse(hypothesis))
 
 
 def _clean(panel: Axes) -> None:

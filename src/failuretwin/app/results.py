@@ -11,6 +11,7 @@ from typing import Any
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import truth_of
 from failuretwin.data_knowledge.store import load_run_set, replacing
+from failuretwin.decision.metrics import Scores, score
 
 Record = dict[str, Any]
 """One diagnosis as the JSON object of the contract."""
@@ -34,7 +35,9 @@ def read_json_lines(path: Path) -> list[Record]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}).") from error
+        raise InputError(
+            f"{path}: cannot be read ({error}). Expected the output of diagnose --json."
+        ) from error
     records = []
     for number, line in enumerate(lines, start=1):
         if line.strip():
@@ -54,6 +57,15 @@ def _read_record(line: str, where: str) -> Record:
     missing = [key for key in NEEDED if not isinstance(record, dict) or key not in record]
     if missing:
         raise InputError(f"{where}: no {', '.join(missing)}. Expected diagnose --json output.")
+    posterior = record["posterior"]
+    numbers = isinstance(posterior, dict) and all(
+        isinstance(p, int | float) for p in posterior.values()
+    )
+    if not numbers or record["diagnosis"] not in (None, *posterior):
+        raise InputError(
+            f"{where}: `posterior` and `diagnosis` do not fit together. Expected a probability for "
+            "each hypothesis, and one of them (or null) as diagnosis."
+        )
     return dict(record)
 
 
@@ -74,11 +86,38 @@ def with_truth(records: Sequence[Record], path: Path) -> list[Record]:
     return [{**record, "truth": known[record["run"]]} for record in records]
 
 
+def score_records(records: Sequence[Record]) -> Scores | None:
+    """Return the scores of those records whose truth is known; None if there are none."""
+    judged = [record for record in records if record["truth"]]
+    if not judged:
+        return None
+    return score(
+        [record["truth"] for record in judged],
+        [record["diagnosis"] for record in judged],
+        [record["posterior"] for record in judged],
+    )
+
+
+def score_line(records: Sequence[Record]) -> str:
+    """Return the accuracy with its protocol, number of runs and interval; empty if unknown."""
+    scores = score_records(records)
+    if scores is None:
+        return ""
+    low, high = scores.interval
+    protocols = "/".join(sorted({record.get("protocol") or "?" for record in records}))
+    return (
+        f"{scores.right} of {scores.runs} runs right: accuracy {100 * scores.accuracy:.1f} % "
+        f"(95 % interval {100 * low:.1f} to {100 * high:.1f} %), protocol {protocols}, "
+        f"log score {scores.log_score:.3f} nats a run"
+    )
+
+
 def write_csv(records: Sequence[Record], path: Path) -> None:
     """Write a row a run: plain columns, then the probability of each hypothesis."""
     with replacing(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         rows = [_csv_row(record) for record in records]
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        columns = dict.fromkeys(column for row in rows for column in row)
+        writer = csv.DictWriter(file, fieldnames=list(columns))
         writer.writeheader()
         writer.writerows(rows)
 
@@ -86,11 +125,12 @@ def write_csv(records: Sequence[Record], path: Path) -> None:
 def _csv_row(record: Record) -> Record:
     row: Record = {}
     for key, value in record.items():
-        if key == "posterior":
+        if key in ("posterior", "evidence"):
             continue
         if key.endswith("_90"):
             low, high = value or (None, None)
             row |= {f"{key}_low": low, f"{key}_high": high}
         else:
-            row[key] = "; ".join(value) if key == "quality" else value
-    return row | {f"p({name})": p for name, p in record["posterior"].items()}
+            row[key] = "; ".join(value) if isinstance(value, list) else value
+    row |= {f"p({name})": p for name, p in record["posterior"].items()}
+    return row | {f"nats({e['movement']})": e["nats"] for e in record["evidence"]}

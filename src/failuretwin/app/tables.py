@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.table import Table
 
-from failuretwin.app.results import Record
+from failuretwin.app.results import Record, score_line, score_records
 from failuretwin.core.diagnosis import Diagnosis
-from failuretwin.decision.metrics import Scores, score
+from failuretwin.decision.metrics import Scores
 
 PIPE_WIDTH = 160
 """Columns when the output is not a terminal, so that sentences stay whole."""
@@ -29,30 +29,19 @@ def print_diagnoses(diagnoses: Sequence[Diagnosis]) -> None:
     for d in diagnoses:
         mark = "" if d.truth is None else ("right" if d.truth == d.diagnosis else "WRONG")
         truth = [d.truth or "", mark] if known else []
-        unused = len(d.quality)
-        quality = f"{unused} movement{'s' * (unused > 1)} unused" if unused else ""
+        count = len(d.quality)
+        quality = f"{count} remark{'s' * (count > 1)}" if count else ""
         table.add_row(d.run, *truth, d.verdict, quality)
     _console().print(table)
 
 
 def print_scores(records: Sequence[Record]) -> None:
     """Print how good the diagnoses are, if the truth of any run is known."""
-    judged = [record for record in records if record["truth"]]
-    if not judged:
+    scores = score_records(records)
+    if scores is None:
         return
-    scores = score(
-        [record["truth"] for record in judged],
-        [record["diagnosis"] for record in judged],
-        [record["posterior"] for record in judged],
-    )
     console = _console()
-    low, high = scores.interval
-    protocols = "/".join(sorted({record.get("protocol") or "?" for record in judged}))
-    console.print(
-        f"\n{scores.right} of {scores.runs} runs right: accuracy {100 * scores.accuracy:.1f} % "
-        f"(95 % interval {100 * low:.1f} to {100 * high:.1f} %), protocol {protocols}, "
-        f"log score {scores.log_score:.3f} nats a run\n"
-    )
+    console.print(f"\n{score_line(records)}\n")
     console.print(_class_table(scores))
     console.print("\nconfusion matrix: a row for each truth, a column for each diagnosis")
     console.print(_confusion_table(scores))

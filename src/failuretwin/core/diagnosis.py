@@ -10,6 +10,19 @@ Interval = tuple[float, float]
 
 
 @dataclass(frozen=True)
+class MovementEvidence:
+    """What one movement says.
+
+    Attributes:
+        movement: Its number in the run, from 1.
+        nats: How much it speaks for the most probable hypothesis over the second.
+    """
+
+    movement: int
+    nats: float
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """Diagnosis of one run. `None` stands for what is not known or does not apply.
 
@@ -23,7 +36,10 @@ class Diagnosis:
         magnitude_unit: Unit of the fault mode.
         magnitude_90: 90 % interval of the magnitude.
         verdict: One plain sentence.
+        explanation: Why, what else it may be, and what to do now, a line each.
+        evidence: What each usable movement says.
         quality: What is wrong with the log, a line each; empty when nothing is.
+        undecided: Why there is no verdict; empty where there is one.
         protocol: How much real data the method has seen: P0, P0c, P1 or P2.
         method: Which diagnoser, with which healthy behaviour.
     """
@@ -37,7 +53,10 @@ class Diagnosis:
     magnitude_unit: str | None = None
     magnitude_90: Interval | None = None
     verdict: str = ""
+    explanation: tuple[str, ...] = ()
+    evidence: tuple[MovementEvidence, ...] = ()
     quality: tuple[str, ...] = ()
+    undecided: str = ""
     protocol: str = "P0"
     method: str = ""
 
@@ -47,19 +66,19 @@ class Diagnosis:
         return sorted(self.posterior, key=lambda name: -self.posterior[name])
 
     @property
-    def diagnosis(self) -> str:
-        """The most probable hypothesis."""
-        return self.ranked[0]
+    def diagnosis(self) -> str | None:
+        """The most probable hypothesis; None where the log allows no verdict."""
+        return None if self.undecided else self.ranked[0]
 
     @property
-    def probability(self) -> float:
-        """Probability of the most probable hypothesis."""
-        return self.posterior[self.diagnosis]
+    def probability(self) -> float | None:
+        """Probability of the most probable hypothesis; None where the log allows no verdict."""
+        return None if self.undecided else self.posterior[self.ranked[0]]
 
     @property
     def runner_up(self) -> str | None:
-        """The second most probable hypothesis; None where there is only one."""
-        return self.ranked[1] if len(self.posterior) > 1 else None
+        """The second most probable hypothesis; None where there is none."""
+        return None if self.undecided or len(self.posterior) < 2 else self.ranked[1]
 
     def to_record(self) -> dict[str, Any]:
         """Return the JSON object of the contract."""
@@ -76,6 +95,8 @@ class Diagnosis:
             "magnitude_unit": self.magnitude_unit,
             "magnitude_90": self.magnitude_90,
             "verdict": self.verdict,
+            "explanation": list(self.explanation),
+            "evidence": [{"movement": e.movement, "nats": e.nats} for e in self.evidence],
             "quality": list(self.quality),
             "protocol": self.protocol,
             "method": self.method,

@@ -65,12 +65,13 @@ class Hypothesis:
         return self.known and not self.faults
 
     @classmethod
-    def parse(cls, text: str, motors: Sequence[str]) -> Hypothesis:
+    def parse(cls, text: str, motors: Sequence[str] | None = None) -> Hypothesis:
         """Read the text form.
 
         Args:
             text: Such as ``"motor_1:stuck+motor_3:drift"``.
-            motors: Names of the robot's motors in chain order.
+            motors: Names of the robot's motors in chain order; None: any names in any order, for
+                text that comes from a result.
 
         Raises:
             InputError: If the text does not follow the form or names an unknown motor or mode.
@@ -78,8 +79,8 @@ class Hypothesis:
         if text in ("healthy", "unknown"):
             return cls(known=text == "healthy")
         faults = tuple(_parse_fault(part, motors) for part in text.split("+"))
-        order = [motors.index(fault.motor) for fault in faults]
-        if order != sorted(set(order)):
+        order = [] if motors is None else [motors.index(fault.motor) for fault in faults]
+        if motors is not None and order != sorted(set(order)):
             raise InputError(
                 f"hypothesis {text!r} names its motors out of chain order or twice. "
                 f"Expected each motor once, in the order {', '.join(motors)}."
@@ -91,14 +92,14 @@ HEALTHY = Hypothesis()
 UNKNOWN = Hypothesis(known=False)
 
 
-def _parse_fault(text: str, motors: Sequence[str]) -> Fault:
+def _parse_fault(text: str, motors: Sequence[str] | None) -> Fault:
     motor, separator, mode = text.partition(":")
     if not separator:
         raise InputError(
             f"hypothesis {text!r} is not of the form MOTOR:MODE. "
-            f"Expected 'healthy' or, for example, '{motors[0]}:stuck'."
+            "Expected 'healthy' or, for example, 'motor_1:stuck'."
         )
-    if motor not in motors:
+    if motors is not None and motor not in motors:
         raise unknown_name("motor", motor, motors)
     return Fault(motor, mode)
 

@@ -11,10 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from failuretwin.core.errors import InputError
+from failuretwin.core.polyline import ROUNDING_RAD, simplify
 from failuretwin.core.types import BoolArray, FloatArray
 
 CORNER_TOLERANCE_RAD = 1e-7
 """Change of a reference from one step to the next [rad] that is rounding and no corner."""
+LONGEST_CORNER = 4
+"""Samples over which a corner between straight lines can bend; a short ramp has two corners."""
 SAME_MOVEMENT_S = 0.1
 """Motors that start within this time [s] move together; a bus serves six servos in about 0.02 s."""
 
@@ -161,29 +164,41 @@ def _movements_of_run(
 
 def _corners(reference: FloatArray, time: FloatArray) -> _Corners:
     """Return the corners of one motor's reference (time,), the first being its start at rest."""
+    if _is_rounded(reference):
+        times, angles = simplify(time, reference, ROUNDING_RAD)
+        speeds = np.append(np.diff(angles) / np.diff(times), 0.0)
+        return _Corners(times, angles, speeds)
     step = time[1] - time[0]
-    times, angles, speeds = [time[0]], [reference[0]], [0.0]
+    found = [(float(time[0]), float(reference[0]), 0.0)]
+    before = 0
     for first, last in _lines(reference):
         speed = (reference[last] - reference[first]) / (time[last] - time[first])
         if abs(speed) * step <= CORNER_TOLERANCE_RAD:
             speed = 0.0
-        if abs(speed - speeds[-1]) * step <= CORNER_TOLERANCE_RAD:
-            continue
-        # Where this line meets the one before it; at its own start, if there was a jump between.
-        meets = angles[-1] - reference[first] + speeds[-1] * (time[first] - times[-1])
-        corner = time[first] + meets / (speed - speeds[-1])
-        if not -1.001 * step <= corner - time[first] <= 0.001 * step:
-            before = first - 1 if first > 0 else first
+        # How far this line lies off the one before it, at its own first sample.
+        corner_time, corner_angle, old_speed = found[-1]
+        off = reference[first] - corner_angle - old_speed * (time[first] - corner_time)
+        turns = abs(speed - old_speed) * step > CORNER_TOLERANCE_RAD
+        back = off / (speed - old_speed) if turns else np.inf
+        if not turns and abs(off) <= CORNER_TOLERANCE_RAD:
+            pass
+        elif -0.001 * step <= back <= 1.001 * step:
+            at = time[first] - back
+            found.append((at, corner_angle + old_speed * (at - corner_time), speed))
+        else:  # between the two lies a ramp too short to be a line of its own
             gap = max(time[first] - time[before], 1e-9)
             jump = (reference[first] - reference[before]) / gap
-            times.append(time[before])
-            angles.append(reference[before])
-            speeds.append(jump)
-            corner = time[first]
-        angles.append(angles[-1] + speeds[-1] * (corner - times[-1]))
-        times.append(corner)
-        speeds.append(speed)
-    return _Corners(np.array(times), np.array(angles), np.array(speeds))
+            found.append((time[before], reference[before], jump))
+            found.append((time[first], reference[first], speed))
+        before = last
+    return _Corners(*np.array(found).T)
+
+
+def _is_rounded(reference: FloatArray) -> bool:
+    """Return whether a reference bends for longer than any corner: its lines are not straight."""
+    bends = np.abs(np.diff(reference, 2)) > CORNER_TOLERANCE_RAD
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], bends.astype(int), [0]])))
+    return bool(np.diff(edges)[::2].max(initial=0) > LONGEST_CORNER)
 
 
 def _lines(reference: FloatArray) -> list[tuple[int, int]]:

@@ -39,6 +39,10 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str]] = {
 }
 """Dimensions and unit of every variable that a run set may hold."""
 
+UNIFORM = 1e-3
+"""Steps of a time grid may differ by this share; single precision rounds by a tenth of it."""
+LARGEST = {"command": 1e6, "measured": 1e6}
+"""Largest sensible value of a reference [rad] and of a tool position [m]."""
 REQUIRED = ("command", "measured")
 COMPONENT_LEVEL = ("position", "temperature", "voltage")
 """Readings from inside the motors; a system-level diagnosis never looks at them."""
@@ -176,6 +180,12 @@ def _check_variables(runs: xr.Dataset, where: str) -> None:
     for name in REQUIRED:
         if runs[name].dtype.kind not in "fiu":
             raise InputError(f"{where}: `{name}` holds {runs[name].dtype}, expected numbers.")
+        largest = float(np.nanmax(np.abs(runs[name].values), initial=0.0))
+        if largest > LARGEST[name]:
+            raise InputError(
+                f"{where}: `{name}` holds values up to {largest:g} {VARIABLES[name][1]}. Check "
+                "its unit."
+            )
 
 
 def _check_time(time: FloatArray, where: str) -> None:
@@ -184,7 +194,7 @@ def _check_time(time: FloatArray, where: str) -> None:
     steps = np.diff(time)
     if not np.all(np.isfinite(time)) or steps.min() <= 0:
         raise InputError(f"{where}: `time` does not increase. Expected a uniform grid from 0 [s].")
-    if abs(time[0]) > 1e-9 or np.ptp(steps) > 1e-6 * steps.mean() + 1e-9:
+    if abs(time[0]) > 1e-9 or np.ptp(steps) > UNIFORM * steps.mean():
         raise InputError(
             f"{where}: `time` is not a uniform grid from 0 (it starts at {time[0]:g} s with steps "
             f"of {steps.min():g} to {steps.max():g} s). Resample onto one, with NaN in `measured` "
@@ -235,7 +245,7 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
         combine_attrs="override",
     )
     return whole.assign_coords(
-        run=np.asarray(_unique([str(name) for name in whole["run"].values]), dtype=object)
+        run=np.asarray(unique_names([str(name) for name in whole["run"].values]), dtype=object)
     )
 
 
@@ -263,7 +273,7 @@ def _pad(part: xr.Dataset, time: FloatArray, movements: int) -> xr.Dataset:
     return part.assign_coords(time=time)
 
 
-def _unique(names: Sequence[str]) -> list[str]:
+def unique_names(names: Sequence[str]) -> list[str]:
     """Return `names` with a number behind each that was there before."""
     given, used, unique = set(names), set[str](), []
     for name in names:

@@ -119,6 +119,9 @@ def _read_table(path: Path, columns: Sequence[str]) -> FloatArray:
             raise InputError(
                 f"{path}: missing a column: {unknown_name('column', column, map(str, table))}"
             )
+    for column in wanted:
+        if f"{column}.1" in table:  # the reader's name for a second column of that name
+            raise InputError(f"{path}: column {column!r} stands there twice. Remove one of them.")
     if table.empty:
         raise InputError(f"{path}: has a header but no rows.")
     numbers = table[wanted].apply(pd.to_numeric, errors="coerce").to_numpy(dtype=np.float64)

@@ -19,6 +19,7 @@ from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable, Truth
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.raw_session import COMMAND_FILE, RawSession
+from failuretwin.data_knowledge.timed_log import check_clock
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -107,6 +108,8 @@ def session_runs(
     label = label_of(session) if published_labels else None
     make = _measured_run if how == "measured" else _published_run
     spans = split_session(session, robot)
+    for span in spans:
+        _check_length(session, span)
     runs = [make(session, robot, span, label) for span in spans]
     length = max(len(run.command) for run in runs)
     step = GRID_STEP_S if how == "measured" else PUBLISHED_TIME[1]
@@ -138,7 +141,9 @@ class _Run:
 def _measured_run(session: RawSession, robot: Robot, span: RowSpan, label: int | None) -> _Run:
     units = robot.servo_units
     begin, end = _measured_window(session, span)
-    time = as_floats(np.arange(int(np.floor((end - begin) / GRID_STEP_S)) + 1) * GRID_STEP_S)
+    stamps = np.concatenate([session.command_time[span.first : span.stop], session.reading_time])
+    check_clock(stamps[(stamps >= begin) & (stamps <= end)], str(session.folder))
+    time = as_floats(np.arange(round((end - begin) / GRID_STEP_S) + 1) * GRID_STEP_S)
     movements = _movements(session, robot, span, begin, _initial_counts(session, span, begin))
     inside = (session.reading_time >= begin) & (session.reading_time <= end)
     kept = inside & ~_before_gap(session)
@@ -172,7 +177,11 @@ def _published_run(session: RawSession, robot: Robot, span: RowSpan, label: int 
     time = PUBLISHED_TIME
     movements = _movements(session, robot, span, begin, session.reading_counts[first])
     raw = np.stack(
-        [np.interp(time, session.reading_time - begin, c) for c in session.reading_counts.T], axis=1
+        [
+            np.interp(time, session.reading_time - begin, counts, right=np.nan)
+            for counts in session.reading_counts.T
+        ],
+        axis=1,
     )
     position = units.to_rad(raw)
     held = np.nan
@@ -188,6 +197,16 @@ def _last_reading_before(session: RawSession, stamp: float) -> float | None:
     return None if index < 0 else float(session.reading_time[index])
 
 
+def _check_length(session: RawSession, span: RowSpan) -> None:
+    """Raise InputError unless the readings outlast the first ramp of a run."""
+    reached = session.command_time[span.first] + session.ramp_s[span.first].max()
+    if session.reading_time[-1] < reached:
+        raise InputError(
+            f"{session.folder}: the readings end before the first movement of the run does (line "
+            f"{span.first + 2} of {COMMAND_FILE}). A run needs one whole movement at least."
+        )
+
+
 def _measured_window(session: RawSession, span: RowSpan) -> tuple[float, float]:
     """Return begin and end of a run [s]: from the last reading before it to the next command."""
     command = float(session.command_time[span.first])
@@ -196,13 +215,6 @@ def _measured_window(session: RawSession, span: RowSpan) -> tuple[float, float]:
     last = float(session.reading_time[-1])
     end = float(session.command_time[span.stop]) if span.stop < len(session.command_time) else last
     end = min(end, last)
-    if end <= session.command_time[span.stop - 1]:
-        rows = f"rows {span.first + 2} to {span.stop + 1} of {COMMAND_FILE}"
-        if span.stop - span.first == 1 or end <= session.command_time[span.first]:
-            raise InputError(
-                f"{session.folder}: the readings end before the movements of {rows} do; a run "
-                "needs one whole movement at least. Log for longer."
-            )
     return begin, end
 
 

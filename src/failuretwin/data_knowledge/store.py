@@ -32,10 +32,9 @@ def load_run_set(path: Path) -> xr.Dataset:
         with opener(path) as stored:
             runs = stored.load()
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        reason = str(error).strip().splitlines() or [type(error).__name__]
         raise InputError(
-            f"{path}: cannot be read as a run set ({reason[0]}). Expected NetCDF (.nc) or Zarr "
-            "(.zarr) as `failuretwin simulate` and `failuretwin import` write them."
+            f"{path}: cannot be read as a run set ({_reason(error)}). Expected NetCDF (.nc) or "
+            "Zarr (.zarr) as `failuretwin simulate` and `failuretwin import` write them."
         ) from error
     return check_runs(runs, str(path))
 
@@ -53,20 +52,22 @@ def save_run_set(runs: xr.Dataset, path: Path) -> None:
         InputError: If the suffix is neither .nc nor .zarr.
         OutputError: If it cannot be written; nothing is left behind.
     """
-    check_suffix(path)
+    check_destination(path)
     with replacing(path) as partial, warnings.catch_warnings():
         # Zarr warns that text and consolidated metadata are not in its final specification yet.
         warnings.filterwarnings("ignore", message=".*Zarr (V3|format 3).*")
         if path.suffix == ".nc":
-            runs.to_netcdf(partial, engine="h5netcdf", encoding=_compression(runs))
+            # In memory first: on a full disk the HDF5 library can bring the whole process down.
+            partial.write_bytes(runs.to_netcdf(engine="h5netcdf", encoding=_compression(runs)))
         else:
             runs.to_zarr(partial, mode="w", consolidated=True)
 
 
-def check_suffix(path: Path) -> None:
-    """Raise InputError unless `path` ends in .nc or .zarr."""
+def check_destination(path: Path) -> None:
+    """Raise an error unless a run set can be written to `path`: worth asking before long work."""
     if path.suffix not in SUFFIXES:
         raise InputError(f"{path}: a run set ends in .nc (NetCDF) or .zarr (Zarr).")
+    _check_writable(path)
 
 
 def _compression(runs: xr.Dataset) -> dict[str, dict[str, object]]:
@@ -82,23 +83,73 @@ def replacing(path: Path) -> Iterator[Path]:
         OutputError: If writing fails for whatever reason of the disk; the unfinished work is
             removed and `path` is as before.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial{path.suffix}")
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        yield path  # a pipe or a device: nothing there can be replaced
+        return
+    target = path.resolve()  # a link stays a link
+    partial = target.with_name(f".{path.name}.{os.getpid()}.partial{path.suffix}")
     try:
         _check_writable(path)
         yield partial
-        if path.is_dir():
-            shutil.rmtree(path)
-        partial.replace(path)
+        _take_place(partial, target)
     except (OSError, RuntimeError) as error:
-        if isinstance(error, OutputError):
-            raise
-        raise OutputError(
-            f"{path}: could not be written ({_reason(error)}). Nothing was left behind; free some "
-            "space or choose another place."
-        ) from error
+        raise _output_error(path, error) from error
     finally:
         with suppress(OSError):
             shutil.rmtree(partial) if partial.is_dir() else partial.unlink(missing_ok=True)
+
+
+def _take_place(partial: Path, path: Path) -> None:
+    """Put `partial` where `path` is; a folder there is kept until the new one stands."""
+    if not path.is_dir():
+        partial.replace(path)
+        return
+    old = path.with_name(f".{path.name}.{os.getpid()}.old")
+    path.replace(old)
+    try:
+        partial.replace(path)
+    except OSError:
+        old.replace(path)
+        raise
+    shutil.rmtree(old)
+
+
+@contextmanager
+def filling(folder: Path) -> Iterator[Path]:
+    """Give a folder to write files to; they appear in `folder` together or not at all.
+
+    Raises:
+        OutputError: If writing fails; `folder` is as before.
+    """
+    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    made = [parent for parent in folder.parents if not parent.exists()]
+    try:
+        if folder.exists() and not folder.is_dir():
+            raise OutputError(f"{folder}: is a file. Give the name of a folder.")
+        partial.mkdir(parents=True)
+        yield partial
+        if folder.exists():
+            for file in partial.iterdir():
+                file.replace(folder / file.name)
+        else:
+            partial.replace(folder)
+    except OSError as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        for parent in made:
+            with suppress(OSError):
+                parent.rmdir()
+        raise _output_error(folder, error) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _output_error(path: Path, error: BaseException) -> OutputError:
+    if isinstance(error, OutputError):
+        return error
+    return OutputError(
+        f"{path}: could not be written ({_reason(error)}). Nothing was left behind; free some "
+        "space or choose another place."
+    )
 
 
 def _check_writable(path: Path) -> None:
@@ -113,4 +164,9 @@ def _check_writable(path: Path) -> None:
 
 def _reason(error: BaseException) -> str:
     text = getattr(error, "strerror", None) or str(error)
-    return text.strip().splitlines()[0] if text.strip() else type(error).__name__
+    return one_line(text) or type(error).__name__
+
+
+def one_line(text: str) -> str:
+    """Return the text of another library's error on one line, without its inner details."""
+    return " ".join(text.partition("(")[0].split())

@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.core.diagnosis import Diagnosis
+from failuretwin.core.diagnosis import Diagnosis, MovementEvidence
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
 from failuretwin.core.runs import check_runs, truth_of
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.data_knowledge.knowledge import prior_odds
+from failuretwin.data_knowledge.log_quality import LogQuality, log_quality
+from failuretwin.decision.assessment import lost_commands, unused_movements, why_undecided
 from failuretwin.decision.evidence import SettledEvidence, settled_evidence
 from failuretwin.decision.healthy import Alternatives, HealthyModel
 from failuretwin.decision.quadrature import log_sum
@@ -23,8 +26,8 @@ from failuretwin.decision.steady_state_error import (
     Range,
     error_evidence,
 )
-from failuretwin.decision.stuck import OnsetPrior, StuckEvidence, stuck_evidence
-from failuretwin.decision.wording import quality_of, verdict
+from failuretwin.decision.stuck import LAG_S, OnsetPrior, StuckEvidence, stuck_evidence
+from failuretwin.decision.wording import explanation, verdict
 from failuretwin.digital_model.imperfections import Imperfections, default_imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
@@ -67,15 +70,34 @@ def priors_of(
     priors = Priors()
     if error_range_counts is not None:
         low, high = error_range_counts
-        if not 0.0 <= low < high:
+        if not 0.0 <= low < high < np.inf:
             raise InputError(f"--sse-range is {low:g} {high:g}, expected 0 <= LOW < HIGH.")
         count = robot.servo_units.rad_per_count
         priors = replace(priors, error_ranges=((low * count, high * count),))
     if onset_s is not None:
-        if not onset_s >= 0.0:
+        if not 0.0 <= onset_s < np.inf:
             raise InputError(f"--onset is {onset_s:g} s, expected 0 or more.")
         priors = replace(priors, onset=replace(priors.onset, known_s=onset_s))
     return priors
+
+
+@dataclass(frozen=True)
+class _Weighed:
+    """Some runs with every hypothesis weighed.
+
+    Attributes:
+        evidence: Settled positions.
+        alternatives: What may have become of each movement.
+        log_posterior: (run, hypothesis).
+        by_movement: Log density of each movement given all others, (run, hypothesis, movement).
+        found: What was found of each fault.
+    """
+
+    evidence: SettledEvidence
+    alternatives: Alternatives
+    log_posterior: FloatArray
+    by_movement: FloatArray
+    found: dict[Hypothesis, FaultEvidence]
 
 
 @dataclass(frozen=True)
@@ -85,7 +107,8 @@ class BayesDiagnoser:
     Attributes:
         twin: Digital twin of the robot.
         imperfections: How the healthy robot differs from it; None: as its profile says.
-        hypotheses: What may be the case, all equally likely; None: the paper's classes.
+        hypotheses: What may be the case, with the prior odds of the table of
+            failure modes; None: the paper's classes.
         priors: Beliefs about onset and size.
     """
 
@@ -133,10 +156,13 @@ class BayesDiagnoser:
         names = [str(name) for name in runs["run"].values]
         known = truth_of(runs)
         truth: list[str | None] = [None] * len(names) if known is None else list(known)
+        quality = log_quality(runs)
         results = []
         for first in range(0, len(names), CHUNK_RUNS):
-            part = slice(first, first + CHUNK_RUNS)
-            results += self._diagnose_part(evidence[part], names[part], truth[part])
+            weighed = self._weigh_all(evidence[first : first + CHUNK_RUNS])
+            for run in range(len(weighed.log_posterior)):
+                at = first + run
+                results.append(self._conclude(weighed, run, names[at], truth[at], quality[at]))
         return results
 
     def _check(self, runs: xr.Dataset) -> None:
@@ -148,65 +174,108 @@ class BayesDiagnoser:
                 f"{', '.join(self.twin.robot.motor_names)}. Name the right robot (--robot)."
             )
 
-    def _diagnose_part(
-        self, evidence: SettledEvidence, names: Sequence[str], truth: Sequence[str | None]
-    ) -> list[Diagnosis]:
+    def _weigh_all(self, evidence: SettledEvidence) -> _Weighed:
         model = self.healthy_model
         alternatives = model.alternatives(evidence.movements)
         healthy = model.log_healthy(evidence, alternatives)
         found: dict[Hypothesis, FaultEvidence] = {}
-        columns = []
+        columns, by_movement = [], []
         for hypothesis in self._hypotheses:
             if hypothesis.is_healthy:
                 columns.append(healthy.sum(axis=1))
+                by_movement.append(healthy)
                 continue
-            found[hypothesis] = self._weigh(hypothesis, evidence, model, alternatives, healthy)
-            columns.append(found[hypothesis].log_evidence)
-        log_likelihood = np.stack(columns, axis=1)
-        log_posterior = log_likelihood - log_sum(log_likelihood, axis=1)[:, None]
-        return [
-            self._conclude(run, names[run], truth[run], np.exp(log_posterior[run]), found, evidence)
-            for run in range(len(names))
-        ]
+            weight = self._weigh(hypothesis, evidence, alternatives, healthy)
+            found[hypothesis] = weight
+            columns.append(weight.log_evidence)
+            by_movement.append(weight.by_movement)
+        log_prior = np.log([prior_odds(hypothesis) for hypothesis in self._hypotheses])
+        log_joint = np.stack(columns, axis=1) + log_prior
+        return _Weighed(
+            evidence=evidence,
+            alternatives=alternatives,
+            log_posterior=log_joint - log_sum(log_joint, axis=1)[:, None],
+            by_movement=np.stack(by_movement, axis=1),
+            found=found,
+        )
 
     def _weigh(
         self,
         hypothesis: Hypothesis,
         evidence: SettledEvidence,
-        model: HealthyModel,
         alternatives: Alternatives,
         healthy: FloatArray,
     ) -> FaultEvidence:
-        fault = hypothesis.faults[0]
+        fault, model = hypothesis.faults[0], self.healthy_model
         motor = self.twin.robot.motor_names.index(fault.motor)
         if fault.mode == "stuck":
             return stuck_evidence(evidence, model, alternatives, healthy, motor, self.priors.onset)
         return error_evidence(evidence, model, alternatives, motor, self.priors.error_ranges)
 
     def _conclude(
-        self,
-        run: int,
-        name: str,
-        truth: str | None,
-        posterior: FloatArray,
-        found: dict[Hypothesis, FaultEvidence],
-        evidence: SettledEvidence,
+        self, weighed: _Weighed, run: int, name: str, truth: str | None, quality: LogQuality
     ) -> Diagnosis:
         imperfections = self.healthy_model.imperfections
-        best = self._hypotheses[int(np.argmax(posterior))]
+        order = np.argsort(-weighed.log_posterior[run], kind="stable")
+        ranked = [self._hypotheses[i] for i in order]
+        undecided = why_undecided(
+            quality,
+            weighed.evidence,
+            run,
+            weighed.by_movement[run, order[0]],
+            self.healthy_model.outlier_log_density,
+        )
+        # Without a verdict nothing is learnt: the prior stands.
+        prior = np.array([prior_odds(hypothesis) for hypothesis in self._hypotheses])
+        posterior = prior / prior.sum() if undecided else np.exp(weighed.log_posterior[run])
         diagnosis = Diagnosis(
             run=name,
             truth=truth,
             posterior={str(h): float(p) for h, p in zip(self._hypotheses, posterior, strict=True)},
-            quality=quality_of(evidence, run),
+            quality=(*quality.remarks, *unused_movements(weighed.evidence, run)),
+            undecided=undecided,
             protocol=imperfections.protocol,
             method=f"bayes, settled poses; healthy behaviour: {imperfections.name}",
         )
-        if best in found:
-            diagnosis = _estimate(diagnosis, best, found[best], run)
+        losses: list[str] = []
+        if not undecided:
+            diagnosis = replace(diagnosis, evidence=_evidence(weighed, run, order))
+            losses = self._losses(weighed, run, ranked[0])
+            if ranked[0] in weighed.found:
+                diagnosis = _estimate(diagnosis, ranked[0], weighed.found[ranked[0]], run)
         return replace(
-            diagnosis, verdict=verdict(diagnosis, enough=bool(evidence.usable[run].any()))
+            diagnosis,
+            verdict=verdict(diagnosis, ranked),
+            explanation=explanation(diagnosis, ranked, losses),
         )
+
+    def _losses(self, weighed: _Weighed, run: int, best: Hypothesis) -> list[str]:
+        """Return the commands that seem not to have arrived if `best` is true."""
+        model, one = self.healthy_model, slice(run, run + 1)
+        evidence, alternatives = weighed.evidence[one], weighed.alternatives[one]
+        base, held = alternatives.base.copy(), model.none_held.copy()
+        found, faulty = weighed.found.get(best), None
+        if found is not None:
+            faulty = best.faults[0].motor
+            motor = self.twin.robot.motor_names.index(faulty)
+            if isinstance(found, StuckEvidence):
+                after = evidence.movements.start[0] >= found.onset[run, 1] - LAG_S
+                base[:, after, :, motor] = found.angle[run, 1]
+                held[motor] = bool(after.all())
+            else:
+                base[..., motor] += found.offset[one, :, None]
+        pose = model.settle(base, alternatives.direction, held)
+        became = model.became(evidence, alternatives, pose, held)[0]
+        return lost_commands(became, model.imperfections.lost_commands, faulty)
+
+
+def _evidence(weighed: _Weighed, run: int, order: IntArray) -> tuple[MovementEvidence, ...]:
+    """Return what each usable movement says of the best hypothesis against the second."""
+    if len(order) < 2:
+        return ()
+    best, second = weighed.by_movement[run, order[0]], weighed.by_movement[run, order[1]]
+    usable = np.flatnonzero(weighed.evidence.usable[run])
+    return tuple(MovementEvidence(int(m) + 1, float(best[m] - second[m])) for m in usable)
 
 
 def _estimate(

@@ -38,6 +38,10 @@ class Alternatives:
     direction: FloatArray
     log_weight: FloatArray
 
+    def __getitem__(self, runs: slice) -> Alternatives:
+        """Return the alternatives of some of the runs."""
+        return Alternatives(self.base[runs], self.direction[runs], self.log_weight[runs])
+
 
 @dataclass(frozen=True)
 class HealthyModel:
@@ -140,13 +144,43 @@ class HealthyModel:
         Returns:
             (run, movement, node) [log 1/m3]; 0 for movements that are not usable.
         """
+        weighed = self._weighed(evidence, alternatives, pose, held)
+        mixed = np.logaddexp(log_sum(weighed, axis=-1), self.outlier_log_density)
+        return np.where(evidence.usable[..., None], mixed, 0.0)
+
+    def became(
+        self,
+        evidence: SettledEvidence,
+        alternatives: Alternatives,
+        pose: FloatArray,
+        held: BoolArray,
+    ) -> FloatArray:
+        """Return the probability of each alternative, (run, movement, alternative).
+
+        Args:
+            evidence: Settled positions.
+            alternatives: What may become of each movement.
+            pose: Predicted settled angles, (run, movement, alternative, motor) [rad].
+            held: Motors that do not scatter, (motor,).
+        """
+        weighed = self._weighed(evidence, alternatives, pose[:, :, None], held)[:, :, 0]
+        mixed = np.logaddexp(log_sum(weighed, axis=-1), self.outlier_log_density)
+        share = np.exp(weighed - mixed[..., None])
+        return np.where(evidence.usable[..., None], share, 0.0)
+
+    def _weighed(
+        self,
+        evidence: SettledEvidence,
+        alternatives: Alternatives,
+        pose: FloatArray,
+        held: BoolArray,
+    ) -> FloatArray:
+        """Return log weight times density, (run, movement, node, alternative)."""
         predicted, jacobian = self.twin.path_and_jacobian(pose)
         scaled = jacobian * np.where(held, 0.0, self.scatter)
         error = evidence.point[:, :, None, None] - predicted
         density = log_student(error, scaled, PATH_NOISE_M**2, self.settling.tail_dof)
-        mixed = log_sum(density + alternatives.log_weight[:, :, None], axis=-1)
-        mixed = np.logaddexp(mixed, self.outlier_log_density)
-        return np.where(evidence.usable[..., None], mixed, 0.0)
+        return density + alternatives.log_weight[:, :, None]
 
     def log_healthy(self, evidence: SettledEvidence, alternatives: Alternatives) -> FloatArray:
         """Return the log density of each position if no motor is faulty, (run, movement)."""

@@ -11,6 +11,8 @@ from failuretwin.core.types import IntArray
 
 Z_95 = 1.959963984540054
 """Two-sided 95 % point of the normal distribution."""
+NO_VERDICT = "cannot tell"
+"""Class of the runs that got no verdict."""
 PROBABILITY_FLOOR = 1e-12
 """A truth that a posterior gives less than this counts as this in the log score."""
 
@@ -93,19 +95,23 @@ class Scores:
 
 
 def score(
-    truth: Sequence[str], diagnosis: Sequence[str], posterior: Sequence[Mapping[str, float]]
+    truth: Sequence[str],
+    diagnosis: Sequence[str | None],
+    posterior: Sequence[Mapping[str, float]],
 ) -> Scores:
     """Score diagnoses against the truth.
 
     Args:
         truth: True hypothesis of each run.
-        diagnosis: Most probable hypothesis of each run.
+        diagnosis: Most probable hypothesis of each run; None: no verdict, a class of its own.
         posterior: Probabilities of each run.
     """
-    classes = tuple(dict.fromkeys([*(name for p in posterior for name in p), *truth]))
+    said_of = [NO_VERDICT if said is None else said for said in diagnosis]
+    names = [name for p in posterior for name in p]
+    classes = tuple(dict.fromkeys([*names, *truth, *said_of]))
     index = {name: i for i, name in enumerate(classes)}
     confusion = np.zeros((len(classes), len(classes)), dtype=np.int64)
-    for true, said in zip(truth, diagnosis, strict=True):
+    for true, said in zip(truth, said_of, strict=True):
         confusion[index[true], index[said]] += 1
     chance = [p.get(t, 0.0) for p, t in zip(posterior, truth, strict=True)]
     log_score = -np.mean(np.log(np.maximum(chance, PROBABILITY_FLOOR)))

@@ -37,10 +37,14 @@ class ErrorEvidence:
 
     Attributes:
         log_evidence: Log marginal likelihood of each run, (run,).
+        by_movement: Log density of each movement given all others, (run, movement).
+        offset: Posterior mean of the error of each movement, (run, movement) [rad].
         size: Quantiles 5, 50, 95 % of the rms error over movements, (run, 3) [rad].
     """
 
     log_evidence: FloatArray
+    by_movement: FloatArray
+    offset: FloatArray
     size: FloatArray
 
 
@@ -68,7 +72,13 @@ def error_evidence(
     log_evidence = log_sum(by_range, axis=1)
     share = np.exp(by_range - log_evidence[:, None])
     posterior = np.exp(terms - by_movement[..., None])
-    return ErrorEvidence(log_evidence, _size(evidence, offset, posterior, share))
+    without = log_sum(by_range[:, None] - by_movement, axis=2)
+    return ErrorEvidence(
+        log_evidence=log_evidence,
+        by_movement=log_evidence[:, None] - without,
+        offset=np.einsum("rmgo,o,rg->rm", posterior, offset, share),
+        size=_size(evidence, offset, posterior, share),
+    )
 
 
 def _offset_nodes(ranges: Sequence[Range]) -> tuple[FloatArray, FloatArray]:
@@ -104,16 +114,16 @@ def _log_density(
 def _size(
     evidence: SettledEvidence, offset: FloatArray, posterior: FloatArray, share: FloatArray
 ) -> FloatArray:
-    """Return quantiles of the rms error over the usable movements, (run, 3) [rad].
+    """Return quantiles of the rms error over all movements, seen or not, (run, 3) [rad].
 
     The mean square is a sum of independent terms; it is taken as normal with their mean and
     variance.
     """
     moments = []
-    usable = evidence.usable[..., None]
-    count = np.maximum(usable.sum(axis=1), 1)
+    exists = evidence.movements.exists[..., None]
+    count = np.maximum(exists.sum(axis=1), 1)
     for power in (2, 4):
-        moments.append(np.einsum("rmgo,o->rmg", posterior, offset**power) * usable)
+        moments.append(np.einsum("rmgo,o->rmg", posterior, offset**power) * exists)
     mean = moments[0].sum(axis=1) / count
     variance = (moments[1] - moments[0] ** 2).sum(axis=1) / count**2
     total = np.sum(share * mean, axis=1)

@@ -26,8 +26,15 @@ COARSE_NODES = 49
 """Nodes spread evenly over the range of the held angle."""
 LOCAL_STEPS = np.array([-8, -5, -3.5, -2.5, -1.75, -1, -0.5, 0, 0.5, 1, 1.75, 2.5, 3.5, 5, 8.0])
 """Nodes around the angle that a movement points to, in its own standard deviations."""
-LAG_S = 0.05
-"""Lag of the motion behind the command [s]; ramps run 0.04-0.06 s late."""
+PRIOR_STEPS = np.array([-5, -2.5, -1, 0, 1, 2.5, 5.0])
+"""Nodes around each angle that the prior favours, in the scale of its peak."""
+SETTLED_SCALE, ON_THE_WAY_SCALE = 2.0, 8.0
+"""How sharply the prior ties the held angle to where the motor had settled, and to where its ramp
+was at a known onset, in scatters of the motor."""
+LAG_S = 0.045
+"""Lag of the motion behind the command [s]: the servo loop's 0.025 s and a delay of 0 to 0.04 s."""
+LAG_SPREAD_S = np.array([-0.02, 0.0, 0.02])
+"""Steps by which the lag may differ from run to run [s]."""
 
 
 @dataclass(frozen=True)
@@ -52,11 +59,13 @@ class StuckEvidence:
 
     Attributes:
         log_evidence: Log marginal likelihood of each run, (run,).
+        by_movement: Log density of each movement given all others, (run, movement).
         angle: Quantiles 5, 50, 95 % of the held angle, (run, 3) [rad].
         onset: Quantiles 5, 50, 95 % of the onset, (run, 3) [s].
     """
 
     log_evidence: FloatArray
+    by_movement: FloatArray
     angle: FloatArray
     onset: FloatArray
 
@@ -79,28 +88,52 @@ def stuck_evidence(
         motor: Index of the motor.
         prior: When and where it may have got stuck.
     """
-    angle = _angle_nodes(evidence, model, alternatives, motor)
+    angle = _angle_nodes(evidence, model, alternatives, motor, prior)
     log_stuck = _log_density(evidence, model, alternatives, motor, angle)
     # Movements before the onset are healthy, from the first affected one on the motor is held.
     before = np.cumsum(log_healthy, axis=1) - log_healthy
     after = np.cumsum(log_stuck[:, ::-1], axis=1)[:, ::-1]
     first_affected = before[:, :, None] + after
-    log_prior = _log_prior(evidence, model, motor, angle, prior)
-    weights = log_trapezoid_weights(angle)[:, None, None]
-    joint = first_affected[:, :, None] + log_prior + weights
+    joint = first_affected[:, :, None] + _log_prior(evidence, model, motor, angle, prior)
     log_evidence = log_sum(joint, axis=(1, 2, 3))
     posterior = np.exp(joint - log_evidence[:, None, None, None])
+    log_posterior = log_sum(joint, axis=2) - log_evidence[:, None, None]
     return StuckEvidence(
         log_evidence=log_evidence,
+        by_movement=_by_movement(log_healthy, log_stuck, log_posterior),
         angle=weighted_quantiles(angle, posterior.sum(axis=(1, 2)), (0.05, 0.5, 0.95)),
-        onset=_onset_quantiles(evidence, motor, angle, posterior),
+        onset=_onset_quantiles(evidence, motor, angle, posterior, prior.known_s),
     )
 
 
-def _angle_nodes(
-    evidence: SettledEvidence, model: HealthyModel, alternatives: Alternatives, motor: int
+def _by_movement(
+    log_healthy: FloatArray, log_stuck: FloatArray, log_posterior: FloatArray
 ) -> FloatArray:
-    """Return angles to integrate over, sorted, (run, node) [rad]."""
+    """Return the log density of each movement given all others, (run, movement).
+
+    It is one over the posterior mean of one over its density. Onset and angle have the posterior
+    `log_posterior` (run, movement first affected, node); a movement before the onset has the
+    density `log_healthy` (run, movement), another `log_stuck` (run, movement, node).
+    """
+    affected = np.logaddexp.accumulate(log_posterior, axis=1)
+    not_yet = np.full_like(log_healthy, -np.inf)
+    later = log_sum(log_posterior, axis=2)[:, ::-1]
+    not_yet[:, :-1] = np.logaddexp.accumulate(later, axis=1)[:, ::-1][:, 1:]
+    inverse = np.logaddexp(log_sum(affected - log_stuck, axis=2), not_yet - log_healthy)
+    return -inverse
+
+
+def _angle_nodes(
+    evidence: SettledEvidence,
+    model: HealthyModel,
+    alternatives: Alternatives,
+    motor: int,
+    prior: OnsetPrior,
+) -> FloatArray:
+    """Return angles to integrate over, sorted, (run, node) [rad].
+
+    They crowd where the likelihood or the prior may have a peak.
+    """
     low, high = _range(model, motor)
     coarse = np.broadcast_to(
         np.linspace(low, high, COARSE_NODES), (len(evidence.point), COARSE_NODES)
@@ -108,7 +141,15 @@ def _angle_nodes(
     best, width = _best_angle(evidence, model, alternatives, motor)
     local = best[..., None] + width[..., None] * LOCAL_STEPS
     local = np.where(np.isfinite(local), local, low).reshape(len(coarse), -1)
-    return np.sort(np.clip(np.concatenate([coarse, local], axis=1), low, high), axis=1)
+    origin, target = _ends(evidence, motor)
+    settled = np.concatenate([origin, target[:, -1:]], axis=1)
+    scale = max(model.scatter[motor], 1e-4)
+    tied = [settled[..., None] + SETTLED_SCALE * scale * PRIOR_STEPS]
+    if prior.known_s is not None:
+        way = _position_at(evidence, motor, prior.known_s)
+        tied.append(way[..., None] + ON_THE_WAY_SCALE * scale * PRIOR_STEPS)
+    nodes = [coarse, local, *(peaks.reshape(len(coarse), -1) for peaks in tied)]
+    return np.sort(np.clip(np.concatenate(nodes, axis=1), low, high), axis=1)
 
 
 def _range(model: HealthyModel, motor: int) -> tuple[float, float]:
@@ -169,23 +210,28 @@ def _log_density(
 def _log_prior(
     evidence: SettledEvidence, model: HealthyModel, motor: int, angle: FloatArray, prior: OnsetPrior
 ) -> FloatArray:
-    """Return log prior densities, (run, movement first affected, plateau | ramp, node)."""
+    """Return log prior masses, (run, movement first affected, plateau | ramp, node).
+
+    Each stretch has its share of the prior; within it the nodes carry the density of the angle
+    times the weights of the trapezoidal rule, normalised so that no mass is lost between nodes.
+    """
     origin, target = _ends(evidence, motor)
     scale = model.scatter[motor]
     low, high = _range(model, motor)
     near = prior.known_s is not None
-    plateau = _student(angle[:, None] - origin[..., None], 2.0 * scale, 4.0)
+    plateau = _student(angle[:, None] - origin[..., None], SETTLED_SCALE * scale, 4.0)
     if prior.known_s is not None:
         way = _position_at(evidence, motor, prior.known_s)
-        ramp = _student(angle[:, None] - way[..., None], 8.0 * scale, 4.0)
+        ramp = _student(angle[:, None] - way[..., None], ON_THE_WAY_SCALE * scale, 4.0)
     else:
         ramp = _between(angle[:, None], origin[..., None], target[..., None], 4.0 * scale)
     free = -np.log(high - low)
     tied = np.stack([plateau, ramp], axis=2)
     share = 0.05 if near else prior.free
     mixed = np.logaddexp(np.log1p(-share) + tied, np.log(share) + free)
-    log_time = log_of(_onset_weights(evidence, motor, prior))
-    return mixed + log_time[..., None]
+    mass = mixed + log_trapezoid_weights(angle)[:, None, None]
+    mass -= log_sum(mass, axis=-1)[..., None]
+    return mass + log_of(_onset_weights(evidence, motor, prior))[..., None]
 
 
 def _student(error: FloatArray, scale: float, dof: float) -> FloatArray:
@@ -246,13 +292,19 @@ def _onset_weights(evidence: SettledEvidence, motor: int, prior: OnsetPrior) -> 
 
 
 def _onset_quantiles(
-    evidence: SettledEvidence, motor: int, angle: FloatArray, posterior: FloatArray
+    evidence: SettledEvidence,
+    motor: int,
+    angle: FloatArray,
+    posterior: FloatArray,
+    known_s: float | None,
 ) -> FloatArray:
     """Return quantiles 5, 50, 95 % of the onset, (run, 3) [s].
 
     On a ramp the held angle says when; on a plateau any time is as likely; a plateau before the
     first movement means before the run.
     """
+    if known_s is not None:
+        return np.full((len(angle), 3), known_s)
     begin, end = _stretches(evidence, motor)
     origin, target = _ends(evidence, motor)
     travel = target - origin
@@ -260,13 +312,13 @@ def _onset_quantiles(
     done = np.clip((angle[:, None] - origin[..., None]) / span[..., None], 0.0, 1.0)
     duration = evidence.movements.ramp_duration[..., motor]
     on_ramp = begin[..., 1, None] + LAG_S + done * duration[..., None]
+    on_ramp = np.maximum(on_ramp[..., None] + LAG_SPREAD_S, 0.0).reshape(*on_ramp.shape[:2], -1)
+    on_ramp_weight = np.repeat(posterior[:, :, 1] / len(LAG_SPREAD_S), len(LAG_SPREAD_S), axis=-1)
     shares = np.linspace(0.05, 0.95, 10)
     on_plateau = begin[..., 0, None] + shares * (end - begin)[..., 0, None]
     on_plateau[:, 0] = 0.0
     weight = posterior.sum(axis=-1)[..., 0, None] / len(shares)
     values = np.concatenate([on_ramp, on_plateau], axis=-1)
-    weights = np.concatenate(
-        [posterior[:, :, 1], np.broadcast_to(weight, on_plateau.shape)], axis=-1
-    )
+    weights = np.concatenate([on_ramp_weight, np.broadcast_to(weight, on_plateau.shape)], axis=-1)
     values, weights = (np.nan_to_num(v.reshape(len(v), -1)) for v in (values, weights))
     return weighted_quantiles(values, weights, (0.05, 0.5, 0.95))

@@ -1,16 +1,19 @@
-"""Diagnoses in plain words."""
+"""Diagnoses in plain words: the verdict, what speaks for it, what else it may be, what to do."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from failuretwin.core.diagnosis import Diagnosis
-from failuretwin.decision.evidence import SettledEvidence
+from failuretwin.core.diagnosis import Diagnosis, MovementEvidence
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.data_knowledge.knowledge import failure_modes, plain_name
 
-
-def plain_name(hypothesis: str) -> str:
-    """Return a hypothesis as a person would say it, such as ``motor 3 stuck``."""
-    return hypothesis.replace(":", " ").replace("_", " ").replace("+", " and ")
+SURE = 0.95
+"""Posterior mass that the hypotheses named as possible hold together."""
+TELLING_NATS = 1.0
+"""Evidence of a movement worth telling [nats]: it changes the odds by a factor of 2.7."""
 
 
 def percent(probability: float) -> str:
@@ -20,42 +23,78 @@ def percent(probability: float) -> str:
     return f"{100 * probability:.1f} %" if probability > 0.99 else f"{100 * probability:.0f} %"
 
 
-def verdict(diagnosis: Diagnosis, *, enough: bool) -> str:
+def verdict(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> str:
     """Return the diagnosis as one sentence.
 
     Args:
         diagnosis: With its estimates filled in.
-        enough: Whether the run holds any evidence at all.
+        ranked: Its hypotheses from the most to the least probable.
     """
-    if not enough:
-        return "cannot tell, because the tool is not seen at rest after any movement"
-    name = diagnosis.diagnosis
-    text = plain_name(name)
-    if name.endswith(":stuck"):
-        text += f" at {np.rad2deg(diagnosis.magnitude or 0.0):.0f} deg {_since(diagnosis.onset_s)}"
-    elif name.endswith(":steady_state_error"):
-        motor = plain_name(name.partition(":")[0])
-        text = (
-            f"{motor} misses its targets by about {np.rad2deg(diagnosis.magnitude or 0.0):.1f} deg"
-        )
-    text += f", {percent(diagnosis.probability)} sure"
-    if diagnosis.probability < 0.9 and diagnosis.runner_up is not None:
-        share = percent(diagnosis.posterior[diagnosis.runner_up])
-        text += f" (or {plain_name(diagnosis.runner_up)}, {share})"
+    if diagnosis.undecided:
+        return f"cannot tell, because {diagnosis.undecided}"
+    best = ranked[0]
+    text = plain_name(best)
+    if not best.is_healthy:
+        text += _size_and_onset(diagnosis, best)
+    text += f", {percent(diagnosis.posterior[str(best)])} sure"
+    possible = possible_hypotheses(diagnosis, ranked)
+    if len(possible) > 1:
+        others = [f"{plain_name(h)} {percent(diagnosis.posterior[str(h)])}" for h in possible[1:3]]
+        text += f" (or {', '.join(others)})"
     return text
 
 
-def _since(onset_s: float | None) -> str:
-    return f"since {onset_s:.1f} s" if onset_s else "since before the run"
+def _size_and_onset(diagnosis: Diagnosis, hypothesis: Hypothesis) -> str:
+    degrees = np.rad2deg(diagnosis.magnitude or 0.0)
+    if hypothesis.faults[0].mode == "stuck":
+        since = f"{diagnosis.onset_s:.1f} s" if diagnosis.onset_s else "before the run"
+        return f" at {degrees:.0f} deg since {since}"
+    return f" by about {degrees:.1f} deg"
 
 
-def quality_of(evidence: SettledEvidence, run: int) -> tuple[str, ...]:
-    """Return what keeps movements of a run from being used, a line each."""
-    lines = []
-    for movement in np.flatnonzero(evidence.movements.exists[run] & ~evidence.usable[run]):
-        if evidence.moving[run, movement]:
-            reason = "the tool does not come to rest"
-        else:
-            reason = "no reading while the tool is at rest"
-        lines.append(f"movement {movement + 1} not used: {reason}")
+def possible_hypotheses(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> Sequence[Hypothesis]:
+    """Return the fewest hypotheses that together are `SURE`."""
+    total = np.cumsum([diagnosis.posterior[str(h)] for h in ranked])
+    return ranked[: int(np.searchsorted(total, SURE)) + 1]
+
+
+def explanation(
+    diagnosis: Diagnosis, ranked: Sequence[Hypothesis], losses: Sequence[str]
+) -> tuple[str, ...]:
+    """Return what speaks for the verdict, what else it may be and what to do, a line each.
+
+    Args:
+        diagnosis: With evidence filled in.
+        ranked: Its hypotheses from the most to the least probable.
+        losses: Commands that seem not to have arrived.
+    """
+    if diagnosis.undecided:
+        return ("Log again, for five movements or more, with the tool in view while it rests.",)
+    lines = list(_evidence_lines(diagnosis.evidence, ranked))
+    lines += losses
+    possible = possible_hypotheses(diagnosis, ranked)
+    if len(possible) > 1:
+        names = " or ".join(plain_name(h) for h in possible)
+        lines.append(f"cannot be told apart in this run: {names}")
+    for fault in ranked[0].faults:
+        mode = failure_modes()[fault.mode]
+        lines.append(f"possible causes: {', '.join(mode.mechanisms)}")
+        lines.append(f"what to do: {mode.advice}")
     return tuple(lines)
+
+
+def _evidence_lines(
+    evidence: Sequence[MovementEvidence], ranked: Sequence[Hypothesis]
+) -> list[str]:
+    if len(ranked) < 2:
+        return []
+    best, second = plain_name(ranked[0]), plain_name(ranked[1])
+    lines = []
+    for item in evidence:
+        if item.nats >= TELLING_NATS:
+            lines.append(f"movement {item.movement}: {item.nats:.1f} nats for {best} over {second}")
+        elif item.nats <= -TELLING_NATS:
+            lines.append(
+                f"movement {item.movement}: {-item.nats:.1f} nats for {second} over {best}"
+            )
+    return lines

@@ -80,7 +80,7 @@ class DigitalTwin:
 
 def _uniform_step(time: FloatArray) -> float:
     steps = np.diff(time)
-    if len(steps) == 0 or steps.min() <= 0 or np.ptp(steps) > 1e-6 * steps.mean():
+    if len(steps) == 0 or steps.min() <= 0 or np.ptp(steps) > 1e-3 * steps.mean():
         raise InputError(
             "`time` is not a uniform, increasing grid. Resample the commands onto one."
         )

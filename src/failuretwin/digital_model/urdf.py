@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,10 @@ from failuretwin.digital_model.chain import Joint, SerialChain, rotation_to_z
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 HELD_TYPES = ("fixed", "floating", "planar")
+
+_XML_COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
+_XACRO = re.compile(rb"<xacro:|\$\{|\$\((?:find|arg|eval|env|optenv)\b")
+"""What only a template holds; an expanded file may still declare the namespace."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +36,9 @@ class UrdfJoint:
         axis: Unit vector in the joint frame.
         low: Lower limit [rad or m].
         high: Upper limit [rad or m].
+        velocity: Largest speed [rad/s or m/s]; None where the file states none above zero.
+        effort: Largest torque or force [N m or N]; None where the file states none above zero.
+        mimic: Name of the joint that it follows; None for a joint of its own.
     """
 
     name: str
@@ -41,6 +49,9 @@ class UrdfJoint:
     axis: tuple[float, float, float]
     low: float
     high: float
+    velocity: float | None = None
+    effort: float | None = None
+    mimic: str | None = None
 
 
 @dataclass(frozen=True)
@@ -50,6 +61,7 @@ class Urdf:
     source: str
     links: tuple[str, ...]
     joints: tuple[UrdfJoint, ...]
+    name: str = ""
 
     def path(self, base_link: str, tool_link: str) -> tuple[UrdfJoint, ...]:
         """Return the joints from `base_link` to `tool_link`, in that order.
@@ -132,17 +144,36 @@ def read_urdf(path: Path) -> Urdf:
     Raises:
         InputError: If the file is missing, not XML, not a URDF, or a joint is malformed.
     """
+    root = read_root(path)
+    links = tuple(link.get("name", "") for link in root.findall("link"))
+    joints = tuple(_read_joint(joint, path) for joint in root.findall("joint"))
+    return Urdf(str(path), links, joints, root.get("name", ""))
+
+
+def read_root(path: Path) -> ElementTree.Element:
+    """Return the <robot> element of a URDF file.
+
+    Raises:
+        InputError: If the file is missing, not XML, a xacro template or not a URDF.
+    """
     try:
-        root = ElementTree.fromstring(path.read_bytes())
+        data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
+    if _XACRO.search(_XML_COMMENT.sub(b"", data)):
+        stem = path.name.removesuffix(".xacro").removesuffix(".urdf")
+        out = f"{stem}.urdf" if path.suffix == ".xacro" else f"{stem}_expanded.urdf"
+        raise InputError(
+            f"{path}: contains xacro tags, so it is the template of a URDF. Expand it with "
+            f"`xacro {path.name} > {out}` and give that file."
+        )
+    try:
+        root = ElementTree.fromstring(data)
     except ElementTree.ParseError as error:
         raise InputError(f"{path}: not an XML file ({error}). Expected a URDF.") from error
     if root.tag != "robot":
         raise InputError(f"{path}: the top element is <{root.tag}>, a URDF has <robot>.")
-    links = tuple(link.get("name", "") for link in root.findall("link"))
-    joints = tuple(_read_joint(joint, path) for joint in root.findall("joint"))
-    return Urdf(str(path), links, joints)
+    return root
 
 
 def _read_joint(element: ElementTree.Element, path: Path) -> UrdfJoint:
@@ -157,8 +188,11 @@ def _read_joint(element: ElementTree.Element, path: Path) -> UrdfJoint:
     origin, limit = element.find("origin"), element.find("limit")
     axis = _triple(element.find("axis"), "xyz", (1.0, 0.0, 0.0), where)
     length = math.hypot(*axis)
+    if type_ in HELD_TYPES:
+        axis, length = (1.0, 0.0, 0.0), 1.0  # exporters write zeros where no axis is needed
     if length == 0.0:
         raise InputError(f"{where} has a zero axis. Expected a direction such as '0 0 1'.")
+    mimic = element.find("mimic")
     unlimited = limit is None or type_ == "continuous"
     return UrdfJoint(
         name=name,
@@ -172,6 +206,9 @@ def _read_joint(element: ElementTree.Element, path: Path) -> UrdfJoint:
         axis=(axis[0] / length, axis[1] / length, axis[2] / length),
         low=-np.inf if unlimited else _number(limit, "lower", where),
         high=np.inf if unlimited else _number(limit, "upper", where),
+        velocity=_above_zero(limit, "velocity", where),
+        effort=_above_zero(limit, "effort", where),
+        mimic=None if mimic is None else mimic.get("joint", ""),
     )
 
 
@@ -199,6 +236,12 @@ def _number(element: ElementTree.Element | None, key: str, where: str) -> float:
         return float(text)
     except ValueError:
         raise InputError(f"{where}: {key}={text!r}, expected a number.") from None
+
+
+def _above_zero(element: ElementTree.Element | None, key: str, where: str) -> float | None:
+    """Return a limit; exporters write 0 for one that they do not know."""
+    value = _number(element, key, where)
+    return value if 0.0 < value < math.inf else None
 
 
 def transform(xyz: tuple[float, float, float], rpy: tuple[float, float, float]) -> FloatArray:

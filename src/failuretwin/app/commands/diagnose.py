@@ -26,7 +26,12 @@ from failuretwin.app.commands.options import PATH, common_options, reading_optio
 @click.option("--onset", type=float, metavar="SECONDS", help="Onset of stuck faults, where known.")
 @click.option("--json", "json_file", type=PATH, help="Write an object a line, a line a run.")
 @click.option("--csv", "csv_file", type=PATH, help="Write a table, a row a run.")
-@click.option("--plot", type=PATH, metavar="DIR", help="Write a picture of each run.")
+@click.option(
+    "--plot",
+    type=PATH,
+    metavar="DIR",
+    help="Write a picture of each run, and index.html with all of them.",
+)
 @reading_options
 @common_options
 def diagnose(
@@ -39,12 +44,15 @@ def diagnose(
     plot: Path | None,
     how: str,
     published_labels: bool,
+    columns: Path | None,
+    approximate: bool,
     robot: str,
     seed: int,
 ) -> None:
     """Diagnose runs from commands and tool path alone.
 
-    INPUT is a run set (.nc, .zarr) or a folder with raw sessions, which is searched downwards.
+    INPUT is a run set (.nc, .zarr), a folder with raw sessions or published MATLAB files (searched
+    downwards), such a file (.mat), a bag (.bag, .mcap), or a CSV file with --columns.
     """
     del seed  # nothing here is drawn by chance
     from failuretwin.app.inputs import read_inputs
@@ -66,15 +74,19 @@ def diagnose(
         ),
         priors=priors_of(model, sse_range, onset),
     )
-    runs = read_inputs(inputs, model, how, published_labels)
+    runs = read_inputs(inputs, model, how, published_labels, columns, approximate)
     diagnoses = diagnoser.diagnose(runs)
     if json_file is not None:
         write_json_lines([diagnosis.to_record() for diagnosis in diagnoses], json_file)
     if csv_file is not None:
         write_csv([diagnosis.to_record() for diagnosis in diagnoses], csv_file)
     if plot is not None:
+        from failuretwin.app.page import write_page
         from failuretwin.app.plots import plot_runs
+        from failuretwin.data_knowledge.store import filling
 
-        plot_runs(runs, diagnoses, twin, plot)
+        with filling(plot) as folder:
+            pictures = plot_runs(runs, diagnoses, twin, folder)
+            write_page(diagnoses, pictures, model.name, folder / "index.html")
     print_diagnoses(diagnoses)
     print_scores([diagnosis.to_record() for diagnosis in diagnoses])

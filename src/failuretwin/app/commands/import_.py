@@ -11,7 +11,13 @@ from failuretwin.app.commands.options import PATH, common_options, reading_optio
 
 @click.command("import")
 @click.argument("sources", nargs=-1, required=True, type=PATH, metavar="SRC...")
-@click.option("--out", required=True, type=PATH, help="Run set to write (.nc or .zarr).")
+@click.option(
+    "--out",
+    required=True,
+    type=PATH,
+    help="What to write: a run set (.nc, .zarr), a published layout (.mat: one file of cells, no "
+    "ending for a folder of pairs), or .csv.",
+)
 @reading_options
 @common_options
 def import_(
@@ -19,19 +25,24 @@ def import_(
     out: Path,
     how: str,
     published_labels: bool,
+    columns: Path | None,
+    approximate: bool,
     robot: str,
     seed: int,
 ) -> None:
     """Read logs and write them as one run set.
 
-    SRC is a run set or a folder with raw sessions, which is searched downwards.
+    SRC is a run set (.nc, .zarr), a folder with raw sessions or published MATLAB files (searched
+    downwards), such a file (.mat), a bag (.bag, .mcap), or a CSV file with --columns.
     """
     del seed  # nothing here is drawn by chance
     from failuretwin.app.inputs import read_inputs
-    from failuretwin.data_knowledge.store import check_suffix, save_run_set
+    from failuretwin.data_knowledge.exports import check_export_suffix, export_runs
     from failuretwin.digital_model.robot import load_robot
+    from failuretwin.digital_model.twin import DigitalTwin
 
-    check_suffix(out)
-    runs = read_inputs(sources, load_robot(robot), how, published_labels)
-    save_run_set(runs, out)
+    check_export_suffix(out)
+    model = load_robot(robot)
+    runs = read_inputs(sources, model, how, published_labels, columns, approximate)
+    export_runs(runs, out, DigitalTwin(model))
     click.echo(f"{runs.sizes['run']} runs written to {out}")

@@ -34,6 +34,19 @@ def common_options(command: F) -> F:
 def reading_options(command: F) -> F:
     """Add what says how raw logs become runs."""
     command = click.option(
+        "--approximate",
+        is_flag=True,
+        help="Published paths without commands: accept commands that reproduce the desired path "
+        "only in the least-squares sense.",
+    )(command)
+    command = click.option(
+        "--columns",
+        type=PATH,
+        metavar="MAP.toml",
+        help="What the columns of a CSV file (or the topics of a bag) are. If MAP.toml does not "
+        "exist, a guess is written there for you to check.",
+    )(command)
+    command = click.option(
         "--published-labels",
         is_flag=True,
         help="Take the truth from folder names that end in _label_K and freeze the motor of labels "

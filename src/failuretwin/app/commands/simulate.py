@@ -52,11 +52,11 @@ def simulate(
     from failuretwin.app.progress import progress_bar
     from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
     from failuretwin.data_knowledge import generation
-    from failuretwin.data_knowledge.store import check_suffix, save_run_set
+    from failuretwin.data_knowledge.store import check_destination, save_run_set
     from failuretwin.digital_model.imperfections import load_imperfections
     from failuretwin.digital_model.robot import load_robot
 
-    check_suffix(out)
+    check_destination(out)
     model = load_robot(robot)
     names = model.motor_names
     plan = generation.Plan(

@@ -1,0 +1,63 @@
+"""One self-contained HTML page for the runs of a folder. Needs the extra `plots`."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from failuretwin import __version__
+from failuretwin.app.results import score_line
+from failuretwin.core.diagnosis import Diagnosis
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.data_knowledge.knowledge import plain_name
+
+
+def write_page(
+    diagnoses: Sequence[Diagnosis], pictures: Sequence[Path], robot: str, path: Path
+) -> None:
+    """Write the page; pictures are part of it.
+
+    Args:
+        diagnoses: Diagnoses of the runs.
+        pictures: PNG file of each run, in the same order.
+        robot: Name of the robot.
+        path: HTML file to write.
+
+    Raises:
+        InputError: If jinja2 is missing.
+    """
+    try:
+        from jinja2 import Environment
+    except ImportError as error:
+        raise InputError(
+            f"pages need jinja2 ({error}). Install it: pip install 'failuretwin[plots]'."
+        ) from error
+    template = (files("failuretwin.app") / "page.html.j2").read_text(encoding="utf-8")
+    page = Environment(autoescape=True).from_string(template)
+    text = page.render(
+        runs=[_entry(d, picture) for d, picture in zip(diagnoses, pictures, strict=True)],
+        robot=robot,
+        method=diagnoses[0].method,
+        protocol=diagnoses[0].protocol,
+        version=__version__,
+        known=any(d.truth is not None for d in diagnoses),
+        score=score_line([d.to_record() for d in diagnoses]),
+    )
+    path.write_text(text, encoding="utf-8")
+
+
+def _entry(diagnosis: Diagnosis, picture: Path) -> dict[str, Any]:
+    truth = diagnosis.truth
+    return {
+        "name": diagnosis.run,
+        "verdict": diagnosis.verdict,
+        "truth": "" if truth is None else plain_name(Hypothesis.parse(truth)),
+        "wrong": truth is not None and truth != diagnosis.diagnosis,
+        "explanation": diagnosis.explanation,
+        "quality": diagnosis.quality,
+        "picture": base64.b64encode(picture.read_bytes()).decode("ascii"),
+    }

@@ -1,0 +1,301 @@
+"""Any CSV log through a column map: which column is what, in which unit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from failuretwin.core.config import from_table, read_toml
+from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.data_knowledge.timed_log import Samples, Targets, TimedLog
+from failuretwin.digital_model.robot import Robot
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+ANGLE_UNITS = {"rad": 1.0, "deg": np.pi / 180.0}
+SERVO = "servo"
+ISO = "iso"
+
+
+@dataclass(frozen=True)
+class TimeColumn:
+    """When a row was taken.
+
+    Attributes:
+        column: Its name.
+        unit: s, ms, us, ns, or iso for dates with times.
+    """
+
+    column: str
+    unit: str = "s"
+
+
+@dataclass(frozen=True)
+class AngleColumns:
+    """Angles of the motors, one column each, in chain order.
+
+    Attributes:
+        columns: Their names.
+        unit: rad, deg, or servo for the counts of the robot's profile.
+        sign: 1 or -1 for each motor, where the log turns the other way; empty: all 1.
+        zero: Value of each motor, in `unit`, that the robot calls 0; empty: all 0.
+    """
+
+    columns: tuple[str, ...]
+    unit: str = "rad"
+    sign: tuple[float, ...] = ()
+    zero: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class CommandColumns:
+    """What the motors were told.
+
+    Attributes:
+        columns: One column for each motor, in chain order.
+        kind: sampled (the reference at every row) or target (where to go, with a duration).
+        unit: rad, deg or servo.
+        duration_columns: For targets: time to get there, a column for each motor, or one for all.
+        duration_unit: s, ms, us or ns.
+        duration_s: For targets without such columns: the same time for every movement [s].
+        sign: As for angles.
+        zero: As for angles.
+    """
+
+    columns: tuple[str, ...]
+    kind: str = "sampled"
+    unit: str = "rad"
+    duration_columns: tuple[str, ...] = ()
+    duration_unit: str = "s"
+    duration_s: float | None = None
+    sign: tuple[float, ...] = ()
+    zero: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class ToolColumns:
+    """Where the tool was, in the base frame.
+
+    Attributes:
+        columns: x, y and z.
+        unit: m, cm or mm.
+    """
+
+    columns: tuple[str, str, str]
+    unit: str = "m"
+
+
+@dataclass(frozen=True)
+class ColumnMap:
+    """Which column of a CSV is what.
+
+    Attributes:
+        time: When each row was taken.
+        command: What the motors were told.
+        tool: Where the tool was; without it the path is computed from motor readings.
+        position: Motor readings.
+        run: Column that tells runs apart; without it a file is one run.
+        separator: Between columns.
+    """
+
+    time: TimeColumn
+    command: CommandColumns
+    tool: ToolColumns | None = None
+    position: AngleColumns | None = None
+    run: str | None = None
+    separator: str = ","
+
+
+def read_column_map(path: Path, robot: Robot) -> ColumnMap:
+    """Read a column map and check that it fits the robot.
+
+    Raises:
+        InputError: If the file is wrong or does not name what the robot needs.
+    """
+    where = str(path)
+    mapping = from_table(ColumnMap, read_toml(path), where)
+    _check_unit(mapping.time.unit, [*TIME_UNITS, ISO], f"{where}: time")
+    command = mapping.command
+    if command.kind not in ("sampled", "target"):
+        raise InputError(f"{where}: {unknown_name('kind', command.kind, ('sampled', 'target'))}")
+    _check_unit(command.duration_unit, TIME_UNITS, f"{where}: command")
+    if command.kind == "target" and not command.duration_columns and command.duration_s is None:
+        raise InputError(
+            f"{where}: targets need to know how long a movement takes. Name duration_columns, or "
+            "give duration_s for all."
+        )
+    if mapping.tool is None and mapping.position is None:
+        raise InputError(f"{where}: needs a [tool] table, or [position] to compute the path from.")
+    if mapping.tool is not None:
+        _check_unit(mapping.tool.unit, LENGTH_UNITS, f"{where}: tool")
+    for name, angles in (("command", command), ("position", mapping.position)):
+        if angles is not None:
+            _check_angles(angles, f"{where}: {name}", robot)
+    return mapping
+
+
+def _check_unit(unit: str, valid: Sequence[str] | dict[str, float], where: str) -> None:
+    if unit not in valid:
+        raise InputError(f"{where}: {unknown_name('unit', unit, valid)}")
+
+
+def _check_angles(angles: CommandColumns | AngleColumns, where: str, robot: Robot) -> None:
+    _check_unit(angles.unit, [*ANGLE_UNITS, SERVO], where)
+    count = len(robot.motors)
+    for name in ("columns", "sign", "zero"):
+        values = getattr(angles, name)
+        if len(values) != count and (name == "columns" or values):
+            raise InputError(
+                f"{where}: {name} has {len(values)} entries, expected {count}, one for each motor "
+                f"of {robot.name!r} ({', '.join(robot.motor_names)})."
+            )
+
+
+def read_mapped_csv(path: Path, mapping: ColumnMap, robot: Robot) -> list[TimedLog]:
+    """Read the runs of a CSV file through a column map.
+
+    Raises:
+        InputError: If the file cannot be read or lacks a column, or a value is no number.
+    """
+    table = load_csv(path, mapping.separator)
+    if mapping.run is None:
+        return [_log(table, path.stem, path, mapping, robot)]
+    _check_columns(table, [mapping.run], path)
+    groups = table.groupby(mapping.run, sort=False)
+    return [_log(part, f"{path.stem}/{key}", path, mapping, robot) for key, part in groups]
+
+
+def load_csv(path: Path, separator: str = ",") -> pd.DataFrame:
+    """Return a CSV file with every cell as text.
+
+    Raises:
+        InputError: If it cannot be read or holds no rows.
+    """
+    import pandas as pd
+
+    try:
+        table = pd.read_csv(path, dtype=str, sep=separator, skipinitialspace=True)
+    except pd.errors.EmptyDataError:
+        raise InputError(f"{path}: is empty. Expected a header and rows of numbers.") from None
+    except (OSError, UnicodeDecodeError, pd.errors.ParserError) as error:
+        raise InputError(f"{path}: cannot be read as CSV ({error}).") from error
+    if table.empty:
+        raise InputError(f"{path}: has a header but no rows.")
+    return table
+
+
+def _check_columns(table: pd.DataFrame, columns: Sequence[str], path: Path) -> None:
+    for column in columns:
+        if column not in table:
+            raise InputError(f"{path}: {unknown_name('column', column, map(str, table))}")
+
+
+def numbers(table: pd.DataFrame, columns: Sequence[str], path: Path) -> FloatArray:
+    """Return columns as numbers, (row, column); empty cells are NaN.
+
+    Raises:
+        InputError: If a column is missing or a cell is neither empty nor a number.
+    """
+    import pandas as pd
+
+    _check_columns(table, columns, path)
+    part = table[list(columns)]
+    values = part.apply(pd.to_numeric, errors="coerce").to_numpy(dtype=np.float64)
+    text = part.notna().to_numpy() & ~np.isfinite(values)
+    text &= ~part.apply(lambda c: c.str.strip().str.lower().isin(["nan", ""])).to_numpy()
+    if text.any():
+        row, column = np.argwhere(text)[0]
+        line = int(part.index[row]) + 2
+        raise InputError(
+            f"{path}: line {line}, column {columns[column]}: got {part.iloc[row, column]!r}, "
+            "expected a number."
+        )
+    return values
+
+
+def _log(table: pd.DataFrame, name: str, path: Path, mapping: ColumnMap, robot: Robot) -> TimedLog:
+    time = _times(table, mapping.time, path)
+    tool = position = None
+    if mapping.tool is not None:
+        scale = LENGTH_UNITS[mapping.tool.unit]
+        tool = _present(time, numbers(table, mapping.tool.columns, path) * scale)
+    if mapping.position is not None:
+        counts = numbers(table, mapping.position.columns, path)
+        position = _present(time, _angles(counts, mapping.position, robot))
+    return TimedLog(name, _commands(table, time, mapping.command, path, robot), tool, position)
+
+
+def _times(table: pd.DataFrame, column: TimeColumn, path: Path) -> FloatArray:
+    """Return the times of the rows from that of the first on, (row,) [s]."""
+    import pandas as pd
+
+    if column.unit != ISO:
+        values = numbers(table, [column.column], path)[:, 0]
+        if not np.all(np.isfinite(values)):
+            raise InputError(f"{path}: column {column.column} has rows without a time.")
+        return as_floats((values - values[0]) * TIME_UNITS[column.unit])
+    _check_columns(table, [column.column], path)
+    try:
+        stamps = pd.to_datetime(table[column.column], format="ISO8601", utc=True)
+    except ValueError as error:
+        raise InputError(f"{path}: column {column.column} is no ISO 8601 time: {error}.") from error
+    return as_floats((stamps - stamps.iloc[0]).dt.total_seconds())
+
+
+def _present(time: FloatArray, values: FloatArray) -> Samples:
+    """Return the rows that hold any value."""
+    there = np.isfinite(values).any(axis=1)
+    return Samples(time[there], values[there])
+
+
+def _angles(values: FloatArray, columns: AngleColumns | CommandColumns, robot: Robot) -> FloatArray:
+    """Return angles [rad] in the robot's sense; servo counts out of range become NaN."""
+    if columns.unit == SERVO:
+        units = robot.servo_units
+        angle = np.where(units.valid(values), units.to_rad(values), np.nan)
+        zero = units.to_rad(np.asarray(columns.zero)) if columns.zero else 0.0
+    else:
+        angle = values * ANGLE_UNITS[columns.unit]
+        zero = np.asarray(columns.zero or 0.0) * ANGLE_UNITS[columns.unit]
+    return as_floats((angle - zero) * np.asarray(columns.sign or 1.0))
+
+
+def _commands(
+    table: pd.DataFrame, time: FloatArray, columns: CommandColumns, path: Path, robot: Robot
+) -> Samples | Targets:
+    samples = _present(time, _angles(numbers(table, columns.columns, path), columns, robot))
+    if len(samples.time) == 0:
+        raise InputError(f"{path}: no row holds a command. Check the [command] columns.")
+    if columns.kind == "sampled":
+        return samples
+    # A log may repeat the target in every row; a movement begins where it changes.
+    target = _hold(samples.value)
+    new = np.concatenate([[True], np.any(np.diff(target, axis=0) != 0.0, axis=1)])
+    there = np.isin(time, samples.time[new])
+    duration = _durations(table, there, columns, path)
+    return Targets(samples.time[new], target[new], np.broadcast_to(duration, target[new].shape))
+
+
+def _hold(values: FloatArray) -> FloatArray:
+    """Return `values` (row, motor) with each NaN replaced by the value above it."""
+    held = values.copy()
+    for row in range(1, len(held)):
+        held[row] = np.where(np.isfinite(held[row]), held[row], held[row - 1])
+    return held
+
+
+def _durations(
+    table: pd.DataFrame, rows: BoolArray, columns: CommandColumns, path: Path
+) -> FloatArray:
+    if not columns.duration_columns:
+        return np.array(columns.duration_s, dtype=np.float64)
+    scale = TIME_UNITS[columns.duration_unit]
+    return numbers(table, columns.duration_columns, path)[rows] * scale

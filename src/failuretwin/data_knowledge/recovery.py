@@ -1,0 +1,184 @@
+"""Motor commands recovered from desired tool paths, for published runs that hold no commands.
+
+A desired path is what the kinematics make of the reference of the motors. Where that reference
+ramps between whole servo units, as the published ones do, movements come back exactly; others can
+be fitted by least squares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.movements import Movements
+from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.data_knowledge.approximate_recovery import fit_run
+from failuretwin.data_knowledge.inverse_kinematics import PlaneArm, plane_arm
+from failuretwin.data_knowledge.ramp_fit import PathPart
+from failuretwin.data_knowledge.whole_unit_recovery import NoWholeUnitsError, solve_run
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.twin import DigitalTwin
+
+STEP_S = 0.01
+"""Nominal step of published runs [s]."""
+
+
+def recover_movements(
+    desired: FloatArray,
+    time: FloatArray,
+    robot: Robot,
+    *,
+    approximate: bool = False,
+    names: Sequence[str],
+) -> Movements:
+    """Return the movements whose reference makes the desired paths.
+
+    Targets are whole servo units, ramps of the published durations; motors that stay have a
+    duration of 0, movements without any travel do not appear. The last ramp of a record that ends
+    within it is one of those that make what is seen of it, and a movement that begins after the
+    record does not appear. What comes back makes the desired path to 1e-9 m.
+
+    Args:
+        desired: Desired tool paths in the base frame, (run, time, axis) [m].
+        time: Uniform time grid, (time,) [s].
+        robot: The robot.
+        approximate: Fit the runs that have no such movements by least squares, with targets
+            and durations of any value. A tool position leaves the pose of an arm with more than
+            three motors open; the fit takes the pose nearest to the one before it among those
+            that also fit the ramps.
+        names: Name of each run, for messages.
+
+    Raises:
+        InputError: If the arrays do not fit, or a run has no such movements and `approximate`
+            is False, or nothing of a run's path can be fitted.
+    """
+    desired, time = _checked(desired, time, names)
+    arm = _arm_unless(robot, approximate=approximate)
+    parts = [
+        _recover_run(PathPart(time, path), robot, arm, approximate, name)
+        for path, name in zip(desired, names, strict=True)
+    ]
+    return _stacked(parts, len(robot.motors))
+
+
+def path_error(
+    movements: Movements, desired: FloatArray, time: FloatArray, robot: Robot
+) -> FloatArray:
+    """Return how far the path of `movements` is off `desired` at most, (run,) [m].
+
+    Args:
+        movements: Movements of every run.
+        desired: Desired tool paths in the base frame, (run, time, axis) [m].
+        time: Time grid, (time,) [s].
+        robot: The robot.
+    """
+    off = DigitalTwin(robot).path(movements.reference(time)) - desired
+    return np.linalg.norm(off, axis=-1).max(axis=1, initial=0.0)
+
+
+def published_time_bases(samples: int) -> list[FloatArray]:
+    """Return the grids that published runs come on, (time,) [s].
+
+    For 1000 samples these are 0.01 to 10.00, and 1000 points from 0 to 10.
+    """
+    end = samples * STEP_S
+    return [as_floats(np.arange(1, samples + 1) * STEP_S), np.linspace(0.0, end, samples)]
+
+
+def published_time(desired: FloatArray, robot: Robot, *, names: Sequence[str]) -> FloatArray:
+    """Return the time base on which movements of published durations make the desired paths.
+
+    The bases differ in their step, which whole movements reveal; an offset of the whole run in
+    time could not be seen. Runs whose movements are all cut off fit both. Where no run decides,
+    because none is exact or the robot is of another kind than the search for whole units can
+    handle, it is the grid from 0.01 s.
+
+    Args:
+        desired: Desired tool paths in the base frame, (run, time, axis) [m].
+        robot: The robot.
+        names: Name of each run, for messages.
+
+    Raises:
+        InputError: If the arrays do not fit.
+    """
+    bases = published_time_bases(np.shape(desired)[1])
+    desired, _ = _checked(desired, bases[0], names)
+    arm = _arm_unless(robot, approximate=True)
+    if arm is None:
+        return bases[0]
+    for path in desired:
+        fitting = [base for base in bases if _is_exact(PathPart(base, path), arm)]
+        if len(fitting) == 1:
+            return fitting[0]
+    return bases[0]
+
+
+def _is_exact(path: PathPart, arm: PlaneArm) -> bool:
+    try:
+        solve_run(path, arm)
+    except NoWholeUnitsError:
+        return False
+    return True
+
+
+def _recover_run(
+    path: PathPart, robot: Robot, arm: PlaneArm | None, approximate: bool, name: str
+) -> Movements:
+    """Return the movements of one run; `arm` is None where whole units cannot be searched."""
+    if arm is not None:
+        try:
+            return solve_run(path, arm)
+        except NoWholeUnitsError as reason:
+            if not approximate:
+                raise InputError(
+                    f"run {name!r}: no movements of robot {robot.name!r} between whole servo "
+                    f"units make its desired path exactly: {reason}. If the path is of another "
+                    "robot, give that one with --robot; if its targets are no whole units or it "
+                    "holds noise, use --approximate."
+                ) from None
+    return fit_run(path, robot, name)
+
+
+def _arm_unless(robot: Robot, *, approximate: bool) -> PlaneArm | None:
+    """Return the arm to search, None where it cannot be searched and need not be."""
+    try:
+        return plane_arm(robot)
+    except InputError:
+        if not approximate:
+            raise
+        return None
+
+
+def _checked(
+    desired: FloatArray, time: FloatArray, names: Sequence[str]
+) -> tuple[FloatArray, FloatArray]:
+    desired, time = as_floats(desired), as_floats(time)
+    if desired.ndim != 3 or desired.shape[1:] != (len(time), 3) or len(time) < 2:
+        raise InputError(
+            f"`desired` has shape {desired.shape}, expected (run, {len(time)} times, 3 axes) with "
+            "two samples at least."
+        )
+    if len(names) != len(desired):
+        raise InputError(f"{len(names)} names for {len(desired)} runs. Give one for each run.")
+    for name, path in zip(names, desired, strict=True):
+        if not np.all(np.isfinite(path)):
+            raise InputError(
+                f"run {name!r}: its desired path holds values that are not finite. Expected a "
+                "position [m] at every sample."
+            )
+    return desired, time
+
+
+def _stacked(parts: Sequence[Movements], motors: int) -> Movements:
+    """Return the movements of all runs, runs with fewer padded by NaN."""
+    count = max((part.start.shape[1] for part in parts), default=0)
+    target, ramp = np.full((2, len(parts), count, motors), np.nan)
+    start = np.full((len(parts), count), np.nan)
+    initial = np.empty((len(parts), motors))
+    for run, part in enumerate(parts):
+        own = part.start.shape[1]
+        initial[run], start[run, :own] = part.initial[0], part.start[0]
+        target[run, :own], ramp[run, :own] = part.target[0], part.ramp_duration[0]
+    return Movements(initial, target, ramp, start)

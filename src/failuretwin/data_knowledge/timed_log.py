@@ -1,0 +1,179 @@
+"""Any log with times becomes a run: commands as sampled or as targets, readings whenever they came.
+
+This is the narrow waist between foreign formats (CSV, bags) and run sets. All values are in SI
+units and in the sense of the robot's commands when they get here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.movements import Movements
+from failuretwin.core.polyline import ROUNDING_RAD, simplify
+from failuretwin.core.runs import RunTable
+from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.twin import DigitalTwin
+
+STEP_S = 0.01
+"""Step of the time grid [s]; finer where the sensor is faster."""
+LONGEST_SILENCE_S = 60.0
+"""Longer without any command or reading is a jump of the clock [s], and no time grid spans it."""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Values at increasing times.
+
+    Attributes:
+        time: (sample,) [s].
+        value: (sample, channel).
+    """
+
+    time: FloatArray
+    value: FloatArray
+
+    @property
+    def rate_hz(self) -> float:
+        """Typical rate of the samples [Hz]."""
+        return float(1.0 / np.median(np.diff(self.time)))
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Commands as targets with the time to reach them.
+
+    Attributes:
+        time: When each was sent, (command,) [s].
+        target: (command, motor) [rad].
+        duration: (command, motor) [s].
+    """
+
+    time: FloatArray
+    target: FloatArray
+    duration: FloatArray
+
+
+@dataclass(frozen=True)
+class TimedLog:
+    """One run as logged.
+
+    Attributes:
+        name: Name of the run.
+        command: References as sampled (sample, motor) [rad], or targets.
+        tool: Tool path (sample, axis) [m]; None: computed from the motor readings, like the
+            published virtual sensor.
+        position: Motor readings (sample, motor) [rad], NaN where one is missing.
+    """
+
+    name: str
+    command: Samples | Targets
+    tool: Samples | None = None
+    position: Samples | None = None
+
+
+def timed_run(log: TimedLog, robot: Robot) -> RunTable:
+    """Return a log as a run on a uniform grid, readings at their nearest grid times.
+
+    Raises:
+        InputError: If the log has no tool path and no motor readings, or its times do not increase.
+    """
+    tool = _tool_path(log, robot)
+    for samples in (log.command, tool, *([log.position] if log.position else [])):
+        _check_times(samples.time, log.name)
+    check_clock(np.concatenate([log.command.time, tool.time]), log.name)
+    begin = min(log.command.time[0], tool.time[0])
+    end = max(tool.time[-1], begin + STEP_S)
+    step = min(STEP_S, 1.0 / tool.rate_hz)
+    time = as_floats(np.arange(round((end - begin) / step) + 1) * step)
+    command, movements = _command(log, time, begin)
+    return RunTable(
+        run=[log.name],
+        motor=robot.motor_names,
+        time=time,
+        command=command[None],
+        measured=_on_grid(tool, time, begin)[None],
+        measured_rate_hz=tool.rate_hz,
+        movements=movements,
+        position=None if log.position is None else _on_grid(log.position, time, begin)[None],
+    )
+
+
+def _tool_path(log: TimedLog, robot: Robot) -> Samples:
+    if log.tool is not None:
+        if len(log.tool.time) < 2:
+            raise InputError(f"{log.name}: fewer than two readings of the tool. Log for longer.")
+        return log.tool
+    if log.position is None or len(log.position.time) < 2:
+        raise InputError(
+            f"{log.name}: holds neither a tool path nor motor readings. Name one of them."
+        )
+    sound = np.asarray(np.isfinite(log.position.value).all(axis=1))
+    path = np.full((len(sound), 3), np.nan)
+    path[sound] = DigitalTwin(robot).path(log.position.value[sound])
+    return Samples(log.position.time, path)
+
+
+def _check_times(time: FloatArray, name: str) -> None:
+    backwards = np.flatnonzero(np.diff(time) < 0)
+    if len(backwards):
+        row = int(backwards[0])
+        raise InputError(
+            f"{name}: time runs backwards after {time[row]:.3f} s (to {time[row + 1]:.3f} s). "
+            "Sort the log, or cut it where its clock jumped."
+        )
+
+
+def check_clock(time: FloatArray, where: str) -> None:
+    """Raise InputError if `time` [s], in any order, holds a silence that no log can mean."""
+    time = np.sort(time)
+    steps = np.diff(time)
+    if len(steps) and steps.max() > LONGEST_SILENCE_S:
+        before = float(time[int(np.argmax(steps))] - time[0])
+        raise InputError(
+            f"{where}: the clock jumps by {steps.max():.0f} s, {before:.1f} s after the start. "
+            "Cut the log there."
+        )
+
+
+def _command(log: TimedLog, time: FloatArray, begin: float) -> tuple[FloatArray, Movements | None]:
+    """Return the reference on the grid (time, motor) [rad] and the movements, where known."""
+    if isinstance(log.command, Samples):
+        lines = [
+            simplify(log.command.time - begin, values, ROUNDING_RAD)
+            for values in log.command.value.T
+        ]
+        return np.stack([np.interp(time, *line) for line in lines], axis=1), None
+    movements = Movements(
+        initial=_initial(log, log.command)[None],
+        target=log.command.target[None],
+        ramp_duration=log.command.duration[None],
+        start=(log.command.time - begin)[None],
+    )
+    return movements.reference(time)[0], movements
+
+
+def _initial(log: TimedLog, command: Targets) -> FloatArray:
+    """Return where the first ramp starts, (motor,) [rad]: the last reading before it, if any.
+
+    Otherwise the first target, so that no ramp is seen.
+    """
+    if log.position is not None:
+        before = (log.position.time <= command.time[0]) & np.isfinite(log.position.value).all(
+            axis=1
+        )
+        if before.any():
+            return log.position.value[np.flatnonzero(before)[-1]]
+    return command.target[0]
+
+
+def _on_grid(samples: Samples, time: FloatArray, begin: float) -> FloatArray:
+    """Return samples at their nearest grid times, NaN elsewhere, (time, channel)."""
+    grid = np.full((len(time), samples.value.shape[1]), np.nan)
+    nearest = np.rint((samples.time - begin) / (time[1] - time[0])).astype(np.int64)
+    inside = (nearest >= 0) & (nearest < len(time))
+    grid[nearest[inside]] = samples.value[inside]
+    return grid

@@ -1,0 +1,84 @@
+"""What keeps a run from being judged, and what happened in it besides any fault."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from failuretwin.core.types import FloatArray
+from failuretwin.data_knowledge.log_quality import LogQuality
+from failuretwin.decision.evidence import SettledEvidence
+from failuretwin.digital_model.imperfections import LostCommand
+
+UNEXPLAINED_NATS = 1.0
+"""A movement whose density is within this of "anywhere within reach" is not explained [nats]."""
+LIKELY = 0.5
+"""Probability from which a lost command is told [-]."""
+
+
+def unused_movements(evidence: SettledEvidence, run: int) -> list[str]:
+    """Return why movements of a run are not used, a line each."""
+    lines = []
+    for movement in np.flatnonzero(evidence.movements.exists[run] & ~evidence.usable[run]):
+        if evidence.moving[run, movement]:
+            reason = "the tool does not come to rest"
+        else:
+            reason = "no reading while the tool is at rest"
+        lines.append(f"movement {movement + 1} not used: {reason}")
+    return lines
+
+
+def why_undecided(
+    quality: LogQuality,
+    evidence: SettledEvidence,
+    run: int,
+    by_movement: FloatArray,
+    outlier_log_density: float,
+) -> str:
+    """Return why a run allows no verdict, empty if it does.
+
+    Args:
+        quality: Defects of the log.
+        evidence: Settled positions.
+        run: Index of the run.
+        by_movement: Log density of each movement under the best hypothesis, (movement,).
+        outlier_log_density: That of a tool anywhere within reach.
+    """
+    if quality.fatal:
+        return quality.fatal
+    usable = evidence.usable[run]
+    if not evidence.movements.exists[run].any():
+        return "no motor is told to move"
+    if not usable.any():
+        return "the tool is not seen at rest after any movement"
+    unexplained = usable & (by_movement < outlier_log_density + UNEXPLAINED_NATS)
+    if 2 * unexplained.sum() <= usable.sum():
+        return ""
+    which = ", ".join(str(m + 1) for m in np.flatnonzero(unexplained))
+    return (
+        f"after movement {which} the tool is nowhere near where any of the hypotheses puts it: "
+        "wrong units or robot, a spoilt sensor, or a fault of another kind"
+    )
+
+
+def lost_commands(
+    became: FloatArray, entries: Sequence[LostCommand], faulty: str | None
+) -> list[str]:
+    """Return the commands of a run that seem not to have arrived, a line each.
+
+    Args:
+        became: Probability of each alternative, (movement, alternative); the first is that all
+            commands arrived, the others are `entries`.
+        entries: Sets of motors that may lose a command.
+        faulty: Motor whose fault is told anyway.
+    """
+    lines = []
+    for movement, share in enumerate(became):
+        best = int(np.argmax(share))
+        if best == 0 or share[best] < LIKELY:
+            continue
+        motors = [m.replace("_", " ") for m in entries[best - 1].motors if m != faulty]
+        if motors:
+            lines.append(f"movement {movement + 1}: {' and '.join(motors)} did not get the command")
+    return lines

@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+FILES = (
+    "trajectory_monitoring_cmd.csv",
+    "trajectory_monitoring_cmd_duration.csv",
+    "trajectory_monitoring_position.csv",
+)
+
+
+def full_disk():
+    """Let no file grow beyond a few bytes, as on a disk without space."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (500, 500))
+
+
+@pytest.fixture(scope="session")
+def failuretwin():
+    """Run the command line as a user does, without a terminal."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    environment.pop("COLUMNS", None)
+
+    def run(*arguments, folder=None, disk_full=False):
+        return subprocess.run(
+            [sys.executable, "-m", "failuretwin", *map(str, arguments)],
+            capture_output=True,
+            text=True,
+            cwd=folder,
+            env=environment,
+            timeout=120,
+            check=False,
+            preexec_fn=full_disk if disk_full else None,
+        )
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def write_session():
+    """Write a session of five movements of a healthy arm; its readings end at `until_s`."""
+
+    def write(folder: Path, until_s=10.0, seed=0):
+        folder.mkdir(parents=True)
+        targets = np.random.default_rng(seed).integers(300, 700, (5, 6)).astype(float)
+        start = 2.0 * np.arange(5)
+        knots = np.stack([start, start + 0.8], axis=1).ravel()
+        values = np.repeat(np.vstack([[500.0] * 6, targets]), 2, axis=0)[1:-1]
+        at = np.arange(-0.55, until_s, 0.1)
+        readings = np.stack([np.interp(at, knots, v) for v in values.T], axis=-1).round()
+        tables = ((start, targets), (start, np.full((5, 6), 800.0)), (at, readings))
+        for name, (time, rows) in zip(FILES, tables, strict=True):
+            lines = ["timestamp,motor_1,motor_2,motor_3,motor_4,motor_5,motor_6"]
+            for stamp, row in zip(time + 100.0, rows, strict=True):
+                lines.append(",".join(map(str, [stamp, *row])))
+            (folder / name).write_text("\n".join(lines) + "\n")
+        return folder
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def simulated(failuretwin, tmp_path_factory):
+    """A run set of nine imperfect runs, one of each class."""
+    path = tmp_path_factory.mktemp("simulated") / "runs.nc"
+    answer = failuretwin(
+        "simulate", "--out", path, "--runs-per-class", 1, "--imperfections", "armpi_fpv"
+    )
+    assert answer.returncode == 0, answer.stderr
+    return path
+
+
+@pytest.fixture
+def listing():
+    """List everything below a folder."""
+    return lambda folder: sorted(str(p.relative_to(folder)) for p in folder.rglob("*"))

@@ -1,0 +1,220 @@
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+
+import pandas as pd
+import pytest
+
+import failuretwin as package
+from failuretwin.data_knowledge.store import load_run_set, save_run_set
+
+CONTRACT = {
+    "run",
+    "truth",
+    "diagnosis",
+    "probability",
+    "posterior",
+    "runner_up",
+    "onset_s",
+    "onset_90",
+    "magnitude",
+    "magnitude_unit",
+    "magnitude_90",
+    "verdict",
+    "quality",
+    "protocol",
+    "method",
+}
+BEYOND_IT = {"explanation", "evidence"}
+"""What a result may say on top of the contract."""
+ANSI = "\x1b"
+
+
+def no_constant(name):
+    raise ValueError(f"{name} is no JSON")
+
+
+def read_lines(path):
+    return [json.loads(line, parse_constant=no_constant) for line in path.read_text().splitlines()]
+
+
+def score_lines(text):
+    """Return what the output says after the table of runs."""
+    return text[re.search(r"\d+ of \d+ runs right", text).start() :].splitlines()
+
+
+@pytest.fixture(scope="module")
+def results(failuretwin, simulated, tmp_path_factory):
+    """Everything that `diagnose` says of the simulated runs."""
+    folder = tmp_path_factory.mktemp("results")
+    answer = failuretwin(
+        "diagnose", simulated, "--json", folder / "x.jsonl", "--csv", folder / "x.csv"
+    )
+    assert answer.returncode == 0, answer.stderr
+    return answer, read_lines(folder / "x.jsonl"), folder
+
+
+def test_version_and_help(failuretwin):
+    assert package.__version__ in failuretwin("--version").stdout
+    text = failuretwin("--help").stdout
+    for verb in ("import", "simulate", "diagnose", "evaluate"):
+        assert re.search(rf"^  {verb}\s", text, re.MULTILINE)
+
+
+def test_a_line_a_run_with_the_keys_of_the_contract(results, simulated):
+    _, records, _ = results
+    assert [r["run"] for r in records] == load_run_set(simulated)["run"].values.tolist()
+    for record in records:
+        assert record.keys() - BEYOND_IT == CONTRACT
+        assert sum(record["posterior"].values()) == pytest.approx(1.0, abs=1e-9)
+        assert len(record["posterior"]) == 9
+        if record["diagnosis"] is not None:
+            best = max(record["posterior"], key=record["posterior"].get)
+            assert record["diagnosis"] == best
+            assert record["probability"] == record["posterior"][best]
+
+
+def test_what_is_not_known_is_null(failuretwin, simulated, tmp_path, results):
+    healthy = next(r for r in results[1] if r["diagnosis"] == "healthy")
+    for key in ("onset_s", "onset_90", "magnitude", "magnitude_unit", "magnitude_90"):
+        assert healthy[key] is None
+    blind = load_run_set(simulated).isel(run=[0]).drop_vars(["fault", "onset", "magnitude"])
+    save_run_set(blind.assign(measured=blind["measured"] * float("nan")), tmp_path / "blind.nc")
+    failuretwin("diagnose", "blind.nc", "--json", "blind.jsonl", folder=tmp_path)
+    (record,) = read_lines(tmp_path / "blind.jsonl")
+    assert record["truth"] is None
+    assert record["verdict"].startswith("cannot tell, because ")
+
+
+def test_csv_has_a_row_a_run(results):
+    _, records, folder = results
+    table = pd.read_csv(folder / "x.csv")
+    assert len(table) == 9
+    assert table["run"].tolist() == [r["run"] for r in records]
+    for column, name in (("p(healthy)", "healthy"), ("p(motor_2:stuck)", "motor_2:stuck")):
+        expected = [r["posterior"][name] for r in records]
+        assert table[column].tolist() == pytest.approx(expected)
+    assert table["diagnosis"].dropna().tolist() == [
+        r["diagnosis"] for r in records if r["diagnosis"]
+    ]
+    sizes = [r["magnitude"] for r in records if r["magnitude"] is not None]
+    assert table["magnitude"].dropna().tolist() == pytest.approx(sizes)
+
+
+def test_table_says_right_and_wrong_and_how_often(results):
+    answer, records, _ = results
+    right = sum(r["truth"] == r["diagnosis"] for r in records)
+    assert len(re.findall(r"\bright\b", answer.stdout)) - 1 == right
+    assert len(re.findall(r"\bWRONG\b", answer.stdout)) == 9 - right
+    accuracy = rf"{right} of 9 runs right: accuracy {100 * right / 9:.1f} % \(95 % interval"
+    assert re.search(accuracy, answer.stdout)
+    for word in ("precision", "recall", "F1", "confusion matrix", "protocol P0c", "log score"):
+        assert word in answer.stdout
+
+
+def test_wrong_diagnoses_are_marked(failuretwin, simulated, tmp_path):
+    runs = load_run_set(simulated).isel(run=[1, 2])
+    save_run_set(runs.assign(fault=("run", runs["fault"].values[::-1])), tmp_path / "lies.nc")
+    answer = failuretwin("diagnose", "lies.nc", folder=tmp_path)
+    assert answer.stdout.count("WRONG") == 2
+    assert "0 of 2 runs right: accuracy 0.0 %" in answer.stdout
+
+
+def test_without_truth_there_is_nothing_to_score(failuretwin, simulated, tmp_path):
+    save_run_set(load_run_set(simulated).drop_vars("fault"), tmp_path / "runs.nc")
+    answer = failuretwin("diagnose", "runs.nc", folder=tmp_path)
+    assert answer.returncode == 0
+    for word in ("right", "WRONG", "accuracy", "confusion"):
+        assert word not in answer.stdout
+
+
+def test_evaluate_says_what_diagnose_said(failuretwin, results):
+    answer, _, folder = results
+    again = failuretwin("evaluate", folder / "x.jsonl")
+    assert again.returncode == 0, again.stderr
+    assert score_lines(again.stdout) == score_lines(answer.stdout)
+
+
+def test_truth_may_come_from_a_run_set(failuretwin, results, simulated, tmp_path):
+    answer, records, _ = results
+    untold = [json.dumps({**r, "truth": None}) + "\n" for r in records]
+    (tmp_path / "untold.jsonl").write_text("".join(untold))
+    alone = failuretwin("evaluate", "untold.jsonl", folder=tmp_path)
+    assert alone.returncode == 2
+    assert "--truth" in alone.stderr
+    told = failuretwin("evaluate", "untold.jsonl", "--truth", simulated, folder=tmp_path)
+    assert score_lines(told.stdout) == score_lines(answer.stdout)
+
+
+@pytest.mark.parametrize(("how", "suffix"), [("measured", ".nc"), ("published", ".zarr")])
+def test_imported_sessions_give_the_same_results(failuretwin, write_session, tmp_path, how, suffix):
+    write_session(tmp_path / "logs" / "20240101_label_0", seed=1)
+    write_session(tmp_path / "logs" / "20240102_label_3", seed=2)
+    options = ["--as", how, "--published-labels"]
+    runs = f"runs{suffix}"
+
+    imported = failuretwin("import", "logs", "--out", runs, *options, folder=tmp_path)
+    assert imported.stdout == f"2 runs written to {runs}\n"
+    stored = failuretwin("diagnose", runs, "--json", "stored.jsonl", folder=tmp_path)
+    direct = failuretwin("diagnose", "logs", *options, "--json", "direct.jsonl", folder=tmp_path)
+
+    assert stored.returncode == direct.returncode == 0, stored.stderr + direct.stderr
+    records = read_lines(tmp_path / "direct.jsonl")
+    assert [r["truth"] for r in records] == ["healthy", "motor_3:stuck"]
+    assert read_lines(tmp_path / "stored.jsonl") == records
+    assert stored.stdout == direct.stdout
+    scores = failuretwin("evaluate", "stored.jsonl", folder=tmp_path)
+    assert score_lines(scores.stdout) == score_lines(direct.stdout)
+
+
+def test_simulated_runs_do_not_depend_on_the_workers(failuretwin, tmp_path):
+    for workers in (1, 2):
+        failuretwin(
+            *("simulate", "--out", f"{workers}.nc", "--runs-per-class", 60, "--workers", workers),
+            *("--hypotheses", "healthy, motor_2:stuck", "--seed", 3),
+            folder=tmp_path,
+        )
+    one, two = (load_run_set(tmp_path / f"{n}.nc") for n in (1, 2))
+    assert one.sizes["run"] == 120
+    assert one.identical(two)
+    assert one.attrs["seed"] == 3
+
+
+def test_a_picture_for_every_run(failuretwin, simulated, tmp_path):
+    runs = load_run_set(simulated).isel(run=[0, 1, 5])
+    names = ["a/b", "a b", "c"]
+    save_run_set(runs.assign_coords(run=names), tmp_path / "runs.nc")
+    answer = failuretwin("diagnose", "runs.nc", "--plot", "x/pictures", folder=tmp_path)
+    assert answer.returncode == 0, answer.stderr
+    pictures = list((tmp_path / "x" / "pictures").glob("*.png"))
+    assert len(pictures) == 3
+    for picture in pictures:
+        assert picture.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
+        assert picture.stat().st_size > 10_000
+    assert list(tmp_path.rglob("*partial*")) == []
+
+
+def test_without_a_terminal_there_is_neither_colour_nor_progress(results):
+    answer, _, _ = results
+    assert ANSI not in answer.stdout
+    assert answer.stderr == ""
+    widest = max(map(len, answer.stdout.splitlines()))
+    assert widest > 100, "sentences are cut to the width of a terminal that is not there"
+
+
+def test_output_may_be_cut_off_by_the_next_command(simulated):
+    """As in `failuretwin diagnose RUNS | head -1`."""
+    command = [sys.executable, "-u", "-m", "failuretwin", "diagnose", str(simulated)]
+    read, write = os.pipe()
+    os.close(read)
+    try:
+        answer = subprocess.run(
+            command, stdout=write, stderr=subprocess.PIPE, text=True, check=False
+        )
+    finally:
+        os.close(write)
+    assert "Traceback" not in answer.stderr

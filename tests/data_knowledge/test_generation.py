@@ -1,0 +1,157 @@
+from __future__ import annotations
+
+import json
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import UNKNOWN, Hypothesis, paper_hypotheses
+from failuretwin.core.runs import check_runs
+from failuretwin.data_knowledge import generation
+from failuretwin.data_knowledge.generation import Plan, simulate, simulate_runs
+from failuretwin.digital_model.imperfections import load_imperfections
+
+BOTH = pytest.mark.parametrize("imperfections", ["none", "armpi_fpv"])
+VALUES = ("command", "measured", "position")
+
+
+@pytest.fixture
+def plan_of(armpi):
+    def plan(imperfections="armpi_fpv", runs_per_class=2, seed=0, hypotheses=None):
+        known = load_imperfections(imperfections, armpi)
+        classes = hypotheses or paper_hypotheses(armpi.motor_names)
+        return Plan(armpi, classes, runs_per_class, seed, known)
+
+    return plan
+
+
+def parse(text, armpi):
+    return [Hypothesis.parse(part, armpi.motor_names) for part in text.split(",")]
+
+
+@BOTH
+def test_run_set_keeps_the_contract(plan_of, imperfections):
+    runs = check_runs(simulate(plan_of(imperfections)), "simulated")
+    classes = [str(h) for h in paper_hypotheses([f"motor_{k}" for k in range(1, 5)])]
+    assert runs["fault"].values.tolist() == np.repeat(classes, 2).tolist()
+    assert runs.sizes == {"run": 18, "time": 1000, "motor": 4, "axis": 3, "movement": 5}
+    np.testing.assert_allclose(runs["time"], np.arange(1000) * 0.01)
+    assert runs.attrs["measured_rate_hz"] == (100.0 if imperfections == "none" else 10.0)
+    assert (runs.attrs["robot"], runs.attrs["seed"]) == ("armpi_fpv", 0)
+    configuration = json.loads(runs.attrs["configuration"])
+    assert configuration["imperfections"] == imperfections
+    assert configuration["hypotheses"] == classes
+
+
+@BOTH
+def test_number_of_workers_does_not_matter(monkeypatch, plan_of, imperfections):
+    monkeypatch.setattr(generation, "CHUNK_RUNS", 5)
+    xr.testing.assert_identical(
+        simulate(plan_of(imperfections), workers=1), simulate(plan_of(imperfections), workers=2)
+    )
+
+
+@BOTH
+def test_size_of_chunks_does_not_matter(monkeypatch, plan_of, imperfections):
+    whole = simulate(plan_of(imperfections))
+    monkeypatch.setattr(generation, "CHUNK_RUNS", 1)
+    xr.testing.assert_identical(simulate(plan_of(imperfections)), whole)
+
+
+@BOTH
+@pytest.mark.parametrize("subset", [[7], [17, 0, 9, 8], range(17, -1, -1)])
+def test_a_run_is_the_same_whatever_is_made_beside_it(plan_of, imperfections, subset):
+    plan = plan_of(imperfections)
+    whole, some = simulate_runs(plan, range(plan.size)), simulate_runs(plan, subset)
+    rows = list(subset)
+    for name in VALUES:
+        np.testing.assert_array_equal(getattr(some, name), getattr(whole, name)[rows])
+    for field in fields(some.movements):
+        np.testing.assert_array_equal(
+            getattr(some.movements, field.name), getattr(whole.movements, field.name)[rows]
+        )
+    assert list(some.run) == [whole.run[row] for row in rows]
+    np.testing.assert_array_equal(some.truth.magnitude, whole.truth.magnitude[rows])
+
+
+@BOTH
+def test_the_seed_alone_decides(plan_of, imperfections):
+    one, same = simulate(plan_of(imperfections)), simulate(plan_of(imperfections))
+    other = simulate(plan_of(imperfections, seed=1))
+    xr.testing.assert_identical(one, same)
+    for run in range(one.sizes["run"]):
+        assert not np.array_equal(one["command"][run], other["command"][run])
+
+
+def test_no_two_runs_are_alike(plan_of):
+    command = simulate(plan_of("none", runs_per_class=5))["target"].values.reshape(45, -1)
+    assert len(np.unique(command, axis=0)) == 45
+
+
+def test_without_imperfections_the_twin_itself_moves(plan_of, twin, armpi):
+    runs = simulate(plan_of("none", 5, hypotheses=parse("healthy", armpi)))
+    position = twin.respond(runs["command"].values, runs["time"].values)
+    np.testing.assert_array_equal(runs["position"].values, position)
+    np.testing.assert_array_equal(runs["measured"].values, twin.path(position))
+
+
+def test_published_stuck_runs_are_the_twin_frozen(plan_of, twin, armpi):
+    runs = simulate(plan_of("none", 5, hypotheses=parse("motor_3:stuck", armpi)))
+    position = twin.respond(runs["command"].values, runs["time"].values)
+    position[:, 49:, 2] = position[:, 49, 2, None]
+    np.testing.assert_array_equal(runs["position"].values, position)
+    np.testing.assert_array_equal(runs["magnitude"].values, position[:, -1, 2])
+    np.testing.assert_allclose(runs["onset"].values, 0.49)
+
+
+def test_steady_state_error_is_that_of_the_truth(plan_of, armpi):
+    runs = simulate(plan_of("none", 20, hypotheses=parse("motor_2:steady_state_error", armpi)))
+    ends = np.append(np.arange(200, 1000, 200), 1000) - 1
+    settled = runs["position"].values[:, ends] - runs["command"].values[:, ends]
+    for run, text in enumerate(runs["fault_detail"].values):
+        (fault,) = json.loads(text)["faults"]
+        np.testing.assert_allclose(settled[run, :, 1], fault["offset_rad"], atol=1e-4)
+        rms = np.sqrt(np.mean(np.square(fault["offset_rad"])))
+        assert runs["magnitude"].values[run] == pytest.approx(rms)
+    assert np.abs(settled[..., [0, 2, 3]]).max() < 1e-4
+
+
+def test_two_faults_act_together(plan_of, armpi):
+    text = "motor_1:stuck+motor_4:steady_state_error"
+    runs = simulate(plan_of("none", 2, hypotheses=parse(text, armpi)))
+    assert set(runs["fault"].values) == {text}
+    assert np.ptp(runs["position"].values[:, 49:, 0], axis=1).max() == 0.0
+    off = runs["position"].values[:, 999, 3] - runs["command"].values[:, 999, 3]
+    assert (np.abs(off) > np.deg2rad(2.3)).all()
+
+
+def test_progress_adds_up_to_all_runs(monkeypatch, plan_of):
+    monkeypatch.setattr(generation, "CHUNK_RUNS", 7)
+    done = []
+    simulate(plan_of("none"), 1, done.append)
+    assert done == [7, 7, 4]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"runs_per_class": 0}, "runs per class is 0, expected 1 or more"),
+        ({"hypotheses": [UNKNOWN]}, "'unknown' cannot be simulated"),
+    ],
+)
+def test_plan_that_cannot_be_made_is_refused(plan_of, changes, message):
+    with pytest.raises(InputError, match=message):
+        replace(plan_of(), **changes)
+
+
+def test_mode_that_cannot_be_simulated_names_those_that_can(plan_of, armpi):
+    with pytest.raises(InputError, match=r"'backlash' cannot .* one of stuck, steady_state_error"):
+        plan_of(hypotheses=parse("motor_1:backlash", armpi))
+
+
+def test_no_workers_are_refused(plan_of):
+    with pytest.raises(InputError, match="workers is 0, expected 1 or more"):
+        simulate(plan_of(), workers=0)

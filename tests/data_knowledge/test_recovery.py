@@ -1,0 +1,378 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.io
+
+from failuretwin import DigitalTwin, ReadOptions, read_runs
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.movements import Movements
+from failuretwin.data_knowledge.generation import Plan, simulate_runs
+from failuretwin.data_knowledge.inverse_kinematics import plane_arm
+from failuretwin.data_knowledge.ramp_fit import Free, PathPart, Ramps, fit_ramps
+from failuretwin.data_knowledge.recovery import (
+    path_error,
+    published_time,
+    published_time_bases,
+    recover_movements,
+)
+from failuretwin.digital_model.imperfections import default_imperfections
+
+FROM_ZERO = np.linspace(0.0, 10.0, 1000)
+FROM_FIRST_STEP = np.arange(1, 1001) * 0.01
+BASES = [FROM_ZERO, FROM_FIRST_STEP]
+
+
+def names_of(desired):
+    return [f"run_{i}" for i in range(len(desired))]
+
+
+@pytest.fixture(scope="module")
+def sample(data):
+    """Desired paths of the 90 published runs."""
+    cells = scipy.io.loadmat(data / "processed_samples" / "cell_array_20241003.mat")["X_test_array"]
+    return np.stack([cell[:, :3] for cell in cells[0]])
+
+
+@pytest.fixture(scope="module")
+def truth(data):
+    folder = data / "real_robot_b_20241003"
+    return read_runs(folder, options=ReadOptions("published"))
+
+
+@pytest.fixture(scope="module")
+def recovered(sample, armpi):
+    return recover_movements(sample, FROM_ZERO, armpi, names=names_of(sample))
+
+
+@pytest.fixture(scope="module")
+def simulated(armpi):
+    """Movements of healthy runs of an imperfect robot: whole units, late starts."""
+    plan = Plan(
+        armpi,
+        [Hypothesis.parse("healthy", armpi.motor_names)],
+        12,
+        seed=3,
+        imperfections=default_imperfections(armpi),
+    )
+    return simulate_runs(plan, range(12)).movements
+
+
+def movements(armpi, counts, start, ramp=0.8):
+    """Movements of one run between poses in units (1 + movement, motor)."""
+    angle = armpi.servo_units.to_rad(np.array(counts, dtype=float))
+    ramps = np.broadcast_to(ramp, (len(counts) - 1, len(armpi.motors)))
+    return Movements(angle[None, 0], angle[None, 1:], ramps[None], np.array([start], dtype=float))
+
+
+def recover_one(armpi, twin, wanted, time=FROM_ZERO, **options):
+    desired = twin.path(wanted.reference(time))
+    found = recover_movements(desired, time, armpi, names=["only"], **options)
+    assert path_error(found, desired, time, armpi).max() <= 1e-9
+    return found
+
+
+def settles(start, ramp, end):
+    """Which movements end before the record does, (run, movement)."""
+    return start + ramp.max(axis=-1) <= end
+
+
+def test_published_runs_come_back_exactly(sample, recovered, armpi):
+    assert sample.shape == (90, 1000, 3)
+    assert path_error(recovered, sample, FROM_ZERO, armpi).max() <= 1e-12
+
+
+def test_recovered_movements_are_those_of_the_raw_logs(recovered, truth):
+    start, ramp = truth["movement_start"].values, truth["ramp_duration"].values
+    seen = start < FROM_ZERO[-1]
+    np.testing.assert_array_equal(recovered.exists, seen)
+    np.testing.assert_allclose(recovered.start[seen], start[seen], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(recovered.initial, truth["command"].values[:, 0], atol=1e-9)
+
+    whole = seen & settles(start, ramp, FROM_ZERO[-1])
+    assert 400 < whole.sum() < 450
+    np.testing.assert_allclose(recovered.target[whole], truth["target"].values[whole], atol=1e-9)
+    moved = np.abs(recovered.target - recovered.origin()) > 1e-6
+    np.testing.assert_allclose(
+        recovered.ramp_duration[whole & moved.all(-1)], ramp[whole & moved.all(-1)]
+    )
+    assert (recovered.ramp_duration[seen][~moved[seen]] == 0.0).all()
+
+
+def test_targets_of_cut_off_ramps_are_whole_units_too(recovered, armpi):
+    counts = armpi.servo_units.to_counts(recovered.target[recovered.exists])
+    np.testing.assert_allclose(counts, counts.round(), atol=1e-6)
+
+
+def test_time_base_of_published_runs_is_found(sample, armpi):
+    found = published_time(sample, armpi, names=names_of(sample))
+    np.testing.assert_array_equal(found, FROM_ZERO)
+
+
+@pytest.mark.parametrize("time", BASES, ids=["from_zero", "from_first_step"])
+def test_simulated_runs_come_back_on_both_time_bases(simulated, armpi, twin, time):
+    desired = twin.path(simulated.reference(time))
+    names = names_of(desired)
+    np.testing.assert_array_equal(published_time(desired, armpi, names=names), time)
+
+    found = recover_movements(desired, time, armpi, names=names)
+    assert path_error(found, desired, time, armpi).max() <= 1e-12
+    seen = simulated.start < time[-1]
+    np.testing.assert_array_equal(found.exists, seen)
+    np.testing.assert_allclose(found.start[seen], simulated.start[seen], rtol=0, atol=1e-9)
+    whole = settles(simulated.start, simulated.ramp_duration, time[-1])
+    np.testing.assert_allclose(found.target[whole], simulated.target[whole], atol=1e-9)
+
+
+def test_the_wrong_time_base_leaves_a_residual(simulated, armpi, twin):
+    desired = twin.path(simulated.reference(FROM_ZERO))
+    with pytest.raises(InputError, match="start and durations of the published kind"):
+        recover_movements(desired, FROM_FIRST_STEP, armpi, names=names_of(desired))
+
+
+def test_time_bases_are_the_published_ones():
+    first, second = published_time_bases(1000)
+    np.testing.assert_allclose(first, FROM_FIRST_STEP)
+    np.testing.assert_array_equal(second, FROM_ZERO)
+
+
+@pytest.mark.parametrize("kind", ["noise", "offset", "glitch", "bump"])
+def test_a_spoilt_path_is_refused_by_name(simulated, armpi, twin, kind):
+    desired = twin.path(simulated.reference(FROM_ZERO))[:3]
+    spoilt = np.zeros((1000, 3))
+    if kind == "noise":
+        spoilt = 1e-3 * np.random.default_rng(0).standard_normal((1000, 3))
+    elif kind == "offset":
+        spoilt[:, 0] = 1e-3
+    elif kind == "glitch":
+        spoilt[150, 2] = 1e-3
+    else:
+        ramp = FROM_ZERO[np.abs(FROM_ZERO - simulated.start[1, 1] - 0.3) < 0.1]
+        spoilt[np.isin(FROM_ZERO, ramp), 1] = 1e-3
+    desired[1] += spoilt
+    with pytest.raises(InputError, match="run 'run_1'") as caught:
+        recover_movements(desired, FROM_ZERO, armpi, names=names_of(desired))
+    assert "--approximate" in str(caught.value)
+
+
+def test_motor_1_is_found_where_the_tool_is_on_its_axis(armpi, twin):
+    wanted = movements(
+        armpi,
+        [[610, 500, 500, 500], [350, 600, 400, 450], [480, 500, 500, 500], [700, 300, 600, 650]],
+        [0.05, 2.08, 4.1],
+        [[0.6, 0.8, 1.0, 0.8], [1.0, 0.6, 0.8, 0.6], [0.8, 1.0, 0.6, 0.6]],
+    )
+    found = recover_one(armpi, twin, wanted)
+    np.testing.assert_allclose(found.initial, wanted.initial, atol=1e-9)
+    np.testing.assert_allclose(found.target, wanted.target, atol=1e-9)
+    # Motor 1 turns unseen once the others hold the tool on its axis; the next ramp shows where to.
+    np.testing.assert_allclose(found.start, wanted.start, rtol=0, atol=1e-9)
+
+
+def test_motors_that_stay_have_no_duration(armpi, twin):
+    wanted = movements(
+        armpi,
+        [[450, 600, 400, 450], [450, 600, 400, 650], [300, 600, 400, 650], [300, 500, 450, 650]],
+        [0.05, 2.08, 4.1],
+    )
+    found = recover_one(armpi, twin, wanted)
+    np.testing.assert_allclose(found.target, wanted.target, atol=1e-9)
+    np.testing.assert_array_equal(
+        found.ramp_duration[0] > 0.0,
+        [[False, False, False, True], [True, False, False, False], [False, True, True, False]],
+    )
+
+
+def test_a_run_without_movements_rests(armpi, twin):
+    wanted = movements(armpi, [[450, 600, 400, 450]], [])
+    found = recover_one(armpi, twin, wanted)
+    assert found.start.shape == (1, 0)
+    np.testing.assert_allclose(found.initial, wanted.initial, atol=1e-9)
+
+
+@pytest.mark.parametrize("seen_s", [0.004, 0.017, 0.05, 0.3, 0.55, 0.7, 0.9])
+def test_a_cut_off_ramp_gives_what_is_seen_of_it(armpi, twin, seen_s):
+    wanted = movements(
+        armpi,
+        [[500, 500, 500, 500], [400, 600, 400, 450], [701, 333, 587, 651]],
+        [0.05, 10.0 - seen_s],
+        [[0.8, 0.8, 0.8, 0.8], [0.6, 0.8, 1.0, 1.0]],
+    )
+    found = recover_one(armpi, twin, wanted)
+    assert found.start.shape == (1, 2)
+    if seen_s >= 0.9:
+        np.testing.assert_allclose(found.target, wanted.target, atol=1e-9)
+
+
+def test_a_movement_after_the_record_is_not_seen(armpi, twin):
+    counts = [[500, 500, 500, 500], [400, 600, 400, 450], [701, 333, 587, 651]]
+    found = recover_one(armpi, twin, movements(armpi, counts, [0.05, 10.3]))
+    assert found.start.shape == (1, 1)
+
+
+def test_a_first_ramp_under_way_at_the_first_sample_is_found(armpi, twin):
+    counts = [[521, 488, 512, 497], [400, 600, 400, 450], [701, 333, 587, 651]]
+    wanted = movements(armpi, counts, [0.004, 2.05], [[0.6, 0.8, 1.0, 0.8]] * 2)
+    found = recover_one(armpi, twin, wanted, FROM_FIRST_STEP)
+    np.testing.assert_allclose(found.initial, wanted.initial, atol=1e-9)
+    np.testing.assert_allclose(found.start, wanted.start, rtol=0, atol=1e-9)
+
+
+def test_a_start_outside_the_movements_range_is_found(armpi, twin):
+    counts = [[450, 720, 400, 450], [300, 600, 450, 650]]
+    found = recover_one(armpi, twin, movements(armpi, counts, [0.05]))
+    np.testing.assert_allclose(armpi.servo_units.to_counts(found.initial), counts[:1], atol=1e-6)
+
+
+def test_shorter_records_and_other_numbers_of_runs_work(armpi, twin, simulated):
+    time = FROM_ZERO[:400]
+    desired = twin.path(simulated.reference(time))[:2]
+    found = recover_movements(desired, time, armpi, names=["a", "b"])
+    assert path_error(found, desired, time, armpi).max() <= 1e-9
+
+
+def turned(robot):
+    """The robot mounted on its side, away from the base's origin."""
+    T = np.eye(4)
+    T[:3, :3] = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    T[:3, 3] = [0.1, -0.2, 0.3]
+    first, *others = robot.chain.joints
+    joints = (replace(first, T_pj=T @ first.T_pj), *others)
+    return replace(robot, chain=replace(robot.chain, joints=joints))
+
+
+def skewed(robot):
+    """The robot with its third axis turned away from the second."""
+    first, second, third, fourth = robot.chain.joints
+    third = replace(third, T_pj=third.T_pj @ np.array(_about_x(0.3)))
+    return replace(robot, chain=replace(robot.chain, joints=(first, second, third, fourth)))
+
+
+def _about_x(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return [[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1]]
+
+
+def physical(robot):
+    """The robot with a sensor that sees the physical pose, motor 3 turning the other way."""
+    return replace(robot, profile=replace(robot.profile, sensor_pose="physical"))
+
+
+@pytest.mark.parametrize("change", [turned, physical])
+def test_the_search_follows_the_chain(armpi, simulated, change):
+    robot = change(armpi)
+    desired = DigitalTwin(robot).path(simulated.reference(FROM_ZERO))[:2]
+    found = recover_movements(desired, FROM_ZERO, robot, names=["a", "b"])
+    assert path_error(found, desired, FROM_ZERO, robot).max() <= 1e-12
+
+
+def test_whole_poses_are_all_and_only_those_that_reach(armpi, twin):
+    arm, rng = plane_arm(armpi), np.random.default_rng(4)
+    low, high = arm.movement_counts.low, arm.movement_counts.high
+    np.testing.assert_array_equal(low, [167, 292, 292, 292])
+    np.testing.assert_array_equal(high, [833, 708, 708, 708])
+    for counts in np.round(rng.uniform(low, high, (20, 4))):
+        point = twin.path(armpi.servo_units.to_rad(counts))
+        np.testing.assert_array_equal(arm.whole_poses(point), counts[None])
+        assert len(arm.whole_poses(point + 1e-6)) == 0
+
+
+def test_poses_with_a_given_last_motor_reach_their_point(armpi, twin):
+    arm = plane_arm(armpi)
+    wanted = np.array([0.4, 0.3, -0.5, 0.2])
+    poses = arm.poses_with_last(twin.path(wanted), np.linspace(-0.3, 0.7, 11))
+    np.testing.assert_allclose(twin.path(poses), np.tile(twin.path(wanted), (len(poses), 1)))
+    assert np.linalg.norm(poses - wanted, axis=1).min() < 1e-9
+
+
+def test_fit_of_a_ramp_finds_all_that_is_free(twin):
+    rng = np.random.default_rng(2)
+    wanted = Ramps(
+        *rng.uniform(-0.8, 0.8, (2, 1, 4)), np.array([[0.6, 0.8, 1.0, 0.7]]), np.array([0.2])
+    )
+    time = np.linspace(0.0, 1.5, 60)
+    part = PathPart(time, twin.path(wanted.reference(time))[0])
+    guess = replace(
+        wanted,
+        target=wanted.target + 0.01,
+        duration=wanted.duration + 0.02,
+        start=wanted.start + 0.01,
+    )
+    free = Free(*(np.full(4, is_free) for is_free in (False, True, True)))
+    found = fit_ramps(guess, free, part, twin, steps=60)
+    np.testing.assert_allclose(found.target, wanted.target, atol=1e-9)
+    np.testing.assert_allclose(found.duration, wanted.duration, atol=1e-9)
+    np.testing.assert_allclose(found.start, wanted.start, atol=1e-9)
+
+
+def test_another_kind_of_arm_asks_for_approximate(armpi, simulated):
+    robot = skewed(armpi)
+    desired = DigitalTwin(robot).path(simulated.reference(FROM_ZERO))[:1]
+    with pytest.raises(InputError, match="three parallel axes") as caught:
+        recover_movements(desired, FROM_ZERO, robot, names=["a"])
+    assert "--approximate" in str(caught.value)
+
+    found = recover_movements(desired, FROM_ZERO, robot, approximate=True, names=["a"])
+    assert path_error(found, desired, FROM_ZERO, robot).max() < 5e-3
+    np.testing.assert_array_equal(
+        published_time(desired, robot, names=["a"]), published_time_bases(1000)[0]
+    )
+
+
+@pytest.fixture(scope="module")
+def between_units(simulated):
+    """Movements whose targets are no whole units."""
+    chosen = [
+        getattr(simulated, name)[:3] for name in ("initial", "target", "ramp_duration", "start")
+    ]
+    initial, target, ramp, start = chosen
+    shift = np.random.default_rng(1).uniform(-0.002, 0.002, target.shape)
+    return Movements(initial, target + shift, ramp, start)
+
+
+def test_targets_between_units_are_fitted_when_asked(armpi, twin, between_units):
+    desired = twin.path(between_units.reference(FROM_ZERO))
+    names = names_of(desired)
+    with pytest.raises(InputError, match=r"run 'run_0'.*--approximate"):
+        recover_movements(desired, FROM_ZERO, armpi, names=names)
+    found = recover_movements(desired, FROM_ZERO, armpi, approximate=True, names=names)
+    assert path_error(found, desired, FROM_ZERO, armpi).max() < 1e-3
+
+
+def test_noisy_paths_are_fitted_when_asked(armpi, twin, between_units):
+    desired = twin.path(between_units.reference(FROM_ZERO))
+    noisy = desired + 1e-4 * np.random.default_rng(0).standard_normal(desired.shape)
+    found = recover_movements(noisy, FROM_ZERO, armpi, approximate=True, names=names_of(desired))
+    off = twin.path(found.reference(FROM_ZERO)) - desired
+    assert np.sqrt(np.mean(np.sum(off**2, axis=2), axis=1)).max() < 5e-4
+
+
+def test_approximate_keeps_exact_runs_exact(simulated, armpi, twin):
+    desired = twin.path(simulated.reference(FROM_ZERO))[:3]
+    names = names_of(desired)
+    exact = recover_movements(desired, FROM_ZERO, armpi, names=names)
+    also = recover_movements(desired, FROM_ZERO, armpi, approximate=True, names=names)
+    np.testing.assert_array_equal(exact.target, also.target)
+
+
+def test_a_path_of_no_movements_is_refused_even_then(armpi):
+    time = FROM_ZERO
+    circle = 0.1 * np.stack([np.cos(3 * time), np.sin(3 * time), np.sin(time) + 2.0], axis=-1)
+    with pytest.raises(
+        InputError, match=r"run 'circle': the best movements .* off its desired path"
+    ):
+        recover_movements(circle[None], time, armpi, approximate=True, names=["circle"])
+
+
+def test_arrays_that_do_not_fit_are_refused(armpi):
+    path = np.zeros((2, 1000, 3))
+    with pytest.raises(InputError, match="shape"):
+        recover_movements(path[..., :2], FROM_ZERO, armpi, names=["a", "b"])
+    with pytest.raises(InputError, match="1 names for 2 runs"):
+        recover_movements(path, FROM_ZERO, armpi, names=["a"])
+    path[1, 5] = np.nan
+    with pytest.raises(InputError, match=r"run 'b'.*not finite"):
+        recover_movements(path, FROM_ZERO, armpi, names=["a", "b"])

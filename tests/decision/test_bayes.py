@@ -1,0 +1,309 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from failuretwin import BayesDiagnoser, DigitalTwin
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import HEALTHY, UNKNOWN, Hypothesis, paper_hypotheses
+from failuretwin.data_knowledge.generation import Plan, simulate
+from failuretwin.decision import bayes, steady_state_error, stuck
+from failuretwin.decision.bayes import Priors, priors_of
+from failuretwin.decision.evidence import settled_evidence
+from failuretwin.digital_model.imperfections import default_imperfections
+
+PAPER = [str(h) for h in paper_hypotheses([f"motor_{k}" for k in range(1, 5)])]
+COUNT = np.deg2rad(0.24)
+
+
+def posteriors(diagnoses):
+    return np.array([list(d.posterior.values()) for d in diagnoses])
+
+
+def known(diagnoses, mode):
+    """Return the rows of runs with a fault of this mode that were diagnosed right."""
+    return [i for i, d in enumerate(diagnoses) if d.truth == d.diagnosis and mode in d.truth]
+
+
+@pytest.fixture(scope="module")
+def few(imperfect):
+    """Two runs of each class."""
+    return imperfect.isel(run=[20 * k + i for k in range(9) for i in (0, 1)])
+
+
+@pytest.fixture(scope="module")
+def blind(few):
+    """The same without a single reading."""
+    return few.assign(measured=np.nan * few["measured"])
+
+
+def test_posteriors_are_probabilities_of_the_papers_classes(diagnoses):
+    assert all(list(d.posterior) == PAPER for d in diagnoses)
+    chance = posteriors(diagnoses)
+    assert ((chance >= 0) & (chance <= 1)).all()
+    np.testing.assert_allclose(chance.sum(axis=1), 1.0, rtol=0, atol=1e-12)
+
+
+def test_imperfect_runs_are_diagnosed(diagnoses):
+    right = sum(d.truth == d.diagnosis for d in diagnoses)
+    assert len(diagnoses) == 180
+    assert right >= 0.9 * 180
+
+
+def test_runs_of_the_published_twin_are_diagnosed(twin, armpi):
+    runs = simulate(Plan(armpi, paper_hypotheses(armpi.motor_names), 10, 2))
+    found = BayesDiagnoser(twin).diagnose(runs)
+    assert sum(d.truth == d.diagnosis for d in found) >= 0.95 * 90
+
+
+def test_command_and_measured_are_enough(twin, few, diagnoses):
+    bare = xr.Dataset(
+        {name: few[name] for name in ("command", "measured")},
+        attrs={"measured_rate_hz": few.attrs["measured_rate_hz"]},
+    )
+    found = BayesDiagnoser(twin).diagnose(bare)
+
+    expected = {d.run: d for d in diagnoses}
+    for diagnosis in found:
+        assert diagnosis == dataclasses.replace(expected[diagnosis.run], truth=None)
+
+
+def test_readings_from_inside_the_motors_change_nothing(twin, few):
+    rng = np.random.default_rng(0)
+    noise = {
+        name: (("run", "time", "motor"), rng.normal(size=few["command"].shape))
+        for name in ("position", "temperature", "voltage")
+    }
+    wrong = {n: few[n] + 1.0 for n in ("target", "ramp_duration", "movement_start", "magnitude")}
+    scrambled = few.assign(noise | wrong)
+    assert BayesDiagnoser(twin).diagnose(scrambled) == BayesDiagnoser(twin).diagnose(few)
+
+
+def test_the_truth_is_passed_on_and_not_looked_at(twin, few):
+    lied = few.assign(fault=("run", few["fault"].values[::-1].copy()))
+    honest, fooled = (BayesDiagnoser(twin).diagnose(runs) for runs in (few, lied))
+    assert [d.truth for d in fooled] == [d.truth for d in honest][::-1]
+    np.testing.assert_array_equal(posteriors(fooled), posteriors(honest))
+
+
+def test_a_run_is_judged_alone(monkeypatch, twin, few):
+    whole = BayesDiagnoser(twin).diagnose(few)
+    backwards = BayesDiagnoser(twin).diagnose(few.isel(run=slice(None, None, -1)))
+    twice = few.isel(run=[3, 3, 11]).assign_coords(run=["a", "b", "c"])
+    again = BayesDiagnoser(twin).diagnose(twice)
+    monkeypatch.setattr(bayes, "CHUNK_RUNS", 1)
+    singly = BayesDiagnoser(twin).diagnose(few)
+
+    expected = posteriors(whole)
+    np.testing.assert_allclose(posteriors(backwards)[::-1], expected, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(posteriors(again), expected[[3, 3, 11]], rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(posteriors(singly), expected, rtol=1e-9, atol=1e-15)
+
+
+def test_runs_are_left_as_they_are(twin, few):
+    before = few.copy(deep=True)
+    BayesDiagnoser(twin).diagnose(few)
+    xr.testing.assert_identical(few, before)
+
+
+def test_stuck_angle_is_found(imperfect, diagnoses):
+    rows = known(diagnoses, "stuck")
+    truth = imperfect["magnitude"].values[rows]
+    estimate = np.array([diagnoses[i].magnitude for i in rows])
+    low, high = np.array([diagnoses[i].magnitude_90 for i in rows]).T
+
+    assert len(rows) >= 70
+    assert np.median(np.abs(estimate - truth)) < np.deg2rad(0.5)
+    assert np.mean((low <= truth) & (truth <= high)) > 0.8
+    assert np.median(high - low) < np.deg2rad(3)
+
+
+def test_onset_of_a_stuck_motor_is_found(diagnoses):
+    rows = known(diagnoses, "stuck")
+    onset = np.array([diagnoses[i].onset_s for i in rows])
+    low, high = np.array([diagnoses[i].onset_90 for i in rows]).T
+    assert np.median(np.abs(onset - 0.49)) < 0.1
+    assert np.mean((low <= 0.49) & (high >= 0.49)) > 0.7
+    assert ((low <= onset) & (onset <= high)).all()
+
+
+def test_size_of_steady_state_errors_is_found(imperfect, diagnoses):
+    rows = known(diagnoses, "steady_state_error")
+    truth = imperfect["magnitude"].values[rows]
+    estimate = np.array([diagnoses[i].magnitude for i in rows])
+    low, high = np.array([diagnoses[i].magnitude_90 for i in rows]).T
+
+    assert len(rows) >= 70
+    assert np.median(np.abs(estimate - truth)) < np.deg2rad(1)
+    assert np.mean((low <= truth) & (truth <= high)) > 0.78
+    assert np.median(high - low) < np.deg2rad(3)
+
+
+def test_healthy_runs_have_no_onset_and_no_size(diagnoses):
+    healthy = [d for d in diagnoses if d.diagnosis == "healthy"]
+    assert len(healthy) > 10
+    for d in healthy:
+        assert (d.onset_s, d.onset_90, d.magnitude, d.magnitude_unit, d.magnitude_90) == (None,) * 5
+
+
+def test_method_and_protocol_say_what_was_used(diagnoses):
+    assert {d.protocol for d in diagnoses} == {"P0c"}
+    assert {d.method for d in diagnoses} == {"bayes, settled poses; healthy behaviour: armpi_fpv"}
+
+
+def test_without_evidence_nothing_is_learnt(twin, blind):
+    chance = posteriors(BayesDiagnoser(twin).diagnose(blind))
+    np.testing.assert_allclose(chance, chance[[0] * len(chance)], rtol=1e-9)
+    np.testing.assert_allclose(chance, 1 / 9, atol=0.01)
+
+
+@pytest.mark.parametrize("onset_s", [None, 0.49, 3.0])
+@pytest.mark.parametrize("motor", range(4))
+def test_density_of_the_held_angle_has_area_one(twin, blind, motor, onset_s):
+    """Where no movement says anything, integrating the prior of angle and onset gives one."""
+    evidence = settled_evidence(blind)
+    model = BayesDiagnoser(twin).healthy_model
+    prior = priors_of(twin.robot, None, onset_s).onset
+    found = stuck.stuck_evidence(
+        evidence,
+        model,
+        model.alternatives(evidence.movements),
+        np.zeros(evidence.usable.shape),
+        motor,
+        prior,
+    )
+    np.testing.assert_allclose(np.exp(found.log_evidence), 1.0, atol=0.1)
+
+
+def test_without_evidence_the_verdict_is_that_nobody_can_tell(twin, blind):
+    for d in BayesDiagnoser(twin).diagnose(blind):
+        assert d.verdict.startswith("cannot tell, because ")
+        assert any(line.startswith("movement 1 not used: no reading") for line in d.quality)
+
+
+def test_verdicts_say_what_was_found(diagnoses):
+    for d in diagnoses:
+        if d.verdict.startswith("cannot tell, because "):
+            continue
+        if d.diagnosis == "healthy":
+            assert d.verdict.startswith("healthy, ")
+        else:
+            motor = d.diagnosis[: len("motor_1")].replace("_", " ")
+            assert motor in d.verdict
+            assert f"{np.rad2deg(d.magnitude):.0f}" in d.verdict or "by about" in d.verdict
+        assert "% sure" in d.verdict
+        assert "100 %" not in d.verdict
+
+
+@pytest.mark.parametrize("onset_s", [None, 0.49, 3.0])
+def test_finer_quadrature_changes_no_posterior(monkeypatch, twin, few, onset_s):
+    diagnoser = BayesDiagnoser(twin, priors=priors_of(twin.robot, None, onset_s))
+    coarse = posteriors(diagnoser.diagnose(few))
+    monkeypatch.setattr(stuck, "COARSE_NODES", 601)
+    monkeypatch.setattr(steady_state_error, "NODES", 150)
+    monkeypatch.setattr(bayes, "CHUNK_RUNS", 3)
+    np.testing.assert_allclose(posteriors(diagnoser.diagnose(few)), coarse, atol=0.02)
+
+
+def test_hypotheses_may_be_few(twin, few):
+    two = (HEALTHY, Hypothesis.parse("motor_3:stuck", twin.robot.motor_names))
+    whole = posteriors(BayesDiagnoser(twin).diagnose(few))
+    found = BayesDiagnoser(twin, hypotheses=two).diagnose(few)
+    assert list(found[0].posterior) == ["healthy", "motor_3:stuck"]
+    share = whole[:, [0, 3]] / whole[:, [0, 3]].sum(axis=1, keepdims=True)
+    told = [i for i, d in enumerate(found) if d.diagnosis is not None]
+    assert len(told) >= 12
+    np.testing.assert_allclose(posteriors(found)[told], share[told], rtol=1e-6, atol=1e-12)
+
+
+def test_a_single_hypothesis_is_certain(twin, few):
+    found = BayesDiagnoser(twin, hypotheses=(HEALTHY,)).diagnose(few)
+    np.testing.assert_array_equal(posteriors(found), 1.0)
+    assert {d.runner_up for d in found} == {None}
+
+
+def test_known_onset_helps_and_is_reported(twin, imperfect, diagnoses):
+    rows = [i for i, d in enumerate(diagnoses) if "stuck" in d.truth]
+    runs = imperfect.isel(run=rows)
+    found = BayesDiagnoser(twin, priors=priors_of(twin.robot, None, 0.49)).diagnose(runs)
+
+    def surprise(some):
+        return -np.mean([np.log(d.posterior[d.truth]) for d in some])
+
+    assert surprise(found) < surprise([diagnoses[i] for i in rows])
+    right = [d for d in found if d.truth == d.diagnosis]
+    assert len(right) >= 0.95 * len(rows)
+    assert {round(d.onset_s, 6) for d in right} == {0.49}
+
+
+def test_wrong_onset_misleads(twin, imperfect, diagnoses):
+    """A motor that stood still from 0.49 s on hardly got stuck at 7 s: the onset is believed."""
+    runs = imperfect.isel(run=slice(20, 100))
+    late = BayesDiagnoser(twin, priors=priors_of(twin.robot, None, 7.0)).diagnose(runs)
+    right = sum(d.truth == d.diagnosis for d in late)
+    assert right < 0.6 * len(known(diagnoses, "stuck"))
+
+
+def test_ranges_of_errors_are_in_servo_units(armpi):
+    assert priors_of(armpi, (5, 20), None).error_ranges == ((5 * COUNT, 20 * COUNT),)
+    assert priors_of(armpi, None, 1.5).onset.known_s == 1.5
+    assert priors_of(armpi, None, None) == Priors()
+
+
+@pytest.mark.parametrize("counts", [(20, 5), (5, 5), (-1, 5), (np.nan, 5), (0, np.inf)])
+def test_error_range_must_be_in_order(armpi, counts):
+    with pytest.raises(InputError, match=r"--sse-range is .*, expected 0 <= LOW < HIGH"):
+        priors_of(armpi, counts, None)
+
+
+@pytest.mark.parametrize("onset_s", [-1.0, np.nan, np.inf])
+def test_onset_must_be_a_time_of_the_run(armpi, onset_s):
+    with pytest.raises(InputError, match=rf"--onset is {onset_s:g} s, expected 0 or more"):
+        priors_of(armpi, None, onset_s)
+
+
+@pytest.mark.parametrize(
+    ("hypothesis", "message"),
+    [
+        (UNKNOWN, "hypothesis 'unknown' cannot be weighed"),
+        ("motor_1:stuck+motor_2:stuck", r"'motor_1:stuck\+motor_2:stuck' cannot be weighed"),
+        ("motor_1:backlash", r"'backlash' cannot .* Expected stuck or steady_state_error"),
+    ],
+)
+def test_hypothesis_that_cannot_be_weighed_is_refused(twin, hypothesis, message):
+    if isinstance(hypothesis, str):
+        hypothesis = Hypothesis.parse(hypothesis, twin.robot.motor_names)
+    with pytest.raises(InputError, match=message):
+        BayesDiagnoser(twin, hypotheses=(HEALTHY, hypothesis))
+
+
+def test_run_set_of_another_robot_is_refused(twin, few):
+    other = few.assign_coords(motor=["hip", "knee", "ankle", "toe"])
+    with pytest.raises(InputError, match=r"motors hip, knee, ankle, toe; robot 'armpi_fpv' has"):
+        BayesDiagnoser(twin).diagnose(other)
+
+
+def test_runs_without_a_movement_are_refused(twin, few):
+    still = few.assign(command=0.0 * few["command"])
+    with pytest.raises(InputError, match="no run holds a movement: `command` never leaves"):
+        BayesDiagnoser(twin).diagnose(still)
+
+
+def test_dataset_that_is_no_run_set_is_refused(twin, few):
+    with pytest.raises(InputError, match="no variable `measured`"):
+        BayesDiagnoser(twin).diagnose(few.drop_vars("measured"))
+
+
+def test_robot_of_which_nothing_is_known_is_judged_with_wide_offsets(armpi, imperfect):
+    unknown = dataclasses.replace(
+        armpi, profile=dataclasses.replace(armpi.profile, imperfections=None)
+    )
+    assert default_imperfections(unknown).protocol == "P0"
+    found = BayesDiagnoser(DigitalTwin(unknown)).diagnose(imperfect)
+    assert {d.protocol for d in found} == {"P0"}
+    assert "not calibrated" in found[0].method
+    right = np.mean([d.truth == d.diagnosis for d in found])
+    assert 0.6 < right < 0.97
