@@ -1,7 +1,7 @@
 """All movements of a run fitted to its path at once, by least squares.
 
 The solver is our own: that of scipy takes singular values of the whole Jacobian, for which BLAS
-starts threads that cost a hundred times the work where cores are shared.
+starts threads that take many times as long where cores are shared.
 """
 
 from __future__ import annotations
