@@ -11,7 +11,7 @@ import click
 
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.bags import BagTopics
+from failuretwin.data_knowledge.bags.reading import BagTopics
 from failuretwin.data_knowledge.column_guess import column_map_text, guess_columns
 from failuretwin.data_knowledge.column_map import read_column_map
 from failuretwin.data_knowledge.reading import ReadOptions, read_runs

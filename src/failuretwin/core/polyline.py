@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import FloatArray, IntArray
+
+Corner = tuple[float, float]
+"""Time and value."""
 
 ROUNDING_RAD = 2e-3
 """Logged references are taken as few straight lines, off by no more than this [rad], a tenth of
@@ -41,7 +44,39 @@ def simplify(
             worst = first + 1 + int(np.argmax(distance))
             kept[worst] = True
             stack += [(first, worst), (worst, last)]
-    return time[kept], _level(value[kept], tolerance)
+    time, value = _sharpen(np.flatnonzero(kept), time, value)
+    return time, _level(value, tolerance)
+
+
+def _sharpen(kept: IntArray, time: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return corners with those that lie between two samples put where their lines meet.
+
+    Args:
+        kept: Samples that are corners of the polyline, (corner,).
+        time: Times of all samples, (sample,) [s].
+        value: All samples, (sample,).
+    """
+    corners = [(float(time[i]), float(value[i])) for i in kept]
+    sharp, i = corners[:1], 1
+    while i < len(corners):
+        between = i + 2 < len(corners) and kept[i + 1] - kept[i] == 1
+        met = _meet(sharp[-1], corners[i], corners[i + 1], corners[i + 2]) if between else None
+        sharp.append(met or corners[i])
+        i += 2 if met else 1
+    return np.array(sharp).T[0], np.array(sharp).T[1]
+
+
+def _meet(a: Corner, b: Corner, c: Corner, d: Corner) -> Corner | None:
+    """Return where the lines a-b and c-d meet, None unless that is between b and c."""
+    before = (b[1] - a[1]) / (b[0] - a[0])
+    after = (d[1] - c[1]) / (d[0] - c[0])
+    if before == after:
+        return None
+    at = (c[1] - b[1] + before * b[0] - after * c[0]) / (before - after)
+    slack = 0.05 * (c[0] - b[0])
+    if not b[0] - slack <= at <= c[0] + slack:
+        return None
+    return at, b[1] + before * (at - b[0])
 
 
 def _level(value: FloatArray, tolerance: float) -> FloatArray:

@@ -28,6 +28,9 @@ FROZEN_TRAVEL_RAD = 0.2
 """Commanded travel that must show at the tool [rad], about 12 degrees."""
 DEAD_SHARE = 0.6
 """A tool that stands still for more than this share of a run says nothing [-]."""
+NEAR_ZERO_M = 0.002
+"""Nearer to zero than this a coordinate can stand still because a motor does [m]: it then moves in
+the plane of the others. No motor can hold a coordinate at another value while the arm moves."""
 SHOWN = 3
 """Times listed for each kind of defect; the rest is counted."""
 
@@ -39,10 +42,12 @@ class LogQuality:
     Attributes:
         remarks: What is wrong, a line each, with times.
         fatal: Why no verdict can be had from it; empty where one can.
+        spoilt: Stretches of time whose readings say nothing of the arm [s].
     """
 
     remarks: tuple[str, ...] = ()
     fatal: str = ""
+    spoilt: tuple[tuple[float, float], ...] = ()
 
 
 def log_quality(runs: xr.Dataset) -> list[LogQuality]:
@@ -56,6 +61,17 @@ def log_quality(runs: xr.Dataset) -> list[LogQuality]:
     measured = as_floats(runs["measured"].values)
     rate = measured_rate(runs)
     return [_quality(time, c, m, rate) for c, m in zip(command, measured, strict=True)]
+
+
+def without_spoilt(runs: xr.Dataset, quality: Sequence[LogQuality]) -> xr.Dataset:
+    """Return the runs with spoilt readings missing; the given run set stays as it is."""
+    if not any(q.spoilt for q in quality):
+        return runs
+    time, measured = as_floats(runs["time"].values), runs["measured"].values.copy()
+    for run, log in enumerate(quality):
+        for begin, end in log.spoilt:
+            measured[run, (time >= begin - 1e-9) & (time <= end + 1e-9)] = np.nan
+    return runs.assign(measured=(runs["measured"].dims, measured))
 
 
 def _quality(
@@ -72,23 +88,34 @@ def _quality(
     ]
     frozen = [_frozen(time, command, values, seen) for values in measured.T]
     still = [stretch for stretch in frozen if stretch is not None]
-    if len(still) < len(frozen):
-        remarks += [
-            f"{axis} stands still {_times([stretch])} while the arm moves: a dead sensor channel, "
-            "unless a stuck motor explains it"
-            for axis, stretch in zip(AXES, frozen, strict=True)
-            if stretch is not None
-        ]
-        return LogQuality(tuple(remarks))
+    if len(still) == len(frozen):
+        return _still_tool(tuple(remarks), still, time[seen])
+    spoilt = []
+    for axis, values, stretch in zip(AXES, measured.T, frozen, strict=True):
+        if stretch is None:
+            continue
+        remark = f"{axis} stands still {_times([stretch])} while the arm moves"
+        if abs(values[np.searchsorted(time, stretch[0] - 1e-9)]) < NEAR_ZERO_M:
+            remarks.append(f"{remark}: a dead sensor channel, or a stuck motor holds it at zero")
+        else:
+            remarks.append(f"{remark}: a dead sensor channel")
+            spoilt.append(stretch)
+    return LogQuality(tuple(remarks), spoilt=tuple(spoilt))
+
+
+def _still_tool(
+    remarks: tuple[str, ...], still: Sequence[tuple[float, float]], at: FloatArray
+) -> LogQuality:
+    """Return the quality of a log whose tool stands still on all axes."""
     begin, end = max(begin for begin, _ in still), min(end for _, end in still)
-    remarks.append(f"the tool stands still {_times([(begin, end)])} though motors are told to move")
-    dead = end - begin > DEAD_SHARE * (time[seen][-1] - time[seen][0])
-    return LogQuality(
-        tuple(remarks),
-        "the tool stands still though motors are told to move: the sensor or the whole arm is dead"
-        if dead
-        else "",
-    )
+    remark = f"the tool stands still {_times([(begin, end)])} though motors are told to move"
+    fatal = ""
+    if end - begin > DEAD_SHARE * (at[-1] - at[0]):
+        fatal = (
+            "the tool stands still though motors are told to move: the sensor or the whole arm is "
+            "dead"
+        )
+    return LogQuality((*remarks, remark), fatal, ((begin, end),))
 
 
 def _partial_readings(time: FloatArray, measured: FloatArray, seen: BoolArray) -> list[str]:

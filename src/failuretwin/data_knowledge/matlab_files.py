@@ -8,6 +8,7 @@ runs, paths only; their commands are recovered from the desired path.
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.runs import RunTable, Truth
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.recovery import published_time, recover_movements
+from failuretwin.data_knowledge.recovery.commands import published_time, recover_movements
 from failuretwin.data_knowledge.session_runs import PUBLISHED_FREEZE, READING_RATE_HZ
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
@@ -48,7 +49,7 @@ def label_text(hypothesis: str) -> str:
     """Return the published label of a hypothesis, such as ``Motor_1_Stuck``."""
     if hypothesis == "healthy":
         return HEALTHY_LABEL
-    return hypothesis.replace(":", "_").capitalize()
+    return "_".join(part.capitalize() for part in hypothesis.split(":"))
 
 
 def hypothesis_of_label(label: str, robot: Robot) -> str | None:
@@ -98,7 +99,9 @@ def read_matlab_file(path: Path, robot: Robot, *, approximate: bool = False) -> 
 
 def _load(path: Path) -> dict[str, Any]:
     try:
-        from matio import load_from_mat
+        with warnings.catch_warnings():  # it sets a deprecated option of pandas when imported
+            warnings.simplefilter("ignore")
+            from matio import load_from_mat
     except ImportError as error:
         raise InputError(
             f"{path}: MATLAB files need mat-io ({error}). Install it: "

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from failuretwin import __version__
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import RunTable, concatenate
-from failuretwin.data_knowledge.bags import BagTopics, is_bag, read_bag
+from failuretwin.data_knowledge.bags.reading import BagTopics, is_bag, read_bag
 from failuretwin.data_knowledge.column_map import ColumnMap, read_mapped_csv
 from failuretwin.data_knowledge.raw_session import SESSION_FILES, find_sessions, read_session
 from failuretwin.data_knowledge.session_runs import As, session_runs

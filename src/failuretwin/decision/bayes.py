@@ -15,7 +15,7 @@ from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
 from failuretwin.core.runs import check_runs, truth_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.data_knowledge.knowledge import prior_odds
-from failuretwin.data_knowledge.log_quality import LogQuality, log_quality
+from failuretwin.data_knowledge.log_quality import LogQuality, log_quality, without_spoilt
 from failuretwin.decision.assessment import lost_commands, unused_movements, why_undecided
 from failuretwin.decision.evidence import SettledEvidence, settled_evidence
 from failuretwin.decision.healthy import Alternatives, HealthyModel
@@ -147,7 +147,8 @@ class BayesDiagnoser:
             InputError: If the run set is of another robot or no run holds a movement.
         """
         self._check(runs)
-        evidence = settled_evidence(runs)
+        quality = log_quality(runs)
+        evidence = settled_evidence(without_spoilt(runs, quality))
         if evidence.movements.start.shape[1] == 0:
             raise InputError(
                 "no run holds a movement: `command` never leaves its first value. Expected runs "
@@ -156,7 +157,6 @@ class BayesDiagnoser:
         names = [str(name) for name in runs["run"].values]
         known = truth_of(runs)
         truth: list[str | None] = [None] * len(names) if known is None else list(known)
-        quality = log_quality(runs)
         results = []
         for first in range(0, len(names), CHUNK_RUNS):
             weighed = self._weigh_all(evidence[first : first + CHUNK_RUNS])

@@ -18,7 +18,7 @@ import numpy as np
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray, IntArray, as_floats
 from failuretwin.core.units import MS_PER_S
-from failuretwin.data_knowledge.bag_file import BagMessage
+from failuretwin.data_knowledge.bags.file import BagMessage
 
 NS_PER_S = 1_000_000_000
 HEADER = {"header": "std_msgs/msg/Header"}

@@ -13,15 +13,15 @@ import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray, IntArray, as_floats
-from failuretwin.data_knowledge.bag_file import (
+from failuretwin.data_knowledge.bags.file import (
     BagMessage,
     BagTopic,
     is_bag,
     read_messages,
     read_topics,
 )
-from failuretwin.data_knowledge.bag_joints import motor_columns, names_a_motor
-from failuretwin.data_knowledge.bag_messages import (
+from failuretwin.data_knowledge.bags.joints import motor_columns, names_a_motor
+from failuretwin.data_knowledge.bags.messages import (
     NS_PER_S,
     JointRows,
     ToolRows,
@@ -29,7 +29,7 @@ from failuretwin.data_knowledge.bag_messages import (
     require_kind,
     tool_rows,
 )
-from failuretwin.data_knowledge.bag_topics import (
+from failuretwin.data_knowledge.bags.topics import (
     ROLES,
     BagTopics,
     Role,

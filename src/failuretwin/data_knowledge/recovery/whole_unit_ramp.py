@@ -9,8 +9,14 @@ from itertools import product
 import numpy as np
 
 from failuretwin.core.types import BoolArray, FloatArray, frozen_array
-from failuretwin.data_knowledge.inverse_kinematics import EXACT_M, MOTORS, PlaneArm
-from failuretwin.data_knowledge.ramp_fit import Free, PathPart, Ramps, fit_ramps, largest_error
+from failuretwin.data_knowledge.recovery.inverse_kinematics import EXACT_M, MOTORS, PlaneArm
+from failuretwin.data_knowledge.recovery.ramp_fit import (
+    Free,
+    PathPart,
+    Ramps,
+    fit_ramps,
+    largest_error,
+)
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.random_movements import RandomMovements
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from failuretwin.core.errors import InputError, unknown_name
-from failuretwin.data_knowledge.bag_file import BagTopic
-from failuretwin.data_knowledge.bag_messages import Kind, kind_of
+from failuretwin.data_knowledge.bags.file import BagTopic
+from failuretwin.data_knowledge.bags.messages import Kind, kind_of
 
 Role = Literal["command", "tool", "position"]
 ROLES: tuple[Role, ...] = get_args(Role)

@@ -13,7 +13,7 @@ import numpy as np
 
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.ramp_fit import PathPart, Ramps
+from failuretwin.data_knowledge.recovery.ramp_fit import PathPart, Ramps
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 

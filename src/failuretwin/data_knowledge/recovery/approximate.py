@@ -14,8 +14,8 @@ import numpy as np
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.ramp_fit import Free, PathPart, Ramps, fit_ramps
-from failuretwin.data_knowledge.run_fit import RunFit
+from failuretwin.data_knowledge.recovery.ramp_fit import Free, PathPart, Ramps, fit_ramps
+from failuretwin.data_knowledge.recovery.run_fit import RunFit
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 

@@ -15,9 +15,9 @@ import numpy as np
 
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.inverse_kinematics import EXACT_M, MOTORS, PlaneArm
-from failuretwin.data_knowledge.ramp_fit import PathPart, Ramps
-from failuretwin.data_knowledge.whole_unit_ramp import SeenRamp
+from failuretwin.data_knowledge.recovery.inverse_kinematics import EXACT_M, MOTORS, PlaneArm
+from failuretwin.data_knowledge.recovery.ramp_fit import PathPart, Ramps
+from failuretwin.data_knowledge.recovery.whole_unit_ramp import SeenRamp
 from failuretwin.digital_model.twin import DigitalTwin
 
 STILL_M = 1e-10

@@ -1,0 +1,1 @@
+"""Motor commands recovered from desired tool paths."""

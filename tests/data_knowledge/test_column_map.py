@@ -1,0 +1,187 @@
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from failuretwin import BayesDiagnoser, DigitalTwin, ReadOptions, load_robot, read_runs
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.data_knowledge.column_guess import column_map_text, guess_columns
+from failuretwin.data_knowledge.column_map import read_column_map
+from failuretwin.data_knowledge.generation import Plan, simulate
+from failuretwin.digital_model.imperfections import load_imperfections
+
+ARMS = ("armpi_fpv", "ur5e", "panda", "so101")
+MAP = """
+[time]
+column = "t"
+unit = "{time}"
+[command]
+columns = ["a", "b", "c", "d"]
+kind = "{kind}"
+unit = "{angle}"
+{more}
+[tool]
+columns = ["x", "y", "z"]
+unit = "mm"
+"""
+
+
+def foreign_table(runs):
+    """Return the runs as another logger would write them: degrees, millimetres, uneven times."""
+    rng, parts = np.random.default_rng(0), []
+    time = runs["time"].values
+    for i, name in enumerate(runs["run"].values):
+        seen = np.isfinite(runs["measured"].values[i]).all(axis=1)
+        kept = np.flatnonzero(
+            (seen & (rng.random(len(time)) < 0.9)) | (rng.random(len(time)) < 0.3)
+        )
+        columns = {"trial": str(name), "Time (ms)": np.round(1000 * time[kept], 1)}
+        for k in range(runs.sizes["motor"]):
+            angle = np.rad2deg(runs["command"].values[i, kept, k])
+            columns[f"J{k + 1}_cmd_deg"] = np.round(angle, 3)
+        for a, axis in enumerate("xyz"):
+            columns[f"TCP {axis} [mm]"] = np.round(1000 * runs["measured"].values[i, kept, a], 3)
+        parts.append(pd.DataFrame(columns))
+    return pd.concat(parts)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_a_foreign_log_gets_the_diagnosis_of_the_direct_way(tmp_path, name):
+    robot = load_robot(name)
+    own = "none" if robot.imperfections_file is None else name
+    hypotheses = paper_hypotheses(robot.motor_names)
+    plan = Plan(robot, hypotheses, 1, seed=2, imperfections=load_imperfections(own, robot))
+    runs, log = simulate(plan), tmp_path / "log.csv"
+    foreign_table(runs).to_csv(log, index=False)
+    mapping = tmp_path / "map.toml"
+    mapping.write_text(column_map_text(guess_columns(log, robot), log.name, robot))
+
+    options = ReadOptions(columns=read_column_map(mapping, robot))
+    foreign = read_runs(log, robot, options)
+
+    diagnoser = BayesDiagnoser(DigitalTwin(robot))
+    direct = diagnoser.diagnose(runs)
+    mapped = diagnoser.diagnose(foreign)
+    assert [d.diagnosis for d in mapped] == [d.diagnosis for d in direct]
+
+
+def write(folder, table, **words):
+    words = {"time": "s", "kind": "sampled", "angle": "rad", "more": ""} | words
+    (folder / "map.toml").write_text(MAP.format(**words))
+    table.to_csv(folder / "log.csv", index=False)
+    return folder / "log.csv"
+
+
+def read(folder, robot):
+    mapping = read_column_map(folder / "map.toml", robot)
+    return read_runs(folder / "log.csv", robot, ReadOptions(columns=mapping))
+
+
+def table(time, command, tool):
+    columns = dict(zip("abcd", np.transpose(command), strict=True))
+    return pd.DataFrame({"t": time} | columns | dict(zip("xyz", 1000 * tool.T, strict=True)))
+
+
+@pytest.mark.parametrize(
+    ("unit", "scale"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9), ("iso", None)]
+)
+def test_times_in_every_unit(armpi, twin, tmp_path, unit, scale):
+    time = np.arange(100) * 0.1
+    command = np.outer(np.clip(time - 1.0, 0.0, 1.0), [0.5, -0.4, 0.3, 0.2])
+    stamps = 1.7e9 * (scale or 1.0) + time * (scale or 1.0)
+    if scale is None:
+        stamps = [str(t) for t in pd.to_datetime(1_700_000_000_000 + 1000 * time, unit="ms")]
+    write(tmp_path, table(stamps, command, twin.path(command)), time=unit)
+
+    runs = read(tmp_path, armpi)
+
+    assert runs.sizes["time"] == 991
+    np.testing.assert_allclose(runs["command"][0, ::10], command, atol=3e-3)
+    np.testing.assert_allclose(runs["measured"][0, ::10], twin.path(command), atol=1e-6)
+
+
+def test_targets_with_durations_in_servo_counts(armpi, tmp_path):
+    rows = pd.DataFrame(
+        {
+            "t": [0.0, 0.5, 1.0, 2.5, 3.0, 4.5],
+            **{m: [np.nan, np.nan, 600, 600, 400, 400] for m in "abcd"},
+            **{axis: [0.0, 0.1, 0.2, 0.3, 0.4, 0.5] for axis in "xyz"},
+            "d": [np.nan, np.nan, 600, 600, 400, 400],
+            "ms": [np.nan, np.nan, 800, np.nan, 1000, np.nan],
+        }
+    )
+    more = 'duration_columns = ["ms"]\nduration_unit = "ms"'
+    write(tmp_path, rows, kind="target", angle="servo", more=more)
+
+    runs = read(tmp_path, armpi)
+
+    np.testing.assert_allclose(runs["movement_start"][0], [1.0, 3.0])
+    np.testing.assert_allclose(runs["ramp_duration"][0], [[0.8] * 4, [1.0] * 4])
+    np.testing.assert_allclose(np.rad2deg(runs["target"][0, :, 0]), [-24.0, 24.0])
+
+
+def test_sign_and_zero_of_another_convention(armpi, twin, tmp_path):
+    time = np.arange(50) * 0.1
+    command = np.outer(np.clip(time - 1.0, 0.0, 1.0), [0.5, -0.4, 0.3, 0.2])
+    logged = command * [1, 1, -1, 1] + [0.1, 0.0, 0.0, 0.0]
+    more = "sign = [1, 1, -1, 1]\nzero = [0.1, 0, 0, 0]"
+    write(tmp_path, table(time, logged, twin.path(command)), more=more)
+
+    runs = read(tmp_path, armpi)
+
+    np.testing.assert_allclose(runs["command"][0, ::10], command, atol=3e-3)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"time": "sec"}, "unknown unit 'sec'"),
+        ({"angle": "radians"}, r"unknown unit 'radians'\. Did you mean 'rad'"),
+        ({"kind": "sample"}, "unknown kind 'sample'. Did you mean 'sampled'"),
+        ({"kind": "target"}, "targets need to know how long a movement takes"),
+        ({"more": "sing = [1, 1, 1, 1]"}, r"unknown key 'sing'\. Did you mean 'sign'"),
+        ({"more": "sign = [1, 1]"}, "sign has 2 entries, expected 4"),
+    ],
+)
+def test_a_wrong_map_is_explained(armpi, tmp_path, words, message):
+    write(tmp_path, pd.DataFrame({"t": [0.0]}), **words)
+
+    with pytest.raises(InputError, match=message):
+        read(tmp_path, armpi)
+
+
+def spoilt(change):
+    time = np.arange(20) * 0.1
+    good = table(time, np.zeros((20, 4)), np.ones((20, 3))).astype(object)
+    change(good)
+    return good
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t.pop("c"), "unknown column 'c'"),
+        (lambda t: t.__setitem__("b", ["x", *t["b"][1:]]), "line 2, column b: got 'x'"),
+        (lambda t: t.__setitem__("t", t["t"].to_numpy()[::-1]), "time runs backwards"),
+        (lambda t: t.__setitem__("t", [*t["t"][:10], *(t["t"][10:] + 900)]), "clock jumps by 900"),
+        (lambda t: t.__setitem__("x", np.nan), "no reading of the tool"),
+    ],
+)
+def test_a_broken_table_is_explained(armpi, tmp_path, change, message):
+    write(tmp_path, spoilt(change))
+    if message == "no reading of the tool":  # an axis that is never there is a quality matter
+        runs = read(tmp_path, armpi)
+        assert np.isnan(runs["measured"].values).any(axis=-1).all()
+        return
+
+    with pytest.raises(InputError, match=message):
+        read(tmp_path, armpi)
+
+
+def test_a_csv_without_a_map_says_how_to_get_one(armpi, tmp_path):
+    write(tmp_path, pd.DataFrame({"t": [0.0]}))
+
+    with pytest.raises(InputError, match=r"needs a column map.*--columns"):
+        read_runs(tmp_path / "log.csv", armpi)

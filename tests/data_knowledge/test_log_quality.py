@@ -1,0 +1,178 @@
+"""Twenty deliberately broken logs: every defect is named, and none without evidence is judged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from failuretwin import BayesDiagnoser
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.data_knowledge.generation import Plan, simulate
+from failuretwin.data_knowledge.log_quality import log_quality
+from failuretwin.digital_model.imperfections import Readings, load_imperfections
+
+
+@pytest.fixture(scope="module")
+def clean(armpi):
+    """One run of a healthy arm, read ten times a second without any defect."""
+    imperfections = replace(
+        load_imperfections("armpi_fpv", armpi),
+        readings=Readings(rate_hz=10.0, whole_counts=True),
+        lost_commands=(),
+    )
+    imperfections = replace(
+        imperfections, timing=replace(imperfections.timing, late_rate=0.0, late_s=(0.0, 0.0))
+    )
+    return simulate(Plan(armpi, [Hypothesis()], 1, seed=4, imperfections=imperfections))
+
+
+def measured_of(runs):
+    return runs["measured"].values.copy()
+
+
+def with_measured(runs, measured):
+    return runs.assign(measured=(runs["measured"].dims, measured))
+
+
+def readings_of(measured):
+    return np.flatnonzero(np.isfinite(measured[0]).all(axis=1))
+
+
+def gap(runs, begin=4.2, end=5.6):
+    measured = measured_of(runs)
+    measured[0, int(100 * begin) : int(100 * end)] = np.nan
+    return with_measured(runs, measured)
+
+
+def glitch(runs, at=(3.0,)):
+    measured = measured_of(runs)
+    for time in at:
+        measured[0, readings_of(measured)[int(10 * time)]] += [0.1, -0.1, 0.05]
+    return with_measured(runs, measured)
+
+
+def frozen(runs, axes=(0, 1, 2), begin=0.0):
+    measured = measured_of(runs)
+    rows = readings_of(measured)
+    rows = rows[rows >= 100 * begin]
+    measured[0][np.ix_(rows, axes)] = measured[0][rows[0], axes]
+    return with_measured(runs, measured)
+
+
+def thinned(runs, keep):
+    measured = measured_of(runs)
+    rows = readings_of(measured)
+    measured[0, np.delete(rows, np.arange(0, len(rows), keep))] = np.nan
+    return with_measured(runs, measured)
+
+
+def scattered(runs):
+    measured = measured_of(runs)
+    rows = readings_of(measured)
+    moved = np.clip(rows + np.random.default_rng(0).integers(-4, 5, len(rows)), 0, 999)
+    out = np.full_like(measured, np.nan)
+    out[0, moved] = measured[0, rows]
+    return with_measured(runs, out)
+
+
+def dropped(runs):
+    measured = measured_of(runs)
+    rows = readings_of(measured)
+    measured[0, rows[5::7]] = np.nan
+    return with_measured(runs, measured)
+
+
+def without_axis(runs):
+    measured = measured_of(runs)
+    measured[0, readings_of(measured)[20:25], 1] = np.nan
+    return with_measured(runs, measured)
+
+
+def empty(runs):
+    return with_measured(runs, np.full_like(runs["measured"].values, np.nan))
+
+
+def never_at_rest(runs):
+    """Readings only while the arm moves."""
+    measured = measured_of(runs)
+    for start in runs["movement_start"].values[0]:
+        measured[0, int(100 * (start + 0.6)) : int(100 * (start + 2.05))] = np.nan
+    return with_measured(runs, measured)
+
+
+def still(runs):
+    return runs.assign(command=runs["command"] * 0.0 + runs["command"].isel(time=0))
+
+
+def scaled(runs, factor):
+    return with_measured(runs, measured_of(runs) * factor)
+
+
+def cut(runs, after):
+    measured = measured_of(runs)
+    measured[0, int(100 * after) :] = np.nan
+    return with_measured(runs, measured)
+
+
+NAMED = {
+    "gap": (gap, ["no readings from 4.1 to 5.6 s"]),
+    "two gaps": (lambda r: gap(gap(r), 7.0, 8.0), ["from 4.1 to 5.6 s, from 6.9 to 8.0 s"]),
+    "long silence": (lambda r: gap(r, 2.5, 8.5), ["or the clock jumped, from 2.4 to 8.5 s"]),
+    "glitch": (glitch, ["1 glitch at 3.0 s"]),
+    "glitches": (lambda r: glitch(r, (1.5, 3.0, 5.5)), ["3 glitches at 1.5, 3.0, 5.5 s"]),
+    "frozen z": (lambda r: frozen(r, (2,)), ["z stands still from 0.0 to", "dead sensor channel"]),
+    "frozen x late": (
+        lambda r: frozen(r, (0,), 7.0),
+        ["x stands still from", "dead sensor channel"],
+    ),
+    "stands still late": (lambda r: frozen(r, begin=6.0), ["the tool stands still from 5.1"]),
+    "slow": (lambda r: thinned(r, 3), ["readings come at 3.3 Hz, not at 10.0 Hz"]),
+    "jitter": (scattered, ["the times of the readings scatter by"]),
+    "dropped": (dropped, ["times a reading or two are missing"]),
+    "lacks an axis": (without_axis, ["5 readings lack an axis, the first at 2.0 s"]),
+    "gap and glitch": (lambda r: gap(glitch(r)), ["no readings from 4.1", "1 glitch at 3.0 s"]),
+    "cut": (lambda r: cut(r, 5.0), ["movement 4 not used", "movement 5 not used"]),
+}
+
+WITHOUT_EVIDENCE = {
+    "empty": (empty, "holds no readings of the tool"),
+    "frozen": (frozen, "stands still though motors are told to move"),
+    "never at rest": (never_at_rest, "not seen at rest after any movement"),
+    "millimetres": (lambda r: scaled(r, 1000.0), "nowhere near where any of the hypotheses"),
+    "mirrored": (lambda r: scaled(r, -1.0), "nowhere near where any of the hypotheses"),
+    "cut early": (lambda r: cut(r, 0.5), "not seen at rest after any movement"),
+}
+
+
+def test_a_clean_log_has_no_defects(clean):
+    assert log_quality(clean)[0].remarks == ()
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_a_defect_is_named(clean, twin, name):
+    spoil, words = NAMED[name]
+    (diagnosis,) = BayesDiagnoser(twin).diagnose(spoil(clean))
+
+    text = "; ".join(diagnosis.quality)
+    for part in words:
+        assert part in text
+
+
+@pytest.mark.parametrize("name", WITHOUT_EVIDENCE)
+def test_a_log_without_evidence_gets_no_verdict(clean, twin, name):
+    spoil, words = WITHOUT_EVIDENCE[name]
+    (diagnosis,) = BayesDiagnoser(twin).diagnose(spoil(clean))
+
+    assert diagnosis.verdict.startswith("cannot tell, because ")
+    assert words in diagnosis.verdict
+    assert diagnosis.diagnosis is diagnosis.probability is None
+    assert max(diagnosis.posterior.values()) == pytest.approx(1 / 9)
+
+
+def test_a_spoilt_log_never_makes_a_healthy_arm_look_surely_faulty(clean, twin):
+    for spoil, _ in NAMED.values():
+        (diagnosis,) = BayesDiagnoser(twin).diagnose(spoil(clean))
+        faulty = 1.0 - diagnosis.posterior["healthy"]
+        assert diagnosis.diagnosis in ("healthy", None) or faulty < 0.9
