@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MM_PER_M = 1000.0
+TITLE_COLUMNS = 100
+"""Letters of the title that fit on one line of the picture."""
 BLUE, RED, GREY = "#1f5f99", "#c8402f", "#9aa3ab"
 
 
@@ -86,8 +89,9 @@ def run_figure(
             )
     _plot_residual(figure.add_subplot(grid[3, 0]), time, desired, measured, diagnosis, style)
     _plot_posterior(figure.add_subplot(grid[:, 1]), diagnosis)
-    truth = "" if diagnosis.truth is None else f"   (truth: {_plain(diagnosis.truth)})"
-    figure.suptitle(f"{diagnosis.verdict}{truth}", fontsize=13, fontweight="bold")
+    truth = "" if diagnosis.truth is None else f"\n(truth: {_plain(diagnosis.truth)})"
+    title = textwrap.fill(diagnosis.verdict, TITLE_COLUMNS) + truth
+    figure.suptitle(title, fontsize=12, fontweight="bold")
     return figure
 
 
