@@ -4,16 +4,13 @@ BIN := .venv/bin
 # Small arrays gain nothing from threads, and threads of several processes get in each other's way.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test slow bench lint format clean
+.PHONY: demo test bench lint format clean
 
 demo: .venv/ready
 	$(BIN)/python examples/demo.py
 
 test: .venv/ready lint
 	$(BIN)/pytest -m "not slow"
-
-slow: .venv/ready
-	$(BIN)/pytest -m slow
 
 bench: .venv/ready
 	$(BIN)/python benchmarks/speed.py

@@ -193,7 +193,10 @@ def test_verdicts_say_what_was_found(diagnoses):
         else:
             motor = d.diagnosis[: len("motor_1")].replace("_", " ")
             assert motor in d.verdict
-            assert f"{np.rad2deg(d.magnitude):.0f}" in d.verdict or "by about" in d.verdict
+            assert (
+                f" {round(float(np.rad2deg(d.magnitude)))} deg" in d.verdict
+                or "by about" in d.verdict
+            )
         assert "% sure" in d.verdict
         assert "100 %" not in d.verdict
 

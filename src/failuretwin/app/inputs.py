@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,13 +15,18 @@ from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.bags.reading import BagTopics
 from failuretwin.data_knowledge.column_guess import column_map_text, guess_columns
 from failuretwin.data_knowledge.column_map import read_column_map
+from failuretwin.data_knowledge.matlab_files import RECOVERY_ERROR
 from failuretwin.data_knowledge.reading import ReadOptions, read_runs
 from failuretwin.data_knowledge.session_runs import As
 from failuretwin.data_knowledge.store import replacing
+from failuretwin.decision.bayes import BayesDiagnoser
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:
     import xarray as xr
+
+TOLD_ERROR_M = 1e-6
+"""Error of recovered commands that the user is told of [m]; exact ones are below 1e-9."""
 
 
 def read_inputs(
@@ -35,7 +41,27 @@ def read_inputs(
     options = ReadOptions(cast(As, how), published_labels, approximate=approximate)
     if columns is not None:
         options = _with_map(options, columns, sources, robot)
-    return read_runs(list(sources), robot, options)
+    runs = read_runs(list(sources), robot, options)
+    error = float(runs.attrs.get(RECOVERY_ERROR, 0.0))
+    if error > TOLD_ERROR_M:
+        click.echo(
+            f"note: approximate commands miss the desired path by up to {1000 * error:.1f} mm "
+            f"(worst: {runs.attrs['recovery_worst_run']}); a diagnosis can be no better than that",
+            err=True,
+        )
+    return runs
+
+
+def tell_mismatch(runs: xr.Dataset, diagnoser: BayesDiagnoser) -> None:
+    """Tell the user where simulated runs lack the imperfections that the diagnoser expects."""
+    made_with = json.loads(runs.attrs.get("configuration", "{}")).get("imperfections")
+    expected = diagnoser.healthy_model.imperfections.name
+    if made_with is not None and made_with != expected:
+        click.echo(
+            f"note: the runs were simulated with imperfections '{made_with}', the diagnosis "
+            f"expects '{expected}'; there will be false alarms",
+            err=True,
+        )
 
 
 def _with_map(

@@ -77,9 +77,11 @@ def run_figure(
         diagnosis: What was found.
     """
     figure = _figure_class()(figsize=(11.0, 6.2), layout="constrained")
+    seen = np.asarray(np.isfinite(measured).all(axis=1))
+    shown = slice(0, len(time) - int(np.argmax(seen[::-1])) if seen.any() else len(time))
+    time, desired, measured, seen = time[shown], desired[shown], measured[shown], seen[shown]
     grid = figure.add_gridspec(4, 2, width_ratios=[2.1, 1.0])
-    seen = np.isfinite(measured).all(axis=1)
-    style = {"ls": "-", "lw": 1.2} if seen.mean() > 0.5 else {"ls": "none", "marker": ".", "ms": 4}
+    style = {"ls": "-", "lw": 1.2} if seen.mean() > 0.95 else {"ls": "none", "marker": ".", "ms": 4}
     for row, axis in enumerate(AXES):
         panel = figure.add_subplot(grid[row, 0])
         _plot_axis(panel, axis, time, desired[:, row], measured[:, row], style)
@@ -104,6 +106,7 @@ def _plot_axis(
     style: Mapping[str, Any],
 ) -> None:
     panel.plot(time, MM_PER_M * desired, color=GREY, lw=2.0, label="commanded")
+    panel.set_xlim(*_span(time))
     panel.plot(time, MM_PER_M * measured, color=BLUE, label="measured", **style)
     panel.set_ylabel(f"tool {axis} [mm]")
     panel.tick_params(labelbottom=False)
@@ -120,6 +123,7 @@ def _plot_residual(
 ) -> None:
     distance = MM_PER_M * np.linalg.norm(measured - desired, axis=1)
     panel.plot(time, distance, color=RED, **style)
+    panel.set_xlim(*_span(time))
     panel.set_ylabel("off by [mm]")
     panel.set_xlabel("time [s]")
     panel.set_ylim(bottom=0.0)
@@ -147,6 +151,12 @@ def _plot_posterior(panel: Axes, diagnosis: Diagnosis) -> None:
         panel.annotate(f"{value:.1f}", (value + 1.5, y), va="center", fontsize=8)
     panel.set_title("what is wrong?", fontsize=10)
     _clean(panel)
+
+
+def _span(time: FloatArray) -> tuple[float, float]:
+    """Return the limits of the time axis [s], the same for every panel."""
+    margin = 0.02 * float(time[-1])
+    return -margin, float(time[-1]) + margin
 
 
 def _plain(hypothesis: str) -> str:

@@ -11,6 +11,8 @@ from failuretwin.app.results import Record, score_line, score_records
 from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.decision.metrics import Scores
 
+TOLD_RUNS = 3
+"""So few runs are explained in full on the screen; for more there are --plot and --json."""
 PIPE_WIDTH = 160
 """Columns when the output is not a terminal, so that sentences stay whole."""
 
@@ -28,11 +30,19 @@ def print_diagnoses(diagnoses: Sequence[Diagnosis]) -> None:
         table.add_column(column, overflow="fold")
     for d in diagnoses:
         mark = "" if d.truth is None else ("right" if d.truth == d.diagnosis else "WRONG")
+        mark = "" if d.diagnosis is None else mark
         truth = [d.truth or "", mark] if known else []
         count = len(d.quality)
         quality = f"{count} remark{'s' * (count > 1)}" if count else ""
         table.add_row(d.run, *truth, d.verdict, quality)
-    _console().print(table)
+    console = _console()
+    console.print(table)
+    if len(diagnoses) <= TOLD_RUNS:
+        for d in diagnoses:
+            console.print(f"\n{d.run}")
+            for line in (*d.explanation, *(f"the log: {remark}" for remark in d.quality)):
+                console.print(f"  - {line}", soft_wrap=True)
+    console.print(f"\n{diagnoses[0].method}", soft_wrap=True)
 
 
 def print_scores(records: Sequence[Record]) -> None:

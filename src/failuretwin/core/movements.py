@@ -18,8 +18,9 @@ CORNER_TOLERANCE_RAD = 1e-7
 """Change of a reference from one step to the next [rad] that is rounding and no corner."""
 LONGEST_CORNER = 4
 """Samples over which a corner between straight lines can bend; a short ramp has two corners."""
-SAME_MOVEMENT_S = 0.1
-"""Motors that start within this time [s] move together; a bus serves six servos in about 0.02 s."""
+SAME_MOVEMENT_S = 0.25
+"""Motors that start within this time [s] move together: a bus serves six servos in about 0.02 s,
+and of a smooth start the shortest travel is seen last."""
 
 
 @dataclass(frozen=True)
@@ -110,10 +111,10 @@ def _hold_padding(
 def find_movements(command: FloatArray, time: FloatArray) -> Movements:
     """Find the movements in references from the corners of the piecewise linear `command`.
 
-    A movement starts where a motor sets out, or changes its speed; motors that do so within
-    0.1 s of each other belong to the same movement. Corners are placed between the samples, where
-    the lines before and after them meet. The target of a ramp that is interrupted is the
-    angle it has come to.
+    A movement starts where a motor sets out or turns back; motors that do so within 0.25 s of each
+    other belong to the same movement, and a curve is one movement from rest to rest. Corners are
+    placed between the samples, where the lines before and after them meet. The target of a ramp
+    that is interrupted is the angle it has come to.
 
     Args:
         command: Reference angles, (run, time, motor) [rad].
@@ -148,13 +149,18 @@ class _Corners:
     angle: FloatArray
     speed: FloatArray
 
+    def starts(self) -> FloatArray:
+        """Return when the motor sets out or turns back [s]; mere changes of speed are curves."""
+        before = np.concatenate([[0.0], self.speed[:-1]])
+        return self.time[(self.speed != 0.0) & (before * self.speed <= 0.0)]
+
 
 def _movements_of_run(
     command: FloatArray, time: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return start (movement,), target and ramp duration (movement, motor) of one run."""
     motors = [_corners(reference, time) for reference in command.T]
-    start = _merge_starts(np.sort(np.concatenate([c.time[c.speed != 0.0] for c in motors])))
+    start = _merge_starts(np.sort(np.concatenate([c.starts() for c in motors])))
     end = np.append(start[1:], time[-1])
     target, ramp = np.empty((2, len(start), len(motors)))
     for k, corners in enumerate(motors):
@@ -225,7 +231,13 @@ def _ramps(corners: _Corners, start: FloatArray, end: FloatArray) -> tuple[Float
         last = int(np.searchsorted(corners.time, end[m] - 1e-9)) - 1
         target[m] = corners.angle[last] + corners.speed[last] * (end[m] - corners.time[last])
         inside = (corners.time >= start[m] - 1e-9) & (corners.time < end[m] - 1e-9)
-        speed = np.abs(corners.speed[inside]).max(initial=0.0)
-        duration[m] = abs(target[m] - origin) / speed if speed > 0.0 else 0.0
+        speeds = np.abs(corners.speed[inside])
+        if np.sum(speeds > 0.0) > 1:  # a curve: from its first corner to its last
+            moving = np.flatnonzero(inside)[speeds > 0.0]
+            stop = corners.time[min(moving[-1] + 1, len(corners.time) - 1)]
+            duration[m] = min(stop, end[m]) - corners.time[moving[0]]
+        else:
+            speed = speeds.max(initial=0.0)
+            duration[m] = abs(target[m] - origin) / speed if speed > 0.0 else 0.0
         origin = target[m]
     return target, duration

@@ -13,6 +13,9 @@ ROUNDING_RAD = 2e-3
 """Logged references are taken as few straight lines, off by no more than this [rad], a tenth of
 a degree: half a count of a coarse servo, well below any fault that can be found."""
 
+LEAST_STEPS = 10
+"""Changes from which a quantum can be read; fewer may share one by chance."""
+
 
 def simplify(
     time: FloatArray, value: FloatArray, tolerance: float
@@ -32,6 +35,7 @@ def simplify(
     """
     known = np.isfinite(value)
     time, value = time[known], value[known]
+    tolerance = max(tolerance, 0.75 * resolution(value))
     kept = np.zeros(len(time), dtype=bool)
     kept[[0, -1]] = True
     stack = [(0, len(time) - 1)]
@@ -45,7 +49,17 @@ def simplify(
             kept[worst] = True
             stack += [(first, worst), (worst, last)]
     time, value = _sharpen(np.flatnonzero(kept), time, value)
-    return time, _level(value, tolerance)
+    return time, _level(value, 2.0 * tolerance)
+
+
+def resolution(value: FloatArray) -> float:
+    """Return the quantum that samples are rounded to, 0 if there is none to be seen."""
+    steps = np.abs(np.diff(value))
+    steps = steps[steps > 1e-9]
+    if len(steps) < LEAST_STEPS:
+        return 0.0
+    multiples = steps / steps.min()
+    return float(steps.min()) if np.all(np.abs(multiples - np.rint(multiples)) < 0.02) else 0.0
 
 
 def _sharpen(kept: IntArray, time: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -55,7 +55,7 @@ def guess_columns(path: Path, robot: Robot) -> Guess:
     separator = _separator(path)
     table = load_csv(path, separator)
     words = {str(name): _words(str(name)) for name in table}
-    time = _first(words, TIME_WORDS)
+    time = _first(words, TIME_WORDS) or _increasing(table)
     run = _first(words, RUN_WORDS)
     rest = {name: found for name, found in words.items() if name not in (time, run)}
     durations = {name: found for name, found in rest.items() if found & DURATION_WORDS}
@@ -97,6 +97,15 @@ def _words(name: str) -> set[str]:
 
 def _first(words: Mapping[str, set[str]], wanted: set[str]) -> str:
     return next((name for name, found in words.items() if found & wanted), "")
+
+
+def _increasing(table: pd.DataFrame) -> str:
+    """Return the first column whose numbers only grow."""
+    for name in table:
+        values = _values(table, [str(name)])[:, 0]
+        if len(values) > 1 and np.all(np.diff(values) > 0):
+            return str(name)
+    return ""
 
 
 def _by_motor(words: Mapping[str, set[str]], robot: Robot) -> tuple[str, ...]:

@@ -104,6 +104,7 @@ class ColumnMap:
         position: Motor readings.
         run: Column that tells runs apart; without it a file is one run.
         separator: Between columns.
+        decimal: Decimal point, or comma where the log writes 0,5.
     """
 
     time: TimeColumn
@@ -112,6 +113,7 @@ class ColumnMap:
     position: AngleColumns | None = None
     run: str | None = None
     separator: str = ","
+    decimal: str = "."
 
 
 def read_column_map(path: Path, robot: Robot) -> ColumnMap:
@@ -139,7 +141,16 @@ def read_column_map(path: Path, robot: Robot) -> ColumnMap:
     for name, angles in (("command", command), ("position", mapping.position)):
         if angles is not None:
             _check_angles(angles, f"{where}: {name}", robot)
+            _check_distinct(angles.columns, f"{where}: {name}")
+    if mapping.tool is not None:
+        _check_distinct(mapping.tool.columns, f"{where}: tool")
     return mapping
+
+
+def _check_distinct(columns: Sequence[str], where: str) -> None:
+    for column in columns:
+        if list(columns).count(column) > 1:
+            raise InputError(f"{where}: column {column!r} is named twice. Each needs its own.")
 
 
 def _check_unit(unit: str, valid: Sequence[str] | dict[str, float], where: str) -> None:
@@ -166,6 +177,8 @@ def read_mapped_csv(path: Path, mapping: ColumnMap, robot: Robot) -> list[TimedL
         InputError: If the file cannot be read or lacks a column, or a value is no number.
     """
     table = load_csv(path, mapping.separator)
+    if mapping.decimal != ".":
+        table = table.apply(lambda c: c.str.replace(mapping.decimal, ".", regex=False))
     if mapping.run is None:
         return [_log(table, path.stem, path, mapping, robot)]
     _check_columns(table, [mapping.run], path)
@@ -216,7 +229,7 @@ def numbers(table: pd.DataFrame, columns: Sequence[str], path: Path) -> FloatArr
         line = int(part.index[row]) + 2
         raise InputError(
             f"{path}: line {line}, column {columns[column]}: got {part.iloc[row, column]!r}, "
-            "expected a number."
+            'expected a number. For decimal commas add decimal = "," at the top of the map.'
         )
     return values
 

@@ -7,9 +7,11 @@ is the same whoever makes it and whatever is made beside it.
 from __future__ import annotations
 
 import json
+import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
+from multiprocessing import Pool
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -235,5 +237,10 @@ def _tables(plan: Plan, chunks: Sequence[range], workers: int) -> Iterator[RunTa
     if workers == 1:
         yield from (simulate_runs(plan, chunk) for chunk in chunks)
         return
-    with ProcessPoolExecutor(workers) as pool:
-        yield from pool.map(simulate_runs, [plan] * len(chunks), chunks)
+    # Leaving the block ends the workers at once, also when the user interrupts.
+    with Pool(workers, initializer=_leave_interrupts_to_the_parent) as pool:
+        yield from pool.imap(partial(simulate_runs, plan), chunks)
+
+
+def _leave_interrupts_to_the_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

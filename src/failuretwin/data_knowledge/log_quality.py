@@ -18,6 +18,8 @@ GAP_S = 0.5
 """A longer silence is a gap [s], whatever the rate."""
 CLOCK_JUMP_S = 5.0
 """A longer silence is more likely a jump of the clock [s]; stalls of the bus last up to 4 s."""
+LEAST_RATE_HZ = 2.0
+"""Slower readings can miss a plateau of a second [Hz]."""
 GLITCH_M = 0.03
 """A single reading this far from both its neighbours is a glitch [m]."""
 STILL_M = 1e-9
@@ -25,7 +27,13 @@ STILL_M = 1e-9
 FROZEN_S = 2.5
 """Shortest time that a channel must stand still to be called frozen [s]; a plateau is shorter."""
 FROZEN_TRAVEL_RAD = 0.2
-"""Commanded travel that must show at the tool [rad], about 12 degrees."""
+"""Travel of two motors that must show at the tool [rad], about 12 degrees; one may be stuck."""
+NEARLY_STILL_M = 0.003
+"""A tool that stays this near [m] stands still, give or take the noise of its sensor."""
+NEARLY_STILL_S = 4.0
+"""For so long it is the sensor or the whole arm [s]; a plateau and a late start last 3 s."""
+LOOK_S = 0.1
+"""Readings are looked at no more often than this for a tool that stands nearly still [s]."""
 DEAD_SHARE = 0.6
 """A tool that stands still for more than this share of a run says nothing [-]."""
 NEAR_ZERO_M = 0.002
@@ -90,6 +98,9 @@ def _quality(
     still = [stretch for stretch in frozen if stretch is not None]
     if len(still) == len(frozen):
         return _still_tool(tuple(remarks), still, time[seen])
+    nearly = _nearly_still(time, command, measured, seen)
+    if nearly is not None:
+        return _still_tool(tuple(remarks), [nearly], time[seen])
     spoilt = []
     for axis, values, stretch in zip(AXES, measured.T, frozen, strict=True):
         if stretch is None:
@@ -132,12 +143,16 @@ def _timing(at: FloatArray, rate: float) -> list[str]:
     if typical < 0.5 / rate:  # drawn out to a finer grid: no times of their own
         return []
     remarks = []
+    if typical > 1.0 / LEAST_RATE_HZ:
+        remarks.append(f"only {1.0 / typical:.1f} readings a second: rests may go unseen")
     if abs(typical * rate - 1.0) > 0.2:
         remarks.append(f"readings come at {1.0 / typical:.1f} Hz, not at {rate:.1f} Hz")
     jitter = 1.4826 * float(np.median(np.abs(steps - typical)))
     if jitter > 0.2 * typical:
         remarks.append(f"the times of the readings scatter by {1000.0 * jitter:.0f} ms")
-    missing = int(np.sum((steps > 1.5 * typical) & (steps <= max(3.0 * typical, GAP_S))))
+    grid = float(steps.min())  # times are rounded to the grid, so steps differ by some of it
+    lacking = steps > 1.5 * typical + min(2.0 * grid, 0.5 * typical)
+    missing = int(np.sum(lacking & (steps <= max(3.0 * typical, GAP_S))))
     if missing > 1:
         remarks.append(f"{missing} times a reading or two are missing")
     return remarks
@@ -183,11 +198,34 @@ def _frozen(
     longest = int(np.argmax(np.diff(edges)))
     first, last = int(edges[longest]), int(edges[longest + 1]) - 1
     begin, end = float(at[first]), float(at[last])
-    inside = (time >= begin) & (time <= end)
-    travel = np.ptp(command[inside], axis=0).max(initial=0.0)
-    if end - begin < FROZEN_S or travel < FROZEN_TRAVEL_RAD:
+    if end - begin < FROZEN_S or not _should_move(time, command, begin, end):
         return None
     return begin, end
+
+
+def _nearly_still(
+    time: FloatArray, command: FloatArray, measured: FloatArray, seen: BoolArray
+) -> tuple[float, float] | None:
+    """Return the longest stretch [s] in which the tool stays near one place though told to move."""
+    at, point = time[seen], measured[seen]
+    every = max(1, int(LOOK_S / np.median(np.diff(at))))
+    at, point = at[::every], point[::every]
+    best, first = (0, 0), 0
+    for last in range(1, len(at)):
+        if np.abs(point[last] - point[first]).max() > NEARLY_STILL_M:
+            first = last
+        elif at[last] - at[first] > at[best[1]] - at[best[0]]:
+            best = (first, last)
+    begin, end = float(at[best[0]]), float(at[best[1]])
+    if end - begin < NEARLY_STILL_S or not _should_move(time, command, begin, end):
+        return None
+    return begin, end
+
+
+def _should_move(time: FloatArray, command: FloatArray, begin: float, end: float) -> bool:
+    """Return whether motors are told to travel that no single stuck one could hide."""
+    travel = np.sort(np.ptp(command[(time >= begin) & (time <= end)], axis=0))
+    return bool(travel[-2:].min(initial=np.inf) > FROZEN_TRAVEL_RAD)
 
 
 def _times(stretches: Sequence[tuple[float, float]]) -> str:

@@ -16,12 +16,16 @@ from typing import Any
 
 import numpy as np
 
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.runs import RunTable, Truth
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.recovery.commands import published_time, recover_movements
+from failuretwin.data_knowledge.recovery.commands import (
+    path_error,
+    published_time,
+    recover_movements,
+)
 from failuretwin.data_knowledge.session_runs import PUBLISHED_FREEZE, READING_RATE_HZ
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
@@ -33,6 +37,8 @@ PATH_COLUMNS = 6
 SAME_PATH_M = 1e-6
 """Commands belong to a desired path if their kinematics differ from it by less than this [m]."""
 HEALTHY_LABEL = "Healthy"
+RECOVERY_ERROR = "recovery_error_m"
+"""Attribute of a run set: largest distance of recovered commands from the desired path [m]."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +113,10 @@ def _load(path: Path) -> dict[str, Any]:
             f"{path}: MATLAB files need mat-io ({error}). Install it: "
             "pip install 'failuretwin[files]'."
         ) from error
+    with path.open("rb") as file:
+        newest = file.read(10) == b"MATLAB 7.3"
+    if newest:
+        raise InputError(f"{path}: is of MATLAB's version 7.3. Save it again with the option -v7.")
     try:
         return dict(load_from_mat(str(path)))
     except Exception as error:  # the reader raises whatever a broken byte leads it to
@@ -123,9 +133,12 @@ def _cell_array_runs(
     approximate: bool,
 ) -> RunTable:
     cells = np.ravel(content[runs])
+    if len(cells) == 0:
+        raise InputError(f"{path}: `{runs}` holds no runs. Expected cells of (samples, 6).")
     texts = [_text(cell) for cell in np.ravel(content.get(labels, []))]
     if texts and len(texts) != len(cells):
         raise InputError(f"{path}: {len(cells)} runs in `{runs}` but {len(texts)} labels.")
+    _check_labels(texts, robot, path)
     paths = []
     for i, cell in enumerate(cells):
         name = f"{path.stem}/run_{i + 1:03d}"
@@ -139,8 +152,10 @@ def _cell_array_runs(
     time = published_time(desired, robot, names=names)
     movements = recover_movements(desired, time, robot, approximate=approximate, names=names)
     start = float(time[0])
+    off = path_error(movements, desired, time, robot)
     shifted = replace(movements, start=movements.start - start)
-    return _table(paths, time - start, shifted, READING_RATE_HZ, robot)
+    table = _table(paths, time - start, shifted, READING_RATE_HZ, robot)
+    return _with_error(table, off)
 
 
 def _pair_run(path: Path, dataset: Any, robot: Robot, *, approximate: bool) -> RunTable:
@@ -153,8 +168,10 @@ def _pair_run(path: Path, dataset: Any, robot: Robot, *, approximate: bool) -> R
         movements = recover_movements(
             desired[None], time, robot, approximate=approximate, names=[name]
         )
+        off = path_error(movements, desired[None], time, robot)
         movements = replace(movements, start=movements.start - time[0])
-        return _table([run], time - time[0], movements, READING_RATE_HZ, robot)
+        table = _table([run], time - time[0], movements, READING_RATE_HZ, robot)
+        return _with_error(table, off)
     time, command, response_time, response = _hidden(hidden, len(robot.motors))
     if len(command) != len(desired) or not _same_path(command, desired, robot):
         raise InputError(f"{path}: its desired path is not that of the commands in {hidden.name}.")
@@ -231,6 +248,13 @@ def _table(
     )
 
 
+def _with_error(table: RunTable, off: FloatArray) -> RunTable:
+    """Return the table with how far recovered commands miss the desired paths (run,) [m]."""
+    worst = int(np.argmax(off))
+    attributes = {RECOVERY_ERROR: float(off[worst]), "recovery_worst_run": table.run[worst]}
+    return replace(table, attributes=attributes)
+
+
 def _truth(paths: Sequence[_Paths], time: FloatArray, robot: Robot) -> Truth | None:
     """Return what the labels say; None unless every run has a known one."""
     faults = [hypothesis_of_label(run.label or "", robot) for run in paths]
@@ -250,6 +274,14 @@ def _onset(fault: str, time: FloatArray) -> float:
     if fault == "healthy":
         return float("nan")
     return float(time[PUBLISHED_FREEZE]) if fault.endswith(":stuck") else 0.0
+
+
+def _check_labels(texts: Sequence[str], robot: Robot, path: Path) -> None:
+    """Raise InputError if some labels are known and others are not; all unknown is no truth."""
+    unknown = [text for text in texts if hypothesis_of_label(text, robot) is None]
+    if unknown and len(unknown) < len(texts):
+        valid = [label_text(str(h)) for h in paper_hypotheses(robot.motor_names)]
+        raise InputError(f"{path}: {unknown_name('label', unknown[0], valid)}")
 
 
 def _text(cell: Any) -> str:

@@ -16,6 +16,8 @@ from failuretwin.digital_model.robot import Robot
 COMMAND_FILE = "trajectory_monitoring_cmd.csv"
 DURATION_FILE = "trajectory_monitoring_cmd_duration.csv"
 POSITION_FILE = "trajectory_monitoring_position.csv"
+RAMP_RANGE_MS = (1.0, 60000.0)
+"""Shortest and longest time to reach a target that makes sense [ms]."""
 SESSION_FILES = (COMMAND_FILE, DURATION_FILE, POSITION_FILE)
 
 
@@ -93,6 +95,9 @@ def read_session(folder: Path, robot: Robot) -> RawSession:
             f"{robot.servo_units.low:g} to {robot.servo_units.high:g} counts in every motor. "
             "Check the servo bus; this log cannot be used."
         )
+    units = robot.servo_units
+    _check_range(command[:, 1:], (units.low, units.high), folder / COMMAND_FILE, columns)
+    _check_range(duration[:, 1:], RAMP_RANGE_MS, folder / DURATION_FILE, columns)
     return RawSession(
         folder=folder,
         command_time=command[:, 0],
@@ -101,6 +106,19 @@ def read_session(folder: Path, robot: Robot) -> RawSession:
         reading_time=reading[:, 0],
         reading_counts=reading[:, 1:],
     )
+
+
+def _check_range(
+    values: FloatArray, limits: tuple[float, float], path: Path, columns: Sequence[str]
+) -> None:
+    low, high = limits
+    wrong = np.argwhere((values < low) | (values > high))
+    if len(wrong):
+        row, column = wrong[0]
+        raise InputError(
+            f"{path}: line {row + 2}, column {columns[column]}: got {values[row, column]:g}, "
+            f"expected {low:g} to {high:g}."
+        )
 
 
 def _read_table(path: Path, columns: Sequence[str]) -> FloatArray:

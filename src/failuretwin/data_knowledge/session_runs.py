@@ -103,8 +103,6 @@ def session_runs(
     Raises:
         InputError: If the session holds no complete run.
     """
-    if how == "published" and np.any(session.ramp_s <= 0):
-        raise InputError(f"{session.folder}: a command has no duration; it cannot be published.")
     label = label_of(session) if published_labels else None
     make = _measured_run if how == "measured" else _published_run
     spans = split_session(session, robot)

@@ -15,6 +15,7 @@ from failuretwin.core.runs import check_runs
 
 if TYPE_CHECKING:
     import xarray as xr
+    from zarr.core.buffer import Buffer
 
 SUFFIXES = (".nc", ".zarr")
 
@@ -60,7 +61,19 @@ def save_run_set(runs: xr.Dataset, path: Path) -> None:
             # In memory first: on a full disk the HDF5 library can bring the whole process down.
             partial.write_bytes(runs.to_netcdf(engine="h5netcdf", encoding=_compression(runs)))
         else:
-            runs.to_zarr(partial, mode="w", consolidated=True)
+            _write_zarr(runs, partial)
+
+
+def _write_zarr(runs: xr.Dataset, folder: Path) -> None:
+    """Write a Zarr store, in memory first: its own writes go on after one of them has failed."""
+    from zarr.storage import MemoryStore
+
+    content: dict[str, Buffer] = {}
+    runs.to_zarr(MemoryStore(content), mode="w", consolidated=True)
+    for key, value in content.items():
+        file = folder / key
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(value.to_bytes())
 
 
 def check_destination(path: Path) -> None:

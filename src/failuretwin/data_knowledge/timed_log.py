@@ -81,13 +81,13 @@ def timed_run(log: TimedLog, robot: Robot) -> RunTable:
     Raises:
         InputError: If the log has no tool path and no motor readings, or its times do not increase.
     """
+    log = _distinct(log)
     tool = _tool_path(log, robot)
-    for samples in (log.command, tool, *([log.position] if log.position else [])):
-        _check_times(samples.time, log.name)
-    check_clock(np.concatenate([log.command.time, tool.time]), log.name)
-    begin = min(log.command.time[0], tool.time[0])
-    end = max(tool.time[-1], begin + STEP_S)
-    step = min(STEP_S, 1.0 / tool.rate_hz)
+    _check_commands(log)
+    stamps = np.unique(np.concatenate([log.command.time, tool.time]))
+    check_clock(stamps, log.name)
+    begin, end = stamps[0], max(tool.time[-1], stamps[0] + STEP_S)
+    step = _grid_step(stamps, tool)
     time = as_floats(np.arange(round((end - begin) / step) + 1) * step)
     command, movements = _command(log, time, begin)
     return RunTable(
@@ -102,9 +102,51 @@ def timed_run(log: TimedLog, robot: Robot) -> RunTable:
     )
 
 
+def _distinct(log: TimedLog) -> TimedLog:
+    """Return the log with one row for each time, the last of those that share it.
+
+    Raises:
+        InputError: If a part of it runs backwards in time.
+    """
+
+    def last(samples: Samples | None) -> Samples | None:
+        if samples is None or len(samples.time) == 0:
+            return samples
+        _check_times(samples.time, log.name)
+        kept = np.append(np.diff(samples.time) > 0, True)
+        return Samples(samples.time[kept], samples.value[kept])
+
+    command = log.command
+    if isinstance(command, Samples):
+        command = last(command) or command
+    else:
+        _check_times(command.time, log.name)
+    return TimedLog(log.name, command, last(log.tool), last(log.position))
+
+
+def _check_commands(log: TimedLog) -> None:
+    values = log.command.value if isinstance(log.command, Samples) else log.command.target
+    for motor, column in enumerate(values.T):
+        least = 2 if isinstance(log.command, Samples) else 1
+        if np.isfinite(column).sum() < least:
+            raise InputError(
+                f"{log.name}: motor {motor + 1} has {np.isfinite(column).sum()} commands, expected "
+                f"{least} or more. Check its column or topic."
+            )
+
+
+def _grid_step(stamps: FloatArray, tool: Samples) -> float:
+    """Return the step of the time grid [s]: the log's own, where it is even and fine enough."""
+    steps = np.diff(stamps)
+    own = float(steps.mean())
+    if own <= 2.0 * STEP_S and np.ptp(steps) < 1e-3 * own:
+        return own
+    return min(STEP_S, 1.0 / tool.rate_hz)
+
+
 def _tool_path(log: TimedLog, robot: Robot) -> Samples:
     if log.tool is not None:
-        if len(log.tool.time) < 2:
+        if len(log.tool.time) < 2 or log.tool.time[-1] <= log.tool.time[0]:
             raise InputError(f"{log.name}: fewer than two readings of the tool. Log for longer.")
         return log.tool
     if log.position is None or len(log.position.time) < 2:

@@ -13,6 +13,8 @@ from failuretwin.digital_model.imperfections import LostCommand
 
 UNEXPLAINED_NATS = 1.0
 """A movement whose density is within this of "anywhere within reach" is not explained [nats]."""
+FEW_MOVEMENTS = 2
+"""So few usable movements carry a verdict only if one hypothesis holds half of the probability."""
 LIKELY = 0.5
 """Probability from which a lost command is told [-]."""
 
@@ -33,6 +35,7 @@ def why_undecided(
     quality: LogQuality,
     evidence: SettledEvidence,
     run: int,
+    probability: float,
     by_movement: FloatArray,
     outlier_log_density: float,
 ) -> str:
@@ -42,6 +45,7 @@ def why_undecided(
         quality: Defects of the log.
         evidence: Settled positions.
         run: Index of the run.
+        probability: Posterior of the best hypothesis.
         by_movement: Log density of each movement under the best hypothesis, (movement,).
         outlier_log_density: That of a tool anywhere within reach.
     """
@@ -52,6 +56,9 @@ def why_undecided(
         return "no motor is told to move"
     if not usable.any():
         return "the tool is not seen at rest after any movement"
+    if usable.sum() <= FEW_MOVEMENTS and probability < 0.5:
+        count = int(usable.sum())
+        return f"only {count} movement{'s' * (count != 1)} can be used and no hypothesis stands out"
     unexplained = usable & (by_movement < outlier_log_density + UNEXPLAINED_NATS)
     if 2 * unexplained.sum() <= usable.sum():
         return ""

@@ -147,6 +147,9 @@ class BayesDiagnoser:
             InputError: If the run set is of another robot or no run holds a movement.
         """
         self._check(runs)
+        known, end = self.priors.onset.known_s, float(runs["time"].values[-1])
+        if known is not None and known > end:
+            raise InputError(f"the onset is given as {known:g} s, but the runs end at {end:g} s.")
         quality = log_quality(runs)
         evidence = settled_evidence(without_spoilt(runs, quality))
         if evidence.movements.start.shape[1] == 0:
@@ -155,8 +158,8 @@ class BayesDiagnoser:
                 "of one movement at least."
             )
         names = [str(name) for name in runs["run"].values]
-        known = truth_of(runs)
-        truth: list[str | None] = [None] * len(names) if known is None else list(known)
+        faults = truth_of(runs)
+        truth: list[str | None] = [None] * len(names) if faults is None else list(faults)
         results = []
         for first in range(0, len(names), CHUNK_RUNS):
             weighed = self._weigh_all(evidence[first : first + CHUNK_RUNS])
@@ -222,6 +225,7 @@ class BayesDiagnoser:
             quality,
             weighed.evidence,
             run,
+            float(np.exp(weighed.log_posterior[run, order[0]])),
             weighed.by_movement[run, order[0]],
             self.healthy_model.outlier_log_density,
         )

@@ -45,10 +45,10 @@ def verdict(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> str:
 
 
 def _size_and_onset(diagnosis: Diagnosis, hypothesis: Hypothesis) -> str:
-    degrees = np.rad2deg(diagnosis.magnitude or 0.0)
+    degrees = float(np.rad2deg(diagnosis.magnitude or 0.0))
     if hypothesis.faults[0].mode == "stuck":
         since = f"{diagnosis.onset_s:.1f} s" if diagnosis.onset_s else "before the run"
-        return f" at {degrees:.0f} deg since {since}"
+        return f" at {round(degrees)} deg since {since}"
     return f" by about {degrees:.1f} deg"
 
 

@@ -55,7 +55,7 @@ def diagnose(
     downwards), such a file (.mat), a bag (.bag, .mcap), or a CSV file with --columns.
     """
     del seed  # nothing here is drawn by chance
-    from failuretwin.app.inputs import read_inputs
+    from failuretwin.app.inputs import read_inputs, tell_mismatch
     from failuretwin.app.results import write_csv, write_json_lines
     from failuretwin.app.tables import print_diagnoses, print_scores
     from failuretwin.core.hypothesis import parse_hypotheses
@@ -75,6 +75,7 @@ def diagnose(
         priors=priors_of(model, sse_range, onset),
     )
     runs = read_inputs(inputs, model, how, published_labels, columns, approximate)
+    tell_mismatch(runs, diagnoser)
     diagnoses = diagnoser.diagnose(runs)
     if json_file is not None:
         write_json_lines([diagnosis.to_record() for diagnosis in diagnoses], json_file)

@@ -37,11 +37,14 @@ def import_(
     """
     del seed  # nothing here is drawn by chance
     from failuretwin.app.inputs import read_inputs
+    from failuretwin.core.errors import InputError
     from failuretwin.data_knowledge.exports import check_export_suffix, export_runs
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.twin import DigitalTwin
 
     check_export_suffix(out)
+    if out.resolve() in [source.resolve() for source in sources]:
+        raise InputError(f"{out}: is what is to be read. Give another name to write to.")
     model = load_robot(robot)
     runs = read_inputs(sources, model, how, published_labels, columns, approximate)
     export_runs(runs, out, DigitalTwin(model))

@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.movements import find_movements
+from failuretwin.core.polyline import resolution, simplify
+from failuretwin.data_knowledge.timed_log import Samples, Targets, TimedLog, timed_run
+
+AT = np.arange(0.0, 6.0, 0.1)
+
+
+def minimum_jerk(time, begin, duration, travel):
+    s = np.clip((time - begin) / duration, 0.0, 1.0)
+    return travel * s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
+
+
+def log_of(twin, command, at=AT):
+    return TimedLog("log", Samples(at, command), Samples(at, twin.path(command)))
+
+
+def test_a_smooth_command_is_one_movement_from_rest_to_rest(armpi, twin):
+    angle = minimum_jerk(AT, 0.5, 1.5, 0.8) + minimum_jerk(AT, 3.0, 1.5, -0.5)
+    command = np.outer(angle, [1.0, 0.5, -0.5, 0.2])
+
+    run = timed_run(log_of(twin, command), armpi)
+    found = find_movements(run.command, run.time)
+
+    assert found.start.shape[1] == 2
+    np.testing.assert_allclose(found.start[0], [0.5, 3.0], atol=0.25)
+    np.testing.assert_allclose(found.target[0, :, 0], [0.8, 0.3], atol=0.01)
+
+
+@pytest.mark.parametrize("quantum", [np.deg2rad(1.0), np.deg2rad(0.1), 1e-5])
+def test_rounded_commands_keep_their_movements(armpi, twin, quantum):
+    time = np.arange(0.0, 6.0, 0.02)
+    angle = np.interp(time, [0.5, 1.3, 3.0, 4.0], [0.0, 0.9, 0.9, -0.3])
+    command = np.outer(np.rint(angle / quantum) * quantum, [1.0, 0.0, 0.0, 0.0])
+
+    run = timed_run(log_of(twin, command, time), armpi)
+    found = find_movements(run.command, run.time)
+
+    assert found.start.shape[1] == 2
+    np.testing.assert_allclose(found.start[0], [0.5, 3.0], atol=0.05)
+
+
+def test_the_quantum_of_rounded_values_is_found():
+    smooth = np.sin(np.linspace(0.0, 3.0, 200))
+
+    assert resolution(np.rint(smooth / 0.01) * 0.01) == pytest.approx(0.01)
+    assert resolution(smooth) == 0.0
+    assert resolution(np.repeat([0.0, 1.0], 50)) == 0.0
+
+
+def test_few_lines_stay_near_the_samples():
+    time = np.linspace(0.0, 3.0, 300)
+    value = np.sin(time) + np.random.default_rng(0).normal(0.0, 1e-4, 300)
+
+    corner_time, corner_value = simplify(time, value, 2e-3)
+
+    assert len(corner_time) < 40
+    assert np.abs(np.interp(time, corner_time, corner_value) - value).max() < 6e-3
+
+
+def test_even_times_become_the_grid(armpi, twin):
+    time = np.arange(1000) * (10 / 999)
+    command = np.zeros((1000, 4))
+
+    run = timed_run(log_of(twin, command, time), armpi)
+
+    np.testing.assert_allclose(run.time, time, atol=1e-9)
+    np.testing.assert_array_equal(run.measured[0], twin.path(command))
+
+
+def test_of_rows_with_the_same_time_the_last_one_counts(armpi, twin):
+    at = np.array([0.0, 0.1, 0.1, 0.2])
+    log = TimedLog("log", Samples(at, np.zeros((4, 4))), Samples(at, np.diag([1, 2, 3, 4])[:, :3]))
+
+    run = timed_run(log, armpi)
+
+    assert run.measured[0, 10].tolist() == [0.0, 0.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("log", "words"),
+    [
+        (TimedLog("a", Samples(AT, np.zeros((60, 4)))), "neither a tool path nor motor readings"),
+        (
+            TimedLog("b", Samples(AT, np.full((60, 4), np.nan)), Samples(AT, np.zeros((60, 3)))),
+            "motor 1 has 0 commands, expected 2 or more",
+        ),
+        (
+            TimedLog("c", Samples(AT[::-1], np.zeros((60, 4))), Samples(AT, np.zeros((60, 3)))),
+            "time runs backwards after 5.900 s",
+        ),
+        (
+            TimedLog("d", Samples(AT, np.zeros((60, 4))), Samples(AT[:1], np.zeros((1, 3)))),
+            "fewer than two readings of the tool",
+        ),
+        (
+            TimedLog(
+                "e",
+                Targets(np.zeros(1), np.full((1, 4), np.nan), np.ones((1, 4))),
+                Samples(AT, np.zeros((60, 3))),
+            ),
+            "motor 1 has 0 commands, expected 1 or more",
+        ),
+    ],
+)
+def test_a_log_that_says_too_little_is_refused(armpi, log, words):
+    with pytest.raises(InputError, match=words):
+        timed_run(log, armpi)
