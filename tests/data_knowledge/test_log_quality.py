@@ -176,3 +176,14 @@ def test_a_spoilt_log_never_makes_a_healthy_arm_look_surely_faulty(clean, twin):
         (diagnosis,) = BayesDiagnoser(twin).diagnose(spoil(clean))
         faulty = 1.0 - diagnosis.posterior["healthy"]
         assert diagnosis.diagnosis in ("healthy", None) or faulty < 0.9
+
+
+def test_a_noisy_sensor_that_stands_still_says_nothing_of_the_arm(clean, twin):
+    noise = np.random.default_rng(1).normal(0.0, 2e-4, clean["measured"].shape)
+    (diagnosis,) = BayesDiagnoser(twin).diagnose(
+        with_measured(clean, measured_of(frozen(clean, begin=4.5)) + noise)
+    )
+
+    assert any("the tool stands still from 4." in remark for remark in diagnosis.quality)
+    assert diagnosis.diagnosis in ("healthy", None) or diagnosis.probability < 0.9
+    assert not any("movement 5" in line for line in diagnosis.explanation)

@@ -209,14 +209,15 @@ def _nearly_still(
     """Return the longest stretch [s] in which the tool stays near one place though told to move."""
     at, point = time[seen], measured[seen]
     every = max(1, int(LOOK_S / np.median(np.diff(at))))
-    at, point = at[::every], point[::every]
     best, first = (0, 0), 0
-    for last in range(1, len(at)):
+    for last in range(0, len(at), every):
         if np.abs(point[last] - point[first]).max() > NEARLY_STILL_M:
             first = last
         elif at[last] - at[first] > at[best[1]] - at[best[0]]:
             best = (first, last)
-    begin, end = float(at[best[0]]), float(at[best[1]])
+    near = np.abs(point[best[1] :] - point[best[0]]).max(axis=1) <= NEARLY_STILL_M
+    leaves = len(near) if near.all() else int(np.argmin(near))
+    begin, end = float(at[best[0]]), float(at[best[1] + leaves - 1])
     if end - begin < NEARLY_STILL_S or not _should_move(time, command, begin, end):
         return None
     return begin, end
