@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pandas as pd
+import pytest
+
+
+def failuretwin(*arguments, cwd):
+    command = [sys.executable, "-m", "failuretwin", *map(str, arguments)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture
+def log(tmp_path, twin):
+    """A folder with a CSV log of one healthy run, in units of its own."""
+    at = np.arange(0.0, 6.0, 0.05)
+    angle = np.interp(at, [0.5, 1.3, 3.0, 4.0], [0.0, 0.7, 0.7, -0.3])
+    command = np.outer(angle, [1.0, 0.5, -0.5, 0.4])
+    tool = 1000 * twin.path(command)
+    columns = {"stamp_ms": 1000 * at}
+    columns |= {f"m{k + 1}_target_deg": np.rad2deg(command[:, k]) for k in range(4)}
+    columns |= {f"tcp_{axis}": tool[:, i] for i, axis in enumerate("xyz")}
+    pd.DataFrame(columns).to_csv(tmp_path / "log.csv", index=False, float_format="%.4f")
+    return tmp_path
+
+
+def test_a_guess_is_written_and_shown_and_nothing_is_read(log):
+    result = failuretwin("import", "log.csv", "--columns", "map.toml", "--out", "r.nc", cwd=log)
+
+    assert result.returncode == 2
+    assert "A GUESS: check every line" in result.stdout
+    assert "did not exist" in result.stderr
+    assert (log / "map.toml").read_text() in result.stdout + "\n"
+    assert not (log / "r.nc").exists()
+
+
+def test_the_checked_guess_leads_to_a_verdict_and_a_page(log):
+    failuretwin("diagnose", "log.csv", "--columns", "map.toml", cwd=log)
+
+    result = failuretwin(
+        "diagnose", "log.csv", "--columns", "map.toml", "--plot", "report", cwd=log
+    )
+
+    assert result.returncode == 0, result.stderr
+    page = (log / "report" / "index.html").read_text()
+    assert "data:image/png;base64," in page
+    assert "http" not in page.replace("http-equiv", "")
+    assert "healthy" in result.stdout
+
+
+def test_a_log_is_never_overwritten_by_what_is_made_of_it(log):
+    before = (log / "log.csv").read_bytes()
+    failuretwin("diagnose", "log.csv", "--columns", "map.toml", cwd=log)
+
+    result = failuretwin("import", "log.csv", "--columns", "map.toml", "--out", "log.csv", cwd=log)
+
+    assert result.returncode == 2
+    assert "is what is to be read" in result.stderr
+    assert (log / "log.csv").read_bytes() == before
+
+
+def test_exported_csv_is_read_back(log):
+    failuretwin("diagnose", "log.csv", "--columns", "map.toml", cwd=log)
+    failuretwin("import", "log.csv", "--columns", "map.toml", "--out", "again.csv", cwd=log)
+
+    guess = failuretwin("diagnose", "again.csv", "--columns", "again.toml", cwd=log)
+    result = failuretwin("diagnose", "again.csv", "--columns", "again.toml", cwd=log)
+
+    assert guess.returncode == 2
+    assert result.returncode == 0, result.stderr
+    assert "healthy" in result.stdout
+
+
+def test_an_interrupt_ends_the_workers_and_leaves_nothing(tmp_path):
+    command = [sys.executable, "-m", "failuretwin", "simulate", "--runs-per-class", "5000"]
+    process = subprocess.Popen(
+        [*command, "--workers", "2", "--out", "runs.zarr"],
+        cwd=tmp_path,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+    time.sleep(3.0)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+
+    assert process.returncode != 0
+    assert b"Traceback" not in errors
+    assert list(tmp_path.iterdir()) == []
