@@ -8,6 +8,7 @@ import time
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 
 
 def failuretwin(*arguments, cwd):
@@ -92,3 +93,31 @@ def test_an_interrupt_ends_the_workers_and_leaves_nothing(tmp_path):
     assert process.returncode != 0
     assert b"Traceback" not in errors
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("said", ["not JSON", "[1, 2]", '{"imperfections": 3}'])
+def test_a_configuration_of_other_people_does_no_harm(tmp_path, said):
+    run = ["--hypotheses", "healthy", "--runs-per-class", "1", "--out", "runs.nc"]
+    failuretwin("simulate", *run, cwd=tmp_path)
+    with xr.open_dataset(tmp_path / "runs.nc", engine="h5netcdf") as stored:
+        runs = stored.load()
+    runs.attrs["configuration"] = said
+    runs.to_netcdf(tmp_path / "theirs.nc", engine="h5netcdf")
+
+    result = failuretwin("diagnose", "theirs.nc", cwd=tmp_path)
+
+    assert result.returncode == 0, result.stderr
+    assert result.stderr == ""
+
+
+def test_paths_that_no_whole_counts_make_need_approximate(tmp_path):
+    run = ["--hypotheses", "healthy", "--runs-per-class", "1", "--seed", "3", "--out"]
+    failuretwin("simulate", *run, "runs.nc", cwd=tmp_path)
+    failuretwin("import", "runs.nc", "--out", "runs.mat", cwd=tmp_path)
+
+    exact = failuretwin("diagnose", "runs.mat", cwd=tmp_path)
+    fitted = failuretwin("diagnose", "runs.mat", "--approximate", cwd=tmp_path)
+
+    assert exact.returncode == 2
+    assert "--approximate" in exact.stderr
+    assert fitted.returncode == 0, fitted.stderr

@@ -172,3 +172,13 @@ def test_a_robot_without_servo_units_says_how_to_add_them(profile):
     robot = load_robot(profile((units, "")))
     with pytest.raises(InputError, match=r"no servo units\. Add a \[servo_units\] table"):
         _ = robot.servo_units
+
+
+def test_a_motor_that_cannot_move_the_tool_is_refused(armpi, tmp_path):
+    profile = (armpi.folder / "armpi_fpv.toml").read_text()
+    (tmp_path / "armpi_fpv.urdf").write_text((armpi.folder / "armpi_fpv.urdf").read_text())
+    motor = profile[profile.rindex("[[motors]]") :].replace("motor_4", "motor_5")
+    (tmp_path / "five.toml").write_text(f"{profile}\n{motor.replace('joint4', 'joint5')}")
+
+    with pytest.raises(InputError, match=r"motor 'motor_5' \(joint5\) cannot move the tool point"):
+        load_robot(tmp_path / "five.toml")

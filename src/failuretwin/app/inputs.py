@@ -15,11 +15,12 @@ from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.bags.reading import BagTopics
 from failuretwin.data_knowledge.column_guess import column_map_text, guess_columns
 from failuretwin.data_knowledge.column_map import read_column_map
-from failuretwin.data_knowledge.matlab_files import RECOVERY_ERROR
+from failuretwin.data_knowledge.matlab_files import RECOVERY_ERROR, RECOVERY_WORST
 from failuretwin.data_knowledge.reading import ReadOptions, read_runs
 from failuretwin.data_knowledge.session_runs import As
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision.bayes import BayesDiagnoser
+from failuretwin.digital_model.imperfections import GENERIC_NAME
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def read_inputs(
     if error > TOLD_ERROR_M:
         click.echo(
             f"note: approximate commands miss the desired path by up to {1000 * error:.1f} mm "
-            f"(worst: {runs.attrs['recovery_worst_run']}); a diagnosis can be no better than that",
+            f"(worst: {runs.attrs[RECOVERY_WORST]}); a diagnosis can be no better than that",
             err=True,
         )
     return runs
@@ -54,14 +55,26 @@ def read_inputs(
 
 def tell_mismatch(runs: xr.Dataset, diagnoser: BayesDiagnoser) -> None:
     """Tell the user where simulated runs lack the imperfections that the diagnoser expects."""
-    made_with = json.loads(runs.attrs.get("configuration", "{}")).get("imperfections")
+    made_with = _made_with(runs)
     expected = diagnoser.healthy_model.imperfections.name
-    if made_with is not None and made_with != expected:
+    if made_with is not None and made_with != expected and expected != GENERIC_NAME:
         click.echo(
             f"note: the runs were simulated with imperfections '{made_with}', the diagnosis "
             f"expects '{expected}'; there will be false alarms",
             err=True,
         )
+
+
+def _made_with(runs: xr.Dataset) -> str | None:
+    """Return the imperfections that runs were simulated with; None for any other run set."""
+    try:
+        configuration = json.loads(runs.attrs.get("configuration", ""))
+    except (TypeError, ValueError):  # a run set of other people may say anything there
+        return None
+    if not isinstance(configuration, dict):
+        return None
+    made_with = configuration.get("imperfections")
+    return made_with if isinstance(made_with, str) else None
 
 
 def _with_map(

@@ -44,8 +44,6 @@ UNIFORM = 1e-3
 LARGEST = {"command": 1e6, "measured": 1e6}
 """Largest sensible value of a reference [rad] and of a tool position [m]."""
 REQUIRED = ("command", "measured")
-COMPONENT_LEVEL = ("position", "temperature", "voltage")
-"""Readings from inside the motors; a system-level diagnosis never looks at them."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ DURATION_WORDS = {"duration", "dur", "ramp"}
 TOOL_WORDS = {"tool", "tcp", "ee", "eef", "tip", "end", "effector", "flange", "hand"}
 TIME_WORDS = {"t", "time", "timestamp", "stamp", "clock"}
 RUN_WORDS = {"run", "trial", "episode", "cycle"}
-UNIT_WORDS = {"s", "sec", "ms", "us", "ns", "rad", "deg", "mm", "cm", "m"}
 
 
 @dataclass(frozen=True)

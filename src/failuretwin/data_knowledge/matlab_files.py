@@ -39,6 +39,8 @@ SAME_PATH_M = 1e-6
 HEALTHY_LABEL = "Healthy"
 RECOVERY_ERROR = "recovery_error_m"
 """Attribute of a run set: largest distance of recovered commands from the desired path [m]."""
+RECOVERY_WORST = "recovery_worst_run"
+"""Attribute of a run set: the run in which that is."""
 
 
 @dataclass(frozen=True)
@@ -251,7 +253,7 @@ def _table(
 def _with_error(table: RunTable, off: FloatArray) -> RunTable:
     """Return the table with how far recovered commands miss the desired paths (run,) [m]."""
     worst = int(np.argmax(off))
-    attributes = {RECOVERY_ERROR: float(off[worst]), "recovery_worst_run": table.run[worst]}
+    attributes = {RECOVERY_ERROR: float(off[worst]), RECOVERY_WORST: table.run[worst]}
     return replace(table, attributes=attributes)
 
 

@@ -13,6 +13,12 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.runs import RunTable, concatenate
 from failuretwin.data_knowledge.bags.reading import BagTopics, is_bag, read_bag
 from failuretwin.data_knowledge.column_map import ColumnMap, read_mapped_csv
+from failuretwin.data_knowledge.matlab_files import (
+    RECOVERY_ERROR,
+    RECOVERY_WORST,
+    find_matlab_files,
+    read_matlab_file,
+)
 from failuretwin.data_knowledge.raw_session import SESSION_FILES, find_sessions, read_session
 from failuretwin.data_knowledge.session_runs import As, session_runs
 from failuretwin.data_knowledge.store import SUFFIXES, load_run_set
@@ -67,7 +73,11 @@ def read_runs(
         sources = [sources]
     options = options or ReadOptions()
     parts = [part for source in sources for part in _read_source(Path(source), robot, options)]
-    return concatenate(parts)
+    runs = concatenate(parts)
+    worst = max(parts, key=lambda part: float(part.attrs.get(RECOVERY_ERROR, -1.0)))
+    if RECOVERY_ERROR in worst.attrs:  # of several files the worst one is told
+        runs.attrs |= {name: worst.attrs[name] for name in (RECOVERY_ERROR, RECOVERY_WORST)}
+    return runs
 
 
 def _read_source(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
@@ -92,8 +102,6 @@ def _read_source(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Data
 
 
 def _read_folder(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
-    from failuretwin.data_knowledge.matlab_files import find_matlab_files
-
     found = [_session_dataset(folder, robot, options) for folder in find_sessions(path)]
     found += [_matlab_dataset(file, robot, options) for file in find_matlab_files(path)]
     if not found and options.columns is not None:
@@ -115,8 +123,6 @@ def _session_dataset(folder: Path, robot: Robot, options: ReadOptions) -> xr.Dat
 
 
 def _matlab_dataset(path: Path, robot: Robot, options: ReadOptions) -> xr.Dataset:
-    from failuretwin.data_knowledge.matlab_files import read_matlab_file
-
     table = read_matlab_file(path, robot, approximate=options.approximate)
     return _named(table, robot, "published MATLAB file", {"approximate": options.approximate})
 

@@ -144,8 +144,7 @@ class HealthyModel:
         Returns:
             (run, movement, node) [log 1/m3]; 0 for movements that are not usable.
         """
-        weighed = self._weighed(evidence, alternatives, pose, held)
-        mixed = np.logaddexp(log_sum(weighed, axis=-1), self.outlier_log_density)
+        _, mixed = self._weighed(evidence, alternatives, pose, held)
         return np.where(evidence.usable[..., None], mixed, 0.0)
 
     def became(
@@ -163,9 +162,8 @@ class HealthyModel:
             pose: Predicted settled angles, (run, movement, alternative, motor) [rad].
             held: Motors that do not scatter, (motor,).
         """
-        weighed = self._weighed(evidence, alternatives, pose[:, :, None], held)[:, :, 0]
-        mixed = np.logaddexp(log_sum(weighed, axis=-1), self.outlier_log_density)
-        share = np.exp(weighed - mixed[..., None])
+        weighed, mixed = self._weighed(evidence, alternatives, pose[:, :, None], held)
+        share = np.exp(weighed - mixed[..., None])[:, :, 0]
         return np.where(evidence.usable[..., None], share, 0.0)
 
     def _weighed(
@@ -174,13 +172,17 @@ class HealthyModel:
         alternatives: Alternatives,
         pose: FloatArray,
         held: BoolArray,
-    ) -> FloatArray:
-        """Return log weight times density, (run, movement, node, alternative)."""
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return log weight times density of each alternative, and of all with outliers.
+
+        (run, movement, node, alternative) and (run, movement, node).
+        """
         predicted, jacobian = self.twin.path_and_jacobian(pose)
         scaled = jacobian * np.where(held, 0.0, self.scatter)
         error = evidence.point[:, :, None, None] - predicted
         density = log_student(error, scaled, PATH_NOISE_M**2, self.settling.tail_dof)
-        return density + alternatives.log_weight[:, :, None]
+        weighed = density + alternatives.log_weight[:, :, None]
+        return weighed, np.logaddexp(log_sum(weighed, axis=-1), self.outlier_log_density)
 
     def log_healthy(self, evidence: SettledEvidence, alternatives: Alternatives) -> FloatArray:
         """Return the log density of each position if no motor is faulty, (run, movement)."""

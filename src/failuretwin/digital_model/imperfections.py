@@ -117,6 +117,8 @@ class Imperfections:
 
 NO_IMPERFECTIONS = Imperfections("none", "the published twin")
 
+GENERIC_NAME = "generic, not calibrated"
+"""What results say of a robot whose healthy behaviour has not been measured."""
 GENERIC_SCATTER_RAD = 0.01
 """Settled scatter assumed of a robot of which nothing is known [rad], about half a degree."""
 
@@ -126,7 +128,7 @@ def generic_imperfections(robot: Robot) -> Imperfections:
     zero = (0.0,) * len(robot.motors)
     scatter = (GENERIC_SCATTER_RAD,) * len(robot.motors)
     settling = Settling(zero, zero, zero, scatter, 4.0, "assumed, no calibration")
-    return Imperfections("generic, not calibrated", "assumed", settling=settling)
+    return Imperfections(GENERIC_NAME, "assumed", settling=settling)
 
 
 def default_imperfections(robot: Robot) -> Imperfections:

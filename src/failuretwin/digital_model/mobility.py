@@ -43,11 +43,20 @@ class Mobility:
 
 def mobility(chain: SerialChain) -> Mobility:
     """Return what the joints of `chain` do to its tool point at random poses in their limits."""
+    low, high, poses = _poses(chain)
+    return Mobility(frozen_array(levers(chain)), _reach(chain, poses, low, high))
+
+
+def levers(chain: SerialChain) -> FloatArray:
+    """Return the largest speed of the tool for unit speed of each joint, (joint,) [m/rad, m/m]."""
+    _, jacobian = chain.position_and_jacobian(_poses(chain)[2])
+    return np.linalg.norm(jacobian, axis=-2).max(axis=0)
+
+
+def _poses(chain: SerialChain) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return lowest and highest joint values (joint,) and random poses between (pose, joint)."""
     low, high = np.array([free_range(joint.low, joint.high) for joint in chain.joints]).T
-    poses = np.random.default_rng(SEED).uniform(low, high, (POSES, len(low)))
-    _, jacobian = chain.position_and_jacobian(poses)
-    lever = np.linalg.norm(jacobian, axis=-2).max(axis=0)
-    return Mobility(frozen_array(lever), _reach(chain, poses, low, high))
+    return low, high, np.random.default_rng(SEED).uniform(low, high, (POSES, len(low)))
 
 
 def has_range(low: float, high: float) -> bool:

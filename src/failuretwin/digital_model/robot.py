@@ -15,6 +15,7 @@ from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.types import FloatArray, frozen_array
 from failuretwin.core.units import ServoUnits
 from failuretwin.digital_model.chain import SerialChain
+from failuretwin.digital_model.mobility import CANNOT_MOVE, levers
 from failuretwin.digital_model.servo import ServoLoop
 from failuretwin.digital_model.urdf import read_urdf
 
@@ -193,6 +194,12 @@ def _load_profile(path: Path) -> Robot:
             f"{path}: motors are listed for joints {', '.join(joints)}; from base to tool the "
             f"order is {', '.join(order)}. List the motors in that order."
         )
+    for motor, lever in zip(profile.motors, levers(chain), strict=True):
+        if lever < CANNOT_MOVE:
+            raise InputError(
+                f"{path}: motor {motor.name!r} ({motor.joint}) cannot move the tool point, so no "
+                "tool path can tell of it. Leave it out, or choose another tool_link."
+            )
     return Robot(profile, chain, path.parent)
 
 

@@ -77,10 +77,11 @@ def diagnose(
     runs = read_inputs(inputs, model, how, published_labels, columns, approximate)
     tell_mismatch(runs, diagnoser)
     diagnoses = diagnoser.diagnose(runs)
+    records = [diagnosis.to_record() for diagnosis in diagnoses]
     if json_file is not None:
-        write_json_lines([diagnosis.to_record() for diagnosis in diagnoses], json_file)
+        write_json_lines(records, json_file)
     if csv_file is not None:
-        write_csv([diagnosis.to_record() for diagnosis in diagnoses], csv_file)
+        write_csv(records, csv_file)
     if plot is not None:
         from failuretwin.app.page import write_page
         from failuretwin.app.plots import plot_runs
@@ -90,4 +91,4 @@ def diagnose(
             pictures = plot_runs(runs, diagnoses, twin, folder)
             write_page(diagnoses, pictures, model.name, folder / "index.html")
     print_diagnoses(diagnoses)
-    print_scores([diagnosis.to_record() for diagnosis in diagnoses])
+    print_scores(records)
