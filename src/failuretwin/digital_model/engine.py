@@ -1,0 +1,53 @@
+"""Engines: from what the motors are told and what hampers them to the angles they take."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.twin import DigitalTwin
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What the motors of many runs are told, and what hampers them. Angles in the log's sense.
+
+    Attributes:
+        reference: Angles that the servo loops follow, (run, time, motor) [rad].
+        held: When a motor is held by its gear, (run, time, motor); None: never.
+        weakness: Share of its stiffness that a motor has lost, (run, time, motor) in [0, 1); None:
+            none.
+        compliance: How far each motor gives way under load, (run, motor) [rad/(N m)]; an engine
+            with a stiffness of its own leaves it aside. None: rigid.
+        payload: Mass carried at the tool point, (run,) [kg]; None: none.
+    """
+
+    reference: FloatArray
+    held: BoolArray | None = None
+    weakness: FloatArray | None = None
+    compliance: FloatArray | None = None
+    payload: FloatArray | None = None
+
+
+class Engine(Protocol):
+    """Moves a robot: the interface of the servo engine and of the physics engine."""
+
+    @property
+    def name(self) -> str:
+        """What the engine is called on the command line."""
+        ...
+
+    def angles(self, drive: Drive, time: FloatArray) -> FloatArray:
+        """Return the angles that the motors take, (run, time, motor) [rad], log's sense.
+
+        The arm is at rest at the first reference when the run begins.
+
+        Args:
+            drive: What the motors are told, and what hampers them.
+            time: Uniform grid, (time,) [s].
+        """
+        ...
