@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing import Pool
 from typing import TYPE_CHECKING
@@ -17,22 +17,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from failuretwin import __version__
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable, Truth, concatenate
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.digital_model.imperfect import (
-    Disturbances,
-    actual_movements,
-    delay_commands,
-    draw_disturbances,
-    sag,
-    sense,
-    stack,
-)
+from failuretwin.digital_model.disturbances import Disturbances, draw_disturbances, stack
+from failuretwin.digital_model.engine import Drive, Engine, ServoEngine
+from failuretwin.digital_model.imperfect import actual_movements, delay_commands, lagged
 from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, Imperfections
 from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.tool_sensor import sense
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.injection import Injection
 from failuretwin.failure_behavior.modes import MODES, FaultMode, FaultValue
@@ -43,6 +38,7 @@ if TYPE_CHECKING:
 
 STEP_S = 0.01
 """Step of the time grid [s], as published."""
+ENGINES = ("servo", "physics")
 CHUNK_RUNS = 100
 """Runs computed at a time: about 30 MB of work."""
 
@@ -59,6 +55,7 @@ class Plan:
         imperfections: What the healthy robot does that its twin does not.
         movements: How movements are drawn.
         modes: Fault modes with their distributions, by id.
+        engine: What moves the robot: ``servo`` (the published loops) or ``physics``.
     """
 
     robot: Robot
@@ -68,10 +65,13 @@ class Plan:
     imperfections: Imperfections = NO_IMPERFECTIONS
     movements: RandomMovements = field(default_factory=RandomMovements)
     modes: Mapping[str, FaultMode] = field(default_factory=lambda: MODES)
+    engine: str = "servo"
 
     def __post_init__(self) -> None:
         if self.runs_per_class < 1:
             raise InputError(f"runs per class is {self.runs_per_class}, expected 1 or more.")
+        if self.engine not in ENGINES:
+            raise unknown_name("engine", self.engine, ENGINES)
         for hypothesis in self.hypotheses:
             if not hypothesis.known:
                 raise InputError("'unknown' cannot be simulated. Name the faults to simulate.")
@@ -107,7 +107,7 @@ class Plan:
         }
         return {
             "robot": self.robot.name,
-            "source": "simulated by the servo engine",
+            "source": f"simulated by the {self.engine} engine",
             "seed": self.seed,
             "failuretwin_version": __version__,
             "configuration": json.dumps(configuration),
@@ -147,7 +147,8 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
     commanded = delay_commands(stack_movements([draw.movements for draw in draws]), chance.late)
     injection = Injection([draw.faults for draw in draws], plan.robot.motor_names, plan.modes)
     command, time = commanded.reference(plan.time), plan.time
-    position = _motor_angles(plan, commanded, command, injection, chance)
+    drive = _drive(plan, commanded, command, injection, chance)
+    position = _engine(plan).angles(drive, time)
     measured = sense(
         DigitalTwin(plan.robot),
         plan.imperfections.readings,
@@ -171,28 +172,49 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
     )
 
 
-def _motor_angles(
+def _drive(
     plan: Plan,
     commanded: Movements,
     command: FloatArray,
     injection: Injection,
     chance: Disturbances,
-) -> FloatArray:
-    """Return the true angles of the motors, (run, time, motor) [rad].
+) -> Drive:
+    """Return what the motors are told once faults and bad luck have had their say.
 
-    A fault acts on targets, then on angles; gravity pulls at the pose that the arm is really in,
-    and a motor that holds its angle does not give way.
+    Args:
+        plan: What to simulate.
+        commanded: Movements as commanded.
+        command: Their references, (run, time, motor) [rad].
+        injection: Faults of the runs.
+        chance: Bad luck of the runs.
     """
-    faulty = injection.on_targets(commanded)
-    if plan.imperfections is NO_IMPERFECTIONS:
-        followed = command if faulty is commanded else faulty.reference(plan.time)
-    else:
-        followed = actual_movements(faulty, plan.imperfections, chance).reference(plan.time)
-    moved = DigitalTwin(plan.robot).respond(followed, plan.time)
-    held = injection.on_angles(moved, plan.time)
-    if plan.imperfections.settling is None:
-        return held
-    return injection.on_angles(moved + sag(plan.imperfections, plan.robot, held), plan.time)
+    faulty, lost = injection.on_movements(commanded, chance.lost)
+    chance = replace(chance, lost=lost)
+    if plan.engine == "physics":  # its gears have friction of their own
+        chance = replace(chance, friction=np.zeros_like(chance.friction))
+    actual = actual_movements(faulty, chance)
+    followed = command if _same(actual, commanded) else actual.reference(plan.time)
+    followed = lagged(followed, plan.time, chance.lag)
+    return Drive(
+        reference=injection.on_reference(followed, plan.time),
+        held=injection.held(plan.time),
+        weakness=injection.weakness(plan.time),
+        compliance=chance.compliance if chance.compliance.any() else None,
+        payload=chance.payload if chance.payload.any() else None,
+    )
+
+
+def _same(one: Movements, other: Movements) -> bool:
+    names = ("initial", "target", "ramp_duration", "start")
+    return all(np.array_equal(getattr(one, n), getattr(other, n), equal_nan=True) for n in names)
+
+
+def _engine(plan: Plan) -> Engine:
+    if plan.engine == "servo":
+        return ServoEngine(plan.robot)
+    from failuretwin.digital_model.physics import PhysicsEngine
+
+    return PhysicsEngine(plan.robot)
 
 
 def _run_name(plan: Plan, run: int) -> str:

@@ -122,7 +122,7 @@ class HealthyModel:
             held: Motors that stay exactly at `base`, (motor,).
         """
         robot = self.twin.robot
-        offset = self.settling.offset(robot.chain, robot.sense, base, direction)
+        offset = self.settling.offset(robot, base, direction)
         return base + np.where(held, 0.0, offset)
 
     def log_density(
