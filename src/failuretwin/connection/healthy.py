@@ -9,9 +9,9 @@ import numpy as np
 from scipy.special import gammaln
 
 from failuretwin.core.movements import Movements
+from failuretwin.core.quadrature import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.decision.evidence import SettledEvidence
-from failuretwin.decision.quadrature import log_of, log_sum
+from failuretwin.data_knowledge.settled_evidence import SettledEvidence
 from failuretwin.digital_model.imperfections import Imperfections
 from failuretwin.digital_model.settling import Settling
 from failuretwin.digital_model.twin import DigitalTwin
