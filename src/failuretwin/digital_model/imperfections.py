@@ -148,6 +148,8 @@ NO_IMPERFECTIONS = Imperfections("none", "the published twin")
 SETTLING_LISTS = ("bias", "compliance", "friction", "scatter")
 """Figures of `Settling` and `Variation` that have one value for each motor."""
 
+CALIBRATION_TABLE = "calibration"
+"""Table of such a file that says how the figures were found; the twin does not read it."""
 GENERIC_NAME = "generic, not calibrated"
 """What results say of a robot whose healthy behaviour has not been measured."""
 GENERIC_SCATTER_RAD = 0.01
@@ -187,7 +189,9 @@ def load_imperfections(name_or_path: str, robot: Robot) -> Imperfections:
     if path is None or (path.suffix != ".toml" and not path.exists()):
         own = f", {robot.name!r}" if robot.imperfections_file else ""
         raise InputError(f"no imperfections {name_or_path!r}. Expected 'none'{own} or a TOML file.")
-    imperfections = from_table(Imperfections, read_toml(path), str(path))
+    table = read_toml(path)
+    table.pop(CALIBRATION_TABLE, None)
+    imperfections = from_table(Imperfections, table, str(path))
     _check_fit(imperfections, robot, path)
     return imperfections
 

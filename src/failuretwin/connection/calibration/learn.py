@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.connection.calibration.calibration import Calibration, LeftOut, Parameter
+from failuretwin.connection.calibration.calibration import (
+    Calibration,
+    HeldOut,
+    LeftOut,
+    Parameter,
+)
+from failuretwin.connection.calibration.held_out import held_out_sessions, judge
 from failuretwin.connection.calibration.motion_part import (
     Lateness,
     gap_starts,
@@ -27,6 +33,7 @@ from failuretwin.connection.calibration.parameters import (
 from failuretwin.connection.calibration.rates import LossRates, Rate, loss_rates, uniform_range
 from failuretwin.connection.calibration.settled_part import SettledPart, fit_settled_part
 from failuretwin.connection.calibration.timing_fit import TimingFit, fit_timing
+from failuretwin.connection.calibration.what_if import best_payload, sense_remarks
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import measured_rate
 from failuretwin.core.types import BoolArray, FloatArray
@@ -46,6 +53,8 @@ if TYPE_CHECKING:
 SUSPECT = 0.9
 """A run that is faulty with at least this probability is left out."""
 BOOTSTRAP_SEED = 0
+FEWEST = 3
+"""Values below which nothing is said of a range."""
 
 
 def calibrate(
@@ -56,7 +65,8 @@ def calibrate(
     *,
     suspicion: FloatArray | None = None,
     use_readings: bool = True,
-    payload: float = 0.0,
+    judged: xr.Dataset | None = None,
+    thorough: bool = True,
 ) -> Calibration:
     """Learn the imperfections of a robot from healthy runs.
 
@@ -68,7 +78,10 @@ def calibrate(
         suspicion: Probability that each run is faulty, (run,); runs with 0.9 or more are left
             out. None: all count.
         use_readings: Whether to look at the motors' own readings, where the runs have them.
-        payload: Mass at the tool point that the URDF does not know [kg].
+        judged: Healthy runs of sessions that only say how good the fit is; None: each session is
+            left out once and judged by a fit to the others.
+        thorough: Whether to check the fit on sessions that it has not seen, and the senses and
+            payload of the robot.
 
     Raises:
         InputError: If too few movements come to rest near their targets.
@@ -78,7 +91,13 @@ def calibrate(
         trusted = suspicion < SUSPECT
     left_out = [LeftOut(str(run), 0, "", "looks faulty") for run in runs["run"].values[~trusted]]
     kept = runs.isel(run=np.flatnonzero(trusted))
-    part = fit_settled_part(observe(kept, use_readings=use_readings), robot, payload)
+    part = fit_settled_part(observe(kept, use_readings=use_readings), robot)
+    payload, remarks = 0.0, list[str]()
+    if thorough:
+        payload, told = best_payload(part, robot)
+        remarks = [*sense_remarks(part, robot), told]
+        if payload > 0.0:
+            part = fit_settled_part(part.observations, robot, payload)
     movements = movements_of(kept)
     late = lateness(movements)
     losses = loss_rates(part.observations, part.lost, _late_of(part, late), robot.motor_names)
@@ -111,6 +130,19 @@ def calibrate(
         movements=int(np.sum(~part.odd)),
         used_readings=part.observations.position is not None,
         left_out=(*left_out, *part.left_out(robot)),
+        held_out=_held_out(part, robot, judged) if thorough else (),
+        remarks=tuple(remarks),
+    )
+
+
+def _held_out(part: SettledPart, robot: Robot, judged: xr.Dataset | None) -> tuple[HeldOut, ...]:
+    seen = part.observations
+    if judged is None:
+        return held_out_sessions(seen, robot)
+    unseen = observe(judged, use_readings=seen.position is not None)
+    return tuple(
+        judge(unseen[unseen.session == index], part, robot, name)
+        for index, name in enumerate(unseen.sessions)
     )
 
 
@@ -135,12 +167,11 @@ def _timing(fit: TimingFit | None, late: Lateness, gaps: FloatArray) -> Timing:
         )
     if late.known:
         found = uniform_range(late.late[np.nan_to_num(late.late) > 0.0])
-        stops = uniform_range(gaps)
         timing = replace(
             timing,
             late_rate=_late_rate(late).mean if found else 0.0,
             late_s=_above_zero(found[0]) if found else (0.0, 0.0),
-            gap_start_s=_above_zero(stops[0]) if stops else (0.0, 0.0),
+            gap_start_s=_above_zero(spread_of(gaps)) if len(gaps) >= FEWEST else (0.0, 0.0),
         )
     return timing
 
@@ -214,7 +245,7 @@ def _lateness_parameters(late: Lateness, gaps: FloatArray) -> list[Parameter]:
         (low, high), least, most = starts
         found.append(Parameter("late start, least", "", "s", low, *least))
         found.append(Parameter("late start, most", "", "s", high, *most))
-    if len(gaps) >= 3:
+    if len(gaps) >= FEWEST:
         low, high = (float(q) for q in np.quantile(gaps, [0.025, 0.975]))
         middle = float(np.median(gaps))
         found.append(Parameter("readings stop before a late start", "", "s", middle, low, high))

@@ -63,7 +63,7 @@ def lateness(movements: Movements) -> Lateness:
 def gap_starts(runs: xr.Dataset, movements: Movements, late: FloatArray) -> FloatArray:
     """Return when readings stop before late starts, after the movement before, (gap,) [s]."""
     time, rate = as_floats(runs["time"].values), measured_rate(runs)
-    seen = np.isfinite(as_floats(runs["measured"].values)).all(axis=2)
+    seen = np.asarray(np.isfinite(as_floats(runs["measured"].values)).all(axis=2))
     found = []
     for run, movement in np.argwhere(np.nan_to_num(late) > 0.0):
         if movement == 0:
