@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing import Pool
 from typing import TYPE_CHECKING
@@ -18,10 +18,11 @@ import numpy as np
 
 from failuretwin import __version__
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.hypothesis import Fault, Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable, Truth, concatenate
 from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.digital_model.holding import hold
 from failuretwin.digital_model.imperfect import (
     Disturbances,
     actual_movements,
@@ -34,8 +35,9 @@ from failuretwin.digital_model.imperfect import (
 from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, Imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.failure_behavior.fault_value import FaultValue
 from failuretwin.failure_behavior.injection import Injection
-from failuretwin.failure_behavior.modes import MODES, FaultMode, FaultValue
+from failuretwin.failure_behavior.modes import MODES, FaultMode
 from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
 
 if TYPE_CHECKING:
@@ -81,6 +83,19 @@ class Plan:
                         f"fault mode {fault.mode!r} cannot be simulated. "
                         f"Expected one of {', '.join(self.modes)}."
                     )
+                if self.modes[fault.mode].needs_compliance:
+                    self._check_compliance(fault)
+
+    def _check_compliance(self, fault: Fault) -> None:
+        """Refuse a loss of stiffness in a motor that does not give way at all."""
+        settling = self.imperfections.settling
+        sag = settling.sag if settling else (0.0,) * len(self.robot.motors)
+        if sag[self.robot.motor_names.index(fault.motor)] == 0.0:
+            raise InputError(
+                f"'{fault}' would not show: with imperfections {self.imperfections.name!r}, "
+                f"{fault.motor} does not give way under load. Choose imperfections in which it "
+                "sags (--imperfections), or another motor."
+            )
 
     @property
     def size(self) -> int:
@@ -165,7 +180,7 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
         measured=measured,
         measured_rate_hz=1.0 / STEP_S if readings is None else readings.rate_hz,
         movements=commanded,
-        truth=_truth(plan, runs, draws, injection.magnitudes(position)),
+        truth=_truth(plan, runs, injection.as_struck(position, time, commanded.start)),
         position=position,
         attributes=plan.attributes(),
     )
@@ -180,32 +195,38 @@ def _motor_angles(
 ) -> FloatArray:
     """Return the true angles of the motors, (run, time, motor) [rad].
 
-    A fault acts on targets, then on angles; gravity pulls at the pose that the arm is really in,
-    and a motor that holds its angle does not give way.
+    Faults act on movements, on what the servo loops follow, and on the gear; gravity pulls at the
+    pose that the arm is really in, and a motor that is held does not give way.
     """
-    faulty = injection.on_targets(commanded)
-    if plan.imperfections is NO_IMPERFECTIONS:
-        followed = command if faulty is commanded else faulty.reference(plan.time)
-    else:
-        followed = actual_movements(faulty, plan.imperfections, chance).reference(plan.time)
-    moved = DigitalTwin(plan.robot).respond(followed, plan.time)
-    held = injection.on_angles(moved, plan.time)
+    time, limits = plan.time, np.array([motor.speed_limit for motor in plan.robot.motors])
+    faulty, lost = injection.on_movements(commanded, chance.lost)
+    if plan.imperfections is not NO_IMPERFECTIONS or faulty is not commanded:
+        chance = replace(chance, lost=lost)
+        command = actual_movements(faulty, plan.imperfections, chance).reference(time)
+    held = injection.held(time)
+    moved = DigitalTwin(plan.robot).respond(injection.on_reference(command, time), time)
+    position = hold(moved, held, time, limits)
     if plan.imperfections.settling is None:
-        return held
-    return injection.on_angles(moved + sag(plan.imperfections, plan.robot, held), plan.time)
+        return position
+    yielding = sag(plan.imperfections, plan.robot, position)
+    weakness = injection.weakness(time)
+    if weakness is not None:
+        yielding = yielding / (1.0 - weakness)
+    return hold(moved + yielding, held, time, limits)
 
 
 def _run_name(plan: Plan, run: int) -> str:
     return f"{plan.hypothesis_of(run)}/{run % plan.runs_per_class:05d}"
 
 
-def _truth(plan: Plan, runs: Sequence[int], draws: Sequence[_Draw], magnitude: FloatArray) -> Truth:
-    onset = [min((v.onset_s for v in draw.faults), default=np.nan) for draw in draws]
+def _truth(plan: Plan, runs: Sequence[int], faults: Sequence[Sequence[FaultValue]]) -> Truth:
+    onset = [min((v.onset_s for v in values), default=np.nan) for values in faults]
+    magnitude = [values[0].magnitude if values else np.nan for values in faults]
     return Truth(
         fault=[str(plan.hypothesis_of(run)) for run in runs],
-        detail=[{"faults": [value.detail() for value in draw.faults]} for draw in draws],
+        detail=[{"faults": [value.detail() for value in values]} for values in faults],
         onset=np.array(onset),
-        magnitude=magnitude,
+        magnitude=np.array(magnitude),
     )
 
 
