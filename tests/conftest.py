@@ -8,6 +8,8 @@ import pytest
 from hypothesis import settings
 
 from failuretwin import DigitalTwin, load_robot
+from failuretwin.core.movements import Movements
+from failuretwin.core.runs import RunTable
 
 settings.register_profile("steady", deadline=None, derandomize=True)
 settings.register_profile("search", deadline=None, max_examples=2000)
@@ -39,3 +41,30 @@ def armpi():
 @pytest.fixture(scope="session")
 def twin(armpi):
     return DigitalTwin(armpi)
+
+
+@pytest.fixture(scope="session")
+def run_of():
+    """Make a run set of one run: motors go to `targets`, the tool reads `measured`."""
+
+    def make(targets, measured, motors=("motor_1", "motor_2"), rate=100.0, ramp_s=0.8):
+        targets = np.asarray(targets, dtype=float)
+        count = len(targets)
+        time = np.arange(200 * count) * 0.01
+        movements = Movements(
+            initial=np.zeros((1, len(motors))),
+            target=targets[None],
+            ramp_duration=np.full((1, *targets.shape), ramp_s),
+            start=2.0 * np.arange(count, dtype=float)[None],
+        )
+        path = measured(time) if callable(measured) else np.repeat(measured, 200, axis=0)
+        return RunTable(
+            run=["run"],
+            motor=motors,
+            time=time,
+            command=movements.reference(time),
+            measured=np.array(path, dtype=float)[None],
+            measured_rate_hz=rate,
+        ).to_dataset()
+
+    return make

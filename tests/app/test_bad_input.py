@@ -243,8 +243,25 @@ def test_full_disk_while_writing_results(refused, simulated, option, name):
         '{"run": "a", "truth": "healthy", "diagnosis": "healthy", "posterior": 3}\n',
         '{"run": "a", "truth": "healthy", "diagnosis": "b", "posterior": {"healthy": 1.0}}\n',
         '{"run": "a", "truth": "healthy", "diagnosis": "healthy", "posterior": {"healthy": "x"}}\n',
+        '{"run": "a", "truth": "healthy", "diagnosis": "healthy", "posterior": {"healthy": 0.5}}\n',
+        '{"run": "a", "truth": "healthy", "diagnosis": "healthy", "posterior": {"healthy": NaN}}\n',
+        '{"run": "a", "truth": 0, "diagnosis": "healthy", "posterior": {"healthy": 1.0}}\n',
+        '{"run": "a", "truth": "healthy", "diagnosis": "healthy", "posterior": {"healthy": 1.0}, '
+        '"onset_90": 1.0}\n',
     ],
-    ids=["empty", "csv", "list", "keys missing", "number", "unknown diagnosis", "text"],
+    ids=[
+        "empty",
+        "csv",
+        "list",
+        "keys missing",
+        "number",
+        "unknown diagnosis",
+        "text",
+        "sum",
+        "not a number",
+        "truth",
+        "interval",
+    ],
 )
 def test_results_that_cannot_be_evaluated(refused, tmp_path, text):
     (tmp_path / "results.jsonl").write_text(text)

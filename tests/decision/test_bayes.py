@@ -10,9 +10,9 @@ from failuretwin import BayesDiagnoser, DigitalTwin
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import HEALTHY, UNKNOWN, Hypothesis, paper_hypotheses
 from failuretwin.data_knowledge.generation import Plan, simulate
+from failuretwin.data_knowledge.settled_evidence import settled_evidence
 from failuretwin.decision import bayes, steady_state_error, stuck
 from failuretwin.decision.bayes import Priors, priors_of
-from failuretwin.decision.evidence import settled_evidence
 from failuretwin.digital_model.imperfections import default_imperfections
 
 PAPER = [str(h) for h in paper_hypotheses([f"motor_{k}" for k in range(1, 5)])]

@@ -22,7 +22,7 @@ ZERO = (0.0,) * 4
 @pytest.fixture(scope="session")
 def sagging():
     """Motors that give way under load and do nothing else that the published twin does not."""
-    settling = Settling(ZERO, (0.2,) * 4, ZERO, ZERO, np.inf, "test")
+    settling = Settling(ZERO, (0.5,) * 4, ZERO, ZERO, np.inf, "test")
     return Imperfections("sagging", "test", settling=settling)
 
 

@@ -119,7 +119,7 @@ def deviation(runs, healthy, first_s, last_s):
 def test_a_ramp_grows_to_what_a_step_is_at_once(mode, simulate, profile):
     slow = replace(mode, profiles=(profile,), onset_s=(0.0, 0.0), rise_s=(6.0, 6.0))
     ramp, step, healthy = (
-        simulate(m, count=40) for m in (slow, replace(slow, profiles=("step",)), None)
+        simulate(m, count=80) for m in (slow, replace(slow, profiles=("step",)), None)
     )
     # The first movement is struck at its start, when the ramp is still at nothing.
     early = (2.0, 4.0) if mode.mode in ON_MOVEMENTS else (0.0, 2.0)
@@ -127,8 +127,9 @@ def test_a_ramp_grows_to_what_a_step_is_at_once(mode, simulate, profile):
     late = deviation(ramp, healthy, 8.0, 10.0), deviation(step, healthy, 8.0, 10.0)
     if mode.mode == "drift":  # half of the rise is lost for good
         assert late[0] / late[1] == pytest.approx((9.0 - 3.0) / 9.0, rel=0.02)
-    else:
-        assert late[0] == pytest.approx(late[1], rel=0.1)
+    else:  # where a lost command leaves the motor hangs on those lost before
+        tolerance = 0.2 if mode.mode == "lost_commands" else 0.1
+        assert late[0] == pytest.approx(late[1], rel=tolerance)
 
 
 def in_episodes(detail, time):

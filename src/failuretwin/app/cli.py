@@ -12,6 +12,7 @@ import sys
 import click
 
 from failuretwin import __version__
+from failuretwin.app.commands.calibrate import calibrate
 from failuretwin.app.commands.diagnose import diagnose
 from failuretwin.app.commands.evaluate import evaluate
 from failuretwin.app.commands.import_ import import_
@@ -26,7 +27,7 @@ def cli() -> None:
     """Tell from commands and the tool path alone which motor of a robot arm failed, and how."""
 
 
-for command in (import_, simulate, diagnose, evaluate, robot):
+for command in (import_, simulate, diagnose, evaluate, calibrate, robot):
     cli.add_command(command)
 
 

@@ -29,7 +29,12 @@ TITLE_COLUMNS = 100
 BLUE, RED, GREY = "#1f5f99", "#c8402f", "#9aa3ab"
 
 
-def _figure_class() -> Any:
+def figure_class() -> Any:
+    """Return matplotlib's figure.
+
+    Raises:
+        InputError: If matplotlib is missing.
+    """
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -76,7 +81,7 @@ def run_figure(
         measured: Tool path, (time, axis) [m], NaN where there is no sample.
         diagnosis: What was found.
     """
-    figure = _figure_class()(figsize=(11.0, 6.2), layout="constrained")
+    figure = figure_class()(figsize=(11.0, 6.2), layout="constrained")
     seen = np.asarray(np.isfinite(measured).all(axis=1))
     shown = slice(0, len(time) - int(np.argmax(seen[::-1])) if seen.any() else len(time))
     time, desired, measured, seen = time[shown], desired[shown], measured[shown], seen[shown]

@@ -17,23 +17,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from failuretwin import __version__
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.hypothesis import Fault, Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable, Truth, concatenate
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.digital_model.holding import hold
-from failuretwin.digital_model.imperfect import (
-    Disturbances,
-    actual_movements,
-    delay_commands,
-    draw_disturbances,
-    sag,
-    sense,
-    stack,
-)
+from failuretwin.digital_model.disturbances import Disturbances, draw_disturbances, stack
+from failuretwin.digital_model.engine import Drive, Engine, ServoEngine
+from failuretwin.digital_model.imperfect import actual_movements, delay_commands, lagged
 from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, Imperfections
 from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.settling import Settling, loads_in_range
+from failuretwin.digital_model.tool_sensor import sense
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.fault_value import FaultValue
 from failuretwin.failure_behavior.injection import Injection
@@ -45,6 +40,9 @@ if TYPE_CHECKING:
 
 STEP_S = 0.01
 """Step of the time grid [s], as published."""
+ENGINES = ("servo", "physics")
+LEAST_SAG_RAD = 1e-6
+"""A motor that its load moves by less than this in any pose counts as rigid [rad]."""
 CHUNK_RUNS = 100
 """Runs computed at a time: about 30 MB of work."""
 
@@ -61,6 +59,7 @@ class Plan:
         imperfections: What the healthy robot does that its twin does not.
         movements: How movements are drawn.
         modes: Fault modes with their distributions, by id.
+        engine: What moves the robot: ``servo`` (the published loops) or ``physics``.
     """
 
     robot: Robot
@@ -70,10 +69,13 @@ class Plan:
     imperfections: Imperfections = NO_IMPERFECTIONS
     movements: RandomMovements = field(default_factory=RandomMovements)
     modes: Mapping[str, FaultMode] = field(default_factory=lambda: MODES)
+    engine: str = "servo"
 
     def __post_init__(self) -> None:
         if self.runs_per_class < 1:
             raise InputError(f"runs per class is {self.runs_per_class}, expected 1 or more.")
+        if self.engine not in ENGINES:
+            raise unknown_name("engine", self.engine, ENGINES)
         for hypothesis in self.hypotheses:
             if not hypothesis.known:
                 raise InputError("'unknown' cannot be simulated. Name the faults to simulate.")
@@ -83,14 +85,15 @@ class Plan:
                         f"fault mode {fault.mode!r} cannot be simulated. "
                         f"Expected one of {', '.join(self.modes)}."
                     )
-                if self.modes[fault.mode].needs_compliance:
+                if self.modes[fault.mode].needs_compliance and self.engine == "servo":
                     self._check_compliance(fault)
 
     def _check_compliance(self, fault: Fault) -> None:
         """Refuse a loss of stiffness in a motor that does not give way at all."""
-        settling = self.imperfections.settling
-        sag = settling.sag if settling else (0.0,) * len(self.robot.motors)
-        if sag[self.robot.motor_names.index(fault.motor)] == 0.0:
+        motor = self.robot.motor_names.index(fault.motor)
+        settling = self.imperfections.settling or Settling.ideal(len(self.robot.motors))
+        load = np.abs(loads_in_range(self.robot, settling.payload)[:, motor]).max()
+        if settling.compliance[motor] * load < LEAST_SAG_RAD:
             raise InputError(
                 f"'{fault}' would not show: with imperfections {self.imperfections.name!r}, "
                 f"{fault.motor} does not give way under load. Choose imperfections in which it "
@@ -122,7 +125,7 @@ class Plan:
         }
         return {
             "robot": self.robot.name,
-            "source": "simulated by the servo engine",
+            "source": f"simulated by the {self.engine} engine",
             "seed": self.seed,
             "failuretwin_version": __version__,
             "configuration": json.dumps(configuration),
@@ -162,7 +165,8 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
     commanded = delay_commands(stack_movements([draw.movements for draw in draws]), chance.late)
     injection = Injection([draw.faults for draw in draws], plan.robot.motor_names, plan.modes)
     command, time = commanded.reference(plan.time), plan.time
-    position = _motor_angles(plan, commanded, command, injection, chance)
+    drive = _drive(plan, commanded, command, injection, chance)
+    position = _engine(plan).angles(drive, time)
     measured = sense(
         DigitalTwin(plan.robot),
         plan.imperfections.readings,
@@ -186,33 +190,49 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
     )
 
 
-def _motor_angles(
+def _drive(
     plan: Plan,
     commanded: Movements,
     command: FloatArray,
     injection: Injection,
     chance: Disturbances,
-) -> FloatArray:
-    """Return the true angles of the motors, (run, time, motor) [rad].
+) -> Drive:
+    """Return what the motors are told once faults and bad luck have had their say.
 
-    Faults act on movements, on what the servo loops follow, and on the gear; gravity pulls at the
-    pose that the arm is really in, and a motor that is held does not give way.
+    Args:
+        plan: What to simulate.
+        commanded: Movements as commanded.
+        command: Their references, (run, time, motor) [rad].
+        injection: Faults of the runs.
+        chance: Bad luck of the runs.
     """
-    time, limits = plan.time, np.array([motor.speed_limit for motor in plan.robot.motors])
     faulty, lost = injection.on_movements(commanded, chance.lost)
-    if plan.imperfections is not NO_IMPERFECTIONS or faulty is not commanded:
-        chance = replace(chance, lost=lost)
-        command = actual_movements(faulty, plan.imperfections, chance).reference(time)
-    held = injection.held(time)
-    moved = DigitalTwin(plan.robot).respond(injection.on_reference(command, time), time)
-    position = hold(moved, held, time, limits)
-    if plan.imperfections.settling is None:
-        return position
-    yielding = sag(plan.imperfections, plan.robot, position)
-    weakness = injection.weakness(time)
-    if weakness is not None:
-        yielding = yielding / (1.0 - weakness)
-    return hold(moved + yielding, held, time, limits)
+    chance = replace(chance, lost=lost)
+    if plan.engine == "physics":  # its gears have friction of their own
+        chance = replace(chance, friction=np.zeros_like(chance.friction))
+    actual = actual_movements(faulty, chance)
+    followed = command if _same(actual, commanded) else actual.reference(plan.time)
+    followed = lagged(followed, plan.time, chance.lag)
+    return Drive(
+        reference=injection.on_reference(followed, plan.time),
+        held=injection.held(plan.time),
+        weakness=injection.weakness(plan.time),
+        compliance=chance.compliance if chance.compliance.any() else None,
+        payload=chance.payload if chance.payload.any() else None,
+    )
+
+
+def _same(one: Movements, other: Movements) -> bool:
+    names = ("initial", "target", "ramp_duration", "start")
+    return all(np.array_equal(getattr(one, n), getattr(other, n), equal_nan=True) for n in names)
+
+
+def _engine(plan: Plan) -> Engine:
+    if plan.engine == "servo":
+        return ServoEngine(plan.robot)
+    from failuretwin.digital_model.physics import PhysicsEngine
+
+    return PhysicsEngine(plan.robot)
 
 
 def _run_name(plan: Plan, run: int) -> str:

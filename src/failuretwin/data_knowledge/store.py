@@ -80,7 +80,7 @@ def check_destination(path: Path) -> None:
     """Raise an error unless a run set can be written to `path`: worth asking before long work."""
     if path.suffix not in SUFFIXES:
         raise InputError(f"{path}: a run set ends in .nc (NetCDF) or .zarr (Zarr).")
-    _check_writable(path)
+    check_writable(path)
 
 
 def _compression(runs: xr.Dataset) -> dict[str, dict[str, object]]:
@@ -102,7 +102,7 @@ def replacing(path: Path) -> Iterator[Path]:
     target = path.resolve()  # a link stays a link
     partial = target.with_name(f".{path.name}.{os.getpid()}.partial{path.suffix}")
     try:
-        _check_writable(path)
+        check_writable(path)
         yield partial
         _take_place(partial, target)
     except (OSError, RuntimeError) as error:
@@ -165,7 +165,8 @@ def _output_error(path: Path, error: BaseException) -> OutputError:
     )
 
 
-def _check_writable(path: Path) -> None:
+def check_writable(path: Path) -> None:
+    """Raise OutputError unless a file can be written to `path`."""
     folder = path.parent
     if not folder.is_dir():
         raise OutputError(f"{path}: folder {folder} does not exist. Make it first.")

@@ -8,7 +8,7 @@ import numpy as np
 
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.log_quality import LogQuality
-from failuretwin.decision.evidence import SettledEvidence
+from failuretwin.data_knowledge.settled_evidence import SettledEvidence
 from failuretwin.digital_model.imperfections import LostCommand
 
 UNEXPLAINED_NATS = 1.0

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from failuretwin.connection.healthy import Alternatives, HealthyModel
 from failuretwin.core.diagnosis import Diagnosis, MovementEvidence
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
+from failuretwin.core.quadrature import log_sum
 from failuretwin.core.runs import check_runs, truth_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.data_knowledge.knowledge import prior_odds
 from failuretwin.data_knowledge.log_quality import LogQuality, log_quality, without_spoilt
+from failuretwin.data_knowledge.settled_evidence import SettledEvidence, settled_evidence
 from failuretwin.decision.assessment import lost_commands, unused_movements, why_undecided
-from failuretwin.decision.evidence import SettledEvidence, settled_evidence
-from failuretwin.decision.healthy import Alternatives, HealthyModel
-from failuretwin.decision.quadrature import log_sum
 from failuretwin.decision.steady_state_error import (
     ERROR_RANGES,
     ErrorEvidence,

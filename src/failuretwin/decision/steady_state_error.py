@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from failuretwin.connection.healthy import Alternatives, HealthyModel
+from failuretwin.core.quadrature import log_of, log_sum
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.evidence import SettledEvidence
-from failuretwin.decision.healthy import Alternatives, HealthyModel
-from failuretwin.decision.quadrature import log_of, log_sum
+from failuretwin.data_knowledge.settled_evidence import SettledEvidence
 
 Range = tuple[float, float]
 

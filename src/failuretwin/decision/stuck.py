@@ -12,15 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln
 
-from failuretwin.core.types import FloatArray
-from failuretwin.decision.evidence import SettledEvidence
-from failuretwin.decision.healthy import PATH_NOISE_M, Alternatives, HealthyModel
-from failuretwin.decision.quadrature import (
+from failuretwin.connection.healthy import PATH_NOISE_M, Alternatives, HealthyModel
+from failuretwin.core.quadrature import (
     log_of,
     log_sum,
     log_trapezoid_weights,
     weighted_quantiles,
 )
+from failuretwin.core.types import FloatArray
+from failuretwin.data_knowledge.settled_evidence import SettledEvidence
 
 COARSE_NODES = 49
 """Nodes spread evenly over the range of the held angle."""

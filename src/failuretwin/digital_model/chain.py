@@ -7,20 +7,22 @@ coordinates, and entries of the constants that are 0 or 1 cost nothing.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray, as_floats
-
-Scalar = float | FloatArray
-"""A coordinate: the same for every pose (float) or one per pose (array)."""
-Vector = tuple[Scalar, Scalar, Scalar]
-
-CHUNK = 8000
-"""Poses at a time: 64 kB an array, so that the working set stays in the second-level cache."""
+from failuretwin.digital_model.vectors import (
+    Vector,
+    add,
+    chunks,
+    move,
+    scale,
+    spin,
+    turn,
+)
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class SerialChain:
         """
         flat = self._flatten(q)
         out = np.empty((len(flat), 3))
-        for rows in _chunks(len(flat)):
+        for rows in chunks(len(flat)):
             point, _ = self._carry(flat[rows].T.copy(), derivatives=False)
             for axis in range(3):
                 out[rows, axis] = point[axis]
@@ -87,7 +89,7 @@ class SerialChain:
         flat = self._flatten(q)
         point_out = np.empty((len(flat), 3))
         jacobian = np.empty((len(flat), 3, len(self.joints)))
-        for rows in _chunks(len(flat)):
+        for rows in chunks(len(flat)):
             point, columns = self._carry(flat[rows].T.copy(), derivatives=True)
             for axis in range(3):
                 point_out[rows, axis] = point[axis]
@@ -115,67 +117,19 @@ class SerialChain:
         columns: list[Vector] = []
         for joint, value in zip(reversed(self.joints), q[::-1], strict=True):
             if joint.prismatic:
-                columns = [_turn(joint.T_pj, column) for column in columns]
+                columns = [turn(joint.T_pj, column) for column in columns]
                 if derivatives:
-                    columns.insert(0, _turn(joint.T_pj, (0.0, 0.0, 1.0)))
-                point = _move(joint.T_pj, (point[0], point[1], _sum(point[2], value)))
+                    columns.insert(0, turn(joint.T_pj, (0.0, 0.0, 1.0)))
+                point = move(joint.T_pj, (point[0], point[1], add(point[2], value)))
             else:
                 c, s = np.cos(value), np.sin(value)
-                turned = _spin(c, s, point)
-                columns = [_turn(joint.T_pj, _spin(c, s, column)) for column in columns]
+                turned = spin(c, s, point)
+                columns = [turn(joint.T_pj, spin(c, s, column)) for column in columns]
                 if derivatives:
-                    tangent = (_scale(-1.0, turned[1]), turned[0], 0.0)
-                    columns.insert(0, _turn(joint.T_pj, tangent))
-                point = _move(joint.T_pj, turned)
+                    tangent = (scale(-1.0, turned[1]), turned[0], 0.0)
+                    columns.insert(0, turn(joint.T_pj, tangent))
+                point = move(joint.T_pj, turned)
         return point, columns
-
-
-def _chunks(count: int) -> Iterator[slice]:
-    return (slice(start, start + CHUNK) for start in range(0, count, CHUNK))
-
-
-def _scale(factor: float, value: Scalar) -> Scalar:
-    if factor == 0.0 or (isinstance(value, float) and value == 0.0):
-        return 0.0
-    if factor == 1.0:
-        return value
-    return -value if factor == -1.0 else factor * value
-
-
-def _sum(a: Scalar, b: Scalar) -> Scalar:
-    if isinstance(a, float) and a == 0.0:
-        return b
-    if isinstance(b, float) and b == 0.0:
-        return a
-    return a + b
-
-
-def _turn(T: FloatArray, v: Vector) -> Vector:
-    """Return the direction `v` turned by the constant transform `T`."""
-    rows = T[:3, :3].tolist()
-    x, y, z = (_sum(_sum(_scale(r[0], v[0]), _scale(r[1], v[1])), _scale(r[2], v[2])) for r in rows)
-    return x, y, z
-
-
-def _move(T: FloatArray, v: Vector) -> Vector:
-    """Return the point `v` moved by the constant transform `T`."""
-    x, y, z = _turn(T, v)
-    offset = T[:3, 3].tolist()
-    return _sum(x, offset[0]), _sum(y, offset[1]), _sum(z, offset[2])
-
-
-def _spin(c: FloatArray, s: FloatArray, v: Vector) -> Vector:
-    """Return `v` turned about z by the angles with cosine `c` and sine `s`."""
-    x, y, z = v
-    x_zero = isinstance(x, float) and x == 0.0
-    y_zero = isinstance(y, float) and y == 0.0
-    if x_zero and y_zero:
-        return v
-    if x_zero:
-        return -(s * y), c * y, z
-    if y_zero:
-        return c * x, s * x, z
-    return c * x - s * y, s * x + c * y, z
 
 
 def rotation_to_z(axis: Sequence[float]) -> FloatArray:

@@ -8,7 +8,9 @@ from typing import Protocol
 import numpy as np
 
 from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.digital_model.holding import hold
 from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.settling import sag
 from failuretwin.digital_model.twin import DigitalTwin
 
 
@@ -51,3 +53,32 @@ class Engine(Protocol):
             time: Uniform grid, (time,) [s].
         """
         ...
+
+
+@dataclass(frozen=True)
+class ServoEngine:
+    """The published twin: exact servo loops, rigid links; motors give way as far as they are told.
+
+    Gravity pulls at the pose that the arm is really in, and a motor that is held does not give way.
+    """
+
+    robot: Robot
+    name: str = "servo"
+
+    def angles(self, drive: Drive, time: FloatArray) -> FloatArray:
+        """Return the angles that the motors take, (run, time, motor) [rad], log's sense."""
+        free = DigitalTwin(self.robot).respond(drive.reference, time)
+        position = self._hold(free, drive, time)
+        if drive.compliance is None:
+            return position
+        payload = 0.0 if drive.payload is None else drive.payload[:, None]
+        yielding = sag(self.robot, position, drive.compliance[:, None], payload)
+        if drive.weakness is not None:
+            yielding /= 1.0 - drive.weakness
+        return self._hold(free + yielding, drive, time)
+
+    def _hold(self, position: FloatArray, drive: Drive, time: FloatArray) -> FloatArray:
+        if drive.held is None:
+            return position
+        limits = np.array([motor.speed_limit for motor in self.robot.motors])
+        return hold(position, drive.held, time, limits)

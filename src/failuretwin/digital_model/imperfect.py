@@ -1,134 +1,14 @@
-"""The imperfect healthy robot: draws what goes wrong by chance, and what motions follow.
-
-Chance and computation are apart: `draw_disturbances` uses one generator for each run, everything
-else is deterministic and works on many runs at once.
-"""
+"""The motions of the imperfect healthy robot, for many runs at once; all chance is drawn before."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from failuretwin.core.movements import Movements
-from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.digital_model.imperfections import Imperfections, Readings
-from failuretwin.digital_model.robot import Robot
-from failuretwin.digital_model.settling import Settling
-from failuretwin.digital_model.twin import DigitalTwin
-
-
-@dataclass(frozen=True)
-class Disturbances:
-    """What chance does to a run, or to many along a leading run axis.
-
-    Attributes:
-        lost: Commands that do not arrive, (movement, motor).
-        scatter: Settled scatter, (1 + movement, motor) [rad]; the first row is before the run.
-        delay: Dead time, () [s].
-        shortening: Share by which ramps end early, ().
-        late: Late start, (movement,) [s].
-        gap_start: Readings stop this long after a movement before a late one, (movement,) [s].
-        reading_time: Times of the readings, (reading,) [s].
-        glitch: Raw counts of spoilt readings, NaN where sound, (reading, motor).
-        noise: Noise of the tool sensor, (reading, axis) [m].
-    """
-
-    lost: BoolArray
-    scatter: FloatArray
-    delay: FloatArray
-    shortening: FloatArray
-    late: FloatArray
-    gap_start: FloatArray
-    reading_time: FloatArray
-    glitch: FloatArray
-    noise: FloatArray
-
-
-def draw_disturbances(
-    imperfections: Imperfections,
-    robot: Robot,
-    movements: int,
-    duration: float,
-    rng: np.random.Generator,
-) -> Disturbances:
-    """Draw the disturbances of one run.
-
-    Args:
-        imperfections: What the robot is like.
-        robot: The robot.
-        movements: Number of movements in the run.
-        duration: Longest time that readings are needed for [s].
-        rng: The run's own generator.
-    """
-    timing, motors = imperfections.timing, len(robot.motors)
-    late = np.where(
-        rng.random(movements) < timing.late_rate, rng.uniform(*timing.late_s, movements), 0.0
-    )
-    late[:1] = 0.0
-    times, glitch, noise = _draw_readings(imperfections.readings, motors, duration, rng)
-    return Disturbances(
-        lost=_draw_losses(imperfections, robot, late > 0, rng),
-        scatter=_draw_scatter(imperfections.settling, movements + 1, motors, rng),
-        delay=np.asarray(rng.uniform(*timing.delay_s)),
-        shortening=np.asarray(rng.uniform(*timing.ramp_shortening)),
-        late=late,
-        gap_start=rng.uniform(*timing.gap_start_s, movements),
-        reading_time=times,
-        glitch=glitch,
-        noise=noise,
-    )
-
-
-def stack(draws: Sequence[Disturbances]) -> Disturbances:
-    """Return the disturbances of many runs along a leading run axis."""
-    names = Disturbances.__dataclass_fields__
-    return Disturbances(**{name: np.stack([getattr(d, name) for d in draws]) for name in names})
-
-
-def _draw_losses(
-    imperfections: Imperfections, robot: Robot, late: BoolArray, rng: np.random.Generator
-) -> BoolArray:
-    """Return which motors lose which command, (movement, motor); at most one set a movement."""
-    names = robot.motor_names
-    lost = np.zeros((len(late), len(names)), dtype=bool)
-    chance, below = rng.random(len(late)), np.zeros(len(late))
-    for entry in imperfections.lost_commands:
-        above = below + np.where(late, entry.rate_when_late, entry.rate)
-        hit = (chance >= below) & (chance < above)
-        for motor in entry.motors:
-            lost[:, names.index(motor)] |= hit
-        below = above
-    return lost
-
-
-def _draw_scatter(
-    settling: Settling | None, rows: int, motors: int, rng: np.random.Generator
-) -> FloatArray:
-    if settling is None:
-        return np.zeros((rows, motors))
-    if np.isinf(settling.tail_dof):
-        unit = rng.standard_normal((rows, motors))
-    else:
-        unit = rng.standard_t(settling.tail_dof, (rows, motors))
-    return unit * np.asarray(settling.scatter)
-
-
-def _draw_readings(
-    readings: Readings | None, motors: int, duration: float, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    if readings is None:
-        return np.empty(0), np.empty((0, motors)), np.empty((0, 3))
-    count = int(np.floor(duration * readings.rate_hz)) + 1
-    times = np.arange(count) / readings.rate_hz
-    times[1:] += rng.normal(0.0, readings.jitter_s, count - 1) if readings.jitter_s else 0.0
-    spoilt = rng.random((count, motors)) < np.asarray(readings.glitch_rate or [0.0] * motors)
-    glitch = np.where(spoilt, rng.integers(-32768, 32768, (count, motors)), np.nan)
-    noise = (
-        rng.normal(0.0, readings.noise_m, (count, 3)) if readings.noise_m else np.zeros((count, 3))
-    )
-    return np.maximum.accumulate(times), glitch, noise
+from failuretwin.core.types import FloatArray
+from failuretwin.digital_model.disturbances import Disturbances
 
 
 def delay_commands(movements: Movements, late: FloatArray) -> Movements:
@@ -145,29 +25,25 @@ def delay_commands(movements: Movements, late: FloatArray) -> Movements:
     return replace(movements, start=movements.start + before)
 
 
-def actual_movements(
-    movements: Movements, imperfections: Imperfections, chance: Disturbances
-) -> Movements:
+def actual_movements(movements: Movements, chance: Disturbances) -> Movements:
     """Return the movements that the motors really make, without gravity sag.
 
     Args:
         movements: As commanded (after any fault that alters targets).
-        imperfections: What the robot is like.
         chance: Disturbances of the same runs.
 
     Returns:
         Movements with lost commands, bias, friction and scatter in their targets, and with late
         starts, delay and early ramp ends in their times.
     """
-    settling = imperfections.settling or Settling.ideal(movements.initial.shape[-1])
-    bias, friction = np.asarray(settling.bias), np.asarray(settling.friction)
-    here = movements.initial + bias + chance.scatter[:, 0]
+    here = movements.initial + chance.bias + chance.scatter[:, 0]
     initial = here
     target = np.empty_like(movements.target)
     commanded = movements.initial
     for m in range(target.shape[1]):
         wanted = movements.target[:, m]
-        settled = wanted + bias - friction * np.sign(wanted - commanded) + chance.scatter[:, 1 + m]
+        short = chance.friction * np.sign(wanted - commanded)
+        settled = wanted + chance.bias - short + chance.scatter[:, 1 + m]
         target[:, m] = np.where(chance.lost[:, m], here, settled)
         commanded = np.where(chance.lost[:, m], commanded, wanted)
         here = target[:, m]
@@ -179,98 +55,25 @@ def actual_movements(
     )
 
 
-def sag(imperfections: Imperfections, robot: Robot, position: FloatArray) -> FloatArray:
-    """Return how far gravity moves every motor at the given pose, (..., motor) [rad].
+def lagged(reference: FloatArray, time: FloatArray, lag: FloatArray) -> FloatArray:
+    """Return references behind a first-order lag, exact for lines between samples.
 
     Args:
-        imperfections: What the robot is like.
-        robot: The robot.
-        position: Pose that the arm is really in, log's sense, (..., motor) [rad].
-    """
-    if imperfections.settling is None:
-        return np.zeros_like(position)
-    only_sag = replace(
-        imperfections.settling,
-        bias=(0.0,) * len(robot.motors),
-        friction=(0.0,) * len(robot.motors),
-    )
-    return only_sag.offset(robot.chain, robot.sense, position, np.zeros(len(robot.motors)))
-
-
-def sense(
-    twin: DigitalTwin,
-    readings: Readings | None,
-    position: FloatArray,
-    time: FloatArray,
-    movement_start: FloatArray,
-    chance: Disturbances,
-) -> FloatArray:
-    """Return the tool path as the sensor reports it.
-
-    Args:
-        twin: Kinematics of the robot.
-        readings: The sensor; None: perfect, one sample at every grid time.
-        position: True angles, (run, time, motor) [rad].
+        reference: (run, time, motor) [rad], at rest at its first value.
         time: Uniform grid, (time,) [s].
-        movement_start: Starts as commanded, (run, movement) [s]; gaps hang on them.
-        chance: Disturbances of the same runs.
-
-    Returns:
-        (run, time, axis) [m], NaN where there is no sample.
+        lag: Time constant of each run, (run,) [s]; 0 leaves a run as it is.
     """
-    if readings is None:
-        return twin.path(position)
-    read = _at_times(position, time, chance.reading_time)
-    if readings.whole_counts:
-        units = twin.robot.servo_units
-        read = units.to_rad(np.round(units.to_counts(read)))
-    missing = _in_gap(chance, movement_start)
-    if readings.drawn_out:
-        return _draw_out(twin, read, chance, missing, time)
-    missing |= np.isfinite(chance.glitch).any(axis=-1)
-    points = np.where(missing[..., None], np.nan, twin.path(read) + chance.noise)
-    nearest = np.rint(chance.reading_time / (time[1] - time[0])).astype(np.int64)
-    inside = nearest < len(time)
-    measured = np.full((*position.shape[:2], 3), np.nan)
-    run = np.broadcast_to(np.arange(len(position))[:, None], nearest.shape)
-    measured[run[inside], nearest[inside]] = points[inside]
-    return measured
+    from scipy.signal import lfilter
 
-
-def _at_times(position: FloatArray, time: FloatArray, at: FloatArray) -> FloatArray:
-    """Return `position` (run, time, motor) linearly interpolated at `at` (run, reading)."""
-    place = np.clip(at / (time[1] - time[0]), 0.0, len(time) - 1.0)
-    low = np.minimum(place.astype(np.int64), len(time) - 2)
-    share = (place - low)[..., None]
-    run = np.arange(len(position))[:, None]
-    return position[run, low] * (1.0 - share) + position[run, low + 1] * share
-
-
-def _in_gap(chance: Disturbances, start: FloatArray) -> BoolArray:
-    """Return which readings the stalled bus swallows, (run, reading)."""
-    late = chance.late[:, 1:]
-    begin = start[:, :-1] + chance.gap_start[:, :-1]
-    end = start[:, 1:] + late
-    at = chance.reading_time[:, :, None]
-    inside = (at > begin[:, None]) & (at < end[:, None]) & (late > 0)[:, None]
-    return np.asarray(inside.any(axis=-1))
-
-
-def _draw_out(
-    twin: DigitalTwin,
-    read: FloatArray,
-    chance: Disturbances,
-    missing: BoolArray,
-    time: FloatArray,
-) -> FloatArray:
-    """Return the path of angles drawn out to the grid by straight lines, as published."""
-    units = twin.robot.servo_units
-    counts = np.where(np.isfinite(chance.glitch), chance.glitch, units.to_counts(read))
-    filled = np.empty((len(read), len(time), read.shape[-1]))
-    for run in range(len(read)):
-        kept = ~missing[run]
-        for motor in range(read.shape[-1]):
-            filled[run, :, motor] = np.interp(
-                time, chance.reading_time[run, kept], counts[run, kept, motor]
-            )
-    return twin.path(units.to_rad(filled))
+    if not lag.any():
+        return reference
+    out = reference.copy()
+    step = time[1] - time[0]
+    for run in np.flatnonzero(lag):
+        kept = np.exp(-step / lag[run])
+        mean = lag[run] / step * (1.0 - kept)
+        moved = reference[run] - reference[run, :1]
+        out[run] = reference[run, :1] + lfilter(
+            [1.0 - mean, mean - kept], [1.0, -kept], moved, axis=0
+        )
+    return out

@@ -23,6 +23,7 @@ class Timing:
 
     Attributes:
         delay_s: Range of the dead time on top of the servo loop [s].
+        lag_s: Range of the time constant of a first-order lag on top of the servo loop [s].
         ramp_shortening: Range of the share by which ramps end early [-].
         late_rate: Share of movements that a stalled bus makes start late [-].
         late_s: Range of the late start, common to all motors [s].
@@ -31,6 +32,7 @@ class Timing:
     """
 
     delay_s: Range = (0.0, 0.0)
+    lag_s: Range = (0.0, 0.0)
     ramp_shortening: Range = (0.0, 0.0)
     late_rate: float = 0.0
     late_s: Range = (0.0, 0.0)
@@ -91,6 +93,30 @@ class Readings:
 
 
 @dataclass(frozen=True)
+class Variation:
+    """How far a robot may differ from the figures: drawn anew for every run.
+
+    One value for each motor in chain order, or none at all for no variation.
+
+    Attributes:
+        bias: Standard deviation of the constant error [rad].
+        compliance: Standard deviation of the compliance's logarithm [-].
+        friction: Standard deviation of the friction [rad].
+        scatter: Standard deviation of the scatter's logarithm [-].
+        rates: Standard deviation of the logarithm of every rate of losses, late starts and
+            glitches [-].
+        payload: Range of a payload on top of the known one [kg].
+    """
+
+    bias: tuple[float, ...] = ()
+    compliance: tuple[float, ...] = ()
+    friction: tuple[float, ...] = ()
+    scatter: tuple[float, ...] = ()
+    rates: float = 0.0
+    payload: Range = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
 class Imperfections:
     """Everything that sets a healthy robot apart from the published twin.
 
@@ -103,6 +129,7 @@ class Imperfections:
         lost_commands: Sets of motors whose commands never arrive, and how often.
         schedule: When movements are commanded.
         readings: The tool sensor; None: a perfect sample at every grid time.
+        variation: Differences from run to run; None: every run has the same robot.
     """
 
     name: str
@@ -113,10 +140,16 @@ class Imperfections:
     lost_commands: tuple[LostCommand, ...] = ()
     schedule: Schedule = field(default_factory=Schedule)
     readings: Readings | None = None
+    variation: Variation | None = None
 
 
 NO_IMPERFECTIONS = Imperfections("none", "the published twin")
 
+SETTLING_LISTS = ("bias", "compliance", "friction", "scatter")
+"""Figures of `Settling` and `Variation` that have one value for each motor."""
+
+CALIBRATION_TABLE = "calibration"
+"""Table of such a file that says how the figures were found; the twin does not read it."""
 GENERIC_NAME = "generic, not calibrated"
 """What results say of a robot whose healthy behaviour has not been measured."""
 GENERIC_SCATTER_RAD = 0.01
@@ -156,21 +189,16 @@ def load_imperfections(name_or_path: str, robot: Robot) -> Imperfections:
     if path is None or (path.suffix != ".toml" and not path.exists()):
         own = f", {robot.name!r}" if robot.imperfections_file else ""
         raise InputError(f"no imperfections {name_or_path!r}. Expected 'none'{own} or a TOML file.")
-    imperfections = from_table(Imperfections, read_toml(path), str(path))
+    table = read_toml(path)
+    table.pop(CALIBRATION_TABLE, None)
+    imperfections = from_table(Imperfections, table, str(path))
     _check_fit(imperfections, robot, path)
     return imperfections
 
 
 def _check_fit(imperfections: Imperfections, robot: Robot, path: Path) -> None:
     count = len(robot.motors)
-    lists: dict[str, tuple[float, ...]] = {}
-    if imperfections.settling is not None:
-        settling = imperfections.settling
-        for name in ("bias", "sag", "friction", "scatter"):
-            lists[f"settling: {name}"] = getattr(settling, name)
-    if imperfections.readings is not None:
-        lists["readings: glitch_rate"] = imperfections.readings.glitch_rate
-    for name, values in lists.items():
+    for name, values in _motor_lists(imperfections).items():
         if len(values) not in (0, count) or (not values and name.startswith("settling")):
             raise InputError(
                 f"{path}: {name} has {len(values)} values, expected {count}, one for each motor "
@@ -182,3 +210,15 @@ def _check_fit(imperfections: Imperfections, robot: Robot, path: Path) -> None:
                 raise InputError(
                     f"{path}: lost_commands: {unknown_name('motor', motor, robot.motor_names)}"
                 )
+
+
+def _motor_lists(imperfections: Imperfections) -> dict[str, tuple[float, ...]]:
+    """Return every figure that has one value for each motor, by the name of its key."""
+    lists: dict[str, tuple[float, ...]] = {}
+    for table in ("settling", "variation"):
+        value = getattr(imperfections, table)
+        if value is not None:
+            lists |= {f"{table}: {name}": getattr(value, name) for name in SETTLING_LISTS}
+    if imperfections.readings is not None:
+        lists["readings: glitch_rate"] = imperfections.readings.glitch_rate
+    return lists

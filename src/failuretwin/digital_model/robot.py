@@ -15,9 +15,11 @@ from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.types import FloatArray, frozen_array
 from failuretwin.core.units import ServoUnits
 from failuretwin.digital_model.chain import SerialChain
+from failuretwin.digital_model.loads import Loads, loads_of
 from failuretwin.digital_model.mobility import CANNOT_MOVE, levers
 from failuretwin.digital_model.servo import ServoLoop
-from failuretwin.digital_model.urdf import read_urdf
+from failuretwin.digital_model.urdf import read_root, read_urdf
+from failuretwin.digital_model.urdf_links import read_links
 
 POSES = ("log", "physical")
 
@@ -99,11 +101,13 @@ class Robot:
     Attributes:
         profile: Its profile.
         chain: Its kinematics; one joint for each motor.
+        loads: What its motors carry.
         folder: Where the profile lies.
     """
 
     profile: Profile
     chain: SerialChain
+    loads: Loads
     folder: Path
 
     @property
@@ -186,7 +190,8 @@ def _load_profile(path: Path) -> Robot:
     _check_unique([motor.name for motor in profile.motors], "motor name", path)
     joints = [motor.joint for motor in profile.motors]
     _check_unique(joints, "joint", path)
-    urdf = read_urdf(path.parent / profile.urdf)
+    urdf_file = path.parent / profile.urdf
+    urdf = read_urdf(urdf_file)
     chain = urdf.chain(profile.base_link, profile.tool_link, joints)
     order = [joint.name for joint in chain.joints]
     if joints != order:
@@ -200,7 +205,8 @@ def _load_profile(path: Path) -> Robot:
                 f"{path}: motor {motor.name!r} ({motor.joint}) cannot move the tool point, so no "
                 "tool path can tell of it. Leave it out, or choose another tool_link."
             )
-    return Robot(profile, chain, path.parent)
+    links = read_links(read_root(urdf_file))
+    return Robot(profile, chain, loads_of(urdf, links, profile.base_link, chain), path.parent)
 
 
 def _check_unique(names: Sequence[str], kind: str, path: Path) -> None:

@@ -7,32 +7,33 @@ from dataclasses import dataclass
 import numpy as np
 
 from failuretwin.core.types import FloatArray
-from failuretwin.digital_model.chain import SerialChain
+from failuretwin.digital_model.robot import Robot
 
 
 @dataclass(frozen=True)
 class Settling:
     """Settled error of each motor and its scatter; one value for each motor in chain order.
 
-    The joint gives way under the weight it carries, so the error grows with the lever arm
-    dz/dq of the tool (how much the tool rises when the joint turns), taken in the physical
-    pose; friction stops it short of its target, seen in the direction of travel.
+    A motor gives way under the load torque of the links and the payload in the pose that the arm
+    is really in; friction stops it short of its target, seen in the direction of travel.
 
     Attributes:
         bias: Constant error [rad].
-        sag: Yielding for each metre of lever arm [rad/m].
+        compliance: Yielding for each unit of load torque [rad/(N m)].
         friction: How far it stops short [rad].
         scatter: Scale of what is left, from movement to movement [rad].
         tail_dof: Degrees of freedom of the scatter's Student t distribution; small = heavy tails.
         source: Where the figures come from.
+        payload: Mass carried at the tool point beside what the URDF knows [kg].
     """
 
     bias: tuple[float, ...]
-    sag: tuple[float, ...]
+    compliance: tuple[float, ...]
     friction: tuple[float, ...]
     scatter: tuple[float, ...]
     tail_dof: float
     source: str
+    payload: float = 0.0
 
     @classmethod
     def ideal(cls, motors: int) -> Settling:
@@ -40,24 +41,43 @@ class Settling:
         zero = (0.0,) * motors
         return cls(zero, zero, zero, zero, np.inf, "ideal motors")
 
-    def offset(
-        self, chain: SerialChain, sense: FloatArray, pose: FloatArray, direction: FloatArray
-    ) -> FloatArray:
+    def offset(self, robot: Robot, pose: FloatArray, direction: FloatArray) -> FloatArray:
         """Return the mean settled error of a healthy motor.
 
         Args:
-            chain: Kinematics of the robot.
-            sense: +1 or -1 by motor, (motor,); physical angle = sense * angle in the log.
+            robot: The robot.
             pose: Angles that the arm settles near, in the log's sense, (..., motor) [rad].
             direction: Sign of each motor's last travel in the log's sense, (..., motor).
 
         Returns:
             Settled angle minus commanded angle in the log's sense, (..., motor) [rad].
         """
-        friction = np.asarray(self.friction) * direction
-        sag = np.asarray(self.sag)
-        if not sag.any():
-            return np.asarray(self.bias) - friction
-        _, jacobian = chain.position_and_jacobian(pose * sense)
-        lever_arm = jacobian[..., 2, :]
-        return np.asarray(self.bias) - sense * sag * lever_arm - friction
+        offset = np.asarray(self.bias) - np.asarray(self.friction) * direction
+        compliance = np.asarray(self.compliance)
+        if not compliance.any():
+            return offset
+        return offset + sag(robot, pose, compliance, self.payload)
+
+
+def loads_in_range(robot: Robot, payload: float) -> FloatArray:
+    """Return gravity torques at 500 poses spread over the motors' ranges, (pose, motor) [N m]."""
+    low, high = np.array([motor.movement_range for motor in robot.motors]).T
+    poses = np.random.default_rng(0).uniform(low, high, (500, len(low)))
+    return robot.loads.torque(poses * robot.sense, payload)
+
+
+def sag(
+    robot: Robot,
+    pose: FloatArray,
+    compliance: FloatArray,
+    payload: FloatArray | float,
+) -> FloatArray:
+    """Return how far gravity moves every motor, (..., motor) [rad], log's sense.
+
+    Args:
+        robot: The robot.
+        pose: Angles that the arm is in, in the log's sense, (..., motor) [rad].
+        compliance: Yielding of each motor, (..., motor) [rad/(N m)].
+        payload: Mass at the tool point, () or the leading axes of `pose` [kg].
+    """
+    return robot.sense * compliance * robot.loads.torque(pose * robot.sense, payload)

@@ -12,6 +12,12 @@ from failuretwin.app.commands.options import PATH, common_options, reading_optio
 @click.command()
 @click.argument("inputs", nargs=-1, required=True, type=PATH, metavar="INPUT...")
 @click.option(
+    "--calibration",
+    type=PATH,
+    metavar="FILE",
+    help="What `calibrate` learned of this robot. Default: the calibration its profile names.",
+)
+@click.option(
     "--hypotheses",
     metavar="H,...",
     help="What may be the case, such as healthy,motor_2:stuck. Default: the paper's nine classes.",
@@ -36,6 +42,7 @@ from failuretwin.app.commands.options import PATH, common_options, reading_optio
 @common_options
 def diagnose(
     inputs: tuple[Path, ...],
+    calibration: Path | None,
     hypotheses: str | None,
     sse_range: tuple[float, float] | None,
     onset: float | None,
@@ -60,6 +67,7 @@ def diagnose(
     from failuretwin.app.tables import print_diagnoses, print_scores
     from failuretwin.core.hypothesis import parse_hypotheses
     from failuretwin.decision.bayes import BayesDiagnoser, priors_of
+    from failuretwin.digital_model.imperfections import load_imperfections
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.twin import DigitalTwin
 
@@ -67,6 +75,7 @@ def diagnose(
     twin = DigitalTwin(model)
     diagnoser = BayesDiagnoser(
         twin,
+        imperfections=None if calibration is None else load_imperfections(str(calibration), model),
         hypotheses=(
             None
             if hypotheses is None

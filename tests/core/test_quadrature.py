@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.special import logsumexp
 
-from failuretwin.decision.quadrature import (
+from failuretwin.core.quadrature import (
     log_of,
     log_sum,
     log_trapezoid_weights,

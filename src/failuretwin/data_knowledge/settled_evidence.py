@@ -36,6 +36,7 @@ class SettledEvidence:
         count: Independent readings behind it, (run, movement).
         usable: Movements with a settled point, (run, movement).
         moving: Movements whose readings do not come to rest, (run, movement).
+        begin: When the readings that count begin, (run, movement) [s].
         end: End of each plateau, (run, movement) [s].
     """
 
@@ -44,6 +45,7 @@ class SettledEvidence:
     count: IntArray
     usable: BoolArray
     moving: BoolArray
+    begin: FloatArray
     end: FloatArray
 
     def __getitem__(self, runs: slice) -> SettledEvidence:
@@ -55,6 +57,7 @@ class SettledEvidence:
             self.count[runs],
             self.usable[runs],
             self.moving[runs],
+            self.begin[runs],
             self.end[runs],
         )
 
@@ -87,7 +90,7 @@ def settled_evidence(runs: xr.Dataset) -> SettledEvidence:
         independent = int((end - begin)[run, movement] * rate) + 1
         count[run, movement] = min(len(samples), independent)
         moving[run, movement] = _spread(samples) > STILL_M
-    return SettledEvidence(movements, point, count, (count > 0) & ~moving, moving, end)
+    return SettledEvidence(movements, point, count, (count > 0) & ~moving, moving, begin, end)
 
 
 def _plateau_ends(movements: Movements, measured: FloatArray, time: FloatArray) -> FloatArray:

@@ -1,0 +1,66 @@
+"""`failuretwin calibrate`: a twin that knows this very robot, from its healthy logs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from failuretwin.app.commands.options import PATH, common_options, reading_options
+
+
+@click.command()
+@click.argument("logs", nargs=-1, required=True, type=PATH, metavar="LOG...")
+@click.option("--out", required=True, type=PATH, help="Calibration to write (.toml).")
+@click.option(
+    "--hold-out",
+    metavar="SESSION",
+    help="Learn nothing from sessions with this in their name; only see how well they are "
+    "predicted. Default: each session is left out once, and the result learns from all.",
+)
+@click.option("--name", help="What results call the calibration. Default: the file's name.")
+@click.option("--report", type=PATH, metavar="DIR", help="Write a page with tables and pictures.")
+@reading_options
+@common_options
+def calibrate(
+    logs: tuple[Path, ...],
+    out: Path,
+    hold_out: str | None,
+    name: str | None,
+    report: Path | None,
+    how: str,
+    published_labels: bool,
+    columns: Path | None,
+    approximate: bool,
+    robot: str,
+    seed: int,
+) -> None:
+    """Learn from healthy logs where the motors settle, how they lag and what goes wrong by chance.
+
+    LOG is whatever `diagnose` reads. Motor readings are used where the logs have them, else the
+    tool path alone. Runs that are labelled or look faulty are left out.
+    """
+    del seed  # nothing here depends on chance
+    from failuretwin.app.calibrating import learn_robot
+    from failuretwin.app.calibration_tables import print_calibration
+    from failuretwin.app.inputs import read_inputs
+    from failuretwin.connection.calibration.calibration_file import (
+        check_calibration_file,
+        save_calibration,
+    )
+    from failuretwin.digital_model.robot import load_robot
+
+    check_calibration_file(out)
+    model = load_robot(robot)
+    runs = read_inputs(logs, model, how, published_labels, columns, approximate)
+    source = ", ".join(str(log) for log in logs)
+    found, judged = learn_robot(runs, model, name or out.stem, source, hold_out)
+    if report is not None:
+        from failuretwin.app.calibration_page import write_calibration_page
+        from failuretwin.data_knowledge.store import filling
+
+        with filling(report) as folder:
+            write_calibration_page(found, judged, model, folder)
+    save_calibration(found, model, out)
+    print_calibration(found, model)
+    click.echo(f"written to {out}; use it with `failuretwin diagnose --calibration {out}`")

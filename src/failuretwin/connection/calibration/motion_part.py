@@ -1,0 +1,148 @@
+"""What the logs say between the plateaus: late starts, gaps, glitches, and ramps for the timing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from failuretwin.connection.calibration.observations import Observations
+from failuretwin.connection.calibration.rates import Rate
+from failuretwin.connection.calibration.settled_part import SettledPart
+from failuretwin.connection.calibration.timing_fit import Transients
+from failuretwin.core.movements import Movements, find_movements
+from failuretwin.core.runs import measured_rate
+from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.digital_model.robot import Robot
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+LATE_S = 0.15
+"""A movement that outlasts the usual time to the next command by this much started late [s]."""
+STEADY_S = 0.05
+"""Commands whose spacing scatters less than this come at a steady pace [s]."""
+AFTER_RAMP_S = 0.25
+"""Readings up to this long after a ramp still tell of its timing [s]."""
+GAP_PERIODS = 4.0
+"""A silence of this many periods of the readings is a gap."""
+
+
+@dataclass(frozen=True)
+class Lateness:
+    """Late starts of a stalled bus, read off the times between commands.
+
+    Attributes:
+        known: Whether commands come at a steady pace, so that lateness can be told.
+        late: How late each movement started, (run, movement) [s]; 0 punctual, NaN not known.
+        period: Usual time from command to command [s].
+    """
+
+    known: bool
+    late: FloatArray
+    period: float
+
+
+def lateness(movements: Movements) -> Lateness:
+    """Return how late movements started: a late start holds up the next command."""
+    spacing = np.diff(movements.start, axis=1)
+    late = np.full(movements.start.shape, np.nan)
+    seen = spacing[np.isfinite(spacing)]
+    if len(seen) < 3:
+        return Lateness(False, late, float("nan"))
+    period = float(np.median(seen))
+    spread = 1.4826 * float(np.median(np.abs(seen - period)))
+    if spread > STEADY_S:
+        return Lateness(False, late, period)
+    excess = spacing - period
+    late[:, :-1] = np.where(np.isfinite(excess), np.where(excess > LATE_S, excess, 0.0), np.nan)
+    return Lateness(True, late, period)
+
+
+def gap_starts(runs: xr.Dataset, movements: Movements, late: FloatArray) -> FloatArray:
+    """Return when readings stop before late starts, after the movement before, (gap,) [s]."""
+    time, rate = as_floats(runs["time"].values), measured_rate(runs)
+    seen = np.asarray(np.isfinite(as_floats(runs["measured"].values)).all(axis=2))
+    found = []
+    for run, movement in np.argwhere(np.nan_to_num(late) > 0.0):
+        if movement == 0:
+            continue
+        begin, end = movements.start[run, movement - 1], movements.start[run, movement]
+        inside = time[seen[run] & (time > begin) & (time < end + late[run, movement])]
+        holes = np.flatnonzero(
+            np.diff(np.append(inside, end + late[run, movement])) > GAP_PERIODS / rate
+        )
+        if len(holes):
+            found.append(inside[holes[0]] + 0.5 / rate - begin)
+    return np.array(found)
+
+
+def glitch_rates(runs: xr.Dataset) -> list[Rate] | None:
+    """Return the share of spoilt readings of each motor; None where motors were not read."""
+    if "position" not in runs:
+        return None
+    finite = np.isfinite(as_floats(runs["position"].values))
+    rows = int(finite.any(axis=2).sum())
+    return [Rate(rows - int(finite[..., motor].sum()), rows) for motor in range(finite.shape[2])]
+
+
+def transients(
+    runs: xr.Dataset, movements: Movements, late: Lateness, part: SettledPart, robot: Robot
+) -> Transients:
+    """Return the readings on ramps that began on time and at a known place.
+
+    Args:
+        runs: The runs of the observations.
+        movements: Their movements.
+        late: How late they started.
+        part: Sorted settled movements and the fit.
+        robot: The robot.
+    """
+    time = as_floats(runs["time"].values)
+    sound = _sound(movements, part.observations, part)
+    on_time = sound & ~(np.nan_to_num(late.late) > 0.0)
+    on_time[:, -1] &= not late.known or not np.any(np.nan_to_num(late.late) > 0.0)
+    used = np.zeros((len(movements.start), len(time)), dtype=bool)
+    for run, movement in np.argwhere(on_time):
+        begin = movements.start[run, movement]
+        end = begin + np.nanmax(movements.ramp_duration[run, movement]) + AFTER_RAMP_S
+        used[run] |= (time >= begin) & (time < end)
+    of_motors = part.observations.position is not None
+    reading = as_floats(runs["position" if of_motors else "measured"].values)
+    return Transients(
+        movements=_settled_movements(movements, part, robot),
+        reading=reading,
+        of_motors=of_motors,
+        used=used & np.isfinite(reading).all(axis=2),
+        time=time,
+    )
+
+
+def _sound(movements: Movements, seen: Observations, part: SettledPart) -> BoolArray:
+    """Return which movements began and ended where the fit says, (run, movement)."""
+    good = np.zeros(movements.start.shape, dtype=bool)
+    fine = ~part.odd & ~part.lost.any(axis=1)
+    good[seen.run[fine], seen.number[fine]] = True
+    before = np.ones_like(good)
+    before[:, 1:] = good[:, :-1]
+    return good & before
+
+
+def _settled_movements(movements: Movements, part: SettledPart, robot: Robot) -> Movements:
+    """Return the movements with the targets at which motors really settle."""
+    settling = part.fit.settling("fit")
+    origin, target = np.nan_to_num(movements.origin()), np.nan_to_num(movements.target)
+    settled = target + settling.offset(robot, target, np.sign(target - origin))
+    still = np.zeros_like(movements.initial)
+    return Movements(
+        initial=movements.initial + settling.offset(robot, movements.initial, still),
+        target=np.where(movements.exists[..., None], settled, np.nan),
+        ramp_duration=movements.ramp_duration,
+        start=movements.start,
+    )
+
+
+def movements_of(runs: xr.Dataset) -> Movements:
+    """Return the movements of a run set."""
+    return find_movements(as_floats(runs["command"].values), as_floats(runs["time"].values))

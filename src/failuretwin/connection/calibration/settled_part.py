@@ -1,0 +1,89 @@
+"""Settled movements sorted into healthy ones, lost commands and what stands out, and the fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from failuretwin.connection.calibration.calibration import LeftOut
+from failuretwin.connection.calibration.observations import Observations, stayed
+from failuretwin.connection.calibration.settled_fit import SettledFit, fit_settling
+from failuretwin.core.errors import InputError
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.settling import Settling
+from failuretwin.digital_model.twin import DigitalTwin
+
+FEWEST_MOVEMENTS = 6
+"""Settled movements below which nothing can be fitted."""
+STANDS_OUT_RAD, STANDS_OUT_M = 0.084, 0.03
+"""Error beyond which a movement is no healthy one [rad], twenty counts, and of the tool [m]."""
+ROUNDS = 2
+"""Rounds of sorting and fitting; the second knows where motors settle."""
+
+
+@dataclass(frozen=True)
+class SettledPart:
+    """Settled movements of healthy logs and what was learned from them.
+
+    Attributes:
+        observations: All settled movements.
+        lost: Motors that did not get their command, (movement, motor).
+        odd: Movements that look like no healthy ones, (movement,).
+        fit: Where motors settle.
+    """
+
+    observations: Observations
+    lost: BoolArray
+    odd: BoolArray
+    fit: SettledFit
+
+    def left_out(self, robot: Robot) -> tuple[LeftOut, ...]:
+        """Return the movements that did not count, each with its reason."""
+        found = []
+        seen = self.observations
+        for i in np.flatnonzero(self.odd | self.lost.any(axis=1)):
+            motors = [robot.motor_names[k] for k in np.flatnonzero(self.lost[i])]
+            reason = "did not get its command" if motors else "is far off its target"
+            name = " and ".join(motors)
+            found.append(LeftOut(seen.runs[seen.run[i]], int(seen.number[i]) + 1, name, reason))
+        return tuple(found)
+
+
+def fit_settled_part(observations: Observations, robot: Robot, payload: float = 0.0) -> SettledPart:
+    """Sort settled movements and fit where motors settle.
+
+    Args:
+        observations: Settled movements of healthy runs.
+        robot: The robot.
+        payload: Mass at the tool point [kg].
+
+    Raises:
+        InputError: If too few movements are left.
+    """
+    settling = Settling.ideal(len(robot.motors))
+    for _ in range(ROUNDS):
+        expected = observations.target + settling.offset(
+            robot, observations.target, observations.direction
+        )
+        lost = stayed(observations, robot, expected)
+        odd = _odd(observations, robot, np.where(lost, observations.origin, expected))
+        kept = ~odd
+        if kept.sum() < FEWEST_MOVEMENTS:
+            raise InputError(
+                f"only {int(kept.sum())} of {len(kept)} movements come to rest near their targets, "
+                f"expected {FEWEST_MOVEMENTS} at least. Give longer logs of a healthy robot."
+            )
+        arrived = (~lost[kept]).astype(np.float64)
+        fit = fit_settling(observations[kept], robot, arrived, payload)
+        settling = fit.settling("fit")
+    return SettledPart(observations, lost, odd, fit)
+
+
+def _odd(observations: Observations, robot: Robot, expected: FloatArray) -> BoolArray:
+    if observations.position is not None:
+        off = np.abs(observations.position - expected) > STANDS_OUT_RAD
+        return np.asarray(off.any(axis=1))
+    away = DigitalTwin(robot).path(expected) - observations.point
+    return np.asarray(np.linalg.norm(away, axis=1) > STANDS_OUT_M)

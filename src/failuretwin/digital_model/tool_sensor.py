@@ -1,0 +1,89 @@
+"""The tool sensor: from the true angles of many runs to the readings of the tool's path."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.digital_model.disturbances import Disturbances
+from failuretwin.digital_model.imperfections import Readings
+from failuretwin.digital_model.twin import DigitalTwin
+
+
+def sense(
+    twin: DigitalTwin,
+    readings: Readings | None,
+    position: FloatArray,
+    time: FloatArray,
+    movement_start: FloatArray,
+    chance: Disturbances,
+) -> FloatArray:
+    """Return the tool path as the sensor reports it.
+
+    Args:
+        twin: Kinematics of the robot.
+        readings: The sensor; None: perfect, one sample at every grid time.
+        position: True angles, (run, time, motor) [rad].
+        time: Uniform grid, (time,) [s].
+        movement_start: Starts as commanded, (run, movement) [s]; gaps hang on them.
+        chance: Disturbances of the same runs.
+
+    Returns:
+        (run, time, axis) [m], NaN where there is no sample.
+    """
+    if readings is None:
+        return twin.path(position)
+    read = _at_times(position, time, chance.reading_time)
+    if readings.whole_counts:
+        units = twin.robot.servo_units
+        read = units.to_rad(np.round(units.to_counts(read)))
+    missing = _in_gap(chance, movement_start)
+    if readings.drawn_out:
+        return _draw_out(twin, read, chance, missing, time)
+    missing |= np.isfinite(chance.glitch).any(axis=-1)
+    points = np.where(missing[..., None], np.nan, twin.path(read) + chance.noise)
+    nearest = np.rint(chance.reading_time / (time[1] - time[0])).astype(np.int64)
+    inside = nearest < len(time)
+    measured = np.full((*position.shape[:2], 3), np.nan)
+    run = np.broadcast_to(np.arange(len(position))[:, None], nearest.shape)
+    measured[run[inside], nearest[inside]] = points[inside]
+    return measured
+
+
+def _at_times(position: FloatArray, time: FloatArray, at: FloatArray) -> FloatArray:
+    """Return `position` (run, time, motor) linearly interpolated at `at` (run, reading)."""
+    place = np.clip(at / (time[1] - time[0]), 0.0, len(time) - 1.0)
+    low = np.minimum(place.astype(np.int64), len(time) - 2)
+    share = (place - low)[..., None]
+    run = np.arange(len(position))[:, None]
+    return position[run, low] * (1.0 - share) + position[run, low + 1] * share
+
+
+def _in_gap(chance: Disturbances, start: FloatArray) -> BoolArray:
+    """Return which readings the stalled bus swallows, (run, reading)."""
+    late = chance.late[:, 1:]
+    begin = start[:, :-1] + chance.gap_start[:, :-1]
+    end = start[:, 1:] + late
+    at = chance.reading_time[:, :, None]
+    inside = (at > begin[:, None]) & (at < end[:, None]) & (late > 0)[:, None]
+    return np.asarray(inside.any(axis=-1))
+
+
+def _draw_out(
+    twin: DigitalTwin,
+    read: FloatArray,
+    chance: Disturbances,
+    missing: BoolArray,
+    time: FloatArray,
+) -> FloatArray:
+    """Return the path of angles drawn out to the grid by straight lines, as published."""
+    units = twin.robot.servo_units
+    counts = np.where(np.isfinite(chance.glitch), chance.glitch, units.to_counts(read))
+    filled = np.empty((len(read), len(time), read.shape[-1]))
+    for run in range(len(read)):
+        kept = ~missing[run]
+        for motor in range(read.shape[-1]):
+            filled[run, :, motor] = np.interp(
+                time, chance.reading_time[run, kept], counts[run, kept, motor]
+            )
+    return twin.path(units.to_rad(filled))
