@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -173,6 +174,21 @@ def test_imported_sessions_give_the_same_results(failuretwin, write_session, tmp
     assert stored.stdout == direct.stdout
     scores = failuretwin("evaluate", "stored.jsonl", folder=tmp_path)
     assert begins_with(score_lines(scores.stdout), score_lines(direct.stdout))
+
+
+def test_faults_come_as_large_as_the_file_says(failuretwin, tmp_path):
+    (tmp_path / "faults.toml").write_text("[drift]\nmagnitude = [0.02, 0.02]\nonset_s = [3, 3]\n")
+    answer = failuretwin(
+        *("simulate", "--out", "x.nc", "--runs-per-class", 2, "--faults", "faults.toml"),
+        *("--hypotheses", "motor_1:stuck,motor_2:drift"),
+        folder=tmp_path,
+    )
+    assert answer.returncode == 0, answer.stderr
+    runs = load_run_set(tmp_path / "x.nc")
+    np.testing.assert_allclose(runs["onset"], [0.49, 0.49, 3.0, 3.0])
+    np.testing.assert_allclose(np.abs(runs["magnitude"][2:]), 0.02)
+    modes = json.loads(runs.attrs["configuration"])["modes"]
+    assert modes["drift"]["magnitude"] == [0.02, 0.02]
 
 
 def test_simulated_runs_do_not_depend_on_the_workers(failuretwin, tmp_path):

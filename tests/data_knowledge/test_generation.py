@@ -8,11 +8,17 @@ import pytest
 import xarray as xr
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import UNKNOWN, Hypothesis, paper_hypotheses
+from failuretwin.core.hypothesis import (
+    MAGNITUDE_UNITS,
+    UNKNOWN,
+    Hypothesis,
+    paper_hypotheses,
+)
 from failuretwin.core.runs import check_runs
 from failuretwin.data_knowledge import generation
 from failuretwin.data_knowledge.generation import Plan, simulate, simulate_runs
 from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.failure_behavior.modes import MODES
 
 BOTH = pytest.mark.parametrize("imperfections", ["none", "armpi_fpv"])
 VALUES = ("command", "measured", "position")
@@ -148,8 +154,27 @@ def test_plan_that_cannot_be_made_is_refused(plan_of, changes, message):
 
 
 def test_mode_that_cannot_be_simulated_names_those_that_can(plan_of, armpi):
+    modes = {name: MODES[name] for name in ("stuck", "steady_state_error")}
     with pytest.raises(InputError, match=r"'backlash' cannot .* one of stuck, steady_state_error"):
-        plan_of(hypotheses=parse("motor_1:backlash", armpi))
+        replace(plan_of(), hypotheses=parse("motor_1:backlash", armpi), modes=modes)
+
+
+@pytest.mark.parametrize(("imperfections", "motor"), [("none", 2), ("armpi_fpv", 1)])
+def test_torque_loss_is_refused_where_nothing_gives_way(plan_of, armpi, imperfections, motor):
+    """Motor 1 turns about the vertical, so no weight pulls at it."""
+    fault = f"motor_{motor}:torque_loss"
+    with pytest.raises(InputError, match=f"'{fault}' would not show.*--imperfections"):
+        plan_of(imperfections, hypotheses=parse(fault, armpi))
+
+
+def test_all_modes_can_be_simulated_with_all_imperfections(plan_of, armpi):
+    faults = ",".join(f"motor_3:{mode}" for mode in MAGNITUDE_UNITS)
+    runs = simulate(plan_of("armpi_fpv", 1, hypotheses=parse(faults, armpi)))
+    assert runs["fault"].values.tolist() == faults.split(",")
+    assert np.isfinite(runs["magnitude"].values).all()
+    modes = json.loads(runs.attrs["configuration"])["modes"]
+    assert list(modes) == list(MAGNITUDE_UNITS)
+    assert modes["lag"]["magnitude"] == [0.1, 0.3]
 
 
 def test_no_workers_are_refused(plan_of):

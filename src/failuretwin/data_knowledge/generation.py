@@ -18,7 +18,7 @@ import numpy as np
 
 from failuretwin import __version__
 from failuretwin.core.errors import InputError, unknown_name
-from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.hypothesis import Fault, Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable, Truth, concatenate
 from failuretwin.core.types import FloatArray, as_floats
@@ -27,10 +27,12 @@ from failuretwin.digital_model.engine import Drive, Engine, ServoEngine
 from failuretwin.digital_model.imperfect import actual_movements, delay_commands, lagged
 from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, Imperfections
 from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.settling import Settling, loads_in_range
 from failuretwin.digital_model.tool_sensor import sense
 from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.failure_behavior.fault_value import FaultValue
 from failuretwin.failure_behavior.injection import Injection
-from failuretwin.failure_behavior.modes import MODES, FaultMode, FaultValue
+from failuretwin.failure_behavior.modes import MODES, FaultMode
 from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
 
 if TYPE_CHECKING:
@@ -39,6 +41,8 @@ if TYPE_CHECKING:
 STEP_S = 0.01
 """Step of the time grid [s], as published."""
 ENGINES = ("servo", "physics")
+LEAST_SAG_RAD = 1e-6
+"""A motor that its load moves by less than this in any pose counts as rigid [rad]."""
 CHUNK_RUNS = 100
 """Runs computed at a time: about 30 MB of work."""
 
@@ -81,6 +85,20 @@ class Plan:
                         f"fault mode {fault.mode!r} cannot be simulated. "
                         f"Expected one of {', '.join(self.modes)}."
                     )
+                if self.modes[fault.mode].needs_compliance and self.engine == "servo":
+                    self._check_compliance(fault)
+
+    def _check_compliance(self, fault: Fault) -> None:
+        """Refuse a loss of stiffness in a motor that does not give way at all."""
+        motor = self.robot.motor_names.index(fault.motor)
+        settling = self.imperfections.settling or Settling.ideal(len(self.robot.motors))
+        load = np.abs(loads_in_range(self.robot, settling.payload)[:, motor]).max()
+        if settling.compliance[motor] * load < LEAST_SAG_RAD:
+            raise InputError(
+                f"'{fault}' would not show: with imperfections {self.imperfections.name!r}, "
+                f"{fault.motor} does not give way under load. Choose imperfections in which it "
+                "sags (--imperfections), or another motor."
+            )
 
     @property
     def size(self) -> int:
@@ -166,7 +184,7 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
         measured=measured,
         measured_rate_hz=1.0 / STEP_S if readings is None else readings.rate_hz,
         movements=commanded,
-        truth=_truth(plan, runs, draws, injection.magnitudes(position)),
+        truth=_truth(plan, runs, injection.as_struck(position, time, commanded.start)),
         position=position,
         attributes=plan.attributes(),
     )
@@ -221,13 +239,14 @@ def _run_name(plan: Plan, run: int) -> str:
     return f"{plan.hypothesis_of(run)}/{run % plan.runs_per_class:05d}"
 
 
-def _truth(plan: Plan, runs: Sequence[int], draws: Sequence[_Draw], magnitude: FloatArray) -> Truth:
-    onset = [min((v.onset_s for v in draw.faults), default=np.nan) for draw in draws]
+def _truth(plan: Plan, runs: Sequence[int], faults: Sequence[Sequence[FaultValue]]) -> Truth:
+    onset = [min((v.onset_s for v in values), default=np.nan) for values in faults]
+    magnitude = [values[0].magnitude if values else np.nan for values in faults]
     return Truth(
         fault=[str(plan.hypothesis_of(run)) for run in runs],
-        detail=[{"faults": [value.detail() for value in draw.faults]} for draw in draws],
+        detail=[{"faults": [value.detail() for value in values]} for values in faults],
         onset=np.array(onset),
-        magnitude=magnitude,
+        magnitude=np.array(magnitude),
     )
 
 

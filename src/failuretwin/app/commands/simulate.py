@@ -32,6 +32,14 @@ from failuretwin.app.commands.options import PATH, common_options
     "name, or a TOML file.",
 )
 @click.option(
+    "--faults",
+    type=PATH,
+    metavar="FILE",
+    help="How large faults are, when they begin and how they grow: a TOML file with a table for "
+    "each mode, such as [drift]. Default: the paper's stuck and steady_state_error; the other "
+    "modes as assumed in docs/fault_modes.md.",
+)
+@click.option(
     "--workers",
     type=click.IntRange(min=1),
     default=1,
@@ -44,6 +52,7 @@ def simulate(
     runs_per_class: int,
     hypotheses: str | None,
     imperfections: str,
+    faults: Path | None,
     workers: int,
     robot: str,
     seed: int,
@@ -55,6 +64,7 @@ def simulate(
     from failuretwin.data_knowledge.store import check_destination, save_run_set
     from failuretwin.digital_model.imperfections import load_imperfections
     from failuretwin.digital_model.robot import load_robot
+    from failuretwin.failure_behavior.modes import MODES, load_modes
 
     check_destination(out)
     model = load_robot(robot)
@@ -69,6 +79,7 @@ def simulate(
         runs_per_class=runs_per_class,
         seed=seed,
         imperfections=load_imperfections(imperfections, model),
+        modes=MODES if faults is None else load_modes(faults),
     )
     with progress_bar("simulating", plan.size) as advance:
         runs = generation.simulate(plan, workers, advance)
