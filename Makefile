@@ -14,6 +14,7 @@ test: .venv/ready lint
 
 bench: .venv/ready
 	$(BIN)/python benchmarks/speed.py
+	$(BIN)/python benchmarks/scale.py
 
 lint: .venv/ready
 	$(BIN)/ruff check .

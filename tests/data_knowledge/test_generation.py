@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 import json
+import pickle
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import xarray as xr
 
+from failuretwin import load_robot
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import (
     MAGNITUDE_UNITS,
@@ -16,7 +18,7 @@ from failuretwin.core.hypothesis import (
 )
 from failuretwin.core.runs import check_runs
 from failuretwin.data_knowledge import generation
-from failuretwin.data_knowledge.generation import Plan, simulate, simulate_runs
+from failuretwin.data_knowledge.generation import Plan, iterate, simulate, simulate_runs
 from failuretwin.digital_model.imperfections import load_imperfections
 from failuretwin.failure_behavior.modes import MODES
 
@@ -141,9 +143,80 @@ def test_progress_adds_up_to_all_runs(monkeypatch, plan_of):
     assert done == [7, 7, 4]
 
 
+@BOTH
+def test_runs_can_be_drawn_without_storing(plan_of, imperfections):
+    plan = plan_of(imperfections)
+    whole = simulate_runs(plan, range(plan.size))
+    tables = list(iterate(plan, 5))
+    assert [len(table.run) for table in tables] == [5, 5, 5, 3]
+    for name in VALUES:
+        drawn = np.concatenate([getattr(table, name) for table in tables])
+        np.testing.assert_array_equal(drawn, getattr(whole, name))
+
+
+def test_runs_can_be_drawn_in_any_order(plan_of):
+    plan = plan_of()
+    order = np.random.default_rng(1).permutation(plan.size)
+    whole = simulate_runs(plan, range(plan.size))
+    tables = list(iterate(plan, 4, order))
+    names = [name for table in tables for name in table.run]
+    assert names == [whole.run[run] for run in order]
+    measured = np.concatenate([table.measured for table in tables])
+    np.testing.assert_array_equal(measured, whole.measured[order])
+
+
+def test_runs_are_drawn_when_they_are_asked_for(monkeypatch, plan_of):
+    made = []
+    monkeypatch.setattr(generation, "simulate_runs", lambda plan, runs: made.append(runs))
+    drawing = iterate(plan_of(runs_per_class=10**6), 10)
+    next(drawing)
+    next(drawing)
+    assert made == [range(10), range(10, 20)]
+
+
+def test_no_runs_at_a_time_are_refused(plan_of):
+    with pytest.raises(InputError, match="runs at a time is 0, expected 1 or more"):
+        next(iterate(plan_of(), 0))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda plan: {"seed": 1},
+        lambda plan: {"runs_per_class": 3},
+        lambda plan: {"hypotheses": plan.hypotheses[:-1]},
+        lambda plan: {"imperfections": load_imperfections("none", plan.robot)},
+        lambda plan: {"movements": replace(plan.movements, period_s=1.9)},
+        lambda plan: {
+            "modes": {**plan.modes, "stuck": replace(plan.modes["stuck"], onset_s=(1.0, 2.0))}
+        },
+        lambda plan: {"robot": load_robot("so101"), "hypotheses": [Hypothesis()]},
+    ],
+    ids=["seed", "runs", "hypotheses", "imperfections", "movements", "modes", "robot"],
+)
+def test_another_plan_has_another_hash(plan_of, change):
+    plan = plan_of()
+    other = replace(plan, **change(plan))
+    assert other.manifest()["plan_sha256"] != plan.manifest()["plan_sha256"]
+    again = pickle.loads(pickle.dumps(plan))
+    assert again.manifest() == plan.manifest() == json.loads(json.dumps(plan.manifest()))
+
+
+def test_another_urdf_has_another_hash(plan_of, tmp_path, armpi):
+    plan = plan_of()
+    for name in ("armpi_fpv.urdf", "armpi_fpv.toml"):
+        (tmp_path / name).write_bytes((armpi.folder / name).read_bytes())
+    moved = replace(plan, robot=load_robot(tmp_path / "armpi_fpv.toml"))
+    assert moved.manifest() == plan.manifest()
+    with (tmp_path / "armpi_fpv.urdf").open("a") as urdf:
+        urdf.write("<!-- another mass -->")
+    assert moved.manifest()["plan_sha256"] != plan.manifest()["plan_sha256"]
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"hypotheses": [Hypothesis(), Hypothesis()]}, "a hypothesis is given twice"),
         ({"runs_per_class": 0}, "runs per class is 0, expected 1 or more"),
         ({"hypotheses": [UNKNOWN]}, "'unknown' cannot be simulated"),
     ],

@@ -6,22 +6,24 @@ is the same whoever makes it and whatever is made beside it.
 
 from __future__ import annotations
 
+import hashlib
 import json
-import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from multiprocessing import Pool
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from failuretwin import __version__
 from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.fingerprint import canonical, fingerprint
 from failuretwin.core.hypothesis import Fault, Hypothesis
 from failuretwin.core.movements import Movements
-from failuretwin.core.runs import RunTable, Truth, concatenate
+from failuretwin.core.runs import RunTable, Truth
 from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.data_knowledge.assembly import assemble
+from failuretwin.data_knowledge.workforce import Workforce
 from failuretwin.digital_model.disturbances import Disturbances, draw_disturbances, stack
 from failuretwin.digital_model.engine import Drive, Engine, ServoEngine
 from failuretwin.digital_model.imperfect import actual_movements, delay_commands, lagged
@@ -76,6 +78,8 @@ class Plan:
             raise InputError(f"runs per class is {self.runs_per_class}, expected 1 or more.")
         if self.engine not in ENGINES:
             raise unknown_name("engine", self.engine, ENGINES)
+        if len(set(self.hypotheses)) < len(self.hypotheses):
+            raise InputError("a hypothesis is given twice. Give each of them once.")
         for hypothesis in self.hypotheses:
             if not hypothesis.known:
                 raise InputError("'unknown' cannot be simulated. Name the faults to simulate.")
@@ -130,6 +134,12 @@ class Plan:
             "failuretwin_version": __version__,
             "configuration": json.dumps(configuration),
         }
+
+    def manifest(self) -> dict[str, Any]:
+        """Return all that decides what the runs are, as JSON can hold it, and its hash."""
+        urdf = (self.robot.folder / self.robot.profile.urdf).read_bytes()
+        content = {"plan": canonical(self), "urdf_sha256": hashlib.sha256(urdf).hexdigest()}
+        return {**content, "plan_sha256": fingerprint(content)}
 
 
 @dataclass(frozen=True)
@@ -250,38 +260,56 @@ def _truth(plan: Plan, runs: Sequence[int], faults: Sequence[Sequence[FaultValue
     )
 
 
-def simulate(
-    plan: Plan, workers: int = 1, on_progress: Callable[[int], None] | None = None
-) -> xr.Dataset:
-    """Simulate all runs of a plan.
+def iterate(
+    plan: Plan, runs_at_a_time: int = CHUNK_RUNS, order: Sequence[int] | None = None
+) -> Iterator[RunTable]:
+    """Simulate runs a few at a time and keep none of them.
 
     Args:
         plan: What to simulate.
-        workers: Processes to spread the work over; the result does not depend on it.
-        on_progress: Called with the number of runs that have just been finished.
+        runs_at_a_time: Runs in each table; the last one may hold fewer.
+        order: Numbers of the runs to make, each below `plan.size`, such as a random permutation;
+            None: all of them, one hypothesis after the other.
+
+    Raises:
+        InputError: If runs at a time are fewer than one.
     """
-    if workers < 1:
-        raise InputError(f"workers is {workers}, expected 1 or more.")
+    if runs_at_a_time < 1:
+        raise InputError(f"runs at a time is {runs_at_a_time}, expected 1 or more.")
+    runs = range(plan.size) if order is None else order
+    for first in range(0, len(runs), runs_at_a_time):
+        yield simulate_runs(plan, runs[first : first + runs_at_a_time])
+
+
+def simulate(
+    plan: Plan,
+    workers: int = 1,
+    on_progress: Callable[[int], None] = lambda runs: None,
+    scheduler: str | None = None,
+) -> xr.Dataset:
+    """Simulate all runs of a plan in memory; `run_factory.produce` has no need to hold them.
+
+    Args:
+        plan: What to simulate.
+        workers: Processes to spread the work over; the result does not depend on it. Scripts that
+            ask for several must be guarded by ``if __name__ == "__main__":``.
+        on_progress: Called with the number of runs that have just been finished.
+        scheduler: Address of a Dask scheduler whose workers do it instead.
+
+    Raises:
+        InputError: If workers are fewer than one or cannot be had.
+    """
     chunks = [
         range(first, min(first + CHUNK_RUNS, plan.size))
         for first in range(0, plan.size, CHUNK_RUNS)
     ]
-    tables = []
-    for table in _tables(plan, chunks, workers):
-        tables.append(table)
-        if on_progress is not None:
-            on_progress(len(table.run))
-    return concatenate([table.to_dataset() for table in tables])
+    with Workforce(workers, scheduler).at_work(partial(simulate_runs, plan), chunks) as results:
+        return assemble(_datasets(results, on_progress), plan.size)
 
 
-def _tables(plan: Plan, chunks: Sequence[range], workers: int) -> Iterator[RunTable]:
-    if workers == 1:
-        yield from (simulate_runs(plan, chunk) for chunk in chunks)
-        return
-    # Leaving the block ends the workers at once, also when the user interrupts.
-    with Pool(workers, initializer=_leave_interrupts_to_the_parent) as pool:
-        yield from pool.imap(partial(simulate_runs, plan), chunks)
-
-
-def _leave_interrupts_to_the_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _datasets(
+    results: Iterator[tuple[range, RunTable]], on_progress: Callable[[int], None]
+) -> Iterator[tuple[int, xr.Dataset]]:
+    for runs, table in results:
+        yield runs[0], table.to_dataset()
+        on_progress(len(runs))
