@@ -18,6 +18,12 @@ from failuretwin.app.commands.options import PATH, common_options, reading_optio
     help="What `calibrate` learned of this robot. Default: the calibration its profile names.",
 )
 @click.option(
+    "--track",
+    is_flag=True,
+    help="Follow the wear of the robot from run to run, and keep its history beside the "
+    "calibration (FILE.history.jsonl). Give runs in their order, the oldest first.",
+)
+@click.option(
     "--hypotheses",
     metavar="H,...",
     help="What may be the case, such as healthy,motor_2:stuck. Default: the paper's nine classes.",
@@ -43,6 +49,7 @@ from failuretwin.app.commands.options import PATH, common_options, reading_optio
 def diagnose(
     inputs: tuple[Path, ...],
     calibration: Path | None,
+    track: bool,
     hypotheses: str | None,
     sse_range: tuple[float, float] | None,
     onset: float | None,
@@ -65,6 +72,12 @@ def diagnose(
     from failuretwin.app.inputs import read_inputs, tell_mismatch
     from failuretwin.app.results import write_csv, write_json_lines
     from failuretwin.app.tables import print_diagnoses, print_scores
+    from failuretwin.app.tracking import (
+        diagnose_tracked,
+        keep_history,
+        open_history,
+        tracking_line,
+    )
     from failuretwin.core.hypothesis import parse_hypotheses
     from failuretwin.decision.bayes import BayesDiagnoser, priors_of
     from failuretwin.digital_model.imperfections import load_imperfections
@@ -83,9 +96,11 @@ def diagnose(
         ),
         priors=priors_of(model, sse_range, onset),
     )
+    history = open_history(diagnoser, calibration) if track else None
     runs = read_inputs(inputs, model, how, published_labels, columns, approximate)
     tell_mismatch(runs, diagnoser)
-    diagnoses = diagnoser.diagnose(runs)
+    tracked = None if history is None else diagnose_tracked(runs, diagnoser, history)
+    diagnoses = diagnoser.diagnose(runs) if tracked is None else tracked.diagnoses
     records = [diagnosis.to_record() for diagnosis in diagnoses]
     if json_file is not None:
         write_json_lines(records, json_file)
@@ -99,5 +114,9 @@ def diagnose(
         with filling(plot) as folder:
             pictures = plot_runs(runs, diagnoses, twin, folder)
             write_page(diagnoses, pictures, model.name, folder / "index.html")
+    if tracked is not None:
+        keep_history(tracked)
     print_diagnoses(diagnoses)
     print_scores(records)
+    if tracked is not None:
+        click.echo(f"\n{tracking_line(tracked)}")

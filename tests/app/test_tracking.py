@@ -1,0 +1,161 @@
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from failuretwin import load_robot
+from failuretwin.core.runs import concatenate
+from failuretwin.data_knowledge.store import load_run_set, save_run_set
+
+RUNS = 32
+
+
+@pytest.fixture(scope="module")
+def healthy(failuretwin, tmp_path_factory):
+    """A run set of healthy runs, without the motors' readings."""
+    path = tmp_path_factory.mktemp("healthy") / "healthy.nc"
+    answer = failuretwin(
+        *("simulate", "--out", path, "--hypotheses", "healthy", "--runs-per-class", RUNS),
+        *("--imperfections", "armpi_fpv"),
+    )
+    assert answer.returncode == 0, answer.stderr
+    save_run_set(load_run_set(path).drop_vars("position"), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def few(healthy):
+    """The first six of them."""
+    path = healthy.with_name("few.nc")
+    save_run_set(load_run_set(healthy).isel(run=slice(0, 6)), path)
+    return path
+
+
+@pytest.fixture
+def calibration(tmp_path):
+    """A calibration without a history."""
+    return shutil.copy(load_robot("armpi_fpv").imperfections_file, tmp_path / "cal.toml")
+
+
+@pytest.fixture
+def track(failuretwin, calibration):
+    def run(*arguments):
+        return failuretwin("diagnose", *arguments, "--calibration", calibration, "--track")
+
+    return run
+
+
+def rows_of(calibration):
+    path = calibration.with_suffix(".history.jsonl")
+    return [json.loads(line) for line in path.read_text().splitlines()][1:]
+
+
+def test_runs_are_tracked_and_the_history_kept(track, calibration, healthy, tmp_path):
+    answer = track(healthy, "--json", tmp_path / "x.jsonl")
+    assert answer.returncode == 0, answer.stderr
+    line = answer.stdout.splitlines()[-1]
+    assert line.startswith("tracked: ")
+    assert "runs learned" in line
+    rows = rows_of(calibration)
+    records = [json.loads(text) for text in (tmp_path / "x.jsonl").read_text().splitlines()]
+    assert [row["run"] for row in rows] == [record["run"] for record in records]
+    for row, record in zip(rows, records, strict=True):
+        faulty = None if record["diagnosis"] is None else 1 - record["posterior"]["healthy"]
+        assert row["probability_faulty"] == pytest.approx(faulty, abs=1e-12)
+    assert [record["protocol"] for record in records[:10]] == ["P0c"] * 10
+    assert records[-1]["protocol"] == "P1"
+    assert records[-1]["method"].endswith("armpi_fpv, tracked")
+
+
+def test_a_session_at_a_time_is_as_good_as_all_at_once(track, calibration, healthy, tmp_path):
+    """Sessions given in one command or in several leave the same history, byte for byte."""
+    runs = load_run_set(healthy)
+    names = [f"session_{i // 16}/{i}" for i in range(RUNS)]
+    runs = runs.assign_coords(run=np.array(names, dtype=object))
+    parts = [tmp_path / "a.nc", tmp_path / "b.nc"]
+    for path, rows in zip(parts, (slice(0, 16), slice(16, RUNS)), strict=True):
+        save_run_set(runs.isel(run=rows), path)
+    history = calibration.with_suffix(".history.jsonl")
+    assert track(*parts).returncode == 0
+    together = history.read_bytes()
+    history.unlink()
+    for part in parts:
+        assert track(part).returncode == 0
+    assert history.read_bytes() == together
+
+
+def test_runs_are_learned_once(track, calibration, few):
+    track(few)
+    history = calibration.with_suffix(".history.jsonl").read_bytes()
+    answer = track(few)
+    assert answer.returncode == 0
+    assert "6 known already" in answer.stdout
+    assert calibration.with_suffix(".history.jsonl").read_bytes() == history
+
+
+def test_a_history_that_failed_to_begin_is_nothing(track, calibration, few):
+    calibration.with_suffix(".history.jsonl").write_text('{"history_of": "arm')
+    assert track(few).returncode == 0
+    assert len(rows_of(calibration)) == 6
+
+
+def test_runs_without_movements_do_no_harm(track, calibration, healthy, tmp_path):
+    """Twelve runs in which no motor is told to move, between healthy ones."""
+    runs = load_run_set(healthy).isel(run=slice(0, 12))
+    still = runs.assign(command=runs["command"] * 0.0)
+    still = still.drop_vars(["target", "ramp_duration", "movement_start"], errors="ignore")
+    moving = runs.drop_vars(["target", "ramp_duration", "movement_start"], errors="ignore")
+    parts = []
+    for name, part in (("a", still), ("b", moving), ("c", still)):
+        names = [f"{name}/{i}" for i in range(12)]
+        parts.append(part.assign_coords(run=np.array(names, dtype=object)))
+    save_run_set(concatenate(parts), tmp_path / "runs.nc")
+    answer = track(tmp_path / "runs.nc")
+    assert answer.returncode == 0, answer.stderr
+    rows = rows_of(calibration)
+    assert len(rows) == 36
+    assert all(row["probability_faulty"] is None and not row["error"] for row in rows[:12])
+
+
+def test_a_fault_is_told_and_not_learned(track, calibration, failuretwin, tmp_path):
+    path = tmp_path / "stuck.nc"
+    failuretwin(
+        *("simulate", "--out", path, "--hypotheses", "motor_1:stuck", "--runs-per-class", 27),
+        *("--imperfections", "armpi_fpv"),
+    )
+    answer = track(path)
+    assert "0 runs learned" in answer.stdout
+    assert "learning is stopped: runs look faulty one after another" in answer.stdout
+    rows = rows_of(calibration)
+    assert rows[-1]["bias"] == rows[0]["bias"]
+    assert not any(fate == "learned" for row in rows for _, fate in row["fates"])
+
+
+def test_it_takes_a_calibration_of_ones_own(failuretwin, few, listing, tmp_path):
+    answer = failuretwin("diagnose", few, "--track", folder=tmp_path)
+    assert answer.returncode == 2
+    assert "--calibration FILE" in answer.stderr
+    assert listing(tmp_path) == []
+
+
+def test_a_history_of_another_calibration_is_refused(track, calibration, few):
+    track(few)
+    calibration.write_text(calibration.read_text().replace("0.001772", "0.002"))
+    answer = track(few)
+    assert answer.returncode == 2
+    assert "history of another calibration" in answer.stderr
+
+
+def test_when_results_cannot_be_written_nothing_is_learned(track, calibration, few, tmp_path):
+    answer = track(few, "--json", tmp_path / "nowhere" / "x.jsonl")
+    assert answer.returncode == 2
+    assert not calibration.with_suffix(".history.jsonl").exists()
+
+
+def test_without_the_flag_no_history_is_kept(failuretwin, calibration, few, listing, tmp_path):
+    before = listing(tmp_path)
+    assert failuretwin("diagnose", few, "--calibration", calibration).returncode == 0
+    assert listing(tmp_path) == before
