@@ -9,6 +9,7 @@ from scipy import optimize, stats
 from worn_robot import (
     CALIBRATION,
     COUNT,
+    DOUBT,
     SETTLING,
     evidence_of,
     follow_all,
@@ -18,13 +19,15 @@ from worn_robot import (
     truth,
 )
 
+from failuretwin.connection.calibration.observations import observe
 from failuretwin.connection.healthy import PATH_NOISE_M
 from failuretwin.connection.run_evidence import RunEvidence, run_evidence
 from failuretwin.connection.sudden_change import sudden_change
 from failuretwin.connection.tracker import DECLARED_NATS, DELAY, MOST_SCORE
 from failuretwin.connection.wear import WearLimits, WearState, learn, wear_unit, worn_settling
 from failuretwin.core.errors import InputError
-from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS
+from failuretwin.data_knowledge.reading import read_runs
+from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, load_imperfections
 
 STATIC = WearLimits(rate=0.0, reach=1e3, limit=1e3)
 BY = pytest.mark.parametrize("readings", [False, True], ids=["tool path", "readings"])
@@ -324,3 +327,18 @@ def test_wear_counts_by_the_scatter_at_the_largest_load(armpi):
 def test_without_settling_there_is_nothing_to_track(armpi):
     with pytest.raises(InputError, match="nothing to track"):
         fresh(armpi, NO_IMPERFECTIONS)
+
+
+@BY
+def test_healthy_sessions_of_a_real_arm_raise_no_alarm(armpi, data, readings):
+    """Fifty runs of one day: the arm stays what its calibration says, within a count."""
+    folders = [data / "real_robot_b_20241003" / f"label_{k}" for k in range(5)]
+    seen = observe(read_runs(folders, armpi), use_readings=readings)
+    known = load_imperfections("armpi_fpv", armpi)
+    tracker = fresh(armpi, replace(known, variation=DOUBT))
+    evidence = run_evidence(seen, armpi, tracker.settling, range(len(seen.runs)))
+    tracker, steps = follow_all(tracker, evidence)
+    assert len(steps) == 50
+    assert tracker.learned_at == 50 - DELAY
+    assert not any(step.alarm for step in steps)
+    assert np.abs(tracker.in_angle(tracker.state.mean - tracker.start.mean)).max() < COUNT
