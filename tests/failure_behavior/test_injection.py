@@ -34,7 +34,9 @@ def movements():
 
 @pytest.fixture
 def lost():
-    return np.random.default_rng(2).random((4, 3, 4)) < 0.3
+    lost = np.random.default_rng(2).random((4, 3, 4)) < 0.3
+    lost[3, :, 0] = [False, True, False]  # a loss beside those of the faulty motor
+    return lost
 
 
 @pytest.fixture
