@@ -152,7 +152,8 @@ def _late_of(part: SettledPart, late: Lateness) -> BoolArray:
 
 
 def _late_rate(late: Lateness) -> Rate:
-    known = late.late[np.isfinite(late.late)]
+    after_first = late.late[:, 1:]  # nothing before the first movement of a run can stall
+    known = after_first[np.isfinite(after_first)]
     return Rate(int(np.sum(known > 0.0)), len(known))
 
 
