@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from multiprocessing import parent_process
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,6 +30,7 @@ from failuretwin.digital_model.disturbances import Disturbances, draw_disturbanc
 from failuretwin.digital_model.engine import Drive, Engine, ServoEngine
 from failuretwin.digital_model.imperfect import actual_movements, delay_commands, lagged
 from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, Imperfections
+from failuretwin.digital_model.physics.engine import PhysicsEngine
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, loads_in_range
 from failuretwin.digital_model.tool_sensor import sense
@@ -124,6 +127,7 @@ class Plan:
             "hypotheses": [str(h) for h in self.hypotheses],
             "runs_per_class": self.runs_per_class,
             "imperfections": self.imperfections.name,
+            "engine": self.engine,
             "movements": vars(self.movements),
             "modes": {name: vars(mode) for name, mode in self.modes.items()},
         }
@@ -177,7 +181,7 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
     command, time = commanded.reference(plan.time), plan.time
     drive = _drive(plan, commanded, command, injection, chance)
     position = _engine(plan).angles(drive, time)
-    measured = sense(
+    measured, read = sense(
         DigitalTwin(plan.robot),
         plan.imperfections.readings,
         position,
@@ -195,7 +199,7 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
         measured_rate_hz=1.0 / STEP_S if readings is None else readings.rate_hz,
         movements=commanded,
         truth=_truth(plan, runs, injection.as_struck(position, time, commanded.start)),
-        position=position,
+        position=read,
         attributes=plan.attributes(),
     )
 
@@ -240,9 +244,9 @@ def _same(one: Movements, other: Movements) -> bool:
 def _engine(plan: Plan) -> Engine:
     if plan.engine == "servo":
         return ServoEngine(plan.robot)
-    from failuretwin.digital_model.physics import PhysicsEngine
-
-    return PhysicsEngine(plan.robot)
+    # Threads in the process that the user started; its workers are as many as there is room for.
+    threads = (os.cpu_count() or 1) if parent_process() is None else 1
+    return PhysicsEngine(plan.robot, threads=threads)
 
 
 def _run_name(plan: Plan, run: int) -> str:

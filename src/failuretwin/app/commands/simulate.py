@@ -32,6 +32,14 @@ from failuretwin.app.commands.options import PATH, common_options
     "name, or a TOML file.",
 )
 @click.option(
+    "--engine",
+    type=click.Choice(["servo", "physics"]),
+    default="servo",
+    show_default=True,
+    help="What moves the robot: the published servo loops, or rigid-body physics (MuJoCo) with "
+    "gears that stick and joints that flex.",
+)
+@click.option(
     "--faults",
     type=PATH,
     metavar="FILE",
@@ -58,6 +66,7 @@ def simulate(
     runs_per_class: int,
     hypotheses: str | None,
     imperfections: str,
+    engine: str,
     faults: Path | None,
     workers: int,
     scheduler: str | None,
@@ -92,6 +101,7 @@ def simulate(
         runs_per_class=runs_per_class,
         seed=seed,
         imperfections=load_imperfections(imperfections, model),
+        engine=engine,
         modes=MODES if faults is None else load_modes(faults),
     )
     workforce = Workforce(workers, scheduler)
