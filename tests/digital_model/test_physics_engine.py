@@ -100,7 +100,7 @@ def test_sag_is_load_times_compliance(armpi, smooth, movements, payload, weaknes
     angle = settled(PhysicsEngine(armpi, smooth).angles(drive, TIME))
 
     sag = compliance(smooth, weakness) * load_torque(armpi, angle, payload)
-    np.testing.assert_allclose(angle, settled(reference) - armpi.sense * sag, rtol=0, atol=5e-5)
+    np.testing.assert_allclose(angle, settled(reference) - armpi.sense * sag, rtol=0, atol=1e-4)
     assert np.abs(sag).max() > 0.04
 
 
