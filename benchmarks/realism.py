@@ -24,7 +24,8 @@ from failuretwin.connection.calibration.motion_part import movements_of
 from failuretwin.connection.calibration.observations import observe, session_names
 from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.generation import Plan, simulate
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
 from failuretwin.digital_model.imperfections import default_imperfections
 from failuretwin.digital_model.robot import Robot

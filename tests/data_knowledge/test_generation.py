@@ -18,7 +18,8 @@ from failuretwin.core.hypothesis import (
 )
 from failuretwin.core.runs import check_runs
 from failuretwin.data_knowledge import generation
-from failuretwin.data_knowledge.generation import Plan, iterate, simulate, simulate_runs
+from failuretwin.data_knowledge.generation import iterate, simulate, simulate_runs
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.digital_model.imperfections import load_imperfections
 from failuretwin.failure_behavior.modes import MODES
 

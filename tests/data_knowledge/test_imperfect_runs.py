@@ -10,7 +10,8 @@ import pytest
 from scipy import stats
 
 from failuretwin.core.hypothesis import HEALTHY
-from failuretwin.data_knowledge.generation import Plan, simulate
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.digital_model.imperfections import load_imperfections
 
 RUNS = 500

@@ -80,7 +80,7 @@ def simulate(
     """
     from failuretwin.app.progress import progress_bar
     from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
-    from failuretwin.data_knowledge import generation
+    from failuretwin.data_knowledge.plan import Plan
     from failuretwin.data_knowledge.run_factory import produce
     from failuretwin.data_knowledge.store import check_destination
     from failuretwin.data_knowledge.workforce import Workforce
@@ -91,7 +91,7 @@ def simulate(
     check_destination(out)
     model = load_robot(robot)
     names = model.motor_names
-    plan = generation.Plan(
+    plan = Plan(
         robot=model,
         hypotheses=(
             parse_hypotheses(hypotheses.split(","), names)
