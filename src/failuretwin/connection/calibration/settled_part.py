@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,12 +32,19 @@ class SettledPart:
         lost: Motors that did not get their command, (movement, motor).
         odd: Movements that look like no healthy ones, (movement,).
         fit: Where motors settle.
+        payload: Mass at the tool point that the fit knows of [kg].
     """
 
     observations: Observations
     lost: BoolArray
     odd: BoolArray
     fit: SettledFit
+    payload: float = 0.0
+
+    @property
+    def settling(self) -> Settling:
+        """Where motors settle, payload included."""
+        return replace(self.fit.settling("fit"), payload=self.payload)
 
     def left_out(self, robot: Robot) -> tuple[LeftOut, ...]:
         """Return the movements that did not count, each with its reason."""
@@ -77,8 +84,9 @@ def fit_settled_part(observations: Observations, robot: Robot, payload: float = 
             )
         arrived = (~lost[kept]).astype(np.float64)
         fit = fit_settling(observations[kept], robot, arrived, payload)
-        settling = fit.settling("fit")
-    return SettledPart(observations, lost, odd, fit)
+        part = SettledPart(observations, lost, odd, fit, payload)
+        settling = part.settling
+    return part
 
 
 def _odd(observations: Observations, robot: Robot, expected: FloatArray) -> BoolArray:

@@ -148,15 +148,36 @@ def _fit_runs(
 
 def _residual(transients: Transients, robot: Robot, values: FloatArray, lag: float) -> FloatArray:
     """Return predicted minus read, (run, time, motor or axis); 0 where a reading does not count."""
-    movements, time = transients.movements, transients.time
-    moved = replace(
-        movements,
-        start=movements.start + values[:, :1],
-        ramp_duration=movements.ramp_duration * (1.0 - values[:, 1])[:, None, None],
-    )
-    reference = lagged(moved.reference(time), time, np.full(len(values), lag))
     twin = DigitalTwin(robot)
-    position = twin.respond(reference, time)
+    delay, shortening = values.T
+    position = motion(transients.movements, transients.time, twin, delay, shortening, lag)
     predicted = position if transients.of_motors else twin.path(position)
     residual = np.where(transients.used[..., None], predicted - transients.reading, 0.0)
     return np.nan_to_num(residual)
+
+
+def motion(
+    movements: Movements,
+    time: FloatArray,
+    twin: DigitalTwin,
+    delay: FloatArray,
+    shortening: FloatArray,
+    lag: float,
+) -> FloatArray:
+    """Return how motors make movements late and short, (run, time, motor) [rad].
+
+    Args:
+        movements: Movements between the angles at which the motors settle.
+        time: Uniform grid, (time,) [s].
+        twin: The servo loops.
+        delay: Dead time of each run, (run,) [s].
+        shortening: Share by which the ramps of each run end early, (run,).
+        lag: Time constant of the lag on top of the servo loops [s].
+    """
+    moved = replace(
+        movements,
+        start=movements.start + delay[:, None],
+        ramp_duration=movements.ramp_duration * (1.0 - shortening)[:, None, None],
+    )
+    reference = lagged(moved.reference(time), time, np.full(len(delay), lag))
+    return twin.respond(reference, time)
