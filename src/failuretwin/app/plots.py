@@ -29,7 +29,12 @@ TITLE_COLUMNS = 100
 BLUE, RED, GREY = "#1f5f99", "#c8402f", "#9aa3ab"
 
 
-def _figure_class() -> Any:
+def figure_class() -> Any:
+    """Return matplotlib's class of figures.
+
+    Raises:
+        InputError: If matplotlib is missing.
+    """
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -76,7 +81,7 @@ def run_figure(
         measured: Tool path, (time, axis) [m], NaN where there is no sample.
         diagnosis: What was found.
     """
-    figure = _figure_class()(figsize=(11.0, 6.2), layout="constrained")
+    figure = figure_class()(figsize=(11.0, 6.2), layout="constrained")
     seen = np.asarray(np.isfinite(measured).all(axis=1))
     shown = slice(0, len(time) - int(np.argmax(seen[::-1])) if seen.any() else len(time))
     time, desired, measured, seen = time[shown], desired[shown], measured[shown], seen[shown]
@@ -110,7 +115,7 @@ def _plot_axis(
     panel.plot(time, MM_PER_M * measured, color=BLUE, label="measured", **style)
     panel.set_ylabel(f"tool {axis} [mm]")
     panel.tick_params(labelbottom=False)
-    _clean(panel)
+    clean(panel)
 
 
 def _plot_residual(
@@ -135,7 +140,7 @@ def _plot_residual(
             xycoords=("data", "axes fraction"),
             fontsize=8,
         )
-    _clean(panel)
+    clean(panel)
 
 
 def _plot_posterior(panel: Axes, diagnosis: Diagnosis) -> None:
@@ -150,7 +155,7 @@ def _plot_posterior(panel: Axes, diagnosis: Diagnosis) -> None:
     for y, value in enumerate(values):
         panel.annotate(f"{value:.1f}", (value + 1.5, y), va="center", fontsize=8)
     panel.set_title("what is wrong?", fontsize=10)
-    _clean(panel)
+    clean(panel)
 
 
 def _span(time: FloatArray) -> tuple[float, float]:
@@ -163,5 +168,6 @@ def _plain(hypothesis: str) -> str:
     return plain_name(Hypothesis.parse(hypothesis))
 
 
-def _clean(panel: Axes) -> None:
+def clean(panel: Axes) -> None:
+    """Take away the lines of a panel that frame nothing."""
     panel.spines[["top", "right"]].set_visible(False)

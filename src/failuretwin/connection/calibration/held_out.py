@@ -53,7 +53,8 @@ def judge(
     settling = others.settling
     generic = generic_imperfections(robot).settling
     assert generic is not None
-    plain, told = _errors(observations, robot, None), _errors(observations, robot, settling)
+    plain = settled_errors(observations, robot, None)
+    told = settled_errors(observations, robot, settling)
     kept = _healthy(plain, observations)
     gain = _log_density(observations, robot, settling) - _log_density(observations, robot, generic)
     gain = gain[kept]
@@ -83,15 +84,26 @@ def typical_size(errors: FloatArray) -> FloatArray:
     return TO_DEVIATION * np.median(np.abs(errors), axis=0)
 
 
-def _errors(observations: Observations, robot: Robot, settling: Settling | None) -> FloatArray:
-    """Return settled minus expected: of motors [rad] or of the tool [m], a row a movement."""
-    pose = _expected(observations, robot, settling)
+def settled_errors(
+    observations: Observations, robot: Robot, settling: Settling | None
+) -> FloatArray:
+    """Return settled minus expected: of motors [rad] or of the tool [m], a row a movement.
+
+    Args:
+        observations: Settled movements.
+        robot: The robot.
+        settling: Where its motors settle; None: exactly at their targets.
+    """
+    pose = expected_pose(observations, robot, settling)
     if observations.position is not None:
         return observations.position - pose
     return observations.point - DigitalTwin(robot).path(pose)
 
 
-def _expected(observations: Observations, robot: Robot, settling: Settling | None) -> FloatArray:
+def expected_pose(
+    observations: Observations, robot: Robot, settling: Settling | None
+) -> FloatArray:
+    """Return the angles at which motors are expected to settle, (movement, motor) [rad]."""
     if settling is None:
         return observations.target
     target, direction = observations.target, observations.direction
@@ -101,7 +113,7 @@ def _expected(observations: Observations, robot: Robot, settling: Settling | Non
 
 def _log_density(observations: Observations, robot: Robot, settling: Settling) -> FloatArray:
     """Return the log density of the settled tool position of each movement, (movement,)."""
-    pose = _expected(observations, robot, settling)
+    pose = expected_pose(observations, robot, settling)
     point, jacobian = DigitalTwin(robot).path_and_jacobian(pose)
     spread = jacobian * np.asarray(settling.scatter)
     return log_student(observations.point - point, spread, PATH_NOISE_M**2, settling.tail_dof)

@@ -157,6 +157,13 @@ def largest_load(robot: Robot, payload: float) -> FloatArray:
     return np.abs(robot.loads.torque(poses * robot.sense, payload)).max(axis=0)
 
 
+def rounding(robot: Robot) -> float:
+    """Return the standard deviation of what whole servo counts round off [rad]."""
+    if robot.profile.servo_units is None:
+        return 0.0
+    return float(abs(robot.servo_units.rad_per_count) / np.sqrt(12.0))
+
+
 def _problem(
     observations: Observations,
     robot: Robot,
@@ -177,14 +184,11 @@ def _problem(
         point, jacobian = twin.path_and_jacobian(pose)
         error = observations.point - point + np.einsum("iak,ik->ia", jacobian, pose - base)
     torque = robot.sense * robot.loads.torque(pose * robot.sense, payload)
-    count = 0.0
-    if robot.profile.servo_units is not None:
-        count = abs(robot.servo_units.rad_per_count) / np.sqrt(12.0)
     return _Problem(
         error=error,
         design=np.stack([np.ones_like(torque), torque, -observations.direction]),
         jacobian=jacobian,
-        rounding=count,
+        rounding=rounding(robot),
         arrived=arrived,
     )
 
