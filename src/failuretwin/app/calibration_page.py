@@ -68,7 +68,7 @@ def write_calibration_page(
         found=found,
         robot=robot.name,
         version=__version__,
-        verdict=verdict_line(found),
+        verdict=verdict_line(found).rstrip("."),
         grade=_grade(found),
         groups=parameter_groups(found, robot),
         count_deg=_count_degrees(robot),

@@ -124,7 +124,7 @@ def _row(parameter: Parameter, ends: np.ndarray, at: np.ndarray) -> Row:
     low, value, high = (float(x) for x in ends)
     told = parameter.identified
     return Row(
-        who=parameter.motor.replace("_", " ").replace("+", " and "),
+        who=parameter.motor.replace("_", " ").replace("+", ", "),
         value=figure(value, high - low) if told else "",
         interval=f"{figure(low, high - low)} to {figure(high, high - low)}" if told else "",
         left=float(at[0]),
