@@ -56,9 +56,9 @@ class HeldOut:
     Attributes:
         session: The session left out.
         movements: Its settled movements.
-        before: Scatter of the settled error of each motor without calibration, its standard
-            deviation [rad]; of the three axes of the tool [m] where the log has no motor readings.
-        after: Robust scatter (1.48 MAD) about what the fit to the others predicts, same units.
+        before: Robust size of the settled error of each motor without calibration, 1.48 times its
+            median size [rad]; of the three axes of the tool [m] where the log has no readings.
+        after: The same about what the fit to the others predicts.
         gain: Mean log density of a movement under the fit, minus that with the generic figures of
             an uncalibrated robot [nats].
         gain_error: Standard error of `gain`.

@@ -109,7 +109,7 @@ def calibrate(
         name=name,
         source=source,
         protocol="P0c",
-        settling=replace(part.fit.settling(source), payload=payload),
+        settling=replace(part.settling, source=source),
         timing=_timing(timing, late, gaps),
         lost_commands=tuple(loss.entry() for loss in losses),
         schedule=_schedule(movements, late, robot),
@@ -138,12 +138,13 @@ def calibrate(
 def _held_out(part: SettledPart, robot: Robot, judged: xr.Dataset | None) -> tuple[HeldOut, ...]:
     seen = part.observations
     if judged is None:
-        return held_out_sessions(seen, robot)
+        return held_out_sessions(seen, robot, part.payload)
     unseen = observe(judged, use_readings=seen.position is not None)
-    return tuple(
+    entries = [
         judge(unseen[unseen.session == index], part, robot, name)
         for index, name in enumerate(unseen.sessions)
-    )
+    ]
+    return tuple(entry for entry in entries if entry is not None)
 
 
 def _late_of(part: SettledPart, late: Lateness) -> BoolArray:
