@@ -50,6 +50,7 @@ def simulate(
 ) -> None:
     """Make labelled runs with the digital twin and write them as a run set."""
     from failuretwin.app.progress import progress_bar
+    from failuretwin.connection.calibration.loops import robot_as_calibrated
     from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
     from failuretwin.data_knowledge import generation
     from failuretwin.data_knowledge.store import check_destination, save_run_set
@@ -57,7 +58,7 @@ def simulate(
     from failuretwin.digital_model.robot import load_robot
 
     check_destination(out)
-    model = load_robot(robot)
+    model = robot_as_calibrated(load_robot(robot), imperfections)
     names = model.motor_names
     plan = generation.Plan(
         robot=model,
