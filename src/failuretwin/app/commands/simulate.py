@@ -79,6 +79,7 @@ def simulate(
     with what is missing. Up to a few thousand can be written to .nc.
     """
     from failuretwin.app.progress import progress_bar
+    from failuretwin.connection.calibration.loops import robot_as_calibrated
     from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
     from failuretwin.data_knowledge.plan import Plan
     from failuretwin.data_knowledge.run_factory import produce
@@ -89,7 +90,7 @@ def simulate(
     from failuretwin.failure_behavior.modes import MODES, load_modes
 
     check_destination(out)
-    model = load_robot(robot)
+    model = robot_as_calibrated(load_robot(robot), imperfections)
     names = model.motor_names
     plan = Plan(
         robot=model,
