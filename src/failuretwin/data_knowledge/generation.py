@@ -83,6 +83,9 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
         chance,
     )
     readings = plan.imperfections.readings
+    duration = _durations(plan, commanded, chance)
+    over = time > duration[:, None] + 1e-9
+    measured[over], read[over] = np.nan, np.nan
     return RunTable(
         run=[_run_name(plan, run) for run in runs],
         motor=plan.robot.motor_names,
@@ -90,6 +93,7 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
         command=command,
         measured=measured,
         measured_rate_hz=1.0 / STEP_S if readings is None else readings.rate_hz,
+        duration=duration,
         movements=commanded,
         truth=_truth(plan, runs, injection.as_struck(position, time, commanded.start)),
         position=read,
@@ -127,6 +131,15 @@ def _drive(
         compliance=chance.compliance if chance.compliance.any() else None,
         payload=chance.payload if chance.payload.any() else None,
     )
+
+
+def _durations(plan: Plan, commanded: Movements, chance: Disturbances) -> FloatArray:
+    """Return how long each run lasts, (run,) [s]: until the command after it would come."""
+    last = float(plan.time[-1])
+    if plan.as_published or plan.imperfections.timing.late_rate == 0.0:
+        return np.full(len(commanded.start), last)
+    end = commanded.start[:, -1] + chance.late[:, -1] + plan.movements.period_s
+    return np.minimum(end, last)
 
 
 def _same(one: Movements, other: Movements) -> bool:

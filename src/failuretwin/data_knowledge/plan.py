@@ -24,6 +24,8 @@ from failuretwin.failure_behavior.random_movements import RandomMovements
 STEP_S = 0.01
 """Step of the time grid [s], as published."""
 ENGINES = ("servo", "physics")
+LATE_STARTS = 2
+"""Late starts that a run has room for; what more of them push beyond the grid is cut off."""
 LEAST_SAG_RAD = 1e-6
 """A motor that its load moves by less than this in any pose counts as rigid [rad]."""
 
@@ -90,8 +92,20 @@ class Plan:
 
     @property
     def time(self) -> FloatArray:
-        """Time grid of every run, (time,) [s]."""
-        return as_floats(np.arange(round(self.movements.duration_s / STEP_S)) * STEP_S)
+        """Time grid of every run, (time,) [s]; long enough for a run of two late starts.
+
+        What is drawn out as published is cut to the published length.
+        """
+        length = self.movements.duration_s
+        if not self.as_published and self.imperfections.timing.late_rate > 0.0:
+            length += LATE_STARTS * self.imperfections.timing.late_s[1]
+        return as_floats(np.arange(round(length / STEP_S)) * STEP_S)
+
+    @property
+    def as_published(self) -> bool:
+        """Whether readings are drawn out to the grid as the published data are."""
+        readings = self.imperfections.readings
+        return readings is not None and readings.drawn_out
 
     def hypothesis_of(self, run: int) -> Hypothesis:
         """Return the true state of a run."""

@@ -66,11 +66,12 @@ def _at_times(position: FloatArray, time: FloatArray, at: FloatArray) -> FloatAr
 
 def _in_gap(chance: Disturbances, start: FloatArray) -> BoolArray:
     """Return which readings the stalled bus swallows, (run, reading)."""
-    late = chance.late[:, 1:]
-    begin = start[:, :-1] + chance.gap_start[:, :-1]
-    end = start[:, 1:] + late
+    stalled = np.concatenate([chance.late[:, 1:] > 0.0, chance.stalled[:, None]], axis=1)
+    begin = start + chance.gap_start
+    end = np.full_like(start, np.inf)
+    end[:, :-1] = start[:, 1:] + chance.late[:, 1:]
     at = chance.reading_time[:, :, None]
-    inside = (at > begin[:, None]) & (at < end[:, None]) & (late > 0)[:, None]
+    inside = (at > begin[:, None]) & (at < end[:, None]) & stalled[:, None]
     return np.asarray(inside.any(axis=-1))
 
 
