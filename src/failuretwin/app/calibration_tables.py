@@ -90,8 +90,8 @@ def verdict_line(found: Calibration) -> str:
     """Return whether the fit beats the uncalibrated twin on sessions that it has not seen."""
     if not found.held_out:
         return (
-            "not checked on unseen logs: there is one session only. Record another day and "
-            "calibrate on both."
+            "not checked on unseen logs: it takes two sessions, each long enough to learn from. "
+            "Record another day and calibrate on both."
         )
     gain, error = mean_gain(found.held_out)
     told = f"{gain:+.2f} nats a movement (95 % interval {gain - error:+.2f} to {gain + error:+.2f})"

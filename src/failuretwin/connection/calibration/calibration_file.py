@@ -90,11 +90,6 @@ def load_calibration(path: Path, robot: Robot) -> Calibration:
             "`failuretwin calibrate`."
         )
     record = from_table(_Record, table, f"{path}: {CALIBRATION_TABLE}")
-    if record.robot != robot.name:
-        raise InputError(
-            f"{path}: is a calibration of robot {record.robot!r}, not of {robot.name!r}. Name the "
-            "right robot (--robot) or calibrate this one."
-        )
     return Calibration(
         imperfections=imperfections,
         parameters=record.parameters,
