@@ -155,7 +155,8 @@ def test_options_that_make_no_sense(refused, simulated, arguments, words):
     ("arguments", "words"),
     [
         (["--hypotheses", "unknown"], "'unknown' cannot be simulated"),
-        (["--hypotheses", "motor_1:lag"], "'lag' cannot be simulated"),
+        (["--hypotheses", "motor_2:torque_loss"], "'motor_2:torque_loss' would not show"),
+        (["--faults", "nowhere.toml"], "nowhere.toml: cannot be read"),
         (["--imperfections", "armpi"], "no imperfections 'armpi'"),
         (["--out", "x.h5"], "ends in .nc"),
         (["--out", "nowhere/x.nc"], "folder nowhere does not exist"),
@@ -163,6 +164,25 @@ def test_options_that_make_no_sense(refused, simulated, arguments, words):
 )
 def test_what_cannot_be_simulated(refused, arguments, words):
     assert words in refused("simulate", "--out", "x.nc", "--runs-per-class", 1, *arguments)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[drfit]\n", "unknown fault mode 'drfit'. Did you mean 'drift'?"),
+        ("drift = 3\n", "drift is 3, expected a table"),
+        ("[drift]\nrate = [0, 1]\n", "drift: unknown key 'rate'"),
+        ("[drift]\nmagnitude = 0.1\n", "drift: magnitude is 0.1, expected a list"),
+        ("[lag]\nmagnitude = [0.3, 0.1]\n", "lag: magnitude is [0.3, 0.1], expected two numbers"),
+        ("[stuck]\nprofiles = ['ramp']\n", "stuck: unknown profile 'ramp'"),
+        ("[drift\n", "not a TOML file"),
+    ],
+)
+def test_distributions_of_faults_that_cannot_be_used(refused, tmp_path, text, words):
+    (tmp_path / "faults.toml").write_text(text)
+    message = refused("simulate", "--out", "x.nc", "--faults", "faults.toml")
+    assert "faults.toml: " in message
+    assert words in message
 
 
 OUTPUTS = pytest.mark.parametrize(
@@ -223,8 +243,25 @@ def test_full_disk_while_writing_results(refused, simulated, option, name):
         '{"run": "a", "truth": "healthy", "diagnosis": "healthy", "posterior": 3}\n',
         '{"run": "a", "truth": "healthy", "diagnosis": "b", "posterior": {"healthy": 1.0}}\n',
         '{"run": "a", "truth": "healthy", "diagnosis": "healthy", "posterior": {"healthy": "x"}}\n',
+        '{"run": "a", "truth": "healthy", "diagnosis": "healthy", "posterior": {"healthy": 0.5}}\n',
+        '{"run": "a", "truth": "healthy", "diagnosis": "healthy", "posterior": {"healthy": NaN}}\n',
+        '{"run": "a", "truth": 0, "diagnosis": "healthy", "posterior": {"healthy": 1.0}}\n',
+        '{"run": "a", "truth": "healthy", "diagnosis": "healthy", "posterior": {"healthy": 1.0}, '
+        '"onset_90": 1.0}\n',
     ],
-    ids=["empty", "csv", "list", "keys missing", "number", "unknown diagnosis", "text"],
+    ids=[
+        "empty",
+        "csv",
+        "list",
+        "keys missing",
+        "number",
+        "unknown diagnosis",
+        "text",
+        "sum",
+        "not a number",
+        "truth",
+        "interval",
+    ],
 )
 def test_results_that_cannot_be_evaluated(refused, tmp_path, text):
     (tmp_path / "results.jsonl").write_text(text)

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -45,6 +46,10 @@ def read_lines(path):
 def score_lines(text):
     """Return what the output says after the table of runs."""
     return text[re.search(r"\d+ of \d+ runs right", text).start() :].splitlines()
+
+
+def begins_with(lines, first):
+    return len(first) > 0 and lines[: len(first)] == first
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +141,7 @@ def test_evaluate_says_what_diagnose_said(failuretwin, results):
     answer, _, folder = results
     again = failuretwin("evaluate", folder / "x.jsonl")
     assert again.returncode == 0, again.stderr
-    assert score_lines(again.stdout) == score_lines(answer.stdout)
+    assert begins_with(score_lines(again.stdout), score_lines(answer.stdout))
 
 
 def test_truth_may_come_from_a_run_set(failuretwin, results, simulated, tmp_path):
@@ -147,7 +152,7 @@ def test_truth_may_come_from_a_run_set(failuretwin, results, simulated, tmp_path
     assert alone.returncode == 2
     assert "--truth" in alone.stderr
     told = failuretwin("evaluate", "untold.jsonl", "--truth", simulated, folder=tmp_path)
-    assert score_lines(told.stdout) == score_lines(answer.stdout)
+    assert begins_with(score_lines(told.stdout), score_lines(answer.stdout))
 
 
 @pytest.mark.parametrize(("how", "suffix"), [("measured", ".nc"), ("published", ".zarr")])
@@ -168,7 +173,22 @@ def test_imported_sessions_give_the_same_results(failuretwin, write_session, tmp
     assert read_lines(tmp_path / "stored.jsonl") == records
     assert stored.stdout == direct.stdout
     scores = failuretwin("evaluate", "stored.jsonl", folder=tmp_path)
-    assert score_lines(scores.stdout) == score_lines(direct.stdout)
+    assert begins_with(score_lines(scores.stdout), score_lines(direct.stdout))
+
+
+def test_faults_come_as_large_as_the_file_says(failuretwin, tmp_path):
+    (tmp_path / "faults.toml").write_text("[drift]\nmagnitude = [0.02, 0.02]\nonset_s = [3, 3]\n")
+    answer = failuretwin(
+        *("simulate", "--out", "x.nc", "--runs-per-class", 2, "--faults", "faults.toml"),
+        *("--hypotheses", "motor_1:stuck,motor_2:drift"),
+        folder=tmp_path,
+    )
+    assert answer.returncode == 0, answer.stderr
+    runs = load_run_set(tmp_path / "x.nc")
+    np.testing.assert_allclose(runs["onset"], [0.49, 0.49, 3.0, 3.0])
+    np.testing.assert_allclose(np.abs(runs["magnitude"][2:]), 0.02)
+    modes = json.loads(runs.attrs["configuration"])["modes"]
+    assert modes["drift"]["magnitude"] == [0.02, 0.02]
 
 
 def test_simulated_runs_do_not_depend_on_the_workers(failuretwin, tmp_path):

@@ -77,10 +77,10 @@ def test_exported_csv_is_read_back(log):
     assert "healthy" in result.stdout
 
 
-def test_an_interrupt_ends_the_workers_and_leaves_nothing(tmp_path):
-    command = [sys.executable, "-m", "failuretwin", "simulate", "--runs-per-class", "5000"]
+def test_an_interrupt_ends_the_workers_and_leaves_no_netcdf(tmp_path):
+    command = [sys.executable, "-m", "failuretwin", "simulate", "--runs-per-class", "600"]
     process = subprocess.Popen(
-        [*command, "--workers", "2", "--out", "runs.zarr"],
+        [*command, "--workers", "2", "--out", "runs.nc"],
         cwd=tmp_path,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,

@@ -10,7 +10,12 @@ from failuretwin import DigitalTwin
 from failuretwin.connection.calibration.held_out import held_out_sessions, judge
 from failuretwin.connection.calibration.motion_part import gap_starts, glitch_rates, lateness
 from failuretwin.connection.calibration.observations import Observations, stayed
-from failuretwin.connection.calibration.rates import Rate, loss_rates, uniform_range
+from failuretwin.connection.calibration.rates import (
+    Rate,
+    loss_rates,
+    median_interval,
+    spread_of,
+)
 from failuretwin.connection.calibration.settled_fit import fit_settling, rounding
 from failuretwin.connection.calibration.settled_part import fit_settled_part
 from failuretwin.connection.calibration.timing_fit import Transients, fit_timing
@@ -87,21 +92,28 @@ def as_vector(settling):
 # Rates and ranges
 
 
-@pytest.mark.parametrize("count", [3, 8, 40])
-def test_interval_of_a_uniform_range_holds_its_ends_as_often_as_it_says(count):
-    draws = np.random.default_rng(count).uniform(0.3, 1.7, (4000, count))
-    found = [uniform_range(values) for values in draws]
-    low = np.mean([least[0] <= 0.3 <= least[1] for _, least, _ in found])
-    high = np.mean([most[0] <= 1.7 <= most[1] for _, _, most in found])
-    error = 4.0 * np.sqrt(0.95 * 0.05 / 4000)
-    assert abs(low - 0.95) < error
-    assert abs(high - 0.95) < error
-    middle = np.mean([ends for ends, _, _ in found], axis=0)
-    np.testing.assert_allclose(middle, [0.3, 1.7], atol=4.0 * 1.4 / np.sqrt(4000 * count) + 1e-2)
+@pytest.mark.parametrize("count", [6, 9, 40])
+def test_interval_of_a_median_holds_it_whatever_the_distribution(count):
+    rng = np.random.default_rng(count)
+    for draws, truth in (
+        (rng.uniform(0.3, 1.7, (4000, count)), 1.0),
+        (rng.standard_exponential((4000, count)), np.log(2.0)),
+    ):
+        found = np.array([median_interval(values) for values in draws])
+        inside = np.mean((found[:, 1] <= truth) & (truth <= found[:, 2]))
+        # As many lie below the median as coins show heads: the interval can be too wide, by one
+        # order statistic, never too narrow.
+        below = stats.binom.ppf(0.025, count, 0.5)
+        expected = 1.0 - 2.0 * stats.binom.cdf(below - 1, count, 0.5)
+        assert expected >= 0.95
+        assert abs(inside - expected) < 4.0 * np.sqrt(0.95 * 0.05 / 4000)
 
 
-def test_two_values_say_nothing_of_a_range():
-    assert uniform_range(np.array([0.4, 1.2])) is None
+def test_spread_of_uniform_draws_is_their_range_whatever_stands_out():
+    values = np.random.default_rng(3).uniform(0.2, 0.8, 4000)
+    np.testing.assert_allclose(spread_of(values), (0.2, 0.8), atol=0.03)
+    spoilt = np.concatenate([values, np.full(40, 1e3)])
+    np.testing.assert_allclose(spread_of(spoilt), (0.2, 0.8), atol=0.05)
 
 
 @pytest.mark.parametrize(("hits", "trials"), [(3, 40), (1, 2), (17, 400)])

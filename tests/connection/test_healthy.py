@@ -14,7 +14,7 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
 from failuretwin.decision.bayes import priors_of
-from failuretwin.digital_model.imperfections import Imperfections, LostCommand, Timing
+from failuretwin.digital_model.imperfections import Imperfections, LostCommand, Timing, Variation
 from failuretwin.digital_model.settling import Settling
 
 COUNT = np.deg2rad(0.24)
@@ -160,3 +160,25 @@ def test_one_lost_command_is_no_fault_where_commands_get_lost(twin, run_of, loss
 def test_evidence_of_a_run_is_where_it_was_put(twin, run_of):
     points = twin.path(TARGETS)
     np.testing.assert_allclose(settled_evidence(run_of(TARGETS, points, MOTORS)).point[0], points)
+
+
+def test_doubt_about_the_robot_widens_the_scatter(armpi, twin):
+    """A motor of unknown bias scatters by both: the variances add up."""
+    doubt = Variation(bias=(0.003, 0.0, 0.0, 0.0), friction=(0.0, 0.004, 0.0, 0.0))
+    sure = HealthyModel(twin, Imperfections("made up", "test", settling=SETTLING))
+    unsure = HealthyModel(
+        twin, Imperfections("made up", "test", settling=SETTLING, variation=doubt)
+    )
+    extra = np.array([0.003, 0.004, 0.0, 0.0])
+    np.testing.assert_allclose(unsure.scatter, np.hypot(sure.scatter, extra), rtol=1e-12)
+
+
+def test_doubt_about_stiffness_counts_by_the_load(armpi, twin):
+    settling = replace(SETTLING, compliance=(0.0, 0.1, 0.1, 0.1), scatter=(0.0,) * 4)
+    doubt = Variation(compliance=(0.0, 0.2, 0.2, 0.2))
+    model = HealthyModel(twin, Imperfections("made up", "test", settling=settling, variation=doubt))
+    low, high = np.array([motor.movement_range for motor in armpi.motors]).T
+    poses = np.random.default_rng(7).uniform(low, high, (20000, 4))
+    load = np.sqrt(np.mean(armpi.loads.torque(poses * armpi.sense) ** 2, axis=0))
+    np.testing.assert_allclose(model.scatter[1:], 0.1 * 0.2 * load[1:], rtol=0.1)
+    assert model.scatter[0] == 0.0

@@ -1,18 +1,27 @@
 from __future__ import annotations
 
 import json
+import pickle
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import xarray as xr
 
+from failuretwin import load_robot
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import UNKNOWN, Hypothesis, paper_hypotheses
+from failuretwin.core.hypothesis import (
+    MAGNITUDE_UNITS,
+    UNKNOWN,
+    Hypothesis,
+    paper_hypotheses,
+)
 from failuretwin.core.runs import check_runs
 from failuretwin.data_knowledge import generation
-from failuretwin.data_knowledge.generation import Plan, simulate, simulate_runs
+from failuretwin.data_knowledge.generation import iterate, simulate, simulate_runs
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.failure_behavior.modes import MODES
 
 BOTH = pytest.mark.parametrize("imperfections", ["none", "armpi_fpv"])
 VALUES = ("command", "measured", "position")
@@ -135,9 +144,80 @@ def test_progress_adds_up_to_all_runs(monkeypatch, plan_of):
     assert done == [7, 7, 4]
 
 
+@BOTH
+def test_runs_can_be_drawn_without_storing(plan_of, imperfections):
+    plan = plan_of(imperfections)
+    whole = simulate_runs(plan, range(plan.size))
+    tables = list(iterate(plan, 5))
+    assert [len(table.run) for table in tables] == [5, 5, 5, 3]
+    for name in VALUES:
+        drawn = np.concatenate([getattr(table, name) for table in tables])
+        np.testing.assert_array_equal(drawn, getattr(whole, name))
+
+
+def test_runs_can_be_drawn_in_any_order(plan_of):
+    plan = plan_of()
+    order = np.random.default_rng(1).permutation(plan.size)
+    whole = simulate_runs(plan, range(plan.size))
+    tables = list(iterate(plan, 4, order))
+    names = [name for table in tables for name in table.run]
+    assert names == [whole.run[run] for run in order]
+    measured = np.concatenate([table.measured for table in tables])
+    np.testing.assert_array_equal(measured, whole.measured[order])
+
+
+def test_runs_are_drawn_when_they_are_asked_for(monkeypatch, plan_of):
+    made = []
+    monkeypatch.setattr(generation, "simulate_runs", lambda plan, runs: made.append(runs))
+    drawing = iterate(plan_of(runs_per_class=10**6), 10)
+    next(drawing)
+    next(drawing)
+    assert made == [range(10), range(10, 20)]
+
+
+def test_no_runs_at_a_time_are_refused(plan_of):
+    with pytest.raises(InputError, match="runs at a time is 0, expected 1 or more"):
+        next(iterate(plan_of(), 0))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda plan: {"seed": 1},
+        lambda plan: {"runs_per_class": 3},
+        lambda plan: {"hypotheses": plan.hypotheses[:-1]},
+        lambda plan: {"imperfections": load_imperfections("none", plan.robot)},
+        lambda plan: {"movements": replace(plan.movements, period_s=1.9)},
+        lambda plan: {
+            "modes": {**plan.modes, "stuck": replace(plan.modes["stuck"], onset_s=(1.0, 2.0))}
+        },
+        lambda plan: {"robot": load_robot("so101"), "hypotheses": [Hypothesis()]},
+    ],
+    ids=["seed", "runs", "hypotheses", "imperfections", "movements", "modes", "robot"],
+)
+def test_another_plan_has_another_hash(plan_of, change):
+    plan = plan_of()
+    other = replace(plan, **change(plan))
+    assert other.manifest()["plan_sha256"] != plan.manifest()["plan_sha256"]
+    again = pickle.loads(pickle.dumps(plan))
+    assert again.manifest() == plan.manifest() == json.loads(json.dumps(plan.manifest()))
+
+
+def test_another_urdf_has_another_hash(plan_of, tmp_path, armpi):
+    plan = plan_of()
+    for name in ("armpi_fpv.urdf", "armpi_fpv.toml"):
+        (tmp_path / name).write_bytes((armpi.folder / name).read_bytes())
+    moved = replace(plan, robot=load_robot(tmp_path / "armpi_fpv.toml"))
+    assert moved.manifest() == plan.manifest()
+    with (tmp_path / "armpi_fpv.urdf").open("a") as urdf:
+        urdf.write("<!-- another mass -->")
+    assert moved.manifest()["plan_sha256"] != plan.manifest()["plan_sha256"]
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"hypotheses": [Hypothesis(), Hypothesis()]}, "a hypothesis is given twice"),
         ({"runs_per_class": 0}, "runs per class is 0, expected 1 or more"),
         ({"hypotheses": [UNKNOWN]}, "'unknown' cannot be simulated"),
     ],
@@ -148,8 +228,27 @@ def test_plan_that_cannot_be_made_is_refused(plan_of, changes, message):
 
 
 def test_mode_that_cannot_be_simulated_names_those_that_can(plan_of, armpi):
+    modes = {name: MODES[name] for name in ("stuck", "steady_state_error")}
     with pytest.raises(InputError, match=r"'backlash' cannot .* one of stuck, steady_state_error"):
-        plan_of(hypotheses=parse("motor_1:backlash", armpi))
+        replace(plan_of(), hypotheses=parse("motor_1:backlash", armpi), modes=modes)
+
+
+@pytest.mark.parametrize(("imperfections", "motor"), [("none", 2), ("armpi_fpv", 1)])
+def test_torque_loss_is_refused_where_nothing_gives_way(plan_of, armpi, imperfections, motor):
+    """Motor 1 turns about the vertical, so no weight pulls at it."""
+    fault = f"motor_{motor}:torque_loss"
+    with pytest.raises(InputError, match=f"'{fault}' would not show.*--imperfections"):
+        plan_of(imperfections, hypotheses=parse(fault, armpi))
+
+
+def test_all_modes_can_be_simulated_with_all_imperfections(plan_of, armpi):
+    faults = ",".join(f"motor_3:{mode}" for mode in MAGNITUDE_UNITS)
+    runs = simulate(plan_of("armpi_fpv", 1, hypotheses=parse(faults, armpi)))
+    assert runs["fault"].values.tolist() == faults.split(",")
+    assert np.isfinite(runs["magnitude"].values).all()
+    modes = json.loads(runs.attrs["configuration"])["modes"]
+    assert list(modes) == list(MAGNITUDE_UNITS)
+    assert modes["lag"]["magnitude"] == [0.1, 0.3]
 
 
 def test_no_workers_are_refused(plan_of):

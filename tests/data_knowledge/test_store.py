@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,9 @@ from failuretwin import read_runs
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.runs import RunTable, Truth
-from failuretwin.data_knowledge.generation import Plan, simulate
+from failuretwin.data_knowledge import swap
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
 from failuretwin.digital_model.imperfections import load_imperfections
 
@@ -135,7 +138,7 @@ def test_interrupted_write_leaves_what_was_there(monkeypatch, old):
 
 def test_failure_to_take_the_old_ones_place_leaves_what_was_there(monkeypatch, old):
     before = contents(old)
-
+    monkeypatch.setattr(swap, "exchange", lambda one, other: False)
     replace, refused = Path.replace, []
 
     def refuse(self, target):
@@ -149,6 +152,32 @@ def test_failure_to_take_the_old_ones_place_leaves_what_was_there(monkeypatch, o
         save_run_set(small(("new",)), old)
     assert contents(old) == before
     assert listing(old.parent) == [old.name]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems need two steps")
+def test_two_folders_change_places_in_one_step(tmp_path):
+    for name in ("one", "other"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / name).touch()
+    assert swap.exchange(tmp_path / "one", tmp_path / "other")
+    assert listing(tmp_path / "one") == ["other"]
+    assert listing(tmp_path / "other") == ["one"]
+
+
+def test_a_system_without_exchange_replaces_a_folder_in_two_steps(monkeypatch, tmp_path):
+    monkeypatch.setattr(swap, "exchange", lambda one, other: False)
+    path = tmp_path / "runs.zarr"
+    save_run_set(small(("old", "older")), path)
+    save_run_set(small(("new",)), path)
+    xr.testing.assert_identical(load_run_set(path), small(("new",)))
+    assert listing(tmp_path) == [path.name]
+
+
+def test_a_zarr_store_is_not_written_over_a_file(tmp_path):
+    (tmp_path / "runs.zarr").write_text("mine")
+    with pytest.raises(OutputError, match=r"is a file, and a Zarr store is a folder"):
+        save_run_set(small(), tmp_path / "runs.zarr")
+    assert (tmp_path / "runs.zarr").read_text() == "mine"
 
 
 @SUFFIXES

@@ -9,7 +9,8 @@ import xarray as xr
 from failuretwin import BayesDiagnoser, DigitalTwin
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import HEALTHY, UNKNOWN, Hypothesis, paper_hypotheses
-from failuretwin.data_knowledge.generation import Plan, simulate
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
 from failuretwin.decision import bayes, steady_state_error, stuck
 from failuretwin.decision.bayes import Priors, priors_of

@@ -1,89 +1,134 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from failuretwin.core.hypothesis import Fault, Hypothesis
 from failuretwin.core.movements import Movements
-from failuretwin.data_knowledge.generation import Plan, simulate_runs
+from failuretwin.data_knowledge.generation import simulate_runs
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, load_imperfections
+from failuretwin.failure_behavior.course import Course
+from failuretwin.failure_behavior.fault_value import FaultValue
 from failuretwin.failure_behavior.injection import Injection
-from failuretwin.failure_behavior.modes import MODES, FaultValue, SteadyStateError, Stuck
+from failuretwin.failure_behavior.modes import MODES, SteadyStateError, Stuck
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 TIME = np.arange(300) * 0.01
 ERROR = np.array([0.1, -0.2, 0.3])
 
 
+def fault(motor, mode, magnitude, onset=0.0, **per_movement):
+    return FaultValue(Fault(motor, mode), magnitude, Course("step", onset), per_movement)
+
+
 @pytest.fixture
 def movements():
     rng = np.random.default_rng(0)
     return Movements(
-        initial=np.zeros((3, 4)),
-        target=rng.uniform(-1, 1, (3, 3, 4)),
-        ramp_duration=np.full((3, 3, 4), 0.6),
-        start=np.tile([0.0, 1.0, 2.0], (3, 1)),
+        initial=np.zeros((4, 4)),
+        target=rng.uniform(-1, 1, (4, 3, 4)),
+        ramp_duration=np.full((4, 3, 4), 0.6),
+        start=np.tile([0.0, 1.0, 2.0], (4, 1)),
     )
 
 
 @pytest.fixture
+def lost():
+    lost = np.random.default_rng(2).random((4, 3, 4)) < 0.3
+    lost[3, :, 0] = [False, True, False]  # a loss beside those of the faulty motor
+    return lost
+
+
+@pytest.fixture
 def position():
-    return np.random.default_rng(1).normal(size=(3, 300, 4))
+    return np.random.default_rng(1).normal(size=(4, 300, 4))
 
 
 @pytest.fixture
 def injection():
-    """First run healthy, second with motor 3 stuck, third with errors of motor 2."""
-    stuck = FaultValue(Fault("motor_3", "stuck"), 0.5, np.zeros(3), np.nan)
-    error = FaultValue(Fault("motor_2", "steady_state_error"), 0.0, ERROR, 0.2)
-    return Injection([(), (stuck,), (error,)], MOTORS, MODES)
+    """First run healthy, then motor 3 stuck, errors of motor 2, and three faults at once."""
+    faults = [
+        (),
+        (fault("motor_3", "stuck", np.nan, onset=0.5),),
+        (fault("motor_2", "steady_state_error", np.nan, offset_rad=ERROR),),
+        (
+            fault("motor_1", "lost_commands", 0.5, chance=np.array([0.4, 0.6, 0.1])),
+            fault("motor_2", "torque_loss", 0.25, onset=1.0),
+            fault("motor_3", "encoder_bias", 0.2, onset=2.0),
+        ),
+    ]
+    return Injection(faults, MOTORS, MODES)
 
 
-def test_stuck_leaves_other_motors_and_earlier_times_as_they_are(injection, position):
-    held = injection.on_angles(position, TIME)
+def test_faults_of_movements_act_on_their_motors_alone(injection, movements, lost):
+    faulty, gone = injection.on_movements(movements, lost)
 
-    expected = position.copy()
-    expected[1, 50:, 2] = position[1, 50, 2]
-    np.testing.assert_array_equal(held, expected)
-
-
-def test_error_is_added_to_the_targets_of_its_motor_alone(injection, movements):
-    faulty = injection.on_targets(movements)
-
-    expected = movements.target.copy()
-    expected[2, :, 1] += ERROR
-    np.testing.assert_array_equal(faulty.target, expected)
+    target, missing = movements.target.copy(), lost.copy()
+    target[2, :, 1] += ERROR
+    missing[3, [0, 2], 0] = True
+    np.testing.assert_array_equal(faulty.target, target)
+    np.testing.assert_array_equal(gone, missing)
     for name in ("initial", "ramp_duration", "start"):
         np.testing.assert_array_equal(getattr(faulty, name), getattr(movements, name))
 
 
-def test_nothing_given_is_changed(injection, movements, position):
-    names = ("initial", "target", "ramp_duration", "start")
-    before = [getattr(movements, name).copy() for name in names]
-    angles = position.copy()
-
-    injection.on_targets(movements)
-    injection.on_angles(position, TIME)
-
-    for name, values in zip(names, before, strict=True):
-        np.testing.assert_array_equal(getattr(movements, name), values)
-    np.testing.assert_array_equal(position, angles)
+def test_faults_of_the_reference_act_on_their_motors_alone(injection, position):
+    expected = position.copy()
+    expected[3, 200:, 2] += 0.2
+    np.testing.assert_array_equal(injection.on_reference(position, TIME), expected)
 
 
-def test_magnitude_is_the_angle_held_or_the_size_of_the_error(injection, position):
-    held = injection.on_angles(position, TIME)
-    expected = [np.nan, position[1, 50, 2], 0.2]
-    np.testing.assert_array_equal(injection.magnitudes(held), expected)
+def test_held_and_weak_are_the_faulty_motors_from_the_onset_on(injection):
+    held, weak = np.zeros((4, 300, 4), dtype=bool), np.zeros((4, 300, 4))
+    held[1, 50:, 2] = True
+    weak[3, 100:, 1] = 0.25
+    np.testing.assert_array_equal(injection.held(TIME), held)
+    np.testing.assert_array_equal(injection.weakness(TIME), weak)
+
+
+def test_where_nothing_acts_everything_stays_the_same_object(movements, lost, position):
+    healthy = Injection([(), (), (), ()], MOTORS, MODES)
+    still, gone = healthy.on_movements(movements, lost)
+    assert still is movements
+    assert gone is lost
+    assert healthy.on_reference(position, TIME) is position
+    assert healthy.held(TIME) is None
+    assert healthy.weakness(TIME) is None
+
+
+def test_nothing_given_is_changed(injection, movements, lost, position):
+    given = [movements.target, movements.ramp_duration, lost, position]
+    before = [values.copy() for values in given]
+
+    injection.on_movements(movements, lost)
+    injection.on_reference(position, TIME)
+
+    for values, old in zip(given, before, strict=True):
+        np.testing.assert_array_equal(values, old)
+
+
+def test_what_only_the_motion_tells_joins_the_truth(injection, movements, position):
+    healthy, stuck, error, several = injection.as_struck(position, TIME, movements.start)
+
+    assert healthy == []
+    assert stuck[0].magnitude == position[1, 50, 2]
+    assert error[0].magnitude == pytest.approx(np.sqrt(np.mean(ERROR**2)))
+    assert error[0].detail()["offset_rad"] == ERROR.tolist()
+    assert [value.magnitude for value in several] == [0.5, 0.25, 0.2]
+    assert several[0].detail()["lost"] == [True, False, True]
 
 
 @pytest.mark.parametrize("imperfections", ["none", "armpi_fpv"])
 @pytest.mark.parametrize("motor", range(1, 5))
 def test_an_error_of_no_size_is_healthy_bit_for_bit(armpi, imperfections, motor):
     known = load_imperfections(imperfections, armpi)
-    fault = Hypothesis((Fault(f"motor_{motor}", "steady_state_error"),))
-    modes = {"steady_state_error": SteadyStateError((0.0, 0.0))}
+    state = Hypothesis((Fault(f"motor_{motor}", "steady_state_error"),))
+    modes = {"steady_state_error": SteadyStateError(magnitude=(0.0, 0.0))}
     healthy = Plan(armpi, [Hypothesis()], 3, seed=7, imperfections=known)
-    faulty = Plan(armpi, [fault], 3, seed=7, imperfections=known, modes=modes)
+    faulty = Plan(armpi, [state], 3, seed=7, imperfections=known, modes=modes)
 
     without, withal = (simulate_runs(plan, range(3)) for plan in (healthy, faulty))
 
@@ -92,16 +137,16 @@ def test_an_error_of_no_size_is_healthy_bit_for_bit(armpi, imperfections, motor)
 
 
 def test_a_motor_stuck_at_the_end_of_the_run_is_healthy_bit_for_bit(armpi):
-    fault = Hypothesis((Fault("motor_2", "stuck"),))
-    late = {"stuck": Stuck((20.0, 20.0))}
+    state = Hypothesis((Fault("motor_2", "stuck"),))
+    late = {"stuck": Stuck(onset_s=(20.0, 20.0))}
     healthy = simulate_runs(Plan(armpi, [Hypothesis()], 2, seed=3), range(2))
-    stuck = simulate_runs(Plan(armpi, [fault], 2, seed=3, modes=late), range(2))
+    stuck = simulate_runs(Plan(armpi, [state], 2, seed=3, modes=late), range(2))
     np.testing.assert_array_equal(stuck.measured, healthy.measured)
 
 
 @pytest.mark.parametrize("imperfections", ["none", "armpi_fpv"])
 def test_a_stuck_motor_stands_still_and_the_others_do_not_notice(armpi, imperfections):
-    known = load_imperfections(imperfections, armpi)
+    known = replace(load_imperfections(imperfections, armpi), readings=None)
     hypotheses = [Hypothesis((Fault("motor_1", "stuck"),))]
     stuck = simulate_runs(Plan(armpi, hypotheses, 3, seed=5, imperfections=known), range(3))
     healthy = simulate_runs(Plan(armpi, [Hypothesis()], 3, seed=5, imperfections=known), range(3))

@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.runs import truth_of
-from failuretwin.data_knowledge.store import load_run_set, replacing
-from failuretwin.decision.metrics import Scores, score
+from failuretwin.data_knowledge.store import replacing
+from failuretwin.decision.metrics import LogScore, Scores, score
 
 Record = dict[str, Any]
 """One diagnosis as the JSON object of the contract."""
 
 NEEDED = ("run", "truth", "diagnosis", "posterior")
+SUM_ERROR = 1e-6
+"""Probabilities of a run may sum to 1 plus or minus this."""
 
 
 def write_json_lines(records: Sequence[Record], path: Path) -> None:
@@ -57,6 +58,7 @@ def _read_record(line: str, where: str) -> Record:
     missing = [key for key in NEEDED if not isinstance(record, dict) or key not in record]
     if missing:
         raise InputError(f"{where}: no {', '.join(missing)}. Expected diagnose --json output.")
+    _check_kinds(record, where)
     posterior = record["posterior"]
     numbers = isinstance(posterior, dict) and all(
         isinstance(p, int | float) for p in posterior.values()
@@ -66,29 +68,47 @@ def _read_record(line: str, where: str) -> Record:
             f"{where}: `posterior` and `diagnosis` do not fit together. Expected a probability for "
             "each hypothesis, and one of them (or null) as diagnosis."
         )
+    _check_probabilities(list(posterior.values()), where)
     return dict(record)
 
 
-def with_truth(records: Sequence[Record], path: Path) -> list[Record]:
-    """Return the records with the truth that a run set knows, matched by run name.
+def _check_kinds(record: Record, where: str) -> None:
+    for key, allowed in (("run", str), ("truth", str | None)):
+        if not isinstance(record[key], allowed):
+            raise InputError(f"{where}: `{key}` is {record[key]!r}, expected text.")
+    for key in ("onset_90", "magnitude_90"):
+        ends = record.get(key)
+        if ends is not None and not (
+            isinstance(ends, list)
+            and len(ends) == 2
+            and all(isinstance(e, int | float) for e in ends)
+        ):
+            raise InputError(f"{where}: `{key}` is {ends!r}, expected two numbers or null.")
 
-    Raises:
-        InputError: If the run set knows no truth or not of every run.
-    """
-    runs = load_run_set(path)
-    faults = truth_of(runs)
-    if faults is None:
-        raise InputError(f"{path}: has no variable `fault`, so it does not know the truth.")
-    known = dict(zip(map(str, runs["run"].values), faults, strict=True))
-    for record in records:
-        if record["run"] not in known:
-            raise InputError(f"{path}: holds no run {record['run']!r} of the results.")
-    return [{**record, "truth": known[record["run"]]} for record in records]
+
+def _check_probabilities(posterior: Sequence[float], where: str) -> None:
+    total = sum(posterior)
+    inside = all(0.0 <= p <= 1.0 + SUM_ERROR for p in posterior)
+    if not inside or not abs(total - 1.0) <= SUM_ERROR:
+        raise InputError(
+            f"{where}: `posterior` sums to {total:g}. Expected probabilities within 0 to 1 that "
+            "sum to 1."
+        )
+
+
+def judged_records(records: Sequence[Record]) -> list[Record]:
+    """Return the records whose truth is known."""
+    return [record for record in records if record["truth"]]
+
+
+def protocol_of(records: Sequence[Record]) -> str:
+    """Return the protocol letters of the records, joined by a slash where they differ."""
+    return "/".join(sorted({record.get("protocol") or "?" for record in records}))
 
 
 def score_records(records: Sequence[Record]) -> Scores | None:
     """Return the scores of those records whose truth is known; None if there are none."""
-    judged = [record for record in records if record["truth"]]
+    judged = judged_records(records)
     if not judged:
         return None
     return score(
@@ -104,11 +124,22 @@ def score_line(records: Sequence[Record]) -> str:
     if scores is None:
         return ""
     low, high = scores.interval
-    protocols = "/".join(sorted({record.get("protocol") or "?" for record in records}))
     return (
         f"{scores.right} of {scores.runs} runs right: accuracy {100 * scores.accuracy:.1f} % "
-        f"(95 % interval {100 * low:.1f} to {100 * high:.1f} %), protocol {protocols}, "
-        f"log score {scores.log_score:.3f} nats a run"
+        f"(95 % interval {100 * low:.1f} to {100 * high:.1f} %), protocol {protocol_of(records)}, "
+        f"log score {log_score_text(scores.surprise)}"
+    )
+
+
+def log_score_text(surprise: LogScore) -> str:
+    """Return the log score in words; says so where a truth was ruled out altogether."""
+    text = f"{surprise.mean:.3f} nats a run"
+    if not surprise.impossible:
+        return text
+    rest = surprise.nats.size - surprise.impossible
+    return (
+        f"{text} (of {surprise.impossible} runs the truth was given no probability; the other "
+        f"{rest}: {surprise.mean_of_rest:.3f})"
     )
 
 

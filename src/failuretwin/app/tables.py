@@ -17,7 +17,8 @@ PIPE_WIDTH = 160
 """Columns when the output is not a terminal, so that sentences stay whole."""
 
 
-def _console() -> Console:
+def table_console() -> Console:
+    """Return where tables are printed."""
     console = Console(highlight=False)
     return console if console.is_terminal else Console(highlight=False, width=PIPE_WIDTH)
 
@@ -35,7 +36,7 @@ def print_diagnoses(diagnoses: Sequence[Diagnosis]) -> None:
         count = len(d.quality)
         quality = f"{count} remark{'s' * (count > 1)}" if count else ""
         table.add_row(d.run, *truth, d.verdict, quality)
-    console = _console()
+    console = table_console()
     console.print(table)
     if len(diagnoses) <= TOLD_RUNS:
         for d in diagnoses:
@@ -50,17 +51,23 @@ def print_scores(records: Sequence[Record]) -> None:
     scores = score_records(records)
     if scores is None:
         return
-    console = _console()
+    console = table_console()
     console.print(f"\n{score_line(records)}\n")
     console.print(_class_table(scores))
     console.print("\nconfusion matrix: a row for each truth, a column for each diagnosis")
     console.print(_confusion_table(scores))
 
 
-def _class_table(scores: Scores) -> Table:
+def plain_table(*columns: str) -> Table:
+    """Return an empty table without rules, its first column to the left, figures to the right."""
     table = Table(box=None, pad_edge=False)
-    for column in ("class", "runs", "precision", "recall", "F1"):
-        table.add_column(column, justify="left" if column == "class" else "right")
+    for i, column in enumerate(columns):
+        table.add_column(column, justify="right" if i else "left")
+    return table
+
+
+def _class_table(scores: Scores) -> Table:
+    table = plain_table("class", "runs", "precision", "recall", "F1")
     for row in scores.by_class():
         ratios = (f"{value:.3f}" for value in (row.precision, row.recall, row.f1))
         table.add_row(row.name, str(row.runs), *ratios)

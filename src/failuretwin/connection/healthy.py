@@ -13,7 +13,7 @@ from failuretwin.core.quadrature import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
 from failuretwin.digital_model.imperfections import Imperfections
-from failuretwin.digital_model.settling import Settling
+from failuretwin.digital_model.settling import Settling, loads_in_range
 from failuretwin.digital_model.twin import DigitalTwin
 
 PATH_NOISE_M = 0.001
@@ -62,8 +62,16 @@ class HealthyModel:
 
     @cached_property
     def scatter(self) -> FloatArray:
-        """Scale of the settled scatter, (motor,) [rad]."""
-        return np.asarray(self.settling.scatter)
+        """Scale of the settled scatter and of what is not known of the robot, (motor,) [rad]."""
+        scatter, doubt = np.asarray(self.settling.scatter), self.imperfections.variation
+        if doubt is None:
+            return scatter
+        robot, settling = self.twin.robot, self.settling
+        load = np.sqrt(np.mean(loads_in_range(robot, settling.payload) ** 2, axis=0))
+        variance = scatter**2 * np.exp(2.0 * _spread(doubt.scatter) ** 2)
+        variance = variance + _spread(doubt.bias) ** 2 + _spread(doubt.friction) ** 2
+        yielding = np.asarray(settling.compliance) * load * _spread(doubt.compliance)
+        return np.sqrt(variance + yielding**2)
 
     @cached_property
     def none_held(self) -> BoolArray:
@@ -188,6 +196,11 @@ class HealthyModel:
         """Return the log density of each position if no motor is faulty, (run, movement)."""
         pose = self.settle(alternatives.base, alternatives.direction, self.none_held)
         return self.log_density(evidence, alternatives, pose[:, :, None], self.none_held)[..., 0]
+
+
+def _spread(deviation: tuple[float, ...]) -> FloatArray:
+    """Return standard deviations as an array that fits any number of motors; none are zero."""
+    return np.asarray(deviation or 0.0)
 
 
 def log_student(

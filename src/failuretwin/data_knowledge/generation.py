@@ -6,112 +6,37 @@ is the same whoever makes it and whatever is made beside it.
 
 from __future__ import annotations
 
-import json
-import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing import Pool
+from multiprocessing import parent_process
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin import __version__
-from failuretwin.core.errors import InputError, unknown_name
-from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
-from failuretwin.core.runs import RunTable, Truth, concatenate
-from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.core.runs import RunTable, Truth
+from failuretwin.core.types import FloatArray
+from failuretwin.data_knowledge.assembly import assemble
+from failuretwin.data_knowledge.plan import STEP_S, Plan
+from failuretwin.data_knowledge.workforce import Workforce
 from failuretwin.digital_model.disturbances import Disturbances, draw_disturbances, stack
 from failuretwin.digital_model.engine import Drive, Engine, ServoEngine
 from failuretwin.digital_model.imperfect import actual_movements, delay_commands, lagged
-from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, Imperfections
-from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.physics.engine import PhysicsEngine
 from failuretwin.digital_model.tool_sensor import sense
 from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.failure_behavior.fault_value import FaultValue
 from failuretwin.failure_behavior.injection import Injection
-from failuretwin.failure_behavior.modes import MODES, FaultMode, FaultValue
-from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
+from failuretwin.failure_behavior.random_movements import stack_movements
 
 if TYPE_CHECKING:
     import xarray as xr
 
-STEP_S = 0.01
-"""Step of the time grid [s], as published."""
-ENGINES = ("servo", "physics")
 CHUNK_RUNS = 100
 """Runs computed at a time: about 30 MB of work."""
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What to simulate.
-
-    Attributes:
-        robot: The robot.
-        hypotheses: States of the robot, in the order in which their runs come.
-        runs_per_class: Runs of each.
-        seed: Seed of all chance.
-        imperfections: What the healthy robot does that its twin does not.
-        movements: How movements are drawn.
-        modes: Fault modes with their distributions, by id.
-        engine: What moves the robot: ``servo`` (the published loops) or ``physics``.
-    """
-
-    robot: Robot
-    hypotheses: Sequence[Hypothesis]
-    runs_per_class: int
-    seed: int = 0
-    imperfections: Imperfections = NO_IMPERFECTIONS
-    movements: RandomMovements = field(default_factory=RandomMovements)
-    modes: Mapping[str, FaultMode] = field(default_factory=lambda: MODES)
-    engine: str = "servo"
-
-    def __post_init__(self) -> None:
-        if self.runs_per_class < 1:
-            raise InputError(f"runs per class is {self.runs_per_class}, expected 1 or more.")
-        if self.engine not in ENGINES:
-            raise unknown_name("engine", self.engine, ENGINES)
-        for hypothesis in self.hypotheses:
-            if not hypothesis.known:
-                raise InputError("'unknown' cannot be simulated. Name the faults to simulate.")
-            for fault in hypothesis.faults:
-                if fault.mode not in self.modes:
-                    raise InputError(
-                        f"fault mode {fault.mode!r} cannot be simulated. "
-                        f"Expected one of {', '.join(self.modes)}."
-                    )
-
-    @property
-    def size(self) -> int:
-        """Number of runs."""
-        return len(self.hypotheses) * self.runs_per_class
-
-    @property
-    def time(self) -> FloatArray:
-        """Time grid of every run, (time,) [s]."""
-        return as_floats(np.arange(round(self.movements.duration_s / STEP_S)) * STEP_S)
-
-    def hypothesis_of(self, run: int) -> Hypothesis:
-        """Return the true state of a run."""
-        return self.hypotheses[run // self.runs_per_class]
-
-    def attributes(self) -> dict[str, str | int]:
-        """Return what a run set says of where it comes from."""
-        configuration = {
-            "hypotheses": [str(h) for h in self.hypotheses],
-            "runs_per_class": self.runs_per_class,
-            "imperfections": self.imperfections.name,
-            "movements": vars(self.movements),
-            "modes": {name: vars(mode) for name, mode in self.modes.items()},
-        }
-        return {
-            "robot": self.robot.name,
-            "source": f"simulated by the {self.engine} engine",
-            "seed": self.seed,
-            "failuretwin_version": __version__,
-            "configuration": json.dumps(configuration),
-        }
 
 
 @dataclass(frozen=True)
@@ -149,7 +74,7 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
     command, time = commanded.reference(plan.time), plan.time
     drive = _drive(plan, commanded, command, injection, chance)
     position = _engine(plan).angles(drive, time)
-    measured = sense(
+    measured, read = sense(
         DigitalTwin(plan.robot),
         plan.imperfections.readings,
         position,
@@ -158,6 +83,9 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
         chance,
     )
     readings = plan.imperfections.readings
+    duration = _durations(plan, commanded, chance)
+    over = time > duration[:, None] + 1e-9
+    measured[over], read[over] = np.nan, np.nan
     return RunTable(
         run=[_run_name(plan, run) for run in runs],
         motor=plan.robot.motor_names,
@@ -165,9 +93,10 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
         command=command,
         measured=measured,
         measured_rate_hz=1.0 / STEP_S if readings is None else readings.rate_hz,
+        duration=duration,
         movements=commanded,
-        truth=_truth(plan, runs, draws, injection.magnitudes(position)),
-        position=position,
+        truth=_truth(plan, runs, injection.as_struck(position, time, commanded.start)),
+        position=read,
         attributes=plan.attributes(),
     )
 
@@ -204,6 +133,15 @@ def _drive(
     )
 
 
+def _durations(plan: Plan, commanded: Movements, chance: Disturbances) -> FloatArray:
+    """Return how long each run lasts, (run,) [s]: until the command after it would come."""
+    last = float(plan.time[-1])
+    if plan.as_published or plan.imperfections.timing.late_rate == 0.0:
+        return np.full(len(commanded.start), last)
+    end = commanded.start[:, -1] + chance.late[:, -1] + plan.movements.period_s
+    return np.minimum(end, last)
+
+
 def _same(one: Movements, other: Movements) -> bool:
     names = ("initial", "target", "ramp_duration", "start")
     return all(np.array_equal(getattr(one, n), getattr(other, n), equal_nan=True) for n in names)
@@ -212,57 +150,76 @@ def _same(one: Movements, other: Movements) -> bool:
 def _engine(plan: Plan) -> Engine:
     if plan.engine == "servo":
         return ServoEngine(plan.robot)
-    from failuretwin.digital_model.physics import PhysicsEngine
-
-    return PhysicsEngine(plan.robot)
+    # Threads in the process that the user started; its workers are as many as there is room for.
+    threads = (os.cpu_count() or 1) if parent_process() is None else 1
+    return PhysicsEngine(plan.robot, threads=threads)
 
 
 def _run_name(plan: Plan, run: int) -> str:
     return f"{plan.hypothesis_of(run)}/{run % plan.runs_per_class:05d}"
 
 
-def _truth(plan: Plan, runs: Sequence[int], draws: Sequence[_Draw], magnitude: FloatArray) -> Truth:
-    onset = [min((v.onset_s for v in draw.faults), default=np.nan) for draw in draws]
+def _truth(plan: Plan, runs: Sequence[int], faults: Sequence[Sequence[FaultValue]]) -> Truth:
+    onset = [min((v.onset_s for v in values), default=np.nan) for values in faults]
+    magnitude = [values[0].magnitude if values else np.nan for values in faults]
     return Truth(
         fault=[str(plan.hypothesis_of(run)) for run in runs],
-        detail=[{"faults": [value.detail() for value in draw.faults]} for draw in draws],
+        detail=[{"faults": [value.detail() for value in values]} for values in faults],
         onset=np.array(onset),
-        magnitude=magnitude,
+        magnitude=np.array(magnitude),
     )
 
 
-def simulate(
-    plan: Plan, workers: int = 1, on_progress: Callable[[int], None] | None = None
-) -> xr.Dataset:
-    """Simulate all runs of a plan.
+def iterate(
+    plan: Plan, runs_at_a_time: int = CHUNK_RUNS, order: Sequence[int] | None = None
+) -> Iterator[RunTable]:
+    """Simulate runs a few at a time and keep none of them.
 
     Args:
         plan: What to simulate.
-        workers: Processes to spread the work over; the result does not depend on it.
-        on_progress: Called with the number of runs that have just been finished.
+        runs_at_a_time: Runs in each table; the last one may hold fewer.
+        order: Numbers of the runs to make, each below `plan.size`, such as a random permutation;
+            None: all of them, one hypothesis after the other.
+
+    Raises:
+        InputError: If runs at a time are fewer than one.
     """
-    if workers < 1:
-        raise InputError(f"workers is {workers}, expected 1 or more.")
+    if runs_at_a_time < 1:
+        raise InputError(f"runs at a time is {runs_at_a_time}, expected 1 or more.")
+    runs = range(plan.size) if order is None else order
+    for first in range(0, len(runs), runs_at_a_time):
+        yield simulate_runs(plan, runs[first : first + runs_at_a_time])
+
+
+def simulate(
+    plan: Plan,
+    workers: int = 1,
+    on_progress: Callable[[int], None] = lambda runs: None,
+    scheduler: str | None = None,
+) -> xr.Dataset:
+    """Simulate all runs of a plan in memory; `run_factory.produce` has no need to hold them.
+
+    Args:
+        plan: What to simulate.
+        workers: Processes to spread the work over; the result does not depend on it. Scripts that
+            ask for several must be guarded by ``if __name__ == "__main__":``.
+        on_progress: Called with the number of runs that have just been finished.
+        scheduler: Address of a Dask scheduler whose workers do it instead.
+
+    Raises:
+        InputError: If workers are fewer than one or cannot be had.
+    """
     chunks = [
         range(first, min(first + CHUNK_RUNS, plan.size))
         for first in range(0, plan.size, CHUNK_RUNS)
     ]
-    tables = []
-    for table in _tables(plan, chunks, workers):
-        tables.append(table)
-        if on_progress is not None:
-            on_progress(len(table.run))
-    return concatenate([table.to_dataset() for table in tables])
+    with Workforce(workers, scheduler).at_work(partial(simulate_runs, plan), chunks) as results:
+        return assemble(_datasets(results, on_progress), plan.size)
 
 
-def _tables(plan: Plan, chunks: Sequence[range], workers: int) -> Iterator[RunTable]:
-    if workers == 1:
-        yield from (simulate_runs(plan, chunk) for chunk in chunks)
-        return
-    # Leaving the block ends the workers at once, also when the user interrupts.
-    with Pool(workers, initializer=_leave_interrupts_to_the_parent) as pool:
-        yield from pool.imap(partial(simulate_runs, plan), chunks)
-
-
-def _leave_interrupts_to_the_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _datasets(
+    results: Iterator[tuple[range, RunTable]], on_progress: Callable[[int], None]
+) -> Iterator[tuple[int, xr.Dataset]]:
+    for runs, table in results:
+        yield runs[0], table.to_dataset()
+        on_progress(len(runs))

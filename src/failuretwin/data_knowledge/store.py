@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.runs import check_runs
+from failuretwin.data_knowledge.swap import take_place
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -26,15 +27,13 @@ def load_run_set(path: Path) -> xr.Dataset:
     Raises:
         InputError: If the file cannot be read or is not a run set.
     """
-    import xarray as xr
-
-    opener = _open_netcdf if path.suffix == ".nc" else xr.open_zarr
+    opener = _open_netcdf if path.suffix == ".nc" else _open_zarr
     try:
         with opener(path) as stored:
             runs = stored.load()
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
         raise InputError(
-            f"{path}: cannot be read as a run set ({_reason(error)}). Expected NetCDF (.nc) or "
+            f"{path}: cannot be read as a run set ({reason(error)}). Expected NetCDF (.nc) or "
             "Zarr (.zarr) as `failuretwin simulate` and `failuretwin import` write them."
         ) from error
     return check_runs(runs, str(path))
@@ -44,6 +43,12 @@ def _open_netcdf(path: Path) -> xr.Dataset:
     import xarray as xr
 
     return xr.open_dataset(path, engine="h5netcdf")
+
+
+def _open_zarr(path: Path) -> xr.Dataset:
+    import xarray as xr
+
+    return xr.open_zarr(path, chunks=None)  # read at once, so nothing is gained by Dask's arrays
 
 
 def save_run_set(runs: xr.Dataset, path: Path) -> None:
@@ -104,27 +109,12 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         check_writable(path)
         yield partial
-        _take_place(partial, target)
+        take_place(partial, target)
     except (OSError, RuntimeError) as error:
         raise _output_error(path, error) from error
     finally:
         with suppress(OSError):
             shutil.rmtree(partial) if partial.is_dir() else partial.unlink(missing_ok=True)
-
-
-def _take_place(partial: Path, path: Path) -> None:
-    """Put `partial` where `path` is; a folder there is kept until the new one stands."""
-    if not path.is_dir():
-        partial.replace(path)
-        return
-    old = path.with_name(f".{path.name}.{os.getpid()}.old")
-    path.replace(old)
-    try:
-        partial.replace(path)
-    except OSError:
-        old.replace(path)
-        raise
-    shutil.rmtree(old)
 
 
 @contextmanager
@@ -160,7 +150,7 @@ def _output_error(path: Path, error: BaseException) -> OutputError:
     if isinstance(error, OutputError):
         return error
     return OutputError(
-        f"{path}: could not be written ({_reason(error)}). Nothing was left behind; free some "
+        f"{path}: could not be written ({reason(error)}). Nothing was left behind; free some "
         "space or choose another place."
     )
 
@@ -174,9 +164,12 @@ def check_writable(path: Path) -> None:
         raise OutputError(f"{path}: folder {folder} is not writable. Choose another.")
     if path.is_dir() and path.suffix != ".zarr":
         raise OutputError(f"{path}: is a folder. Give the name of a file.")
+    if path.is_file() and path.suffix == ".zarr":
+        raise OutputError(f"{path}: is a file, and a Zarr store is a folder. Choose another name.")
 
 
-def _reason(error: BaseException) -> str:
+def reason(error: BaseException) -> str:
+    """Return what the system or a library says of an error, on one line."""
     text = getattr(error, "strerror", None) or str(error)
     return one_line(text) or type(error).__name__
 

@@ -59,6 +59,13 @@ class Settling:
         return offset + sag(robot, pose, compliance, self.payload)
 
 
+def loads_in_range(robot: Robot, payload: float) -> FloatArray:
+    """Return gravity torques at 500 poses spread over the motors' ranges, (pose, motor) [N m]."""
+    low, high = np.array([motor.movement_range for motor in robot.motors]).T
+    poses = np.random.default_rng(0).uniform(low, high, (500, len(low)))
+    return robot.loads.torque(poses * robot.sense, payload)
+
+
 def sag(
     robot: Robot,
     pose: FloatArray,

@@ -32,11 +32,33 @@ from failuretwin.app.commands.options import PATH, common_options
     "name, or a TOML file.",
 )
 @click.option(
+    "--engine",
+    type=click.Choice(["servo", "physics"]),
+    default="servo",
+    show_default=True,
+    help="What moves the robot: the published servo loops, or rigid-body physics (MuJoCo) with "
+    "gears that stick and joints that flex.",
+)
+@click.option(
+    "--faults",
+    type=PATH,
+    metavar="FILE",
+    help="How large faults are, when they begin and how they grow: a TOML file with a table for "
+    "each mode, such as [drift]. Default: the paper's stuck and steady_state_error; the other "
+    "modes as assumed in docs/fault_modes.md.",
+)
+@click.option(
     "--workers",
     type=click.IntRange(min=1),
     default=1,
     show_default=True,
-    help="Processes to spread the work over; the runs do not depend on it.",
+    help="Processes on this machine to spread the work over; the runs do not depend on it.",
+)
+@click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="Dask scheduler whose workers do the work instead, such as tcp://host:8786. They must "
+    "share the folder of --out.",
 )
 @common_options
 def simulate(
@@ -44,22 +66,33 @@ def simulate(
     runs_per_class: int,
     hypotheses: str | None,
     imperfections: str,
+    engine: str,
+    faults: Path | None,
     workers: int,
+    scheduler: str | None,
     robot: str,
     seed: int,
 ) -> None:
-    """Make labelled runs with the digital twin and write them as a run set."""
+    """Make labelled runs with the digital twin and write them as a run set.
+
+    To .zarr any number of runs can be written; if that is interrupted, the same command goes on
+    with what is missing. Up to a few thousand can be written to .nc.
+    """
     from failuretwin.app.progress import progress_bar
+    from failuretwin.connection.calibration.loops import robot_as_calibrated
     from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
-    from failuretwin.data_knowledge import generation
-    from failuretwin.data_knowledge.store import check_destination, save_run_set
+    from failuretwin.data_knowledge.plan import Plan
+    from failuretwin.data_knowledge.run_factory import produce
+    from failuretwin.data_knowledge.store import check_destination
+    from failuretwin.data_knowledge.workforce import Workforce
     from failuretwin.digital_model.imperfections import load_imperfections
     from failuretwin.digital_model.robot import load_robot
+    from failuretwin.failure_behavior.modes import MODES, load_modes
 
     check_destination(out)
-    model = load_robot(robot)
+    model = robot_as_calibrated(load_robot(robot), imperfections)
     names = model.motor_names
-    plan = generation.Plan(
+    plan = Plan(
         robot=model,
         hypotheses=(
             parse_hypotheses(hypotheses.split(","), names)
@@ -69,8 +102,10 @@ def simulate(
         runs_per_class=runs_per_class,
         seed=seed,
         imperfections=load_imperfections(imperfections, model),
+        engine=engine,
+        modes=MODES if faults is None else load_modes(faults),
     )
+    workforce = Workforce(workers, scheduler)
     with progress_bar("simulating", plan.size) as advance:
-        runs = generation.simulate(plan, workers, advance)
-    save_run_set(runs, out)
+        produce(plan, out, workforce, advance, tell=lambda text: click.echo(text, err=True))
     click.echo(f"{plan.size} runs written to {out}")

@@ -17,7 +17,7 @@ from failuretwin.connection.calibration.observations import Observations
 from failuretwin.connection.healthy import log_student
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.robot import Robot
-from failuretwin.digital_model.settling import Settling
+from failuretwin.digital_model.settling import Settling, loads_in_range
 from failuretwin.digital_model.twin import DigitalTwin
 
 OFFSET_PRIOR_RAD = 0.03
@@ -163,9 +163,7 @@ class _Prior:
 
 def largest_load(robot: Robot, payload: float) -> FloatArray:
     """Return the largest gravity torque that each motor meets in its range, (motor,) [N m]."""
-    low, high = np.array([motor.movement_range for motor in robot.motors]).T
-    poses = np.random.default_rng(0).uniform(low, high, (500, len(low)))
-    return np.abs(robot.loads.torque(poses * robot.sense, payload)).max(axis=0)
+    return np.abs(loads_in_range(robot, payload)).max(axis=0)
 
 
 def rounding(robot: Robot) -> float:

@@ -1,42 +1,32 @@
-"""How good diagnoses are, where the truth is known."""
+"""Right or wrong: accuracy, confusion, precision, recall and F1 of each class."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from failuretwin.core.types import IntArray
+from failuretwin.decision.metrics.proper import LogScore, log_score
+from failuretwin.decision.metrics.shares import wilson_interval
 
-Z_95 = 1.959963984540054
-"""Two-sided 95 % point of the normal distribution."""
 NO_VERDICT = "cannot tell"
 """Class of the runs that got no verdict."""
-PROBABILITY_FLOOR = 1e-12
-"""A truth that a posterior gives less than this counts as this in the log score."""
-
-
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """Return the Wilson 95 % interval of a share."""
-    if trials == 0:
-        return 0.0, 1.0
-    share, z2 = successes / trials, Z_95**2
-    centre = (share + z2 / (2 * trials)) / (1 + z2 / trials)
-    half = Z_95 * np.sqrt(share * (1 - share) / trials + z2 / (4 * trials**2)) / (1 + z2 / trials)
-    return max(0.0, float(centre - half)), min(1.0, float(centre + half))
 
 
 @dataclass(frozen=True)
 class ClassScore:
-    """Scores of one class; NaN where the ratio has no meaning.
+    """Scores of one class; NaN where the ratio has no meaning (0 / 0).
 
     Attributes:
         name: The hypothesis.
         runs: Runs of which it is the truth.
-        precision: Share of its diagnoses that are right.
-        recall: Share of its runs that are found.
-        f1: Harmonic mean of both.
+        precision: Share of its diagnoses that are right; NaN if it was never diagnosed.
+        recall: Share of its runs that are found; NaN if it is never the truth.
+        f1: 2 hits / (runs + diagnoses), the harmonic mean of both where both have a meaning. A
+            class that is true but never diagnosed has 0; NaN if it is neither.
     """
 
     name: str
@@ -53,12 +43,17 @@ class Scores:
     Attributes:
         classes: Hypotheses in the order of the confusion matrix.
         confusion: Counts, (truth, diagnosis).
-        log_score: Mean of minus the log probability of the truth [nats a run].
+        surprise: Log score of the same runs.
     """
 
     classes: tuple[str, ...]
     confusion: IntArray
-    log_score: float
+    surprise: LogScore
+
+    @property
+    def log_score(self) -> float:
+        """Mean of minus the log probability of the truth [nats a run]; may be infinite."""
+        return self.surprise.mean
 
     @property
     def runs(self) -> int:
@@ -80,18 +75,32 @@ class Scores:
         """Wilson 95 % interval of the accuracy."""
         return wilson_interval(self.right, self.runs)
 
+    @property
+    def macro_f1(self) -> float:
+        """Mean F1 of the classes that are the truth of any run, each with the same weight.
+
+        Other classes (never true; "cannot tell") have no say of their own: their diagnoses already
+        lower the recall of the classes that were true.
+        """
+        return float(np.mean([row.f1 for row in self.by_class() if row.runs]))
+
     def by_class(self) -> list[ClassScore]:
         """Return precision, recall and F1 of each class."""
         truth, said = self.confusion.sum(axis=1), self.confusion.sum(axis=0)
-        rows = []
-        for i, name in enumerate(self.classes):
-            hit = float(self.confusion[i, i])
-            precision = hit / said[i] if said[i] else float("nan")
-            recall = hit / truth[i] if truth[i] else float("nan")
-            total = precision + recall
-            f1 = 2 * precision * recall / total if total > 0 else float("nan")
-            rows.append(ClassScore(name, int(truth[i]), float(precision), float(recall), f1))
-        return rows
+        return [
+            ClassScore(
+                name=name,
+                runs=int(truth[i]),
+                precision=_ratio(self.confusion[i, i], said[i]),
+                recall=_ratio(self.confusion[i, i], truth[i]),
+                f1=_ratio(2 * self.confusion[i, i], truth[i] + said[i]),
+            )
+            for i, name in enumerate(self.classes)
+        ]
+
+
+def _ratio(part: int, whole: int) -> float:
+    return float(part / whole) if whole else math.nan
 
 
 def score(
@@ -113,6 +122,4 @@ def score(
     confusion = np.zeros((len(classes), len(classes)), dtype=np.int64)
     for true, said in zip(truth, said_of, strict=True):
         confusion[index[true], index[said]] += 1
-    chance = [p.get(t, 0.0) for p, t in zip(posterior, truth, strict=True)]
-    log_score = -np.mean(np.log(np.maximum(chance, PROBABILITY_FLOOR)))
-    return Scores(classes, confusion, float(log_score))
+    return Scores(classes, confusion, log_score(truth, posterior))

@@ -1,0 +1,130 @@
+"""Two result files on the same runs: which method is better?"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from failuretwin.app.results import Record, judged_records, protocol_of
+from failuretwin.core.errors import InputError
+from failuretwin.core.types import BoolArray
+from failuretwin.decision.metrics import (
+    LogScoreGain,
+    McNemar,
+    log_score,
+    log_score_gain,
+    mcnemar,
+)
+
+NAMED_RUNS = 3
+"""So many runs are named in an error."""
+
+
+@dataclass(frozen=True)
+class Results:
+    """A result file and what to call it.
+
+    Attributes:
+        name: Such as its path.
+        records: Its diagnoses.
+    """
+
+    name: str
+    records: Sequence[Record]
+
+    @property
+    def protocol(self) -> str:
+        """How much real data the method has seen."""
+        return protocol_of(self.records)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What two result files say of the same runs.
+
+    Attributes:
+        first: Name and protocol of the first.
+        second: Name and protocol of the second.
+        split: Which runs they got right.
+        gain: Nats a run that the second saves.
+    """
+
+    first: str
+    second: str
+    split: McNemar
+    gain: LogScoreGain
+
+    @property
+    def runs(self) -> int:
+        """Number of runs compared."""
+        split = self.split
+        return split.both + split.first_only + split.second_only + split.neither
+
+
+def compare_results(first: Results, second: Results, rng: np.random.Generator) -> Comparison:
+    """Compare two result files run by run, matched by run name.
+
+    Args:
+        first: Diagnoses, with the truth of those runs that are to count.
+        second: Others of the same runs; where they lack the truth, that of the first counts.
+        rng: Source of chance, for the bootstrap.
+
+    Raises:
+        InputError: If the runs or their truths differ.
+    """
+    ours, theirs = _paired(first, second)
+    truth = [record["truth"] for record in ours]
+    return Comparison(
+        first=f"{first.name} (protocol {first.protocol})",
+        second=f"{second.name} (protocol {second.protocol})",
+        split=mcnemar(_right(ours, truth), _right(theirs, truth)),
+        gain=log_score_gain(
+            log_score(truth, [record["posterior"] for record in ours]).nats,
+            log_score(truth, [record["posterior"] for record in theirs]).nats,
+            rng,
+        ),
+    )
+
+
+def _right(records: Sequence[Record], truth: Sequence[str]) -> BoolArray:
+    pairs = zip(records, truth, strict=True)
+    return np.array([record["diagnosis"] == true for record, true in pairs], dtype=np.bool_)
+
+
+def _paired(first: Results, second: Results) -> tuple[list[Record], list[Record]]:
+    """Return the records of both whose truth is known, run by run."""
+    ours, theirs = _by_run(first), _by_run(second)
+    for has, lacks, missing in (
+        (first, second, [run for run in ours if run not in theirs]),
+        (second, first, [run for run in theirs if run not in ours]),
+    ):
+        if missing:
+            raise InputError(
+                f"{lacks.name}: lacks {len(missing)} runs of {has.name} ({_some(missing)}). Two "
+                "methods are compared on the same runs: diagnose the same inputs with both."
+            )
+    judged = judged_records(first.records)
+    matched = [theirs[record["run"]] for record in judged]
+    for one, other in zip(judged, matched, strict=True):
+        if other["truth"] not in (None, "", one["truth"]):
+            raise InputError(
+                f"{second.name}: run {one['run']!r} is {other['truth']} there, but {one['truth']} "
+                f"in {first.name}. Give the truth of both with --truth RUNS."
+            )
+    return judged, matched
+
+
+def _by_run(results: Results) -> dict[str, Record]:
+    by_run = {record["run"]: record for record in results.records}
+    if len(by_run) < len(results.records):
+        count = Counter(record["run"] for record in results.records)
+        twice = [run for run, times in count.items() if times > 1]
+        raise InputError(f"{results.name}: {_some(twice)} given twice. Expected each run once.")
+    return by_run
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:NAMED_RUNS]) + (", ..." if len(names) > NAMED_RUNS else "")

@@ -1,0 +1,72 @@
+"""`failuretwin simulate` as a user sees it: one worker or many, cut short and continued."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from failuretwin.data_knowledge.store import load_run_set
+
+COMMAND = ("simulate", "--runs-per-class", 40, "--imperfections", "armpi_fpv", "--out")
+
+
+def contents(folder):
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
+
+
+@pytest.fixture(scope="module")
+def made_by_one(failuretwin, tmp_path_factory):
+    """A run set in four pieces, made by one process."""
+    path = tmp_path_factory.mktemp("one") / "runs.zarr"
+    answer = failuretwin(*COMMAND, path)
+    assert (answer.returncode, answer.stderr) == (0, "")
+    assert answer.stdout == f"360 runs written to {path}\n"
+    return path
+
+
+def test_two_workers_write_the_same_bytes(failuretwin, tmp_path, made_by_one):
+    answer = failuretwin(*COMMAND, tmp_path / "two.zarr", "--workers", 2)
+    assert (answer.returncode, answer.stderr) == (0, "")
+    assert contents(tmp_path / "two.zarr") == contents(made_by_one)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_interrupted_work_is_kept_and_continued(failuretwin, tmp_path, workers):
+    arguments = [*COMMAND, tmp_path / "runs.zarr", "--runs-per-class", 100]
+    words = [*arguments, "--workers", workers]
+    command = [sys.executable, "-m", "failuretwin", *map(str, words)]
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        while len(list(tmp_path.glob(".*.partial/done/*"))) < 2:
+            assert process.poll() is None
+            time.sleep(0.005)
+        # As a terminal does: to the whole group, workers included; the group is this process's own.
+        assert os.getpgid(process.pid) == process.pid
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.wait(30) == 1
+        told, _, rest = process.stderr.read().partition("\n")
+    assert "of 900 runs are kept in" in told
+    assert rest.split() == ["interrupted"]
+    kept = told.split()[0]
+    assert not (tmp_path / "runs.zarr").exists()
+    again = failuretwin(*arguments)
+    assert again.stderr == f"continuing: {kept} of 900 runs were there\n"
+    assert load_run_set(tmp_path / "runs.zarr").sizes["run"] == 900
+    assert [path.name for path in tmp_path.iterdir()] == ["runs.zarr"]
+
+
+def test_wrong_scheduler_is_refused_soon(failuretwin, tmp_path):
+    start = time.monotonic()
+    answer = failuretwin(*COMMAND, tmp_path / "x.zarr", "--scheduler", "tcp://127.0.0.1:1")
+    assert time.monotonic() - start < 15.0
+    assert answer.returncode == 2
+    assert answer.stderr.startswith("error: scheduler 'tcp://127.0.0.1:1' does not answer")
+    assert len(answer.stderr.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []

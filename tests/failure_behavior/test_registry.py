@@ -1,0 +1,95 @@
+"""The registry of modes, distributions from files, and the page that describes both."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import MAGNITUDE_UNITS
+from failuretwin.failure_behavior.modes import MODES, Drift, Lag, Stuck, load_modes, register
+
+PAGE = Path(__file__).parents[2] / "docs" / "fault_modes.md"
+
+
+@pytest.fixture(scope="module")
+def page():
+    return PAGE.read_text("utf-8")
+
+
+@pytest.fixture
+def load(tmp_path):
+    def load(text):
+        path = tmp_path / "faults.toml"
+        path.write_text(text)
+        return load_modes(path)
+
+    return load
+
+
+def test_every_mode_with_a_unit_can_be_simulated():
+    assert list(MODES) == list(MAGNITUDE_UNITS)
+    assert all(name == mode.mode for name, mode in MODES.items())
+
+
+def test_the_table_on_the_page_is_what_the_modes_are(page):
+    rows = [line.strip("| ").split(" | ") for line in page.splitlines() if line[:3] == "| `"]
+    assert [row[0].strip("`") for row in rows] == list(MODES)
+    for row, mode in zip(rows, MODES.values(), strict=True):
+        *_, default, profiles = row
+        assert tuple(re.findall(r"\w+", profiles)) == mode.allowed_profiles
+        assert tuple(re.findall(r"\*\*(\w+)\*\*", profiles)) == mode.profiles
+        if mode.mode != "stuck":
+            low, high = re.search(r"([\d.]+) to ([\d.]+)", default).groups()
+            assert (float(low), float(high)) == pytest.approx(mode.magnitude, abs=5e-4)
+        if mode.mode not in ("stuck", "steady_state_error"):
+            assert mode.onset_s == (0.0, 5.0)
+
+
+def test_the_example_on_the_page_loads(page, load):
+    (text,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    modes = load(text)
+    assert modes["drift"] == Drift(
+        magnitude=(0.02, 0.02),
+        both_signs=False,
+        onset_s=(0.0, 2.0),
+        profiles=("step", "ramp"),
+        rise_s=(1.0, 4.0),
+    )
+    assert modes["stuck"] == Stuck(onset_s=(1.0, 8.0), profiles=("intermittent",))
+    assert {name: modes[name] for name in MODES.keys() - {"drift", "stuck"}} == {
+        name: mode for name, mode in MODES.items() if name not in ("drift", "stuck")
+    }
+
+
+def test_loading_changes_no_defaults(load):
+    before = dict(MODES)
+    assert load("[lag]\nmagnitude = [0.2, 0.2]\n")["lag"] == Lag(magnitude=(0.2, 0.2))
+    assert before == MODES
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[stuk]\n", "unknown fault mode 'stuk'. Did you mean 'stuck'"),
+        ("[lag]\nmagnitude = [0.1, 0.2, 0.3]\n", "lag: magnitude is .* expected 2 values"),
+        ("[lag]\nmagnitude = [-0.1, 0.2]\n", "lag: magnitude is .* between 0 and inf"),
+        # What a mode has no use for is no option of it.
+        ("[stuck]\nmagnitude = [0.1, 0.2]\n", "stuck: unknown key 'magnitude'"),
+        ("[stuck]\nrise_s = [1, 2]\n", "stuck: unknown key 'rise_s'"),
+        ("[intermittent]\nepisode_share = [0.1, 0.2]\n", "unknown key 'episode_share'"),
+        ("[backlash]\nepisode_s = [1, 2]\n", "backlash: unknown key 'episode_s'"),
+    ],
+)
+def test_bad_files_are_refused_by_name(load, text, message):
+    with pytest.raises(InputError, match=rf"faults\.toml: .*{message}"):
+        load(text)
+
+
+def test_a_name_is_given_once():
+    before = dict(MODES), dict(MAGNITUDE_UNITS)
+    with pytest.raises(InputError, match="'lag' already"):
+        register(Lag(), "s")
+    assert before == (MODES, MAGNITUDE_UNITS)
