@@ -101,7 +101,7 @@ def expected_figure(seen: Predictions, robot: Robot) -> Figure:
         if beyond:
             panel.annotate(f"{beyond} beyond", (0.03, 0.94), xycoords="axes fraction", fontsize=8)
         before, after = (1.4826 * float(np.median(np.abs(e))) for e in (error, error - expected))
-        panel.set_title(f"{name}: {before:.2g} to {after:.2g} {unit}", fontsize=10)
+        panel.set_title(f"{name}: {before:.2f} to {after:.2f} {unit}", fontsize=10)
         panel.set_xlabel(f"expected error [{unit}]", fontsize=9)
         _finish(panel)
     panels[0].set_ylabel(f"settled error [{unit}]")
@@ -175,6 +175,7 @@ def session_figure(held_out: Sequence[HeldOut], robot: Robot, of_motors: bool) -
         panel.set_xlabel(f"settled error [{unit}]", fontsize=9)
         panel.set_yticks(rows, [entry.session for entry in held_out], fontsize=8)
         panel.tick_params(axis="y", length=0)
+        panel.set_ylim(-0.6, len(held_out) - 0.4)
         _finish(panel)
     _legend(figure, panels[0])
     return figure
