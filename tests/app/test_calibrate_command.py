@@ -348,9 +348,9 @@ def test_a_robot_has_its_own_calibration(failuretwin, learned, two_days, small, 
         load_calibration(path, armpi)
 
 
-def test_imperfections_are_no_calibration(armpi):
+def test_imperfections_are_no_calibration(armpi, measured_file):
     with pytest.raises(InputError, match="holds imperfections without a calibration"):
-        load_calibration(armpi.imperfections_file, armpi)
+        load_calibration(measured_file, armpi)
 
 
 # The file

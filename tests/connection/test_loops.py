@@ -57,6 +57,6 @@ def test_the_file_keeps_the_loops(tmp_path, armpi, calibration):
     assert robot_as_calibrated(armpi, str(path)).motors[1].loop.I == 17.5
 
 
-def test_imperfections_without_a_calibration_bring_no_loops(armpi):
+def test_imperfections_without_a_calibration_bring_no_loops(armpi, measured_file):
     assert robot_as_calibrated(armpi, "none") is armpi
-    assert robot_as_calibrated(armpi, str(armpi.imperfections_file)) is armpi
+    assert robot_as_calibrated(armpi, str(measured_file)) is armpi

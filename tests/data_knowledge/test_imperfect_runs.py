@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from scipy import stats
 from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.plan import Plan
-from failuretwin.digital_model.imperfections import load_imperfections
 
 RUNS = 500
 COUNT = np.deg2rad(0.24)
@@ -27,19 +25,14 @@ def within(hits, rate):
 
 
 @pytest.fixture(scope="module")
-def known(armpi):
-    return load_imperfections(str(Path(__file__).with_name("measured_armpi.toml")), armpi)
+def runs(armpi, measured_armpi):
+    return simulate(Plan(armpi, [HEALTHY], RUNS, seed=11, imperfections=measured_armpi))
 
 
 @pytest.fixture(scope="module")
-def runs(armpi, known):
-    return simulate(Plan(armpi, [HEALTHY], RUNS, seed=11, imperfections=known))
-
-
-@pytest.fixture(scope="module")
-def exact(armpi, known):
+def exact(armpi, measured_armpi):
     """The same schedules and late starts, looked at by perfect sensors."""
-    perfect = replace(known, readings=None)
+    perfect = replace(measured_armpi, readings=None)
     return simulate(Plan(armpi, [HEALTHY], RUNS, seed=11, imperfections=perfect))
 
 
