@@ -348,9 +348,12 @@ def test_a_robot_has_its_own_calibration(failuretwin, learned, two_days, small, 
         load_calibration(path, armpi)
 
 
-def test_imperfections_are_no_calibration(armpi, measured_file):
+def test_imperfections_are_no_calibration(armpi, tmp_path):
+    path = tmp_path / "typed.toml"
+    path.write_text('name = "typed"\nsource = "by hand"\n')
+    assert load_imperfections(str(path), armpi).name == "typed"
     with pytest.raises(InputError, match="holds imperfections without a calibration"):
-        load_calibration(measured_file, armpi)
+        load_calibration(path, armpi)
 
 
 # The file

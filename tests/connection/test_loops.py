@@ -57,6 +57,8 @@ def test_the_file_keeps_the_loops(tmp_path, armpi, calibration):
     assert robot_as_calibrated(armpi, str(path)).motors[1].loop.I == 17.5
 
 
-def test_imperfections_without_a_calibration_bring_no_loops(armpi, measured_file):
+def test_imperfections_without_a_calibration_bring_no_loops(armpi, tmp_path):
     assert robot_as_calibrated(armpi, "none") is armpi
-    assert robot_as_calibrated(armpi, str(measured_file)) is armpi
+    path = tmp_path / "typed.toml"
+    path.write_text('name = "typed"\nsource = "by hand"\n')
+    assert robot_as_calibrated(armpi, str(path)) is armpi

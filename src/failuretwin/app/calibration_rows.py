@@ -27,6 +27,13 @@ MEANING = {
     "lost commands": "movements on time for which a motor does not get its command",
     "lost commands when late": "the same for movements that start late",
     "spoilt readings": "readings that are missing or out of range",
+    "loop gain P": "proportional gain of the servo loop, from step tests",
+    "loop gain I": "integral gain of the servo loop, from step tests",
+    "filter time": "time constant of the loop's input filter, from step tests",
+    "speed limit": "largest speed of the motor, from step tests",
+    "dead time": "time from a command to the first motion, from step tests",
+    "overshoot": "how far a step goes beyond where it settles",
+    "settling time after the ramp": "until a step stays where it settles",
 }
 TITLES = {"tail_dof": "tails"}
 SHORT_S = 0.2
