@@ -4,7 +4,7 @@ BIN := .venv/bin
 # Small arrays gain nothing from threads, and threads of several processes get in each other's way.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test bench lint format clean
+.PHONY: demo test bench calibrations lint format clean
 
 demo: .venv/ready
 	$(BIN)/python examples/demo.py
@@ -33,3 +33,14 @@ format: .venv/ready
 
 clean:
 	rm -rf .venv .mypy_cache .pytest_cache .ruff_cache .hypothesis
+
+# The calibrations that come with the package; DATA is the folder of the published logs.
+DATA ?= ../shared/data
+CALIBRATIONS := src/failuretwin/digital_model/robots/calibrations
+calibrations: .venv/ready
+	cd $(DATA) && $(CURDIR)/$(BIN)/failuretwin calibrate real_robot_b_20241003/label_[0-4] \
+		--name armpi_fpv --out $(CURDIR)/$(CALIBRATIONS)/armpi_fpv.toml
+	cd $(DATA) && $(CURDIR)/$(BIN)/failuretwin calibrate healthy_logs/robot_b \
+		--name armpi_fpv_b_2024-05 --out $(CURDIR)/$(CALIBRATIONS)/armpi_fpv_b_2024-05.toml
+	cd $(DATA) && $(CURDIR)/$(BIN)/failuretwin calibrate healthy_logs/robot_a \
+		--name armpi_fpv_a_2024 --out $(CURDIR)/$(CALIBRATIONS)/armpi_fpv_a_2024.toml

@@ -24,7 +24,8 @@ from failuretwin.connection.calibration.motion_part import movements_of
 from failuretwin.connection.calibration.observations import observe, session_names
 from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.generation import Plan, simulate
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
 from failuretwin.digital_model.imperfections import default_imperfections
 from failuretwin.digital_model.robot import Robot
@@ -81,10 +82,8 @@ def table(real: object, simulated: object, robot: Robot) -> None:
     for k, motor in enumerate(robot.motor_names):
         for what, statistic in (("mean", np.mean), ("sd", np.std)):
             values = [float(statistic(error[:, k])) for error in errors]
-            draws = [
-                float(statistic(errors[0][np.random.default_rng(i).integers(len(errors[0]), size=len(errors[0])), k]))
-                for i in range(200)
-            ]
+            rng = np.random.default_rng(0)
+            draws = [statistic(rng.choice(errors[0][:, k], len(errors[0]))) for _ in range(200)]
             low, high = np.quantile(draws, [0.025, 0.975])
             name = f"settled error of {motor}, {what} [counts]"
             print(f"{name:44s} {values[0]:9.2f} {low:9.2f} to {high:7.2f} {values[1]:10.2f}")
@@ -105,15 +104,15 @@ def two_sample(real: object, simulated: object, robot: Robot) -> None:
     sessions = session_names(real)
     names = sorted(set(sessions))
     a, b = features(real, robot), features(simulated, robot)
-    X, y = np.concatenate([a, b]), np.repeat([1, 0], [len(a), len(b)])
+    values_of, y = np.concatenate([a, b]), np.repeat([1, 0], [len(a), len(b)])
     groups = [names.index(s) for s in sessions] + [i % len(names) for i in range(len(b))]
-    filled = np.where(np.isfinite(X), X, 0.0)
+    filled = np.where(np.isfinite(values_of), values_of, 0.0)
     linear = make_pipeline(
         StandardScaler(), LogisticRegression(class_weight="balanced", max_iter=2000, C=0.1)
     )
     trees = HistGradientBoostingClassifier(class_weight="balanced", max_iter=100, random_state=0)
     folds = GroupKFold(min(FOLDS, len(names)))
-    for name, model, values in (("linear", linear, filled), ("boosted trees", trees, X)):
+    for name, model, values in (("linear", linear, filled), ("boosted trees", trees, values_of)):
         chance = cross_val_predict(
             model, values, y, groups=groups, cv=folds, method="predict_proba"
         )[:, 1]
@@ -123,7 +122,9 @@ def two_sample(real: object, simulated: object, robot: Robot) -> None:
         draws = []
         rng = np.random.default_rng(0)
         for _ in range(500):
-            pick = np.concatenate([rng.choice(np.flatnonzero(y == k), np.sum(y == k)) for k in (0, 1)])
+            pick = np.concatenate(
+                [rng.choice(np.flatnonzero(y == k), np.sum(y == k)) for k in (0, 1)]
+            )
             draws.append(roc_auc_score(y[pick], chance[pick]))
         low, high = np.quantile(draws, [0.025, 0.975])
         print(

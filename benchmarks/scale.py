@@ -17,7 +17,8 @@ from pathlib import Path
 
 from failuretwin import load_robot
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge.generation import Plan, iterate
+from failuretwin.data_knowledge.generation import iterate
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.run_factory import produce
 from failuretwin.digital_model.imperfections import load_imperfections
 

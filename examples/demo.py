@@ -13,7 +13,8 @@ from failuretwin.app.plots import run_figure
 from failuretwin.app.progress import progress_bar
 from failuretwin.app.tables import print_diagnoses, print_scores
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge.generation import Plan, simulate
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.digital_model.imperfections import load_imperfections
 
 RUNS_PER_CLASS = 10

@@ -10,6 +10,7 @@ from hypothesis import settings
 from failuretwin import DigitalTwin, load_robot
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
+from failuretwin.digital_model.imperfections import load_imperfections
 
 settings.register_profile("steady", deadline=None, derandomize=True)
 settings.register_profile("search", deadline=None, max_examples=2000)
@@ -36,6 +37,17 @@ def simulink(data):
 @pytest.fixture(scope="session")
 def armpi():
     return load_robot("armpi_fpv")
+
+
+@pytest.fixture(scope="session")
+def measured_file():
+    """Imperfections with figures that stay as they are, without a calibration."""
+    return Path(__file__).with_name("measured_armpi.toml")
+
+
+@pytest.fixture(scope="session")
+def measured_armpi(armpi, measured_file):
+    return load_imperfections(str(measured_file), armpi)
 
 
 @pytest.fixture(scope="session")

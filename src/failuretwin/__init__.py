@@ -10,6 +10,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from failuretwin.data_knowledge.generation import iterate, simulate
+    from failuretwin.data_knowledge.plan import Plan
     from failuretwin.data_knowledge.reading import ReadOptions, read_runs
     from failuretwin.decision.bayes import BayesDiagnoser, Priors
     from failuretwin.digital_model.robot import load_robot
@@ -20,20 +22,26 @@ __version__ = "0.1.0"
 _HOME = {
     "BayesDiagnoser": "decision.bayes",
     "DigitalTwin": "digital_model.twin",
+    "Plan": "data_knowledge.plan",
     "Priors": "decision.bayes",
     "ReadOptions": "data_knowledge.reading",
+    "iterate": "data_knowledge.generation",
     "load_robot": "digital_model.robot",
     "read_runs": "data_knowledge.reading",
+    "simulate": "data_knowledge.generation",
 }
 
 __all__ = [
     "BayesDiagnoser",
     "DigitalTwin",
+    "Plan",
     "Priors",
     "ReadOptions",
     "__version__",
+    "iterate",
     "load_robot",
     "read_runs",
+    "simulate",
 ]
 
 

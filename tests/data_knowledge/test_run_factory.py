@@ -18,8 +18,9 @@ from failuretwin import read_runs
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge import run_factory, run_pieces
-from failuretwin.data_knowledge.generation import Plan, simulate
+from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.lock import sole_writer
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.run_factory import produce
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
 from failuretwin.digital_model.imperfections import load_imperfections
@@ -300,7 +301,7 @@ import resource, sys
 from pathlib import Path
 from failuretwin import load_robot
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.data_knowledge.generation import Plan
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.run_factory import produce
 produce(Plan(load_robot("armpi_fpv"), [Hypothesis()], int(sys.argv[2])), Path(sys.argv[1]))
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
@@ -327,7 +328,7 @@ import sys
 from pathlib import Path
 from failuretwin import load_robot
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge.generation import Plan
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.run_factory import produce
 from failuretwin.digital_model.imperfections import load_imperfections
 robot = load_robot("armpi_fpv")

@@ -14,7 +14,8 @@ from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.runs import RunTable, Truth
 from failuretwin.data_knowledge import swap
-from failuretwin.data_knowledge.generation import Plan, simulate
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
 from failuretwin.digital_model.imperfections import load_imperfections
 

@@ -15,7 +15,8 @@ import pytest
 from failuretwin.core.errors import FailureTwinError, InputError, OutputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge import dask_client
-from failuretwin.data_knowledge.generation import Plan, simulate
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.run_factory import produce
 from failuretwin.data_knowledge.workforce import Workforce
 from failuretwin.digital_model.imperfections import load_imperfections
@@ -159,7 +160,7 @@ import sys
 from pathlib import Path
 from failuretwin import load_robot
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge.generation import Plan
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.run_factory import produce
 from failuretwin.data_knowledge.workforce import Workforce
 from failuretwin.digital_model.imperfections import load_imperfections

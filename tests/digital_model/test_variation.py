@@ -25,8 +25,8 @@ SPREAD = Variation(
 
 
 @pytest.fixture(scope="module")
-def known(armpi):
-    return load_imperfections("armpi_fpv", armpi)
+def known(measured_armpi):
+    return measured_armpi
 
 
 @pytest.fixture(scope="module")

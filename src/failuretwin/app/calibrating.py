@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from failuretwin.app.calibration_tables import shown_unit
 from failuretwin.connection.calibration.calibration import Calibration, LeftOut
 from failuretwin.connection.calibration.learn import SUSPECT, calibrate
 from failuretwin.connection.calibration.observations import session_names
@@ -24,6 +25,10 @@ MOST_SUSPECT = 0.25
 """Share of runs that may look faulty before the logs are refused."""
 MOST_LEFT_OUT = 0.3
 """Share of movements that may be left out before the logs are refused."""
+
+MOST_SCATTER_RAD = 0.03
+"""Settled scatter beyond which a motor is no healthy one [rad], three times what is assumed of a
+robot of which nothing is known: errors redrawn for every movement pass for scatter."""
 
 
 def learn_robot(
@@ -49,6 +54,7 @@ def learn_robot(
     inside = _held_out_runs(runs, hold_out)
     learning = runs.isel(run=np.flatnonzero(~inside))
     first = calibrate(learning, robot, name, source, thorough=False)
+    _refuse_scatter(first, robot)
     doubt = suspicion(learning, robot, first.imperfections)
     _refuse_suspects(learning, doubt)
     judged = runs.isel(run=np.flatnonzero(inside)) if inside.any() else None
@@ -83,6 +89,17 @@ def _held_out_runs(runs: xr.Dataset, hold_out: str | None) -> np.ndarray:
     if inside.all():
         raise InputError(f"--hold-out {hold_out!r} leaves nothing to learn from: {known}.")
     return inside
+
+
+def _refuse_scatter(first: Calibration, robot: Robot) -> None:
+    for parameter in first.parameters:
+        if parameter.name == "scatter" and parameter.low > MOST_SCATTER_RAD:
+            scale, unit = shown_unit("rad", robot)
+            raise InputError(
+                f"{parameter.motor} settles anew with every movement, with a scatter of "
+                f"{scale * parameter.value:.1f} {unit}; expected {scale * MOST_SCATTER_RAD:.1f} at "
+                "most. Nothing is learned from these logs; give logs of a healthy robot."
+            )
 
 
 def _refuse_suspects(runs: xr.Dataset, doubt: FloatArray) -> None:

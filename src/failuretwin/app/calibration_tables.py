@@ -77,22 +77,21 @@ def _held_out_table(found: Calibration, robot: Robot) -> Table:
 
 def left_out_line(found: Calibration) -> str:
     """Return how many runs and movements were left out and why, in one line."""
-    kinds = Counter(
-        f"{'run' if entry.movement == 0 else 'movement'} where "
-        f"{entry.motor or 'something'} {entry.reason}"
-        if entry.motor
-        else f"{'run' if entry.movement == 0 else 'movement'} that {entry.reason}"
-        for entry in found.left_out
-    )
-    return "; ".join(f"{count} {kind}" for kind, count in kinds.most_common())
+    kinds = Counter((entry.movement == 0, entry.motor, entry.reason) for entry in found.left_out)
+    return "; ".join(_counted(count, *kind) for kind, count in kinds.most_common())
+
+
+def _counted(count: int, whole_run: bool, motor: str, reason: str) -> str:
+    what = ("run" if whole_run else "movement") + ("" if count == 1 else "s")
+    return f"{count} {what}: {motor} {reason}" if motor else f"{count} {what}: {reason}"
 
 
 def verdict_line(found: Calibration) -> str:
     """Return whether the fit beats the uncalibrated twin on sessions that it has not seen."""
     if not found.held_out:
         return (
-            "not checked on unseen logs: there is one session only. Record another day and "
-            "calibrate on both."
+            "not checked on unseen logs: it takes two sessions, each long enough to learn from. "
+            "Record another day and calibrate on both."
         )
     gain, error = mean_gain(found.held_out)
     told = f"{gain:+.2f} nats a movement (95 % interval {gain - error:+.2f} to {gain + error:+.2f})"

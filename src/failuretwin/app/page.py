@@ -6,7 +6,7 @@ import base64
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from failuretwin import __version__
 from failuretwin.app.results import score_line
@@ -14,6 +14,9 @@ from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.data_knowledge.knowledge import plain_name
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 
 def write_page(
@@ -30,14 +33,8 @@ def write_page(
     Raises:
         InputError: If jinja2 is missing.
     """
-    try:
-        from jinja2 import Environment
-    except ImportError as error:
-        raise InputError(
-            f"pages need jinja2 ({error}). Install it: pip install 'failuretwin[plots]'."
-        ) from error
     template = (files("failuretwin.app") / "page.html.j2").read_text(encoding="utf-8")
-    page = Environment(autoescape=True).from_string(template)
+    page = environment().from_string(template)
     text = page.render(
         runs=[_entry(d, picture) for d, picture in zip(diagnoses, pictures, strict=True)],
         robot=robot,
@@ -48,6 +45,21 @@ def write_page(
         score=score_line([d.to_record() for d in diagnoses]),
     )
     path.write_text(text, encoding="utf-8")
+
+
+def environment() -> Environment:
+    """Return what renders the templates of pages; text in them is escaped.
+
+    Raises:
+        InputError: If jinja2 is missing.
+    """
+    try:
+        from jinja2 import Environment, StrictUndefined
+    except ImportError as error:
+        raise InputError(
+            f"pages need jinja2 ({error}). Install it: pip install 'failuretwin[plots]'."
+        ) from error
+    return Environment(autoescape=True, undefined=StrictUndefined)
 
 
 def _entry(diagnosis: Diagnosis, picture: Path) -> dict[str, Any]:

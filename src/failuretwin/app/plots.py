@@ -30,7 +30,7 @@ BLUE, RED, GREY = "#1f5f99", "#c8402f", "#9aa3ab"
 
 
 def figure_class() -> Any:
-    """Return matplotlib's figure.
+    """Return matplotlib's class of figures.
 
     Raises:
         InputError: If matplotlib is missing.
@@ -115,7 +115,7 @@ def _plot_axis(
     panel.plot(time, MM_PER_M * measured, color=BLUE, label="measured", **style)
     panel.set_ylabel(f"tool {axis} [mm]")
     panel.tick_params(labelbottom=False)
-    _clean(panel)
+    clean(panel)
 
 
 def _plot_residual(
@@ -140,7 +140,7 @@ def _plot_residual(
             xycoords=("data", "axes fraction"),
             fontsize=8,
         )
-    _clean(panel)
+    clean(panel)
 
 
 def _plot_posterior(panel: Axes, diagnosis: Diagnosis) -> None:
@@ -155,7 +155,7 @@ def _plot_posterior(panel: Axes, diagnosis: Diagnosis) -> None:
     for y, value in enumerate(values):
         panel.annotate(f"{value:.1f}", (value + 1.5, y), va="center", fontsize=8)
     panel.set_title("what is wrong?", fontsize=10)
-    _clean(panel)
+    clean(panel)
 
 
 def _span(time: FloatArray) -> tuple[float, float]:
@@ -168,5 +168,6 @@ def _plain(hypothesis: str) -> str:
     return plain_name(Hypothesis.parse(hypothesis))
 
 
-def _clean(panel: Axes) -> None:
+def clean(panel: Axes) -> None:
+    """Take away the lines of a panel that frame nothing."""
     panel.spines[["top", "right"]].set_visible(False)

@@ -6,140 +6,37 @@ is the same whoever makes it and whatever is made beside it.
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from multiprocessing import parent_process
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin import __version__
-from failuretwin.core.errors import InputError, unknown_name
-from failuretwin.core.fingerprint import canonical, fingerprint
-from failuretwin.core.hypothesis import Fault, Hypothesis
+from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable, Truth
-from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.assembly import assemble
+from failuretwin.data_knowledge.plan import STEP_S, Plan
 from failuretwin.data_knowledge.workforce import Workforce
 from failuretwin.digital_model.disturbances import Disturbances, draw_disturbances, stack
 from failuretwin.digital_model.engine import Drive, Engine, ServoEngine
 from failuretwin.digital_model.imperfect import actual_movements, delay_commands, lagged
-from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, Imperfections
-from failuretwin.digital_model.robot import Robot
-from failuretwin.digital_model.settling import Settling, loads_in_range
+from failuretwin.digital_model.physics.engine import PhysicsEngine
 from failuretwin.digital_model.tool_sensor import sense
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.fault_value import FaultValue
 from failuretwin.failure_behavior.injection import Injection
-from failuretwin.failure_behavior.modes import MODES, FaultMode
-from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
+from failuretwin.failure_behavior.random_movements import stack_movements
 
 if TYPE_CHECKING:
     import xarray as xr
 
-STEP_S = 0.01
-"""Step of the time grid [s], as published."""
-ENGINES = ("servo", "physics")
-LEAST_SAG_RAD = 1e-6
-"""A motor that its load moves by less than this in any pose counts as rigid [rad]."""
 CHUNK_RUNS = 100
 """Runs computed at a time: about 30 MB of work."""
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What to simulate.
-
-    Attributes:
-        robot: The robot.
-        hypotheses: States of the robot, in the order in which their runs come.
-        runs_per_class: Runs of each.
-        seed: Seed of all chance.
-        imperfections: What the healthy robot does that its twin does not.
-        movements: How movements are drawn.
-        modes: Fault modes with their distributions, by id.
-        engine: What moves the robot: ``servo`` (the published loops) or ``physics``.
-    """
-
-    robot: Robot
-    hypotheses: Sequence[Hypothesis]
-    runs_per_class: int
-    seed: int = 0
-    imperfections: Imperfections = NO_IMPERFECTIONS
-    movements: RandomMovements = field(default_factory=RandomMovements)
-    modes: Mapping[str, FaultMode] = field(default_factory=lambda: MODES)
-    engine: str = "servo"
-
-    def __post_init__(self) -> None:
-        if self.runs_per_class < 1:
-            raise InputError(f"runs per class is {self.runs_per_class}, expected 1 or more.")
-        if self.engine not in ENGINES:
-            raise unknown_name("engine", self.engine, ENGINES)
-        if len(set(self.hypotheses)) < len(self.hypotheses):
-            raise InputError("a hypothesis is given twice. Give each of them once.")
-        for hypothesis in self.hypotheses:
-            if not hypothesis.known:
-                raise InputError("'unknown' cannot be simulated. Name the faults to simulate.")
-            for fault in hypothesis.faults:
-                if fault.mode not in self.modes:
-                    raise InputError(
-                        f"fault mode {fault.mode!r} cannot be simulated. "
-                        f"Expected one of {', '.join(self.modes)}."
-                    )
-                if self.modes[fault.mode].needs_compliance and self.engine == "servo":
-                    self._check_compliance(fault)
-
-    def _check_compliance(self, fault: Fault) -> None:
-        """Refuse a loss of stiffness in a motor that does not give way at all."""
-        motor = self.robot.motor_names.index(fault.motor)
-        settling = self.imperfections.settling or Settling.ideal(len(self.robot.motors))
-        load = np.abs(loads_in_range(self.robot, settling.payload)[:, motor]).max()
-        if settling.compliance[motor] * load < LEAST_SAG_RAD:
-            raise InputError(
-                f"'{fault}' would not show: with imperfections {self.imperfections.name!r}, "
-                f"{fault.motor} does not give way under load. Choose imperfections in which it "
-                "sags (--imperfections), or another motor."
-            )
-
-    @property
-    def size(self) -> int:
-        """Number of runs."""
-        return len(self.hypotheses) * self.runs_per_class
-
-    @property
-    def time(self) -> FloatArray:
-        """Time grid of every run, (time,) [s]."""
-        return as_floats(np.arange(round(self.movements.duration_s / STEP_S)) * STEP_S)
-
-    def hypothesis_of(self, run: int) -> Hypothesis:
-        """Return the true state of a run."""
-        return self.hypotheses[run // self.runs_per_class]
-
-    def attributes(self) -> dict[str, str | int]:
-        """Return what a run set says of where it comes from."""
-        configuration = {
-            "hypotheses": [str(h) for h in self.hypotheses],
-            "runs_per_class": self.runs_per_class,
-            "imperfections": self.imperfections.name,
-            "movements": vars(self.movements),
-            "modes": {name: vars(mode) for name, mode in self.modes.items()},
-        }
-        return {
-            "robot": self.robot.name,
-            "source": f"simulated by the {self.engine} engine",
-            "seed": self.seed,
-            "failuretwin_version": __version__,
-            "configuration": json.dumps(configuration),
-        }
-
-    def manifest(self) -> dict[str, Any]:
-        """Return all that decides what the runs are, as JSON can hold it, and its hash."""
-        urdf = (self.robot.folder / self.robot.profile.urdf).read_bytes()
-        content = {"plan": canonical(self), "urdf_sha256": hashlib.sha256(urdf).hexdigest()}
-        return {**content, "plan_sha256": fingerprint(content)}
 
 
 @dataclass(frozen=True)
@@ -177,7 +74,7 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
     command, time = commanded.reference(plan.time), plan.time
     drive = _drive(plan, commanded, command, injection, chance)
     position = _engine(plan).angles(drive, time)
-    measured = sense(
+    measured, read = sense(
         DigitalTwin(plan.robot),
         plan.imperfections.readings,
         position,
@@ -186,6 +83,9 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
         chance,
     )
     readings = plan.imperfections.readings
+    duration = _durations(plan, commanded, chance)
+    over = time > duration[:, None] + 1e-9
+    measured[over], read[over] = np.nan, np.nan
     return RunTable(
         run=[_run_name(plan, run) for run in runs],
         motor=plan.robot.motor_names,
@@ -193,9 +93,10 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
         command=command,
         measured=measured,
         measured_rate_hz=1.0 / STEP_S if readings is None else readings.rate_hz,
+        duration=duration,
         movements=commanded,
         truth=_truth(plan, runs, injection.as_struck(position, time, commanded.start)),
-        position=position,
+        position=read,
         attributes=plan.attributes(),
     )
 
@@ -232,6 +133,15 @@ def _drive(
     )
 
 
+def _durations(plan: Plan, commanded: Movements, chance: Disturbances) -> FloatArray:
+    """Return how long each run lasts, (run,) [s]: until the command after it would come."""
+    last = float(plan.time[-1])
+    if plan.as_published or plan.imperfections.timing.late_rate == 0.0:
+        return np.full(len(commanded.start), last)
+    end = commanded.start[:, -1] + chance.late[:, -1] + plan.movements.period_s
+    return np.minimum(end, last)
+
+
 def _same(one: Movements, other: Movements) -> bool:
     names = ("initial", "target", "ramp_duration", "start")
     return all(np.array_equal(getattr(one, n), getattr(other, n), equal_nan=True) for n in names)
@@ -240,9 +150,9 @@ def _same(one: Movements, other: Movements) -> bool:
 def _engine(plan: Plan) -> Engine:
     if plan.engine == "servo":
         return ServoEngine(plan.robot)
-    from failuretwin.digital_model.physics import PhysicsEngine
-
-    return PhysicsEngine(plan.robot)
+    # Threads in the process that the user started; its workers are as many as there is room for.
+    threads = (os.cpu_count() or 1) if parent_process() is None else 1
+    return PhysicsEngine(plan.robot, threads=threads)
 
 
 def _run_name(plan: Plan, run: int) -> str:

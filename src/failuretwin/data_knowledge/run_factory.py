@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from failuretwin.core.errors import FailureTwinError, InputError, OutputError
-from failuretwin.data_knowledge.generation import CHUNK_RUNS, Plan, simulate, simulate_runs
+from failuretwin.data_knowledge.generation import CHUNK_RUNS, simulate, simulate_runs
 from failuretwin.data_knowledge.lock import sole_writer
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.run_pieces import Job, make_piece, versions
 from failuretwin.data_knowledge.store import check_destination, reason, save_run_set
 from failuretwin.data_knowledge.unfinished import take_up, whole_digest

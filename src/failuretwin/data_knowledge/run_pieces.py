@@ -8,7 +8,8 @@ from importlib import import_module
 
 from failuretwin import __version__
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.generation import Plan, simulate_runs
+from failuretwin.data_knowledge.generation import simulate_runs
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.unfinished import Unfinished
 from failuretwin.data_knowledge.zarr_layout import piece_content
 

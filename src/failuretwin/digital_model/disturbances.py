@@ -33,6 +33,8 @@ class Disturbances:
         lag: Time constant of a first-order lag, () [s].
         shortening: Share by which ramps end early, ().
         late: Late start, (movement,) [s].
+        stalled: Whether the command after the run is late, so that the last movement's readings
+            stop too, ().
         gap_start: Readings stop this long after a movement before a late one, (movement,) [s].
         reading_time: Times of the readings, (reading,) [s].
         glitch: Raw counts of spoilt readings, NaN where sound, (reading, motor).
@@ -49,6 +51,7 @@ class Disturbances:
     lag: FloatArray
     shortening: FloatArray
     late: FloatArray
+    stalled: BoolArray
     gap_start: FloatArray
     reading_time: FloatArray
     glitch: FloatArray
@@ -90,6 +93,7 @@ def draw_disturbances(
         shortening=np.asarray(rng.uniform(*timing.ramp_shortening)),
         lag=np.asarray(rng.uniform(*timing.lag_s)),
         late=late,
+        stalled=np.asarray(rng.random() < timing.late_rate),
         gap_start=rng.uniform(*timing.gap_start_s, movements),
         reading_time=times,
         glitch=glitch,

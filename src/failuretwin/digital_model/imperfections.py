@@ -149,7 +149,7 @@ SETTLING_LISTS = ("bias", "compliance", "friction", "scatter")
 """Figures of `Settling` and `Variation` that have one value for each motor."""
 
 CALIBRATION_TABLE = "calibration"
-"""Table of such a file that says how the figures were found; the twin does not read it."""
+"""Table of such a file that says of which robot and how the figures were found."""
 GENERIC_NAME = "generic, not calibrated"
 """What results say of a robot whose healthy behaviour has not been measured."""
 GENERIC_SCATTER_RAD = 0.01
@@ -179,7 +179,8 @@ def load_imperfections(name_or_path: str, robot: Robot) -> Imperfections:
         robot: The robot they are for.
 
     Raises:
-        InputError: If there are none under this name or they do not fit the robot's motors.
+        InputError: If there are none under this name, or they belong to another robot or do not fit
+            its motors.
     """
     if name_or_path == "none":
         return NO_IMPERFECTIONS
@@ -190,10 +191,19 @@ def load_imperfections(name_or_path: str, robot: Robot) -> Imperfections:
         own = f", {robot.name!r}" if robot.imperfections_file else ""
         raise InputError(f"no imperfections {name_or_path!r}. Expected 'none'{own} or a TOML file.")
     table = read_toml(path)
-    table.pop(CALIBRATION_TABLE, None)
+    _check_robot(table.pop(CALIBRATION_TABLE, None), robot, path)
     imperfections = from_table(Imperfections, table, str(path))
     _check_fit(imperfections, robot, path)
     return imperfections
+
+
+def _check_robot(calibration: object, robot: Robot, path: Path) -> None:
+    owner = calibration.get("robot") if isinstance(calibration, dict) else None
+    if owner not in (None, robot.name):
+        raise InputError(
+            f"{path}: is a calibration of robot {owner!r}, not of {robot.name!r}. Name the right "
+            "robot (--robot) or calibrate this one."
+        )
 
 
 def _check_fit(imperfections: Imperfections, robot: Robot, path: Path) -> None:

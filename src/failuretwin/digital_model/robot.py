@@ -74,6 +74,7 @@ class Profile:
             that applies the kinematics to angles in the log's sense) or ``physical``.
         servo_units: Count scale of commands and readings in raw logs, if they use one.
         imperfections: Imperfections of the healthy robot, a TOML file relative to the profile.
+        physics: Motors and gears for the physics engine, a TOML file relative to the profile.
         sources: Where each group of numbers comes from.
     """
 
@@ -85,6 +86,7 @@ class Profile:
     sensor_pose: str = "physical"
     servo_units: ServoUnits | None = None
     imperfections: str | None = None
+    physics: str | None = None
     sources: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -150,9 +152,20 @@ class Robot:
         return self.profile.servo_units
 
     @property
+    def urdf_file(self) -> Path:
+        """The URDF."""
+        return self.folder / self.profile.urdf
+
+    @property
     def imperfections_file(self) -> Path | None:
         """File with the imperfections of the healthy robot, if the profile names one."""
         name = self.profile.imperfections
+        return None if name is None else self.folder / name
+
+    @property
+    def physics_file(self) -> Path | None:
+        """File with motors and gears for the physics engine, if the profile names one."""
+        name = self.profile.physics
         return None if name is None else self.folder / name
 
 

@@ -1,4 +1,4 @@
-"""The tool sensor: from the true angles of many runs to the readings of the tool's path."""
+"""The sensors: from the true angles of many runs to readings of motors and of the tool's path."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def sense(
     time: FloatArray,
     movement_start: FloatArray,
     chance: Disturbances,
-) -> FloatArray:
-    """Return the tool path as the sensor reports it.
+) -> tuple[FloatArray, FloatArray]:
+    """Return the tool path and the motors' angles as the sensors report them.
 
     Args:
         twin: Kinematics of the robot.
@@ -29,10 +29,11 @@ def sense(
         chance: Disturbances of the same runs.
 
     Returns:
-        (run, time, axis) [m], NaN where there is no sample.
+        Tool path (run, time, axis) [m] and angles (run, time, motor) [rad], NaN where there is no
+        sample.
     """
     if readings is None:
-        return twin.path(position)
+        return twin.path(position), position
     read = _at_times(position, time, chance.reading_time)
     if readings.whole_counts:
         units = twin.robot.servo_units
@@ -40,14 +41,18 @@ def sense(
     missing = _in_gap(chance, movement_start)
     if readings.drawn_out:
         return _draw_out(twin, read, chance, missing, time)
-    missing |= np.isfinite(chance.glitch).any(axis=-1)
-    points = np.where(missing[..., None], np.nan, twin.path(read) + chance.noise)
+    spoilt = np.isfinite(chance.glitch)
+    unseen = missing | spoilt.any(axis=-1)
+    points = np.where(unseen[..., None], np.nan, twin.path(read) + chance.noise)
+    angles = np.where(missing[..., None] | spoilt, np.nan, read)
     nearest = np.rint(chance.reading_time / (time[1] - time[0])).astype(np.int64)
     inside = nearest < len(time)
-    measured = np.full((*position.shape[:2], 3), np.nan)
     run = np.broadcast_to(np.arange(len(position))[:, None], nearest.shape)
+    measured = np.full((*position.shape[:2], 3), np.nan)
     measured[run[inside], nearest[inside]] = points[inside]
-    return measured
+    angle = np.full(position.shape, np.nan)
+    angle[run[inside], nearest[inside]] = angles[inside]
+    return measured, angle
 
 
 def _at_times(position: FloatArray, time: FloatArray, at: FloatArray) -> FloatArray:
@@ -61,11 +66,12 @@ def _at_times(position: FloatArray, time: FloatArray, at: FloatArray) -> FloatAr
 
 def _in_gap(chance: Disturbances, start: FloatArray) -> BoolArray:
     """Return which readings the stalled bus swallows, (run, reading)."""
-    late = chance.late[:, 1:]
-    begin = start[:, :-1] + chance.gap_start[:, :-1]
-    end = start[:, 1:] + late
+    stalled = np.concatenate([chance.late[:, 1:] > 0.0, chance.stalled[:, None]], axis=1)
+    begin = start + chance.gap_start
+    end = np.full_like(start, np.inf)
+    end[:, :-1] = start[:, 1:] + chance.late[:, 1:]
     at = chance.reading_time[:, :, None]
-    inside = (at > begin[:, None]) & (at < end[:, None]) & (late > 0)[:, None]
+    inside = (at > begin[:, None]) & (at < end[:, None]) & stalled[:, None]
     return np.asarray(inside.any(axis=-1))
 
 
@@ -75,8 +81,8 @@ def _draw_out(
     chance: Disturbances,
     missing: BoolArray,
     time: FloatArray,
-) -> FloatArray:
-    """Return the path of angles drawn out to the grid by straight lines, as published."""
+) -> tuple[FloatArray, FloatArray]:
+    """Return path and angles drawn out to the grid by straight lines, as published."""
     units = twin.robot.servo_units
     counts = np.where(np.isfinite(chance.glitch), chance.glitch, units.to_counts(read))
     filled = np.empty((len(read), len(time), read.shape[-1]))
@@ -86,4 +92,5 @@ def _draw_out(
             filled[run, :, motor] = np.interp(
                 time, chance.reading_time[run, kept], counts[run, kept, motor]
             )
-    return twin.path(units.to_rad(filled))
+    angle = units.to_rad(filled)
+    return twin.path(angle), angle

@@ -38,12 +38,14 @@ def calibrate(
     """Learn from healthy logs where the motors settle, how they lag and what goes wrong by chance.
 
     LOG is whatever `diagnose` reads. Motor readings are used where the logs have them, else the
-    tool path alone. Runs that are labelled or look faulty are left out.
+    tool path alone. Runs that are labelled or look faulty are left out. Step tests (CSV files, or
+    folders that hold some) add servo loops and speed limits.
     """
     del seed  # nothing here depends on chance
     from failuretwin.app.calibrating import learn_robot
     from failuretwin.app.calibration_tables import print_calibration
     from failuretwin.app.inputs import read_inputs
+    from failuretwin.app.step_inputs import learn_loops, split_step_tests, with_step_tests
     from failuretwin.connection.calibration.calibration_file import (
         check_calibration_file,
         save_calibration,
@@ -51,10 +53,13 @@ def calibrate(
     from failuretwin.digital_model.robot import load_robot
 
     check_calibration_file(out)
-    model = load_robot(robot)
-    runs = read_inputs(logs, model, how, published_labels, columns, approximate)
+    tests, others = split_step_tests(logs, columns)
+    steps = learn_loops(tests, load_robot(robot))
+    model = steps.robot
+    runs = read_inputs(others, model, how, published_labels, columns, approximate)
     source = ", ".join(str(log) for log in logs)
     found, judged = learn_robot(runs, model, name or out.stem, source, hold_out)
+    found = with_step_tests(found, steps)
     if report is not None:
         from failuretwin.app.calibration_page import write_calibration_page
         from failuretwin.data_knowledge.store import filling

@@ -32,6 +32,14 @@ from failuretwin.app.commands.options import PATH, common_options
     "name, or a TOML file.",
 )
 @click.option(
+    "--engine",
+    type=click.Choice(["servo", "physics"]),
+    default="servo",
+    show_default=True,
+    help="What moves the robot: the published servo loops, or rigid-body physics (MuJoCo) with "
+    "gears that stick and joints that flex.",
+)
+@click.option(
     "--faults",
     type=PATH,
     metavar="FILE",
@@ -58,6 +66,7 @@ def simulate(
     runs_per_class: int,
     hypotheses: str | None,
     imperfections: str,
+    engine: str,
     faults: Path | None,
     workers: int,
     scheduler: str | None,
@@ -70,8 +79,9 @@ def simulate(
     with what is missing. Up to a few thousand can be written to .nc.
     """
     from failuretwin.app.progress import progress_bar
+    from failuretwin.connection.calibration.loops import robot_as_calibrated
     from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
-    from failuretwin.data_knowledge import generation
+    from failuretwin.data_knowledge.plan import Plan
     from failuretwin.data_knowledge.run_factory import produce
     from failuretwin.data_knowledge.store import check_destination
     from failuretwin.data_knowledge.workforce import Workforce
@@ -80,9 +90,9 @@ def simulate(
     from failuretwin.failure_behavior.modes import MODES, load_modes
 
     check_destination(out)
-    model = load_robot(robot)
+    model = robot_as_calibrated(load_robot(robot), imperfections)
     names = model.motor_names
-    plan = generation.Plan(
+    plan = Plan(
         robot=model,
         hypotheses=(
             parse_hypotheses(hypotheses.split(","), names)
@@ -92,6 +102,7 @@ def simulate(
         runs_per_class=runs_per_class,
         seed=seed,
         imperfections=load_imperfections(imperfections, model),
+        engine=engine,
         modes=MODES if faults is None else load_modes(faults),
     )
     workforce = Workforce(workers, scheduler)

@@ -33,6 +33,25 @@ class Parameter:
 
 
 @dataclass(frozen=True)
+class LoopFit:
+    """Servo loop of a motor as its step tests speak for it.
+
+    Attributes:
+        motor: Its name.
+        P: Proportional gain [-].
+        I: Integral gain [1/s].
+        filter_s: Time constant of the input filter [s].
+        speed_limit: Largest speed [rad/s].
+    """
+
+    motor: str
+    P: float
+    I: float  # noqa: E741 - the field's name for an integral gain
+    filter_s: float
+    speed_limit: float
+
+
+@dataclass(frozen=True)
 class LeftOut:
     """A movement that did not count, because it does not look like one of a healthy motor.
 
@@ -56,9 +75,9 @@ class HeldOut:
     Attributes:
         session: The session left out.
         movements: Its settled movements.
-        before: Scatter of the settled error of each motor without calibration, its standard
-            deviation [rad]; of the three axes of the tool [m] where the log has no motor readings.
-        after: Robust scatter (1.48 MAD) about what the fit to the others predicts, same units.
+        before: Robust size of the settled error of each motor without calibration, 1.48 times its
+            median size [rad]; of the three axes of the tool [m] where the log has no readings.
+        after: The same about what the fit to the others predicts.
         gain: Mean log density of a movement under the fit, minus that with the generic figures of
             an uncalibrated robot [nats].
         gain_error: Standard error of `gain`.
@@ -86,6 +105,8 @@ class Calibration:
         left_out: What was left out.
         held_out: How well it predicts sessions that it has not seen.
         remarks: What else the user should know, in sentences.
+        loops: Servo loops from step tests; motors without any keep those of the profile. Timing is
+            what is left on top of them.
     """
 
     imperfections: Imperfections
@@ -97,3 +118,4 @@ class Calibration:
     left_out: tuple[LeftOut, ...] = ()
     held_out: tuple[HeldOut, ...] = ()
     remarks: tuple[str, ...] = ()
+    loops: tuple[LoopFit, ...] = ()

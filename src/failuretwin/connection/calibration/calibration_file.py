@@ -11,6 +11,7 @@ from failuretwin.connection.calibration.calibration import (
     Calibration,
     HeldOut,
     LeftOut,
+    LoopFit,
     Parameter,
 )
 from failuretwin.core.config import from_table, read_toml
@@ -34,6 +35,7 @@ class _Record:
     left_out: tuple[LeftOut, ...] = ()
     held_out: tuple[HeldOut, ...] = ()
     remarks: tuple[str, ...] = ()
+    loops: tuple[LoopFit, ...] = ()
 
 
 def save_calibration(calibration: Calibration, robot: Robot, path: Path) -> None:
@@ -55,6 +57,7 @@ def save_calibration(calibration: Calibration, robot: Robot, path: Path) -> None
         left_out=calibration.left_out,
         held_out=calibration.held_out,
         remarks=calibration.remarks,
+        loops=calibration.loops,
     )
     table = {**_plain(calibration.imperfections), CALIBRATION_TABLE: _plain(record)}
     text = (
@@ -87,11 +90,6 @@ def load_calibration(path: Path, robot: Robot) -> Calibration:
             "`failuretwin calibrate`."
         )
     record = from_table(_Record, table, f"{path}: {CALIBRATION_TABLE}")
-    if record.robot != robot.name:
-        raise InputError(
-            f"{path}: is a calibration of robot {record.robot!r}, not of {robot.name!r}. Name the "
-            "right robot (--robot) or calibrate this one."
-        )
     return Calibration(
         imperfections=imperfections,
         parameters=record.parameters,
@@ -102,6 +100,7 @@ def load_calibration(path: Path, robot: Robot) -> Calibration:
         left_out=record.left_out,
         held_out=record.held_out,
         remarks=record.remarks,
+        loops=record.loops,
     )
 
 

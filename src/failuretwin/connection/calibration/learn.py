@@ -23,6 +23,12 @@ from failuretwin.connection.calibration.motion_part import (
     movements_of,
     transients,
 )
+from failuretwin.connection.calibration.motion_values import (
+    lateness_parameters,
+    readings_of,
+    schedule_of,
+    timing_of,
+)
 from failuretwin.connection.calibration.observations import observe
 from failuretwin.connection.calibration.parameters import (
     loss_parameters,
@@ -30,19 +36,13 @@ from failuretwin.connection.calibration.parameters import (
     settling_parameters,
     timing_parameters,
 )
-from failuretwin.connection.calibration.rates import LossRates, Rate, loss_rates, uniform_range
+from failuretwin.connection.calibration.rates import LossRates, Rate, loss_rates
 from failuretwin.connection.calibration.settled_part import SettledPart, fit_settled_part
-from failuretwin.connection.calibration.timing_fit import TimingFit, fit_timing
+from failuretwin.connection.calibration.timing_fit import fit_timing
 from failuretwin.connection.calibration.what_if import best_payload, sense_remarks
-from failuretwin.core.movements import Movements
-from failuretwin.core.runs import measured_rate
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.imperfections import (
     Imperfections,
-    Range,
-    Readings,
-    Schedule,
-    Timing,
     Variation,
 )
 from failuretwin.digital_model.robot import Robot
@@ -53,8 +53,6 @@ if TYPE_CHECKING:
 SUSPECT = 0.9
 """A run that is faulty with at least this probability is left out."""
 BOOTSTRAP_SEED = 0
-FEWEST = 3
-"""Values below which nothing is said of a range."""
 
 
 def calibrate(
@@ -109,11 +107,11 @@ def calibrate(
         name=name,
         source=source,
         protocol="P0c",
-        settling=replace(part.fit.settling(source), payload=payload),
-        timing=_timing(timing, late, gaps),
+        settling=replace(part.settling, source=source),
+        timing=timing_of(timing, late, gaps),
         lost_commands=tuple(loss.entry() for loss in losses),
-        schedule=_schedule(movements, late, robot),
-        readings=_readings(kept, robot, glitches),
+        schedule=schedule_of(movements, late, robot),
+        readings=readings_of(kept, robot, glitches),
         variation=_variation(part, losses),
     )
     return Calibration(
@@ -121,7 +119,7 @@ def calibrate(
         parameters=(
             *settling_parameters(part.fit, robot, payload),
             *timing_parameters(timing, np.random.default_rng(BOOTSTRAP_SEED)),
-            *_lateness_parameters(late, gaps),
+            *lateness_parameters(late, gaps),
             *loss_parameters(losses),
             *_glitch_parameters(glitches, robot),
         ),
@@ -138,84 +136,18 @@ def calibrate(
 def _held_out(part: SettledPart, robot: Robot, judged: xr.Dataset | None) -> tuple[HeldOut, ...]:
     seen = part.observations
     if judged is None:
-        return held_out_sessions(seen, robot)
+        return held_out_sessions(seen, robot, part.payload)
     unseen = observe(judged, use_readings=seen.position is not None)
-    return tuple(
+    entries = [
         judge(unseen[unseen.session == index], part, robot, name)
         for index, name in enumerate(unseen.sessions)
-    )
+    ]
+    return tuple(entry for entry in entries if entry is not None)
 
 
 def _late_of(part: SettledPart, late: Lateness) -> BoolArray:
     seen = part.observations
     return np.asarray(np.nan_to_num(late.late)[seen.run, seen.number] > 0.0)
-
-
-def _late_rate(late: Lateness) -> Rate:
-    known = late.late[np.isfinite(late.late)]
-    return Rate(int(np.sum(known > 0.0)), len(known))
-
-
-def _timing(fit: TimingFit | None, late: Lateness, gaps: FloatArray) -> Timing:
-    timing = Timing()
-    if fit is not None:
-        timing = replace(
-            timing,
-            delay_s=spread_of(fit.delay),
-            ramp_shortening=spread_of(fit.shortening),
-            lag_s=(fit.lag, fit.lag),
-        )
-    if late.known:
-        found = uniform_range(late.late[np.nan_to_num(late.late) > 0.0])
-        timing = replace(
-            timing,
-            late_rate=_late_rate(late).mean if found else 0.0,
-            late_s=_above_zero(found[0]) if found else (0.0, 0.0),
-            gap_start_s=_above_zero(spread_of(gaps)) if len(gaps) >= FEWEST else (0.0, 0.0),
-        )
-    return timing
-
-
-def _above_zero(values: Range) -> Range:
-    return max(values[0], 0.0), max(values[1], 0.0)
-
-
-def spread_of(values: FloatArray) -> Range:
-    """Return the range of uniform draws, robustly: median and twice the median deviation."""
-    middle = float(np.median(values))
-    half = 2.0 * float(np.median(np.abs(values - middle)))
-    return middle - half, middle + half
-
-
-def _schedule(movements: Movements, late: Lateness, robot: Robot) -> Schedule:
-    """Return the schedule of the logs; runs of another length keep its pace."""
-    first = movements.start[:, 0]
-    spacing = np.diff(movements.start, axis=1)
-    punctual = spacing[np.nan_to_num(late.late[:, :-1], nan=1.0) == 0.0]
-    if len(punctual) == 0:
-        return Schedule()
-    whole = False
-    if robot.profile.servo_units is not None:
-        counts = robot.servo_units.to_counts(movements.target[movements.exists])
-        whole = bool(np.max(np.abs(counts - np.rint(counts))) < 1e-6)
-    return Schedule(
-        first_start_s=(float(np.nanmin(first)), float(np.nanmax(first))),
-        period_s=(float(punctual.min()), float(punctual.max())),
-        whole_counts=whole,
-    )
-
-
-def _readings(runs: xr.Dataset, robot: Robot, glitches: Sequence[Rate] | None) -> Readings:
-    whole = False
-    if robot.profile.servo_units is not None and "position" in runs:
-        position = runs["position"].values
-        counts = robot.servo_units.to_counts(position[np.isfinite(position)])
-        whole = bool(np.mean(np.abs(counts - np.rint(counts)) < 1e-3) > 0.95)
-    return Readings(
-        rate_hz=measured_rate(runs),
-        whole_counts=whole,
-        glitch_rate=tuple(rate.mean for rate in glitches or ()),
-    )
 
 
 def _variation(part: SettledPart, losses: Sequence[LossRates]) -> Variation:
@@ -232,24 +164,6 @@ def _variation(part: SettledPart, losses: Sequence[LossRates]) -> Variation:
         scatter=tuple(log_scatter.tolist()),
         rates=float(1.0 / np.sqrt(hits + 0.5)) if hits else 0.0,
     )
-
-
-def _lateness_parameters(late: Lateness, gaps: FloatArray) -> list[Parameter]:
-    if not late.known:
-        note = "commands do not come at a steady pace; send them on a fixed schedule"
-        return [Parameter("late starts", "", "share", 0.0, 0.0, 1.0, False, note)]
-    rate = _late_rate(late)
-    found = [rate_parameter("late starts", "", rate)]
-    starts = uniform_range(late.late[np.nan_to_num(late.late) > 0.0])
-    if starts is not None:
-        (low, high), least, most = starts
-        found.append(Parameter("late start, least", "", "s", low, *least))
-        found.append(Parameter("late start, most", "", "s", high, *most))
-    if len(gaps) >= FEWEST:
-        low, high = (float(q) for q in np.quantile(gaps, [0.025, 0.975]))
-        middle = float(np.median(gaps))
-        found.append(Parameter("readings stop before a late start", "", "s", middle, low, high))
-    return found
 
 
 def _glitch_parameters(glitches: Sequence[Rate] | None, robot: Robot) -> list[Parameter]:

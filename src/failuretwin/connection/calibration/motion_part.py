@@ -15,6 +15,7 @@ from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.runs import measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.settling import Settling
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -111,7 +112,7 @@ def transients(
     of_motors = part.observations.position is not None
     reading = as_floats(runs["position" if of_motors else "measured"].values)
     return Transients(
-        movements=_settled_movements(movements, part, robot),
+        movements=settled_movements(movements, part.settling, robot),
         reading=reading,
         of_motors=of_motors,
         used=used & np.isfinite(reading).all(axis=2),
@@ -129,9 +130,8 @@ def _sound(movements: Movements, seen: Observations, part: SettledPart) -> BoolA
     return good & before
 
 
-def _settled_movements(movements: Movements, part: SettledPart, robot: Robot) -> Movements:
+def settled_movements(movements: Movements, settling: Settling, robot: Robot) -> Movements:
     """Return the movements with the targets at which motors really settle."""
-    settling = part.fit.settling("fit")
     origin, target = np.nan_to_num(movements.origin()), np.nan_to_num(movements.target)
     settled = target + settling.offset(robot, target, np.sign(target - origin))
     still = np.zeros_like(movements.initial)

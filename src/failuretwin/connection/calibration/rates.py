@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import beta
+from scipy.stats import beta, binom
 
 from failuretwin.connection.calibration.observations import Observations
 from failuretwin.core.types import BoolArray, FloatArray
@@ -90,17 +90,21 @@ def loss_rates(
     return rates
 
 
-def uniform_range(values: FloatArray) -> tuple[Range, Range, Range] | None:
-    """Return the range of uniform draws and the 95 % intervals of its ends; None below 3 values.
+def median_interval(values: FloatArray) -> tuple[float, float, float]:
+    """Return the median and its 95 % interval by order statistics, whatever the distribution.
 
-    For n draws with least m and spread R the true lower end lies above m - R (p^(-1/(n-1)) - 1)
-    with probability 1 - p: the ratio of the gap to R has the distribution function
-    1 - (1 + t)^-(n-1).
+    How many of n values lie below the median is binomial; below six values even the extremes hold
+    it less often than that.
     """
-    if len(values) < 3:
-        return None
-    low, high = float(values.min()), float(values.max())
-    spread = high - low
-    reach = spread * (0.05 ** (-1.0 / (len(values) - 1)) - 1.0)
-    step = spread / (len(values) - 1)
-    return (low - step, high + step), (low - reach, low), (high, high + reach)
+    ordered, count = np.sort(values), len(values)
+    rank = int(binom.ppf(LEVEL[0], count, 0.5))
+    low = ordered[max(rank - 1, 0)]
+    high = ordered[min(count - rank, count - 1)]
+    return float(np.median(values)), float(low), float(high)
+
+
+def spread_of(values: FloatArray) -> Range:
+    """Return the range of uniform draws, robustly: median and twice the median deviation."""
+    middle = float(np.median(values))
+    half = 2.0 * float(np.median(np.abs(values - middle)))
+    return middle - half, middle + half

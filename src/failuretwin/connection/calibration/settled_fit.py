@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import gammaln
 
 from failuretwin.connection.calibration.observations import Observations
-from failuretwin.connection.healthy import PATH_NOISE_M, log_student
+from failuretwin.connection.healthy import log_student
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, loads_in_range
@@ -26,6 +26,8 @@ SCATTER_PRIOR_RAD, SCATTER_PRIOR_SPREAD = 0.007, 1.0
 """Prior median of the scatter [rad] and standard deviation of its logarithm."""
 DOF_PRIOR, DOF_PRIOR_SPREAD = 5.0, 0.7
 """Prior median of the degrees of freedom and standard deviation of their logarithm."""
+TOOL_NOISE_PRIOR_M, TOOL_NOISE_PRIOR_SPREAD = 0.0005, 1.0
+"""Prior median of a tool sensor's own noise [m] and standard deviation of its logarithm."""
 POSE_ROUNDS = 3
 """Rounds in which the pose that gravity acts in and the fit settle together (tool path alone)."""
 
@@ -78,7 +80,7 @@ class _Problem:
         error: Settled minus commanded: angles (movement, motor) [rad] or tool (movement, axis) [m].
         design: Factor of bias, compliance and friction, (3, movement, motor).
         jacobian: Tool position by angle, (movement, axis, motor); None where angles were read.
-        rounding: Standard deviation of what the readings round off [rad].
+        rounding: Standard deviation of what the motors' readings round off [rad].
         arrived: Motors whose command arrived, (movement, motor); readings of others do not count.
     """
 
@@ -89,21 +91,24 @@ class _Problem:
     arrived: FloatArray
 
     def log_likelihood(self, parameters: FloatArray) -> float:
-        """Return the log likelihood of parameters as in `SettledFit.mode`."""
-        grouped = parameters[:-1].reshape(4, -1)
+        """Return the log likelihood of parameters as in `SettledFit.mode`.
+
+        With the tool path alone, the logarithm of the tool sensor's noise [m] comes after them.
+        """
+        motors = self.design.shape[2]
+        grouped = parameters[: 4 * motors].reshape(4, -1)
         linear, log_scatter = grouped[:3], grouped[3]
-        dof = float(np.exp(parameters[-1]))
+        dof = float(np.exp(parameters[4 * motors]))
         expected = np.einsum("pik,pk->ik", self.design, linear)
-        scatter = np.exp(log_scatter)
+        scale = np.hypot(np.exp(log_scatter), self.rounding)
         if self.jacobian is None:
-            scale = np.sqrt(scatter**2 + self.rounding**2)
             unit = (self.error - expected) / scale
             constant = gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * np.log(dof * np.pi)
             density = constant - np.log(scale) - 0.5 * (dof + 1) * np.log1p(unit**2 / dof)
             return float(np.sum(density * self.arrived))
         moved = np.einsum("iak,ik->ia", self.jacobian, expected)
-        spread = self.jacobian * scatter
-        return float(np.sum(log_student(self.error - moved, spread, PATH_NOISE_M**2, dof)))
+        noise = float(np.exp(2.0 * parameters[-1]))
+        return float(np.sum(log_student(self.error - moved, self.jacobian * scale, noise, dof)))
 
 
 def fit_settling(
@@ -117,11 +122,12 @@ def fit_settling(
         arrived: 1 where a motor got its command, 0 where it did not, (movement, motor).
         payload: Mass at the tool point [kg].
     """
-    prior = _Prior.of(robot, payload)
-    fit = None
-    for _ in range(1 if observations.position is not None else POSE_ROUNDS):
+    of_motors = observations.position is not None
+    prior = _Prior.of(robot, payload, of_motors)
+    fit, start = None, prior.mean
+    for _ in range(1 if of_motors else POSE_ROUNDS):
         problem = _problem(observations, robot, arrived, payload, fit)
-        fit = _mode(problem, prior, prior.mean if fit is None else fit.mode)
+        fit, start = _mode(problem, prior, start)
     assert fit is not None
     return fit
 
@@ -134,7 +140,7 @@ class _Prior:
     deviation: FloatArray
 
     @classmethod
-    def of(cls, robot: Robot, payload: float) -> _Prior:
+    def of(cls, robot: Robot, payload: float, of_motors: bool) -> _Prior:
         """Return priors that know how large a load the motors of the robot carry."""
         motors = len(robot.motors)
         load = np.maximum(largest_load(robot, payload), 1e-6)
@@ -144,7 +150,12 @@ class _Prior:
         compliance = np.where(load > 1e-6, OFFSET_PRIOR_RAD / load, 1e-9)
         spread = np.full(motors, SCATTER_PRIOR_SPREAD)
         deviation = np.concatenate([offset, compliance, offset, spread, [DOF_PRIOR_SPREAD]])
-        return cls(mean, deviation)
+        if of_motors:
+            return cls(mean, deviation)
+        return cls(
+            np.append(mean, np.log(TOOL_NOISE_PRIOR_M)),
+            np.append(deviation, TOOL_NOISE_PRIOR_SPREAD),
+        )
 
     def log_density(self, parameters: FloatArray) -> float:
         return -0.5 * float(np.sum(((parameters - self.mean) / self.deviation) ** 2))
@@ -153,6 +164,13 @@ class _Prior:
 def largest_load(robot: Robot, payload: float) -> FloatArray:
     """Return the largest gravity torque that each motor meets in its range, (motor,) [N m]."""
     return np.abs(loads_in_range(robot, payload)).max(axis=0)
+
+
+def rounding(robot: Robot) -> float:
+    """Return the standard deviation of what whole servo counts round off [rad]."""
+    if robot.profile.servo_units is None:
+        return 0.0
+    return float(abs(robot.servo_units.rad_per_count) / np.sqrt(12.0))
 
 
 def _problem(
@@ -175,20 +193,21 @@ def _problem(
         point, jacobian = twin.path_and_jacobian(pose)
         error = observations.point - point + np.einsum("iak,ik->ia", jacobian, pose - base)
     torque = robot.sense * robot.loads.torque(pose * robot.sense, payload)
-    count = 0.0
-    if robot.profile.servo_units is not None:
-        count = abs(robot.servo_units.rad_per_count) / np.sqrt(12.0)
     return _Problem(
         error=error,
         design=np.stack([np.ones_like(torque), torque, -observations.direction]),
         jacobian=jacobian,
-        rounding=count,
+        rounding=rounding(robot),
         arrived=arrived,
     )
 
 
-def _mode(problem: _Problem, prior: _Prior, start: FloatArray) -> SettledFit:
-    """Return the posterior mode and its curvature, found in units of the prior deviations."""
+def _mode(problem: _Problem, prior: _Prior, start: FloatArray) -> tuple[SettledFit, FloatArray]:
+    """Return the posterior mode and its curvature, found in units of the prior deviations.
+
+    The noise of a tool sensor belongs to no motor: it is averaged out of the fit, and only the
+    second result, all parameters at the mode, still has it.
+    """
     from scipy.optimize import minimize
 
     unit = prior.deviation
@@ -202,7 +221,10 @@ def _mode(problem: _Problem, prior: _Prior, start: FloatArray) -> SettledFit:
     values, vectors = np.linalg.eigh(curvature)
     inverse = (vectors / np.maximum(values, 0.5)) @ vectors.T
     covariance = inverse * np.outer(unit, unit)
-    return SettledFit(found.x * unit, covariance, prior.deviation, -float(found.fun))
+    own = slice(4 * problem.design.shape[2] + 1)
+    mode = found.x * unit
+    fit = SettledFit(mode[own], covariance[own, own], prior.deviation[own], -float(found.fun))
+    return fit, mode
 
 
 def _hessian(cost: Callable[[FloatArray], float], at: FloatArray, step: float = 1e-3) -> FloatArray:

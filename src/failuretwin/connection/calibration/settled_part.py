@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,12 +32,19 @@ class SettledPart:
         lost: Motors that did not get their command, (movement, motor).
         odd: Movements that look like no healthy ones, (movement,).
         fit: Where motors settle.
+        payload: Mass at the tool point that the fit knows of [kg].
     """
 
     observations: Observations
     lost: BoolArray
     odd: BoolArray
     fit: SettledFit
+    payload: float = 0.0
+
+    @property
+    def settling(self) -> Settling:
+        """Where motors settle, payload included."""
+        return replace(self.fit.settling("fit"), payload=self.payload)
 
     def left_out(self, robot: Robot) -> tuple[LeftOut, ...]:
         """Return the movements that did not count, each with its reason."""
@@ -45,7 +52,9 @@ class SettledPart:
         seen = self.observations
         for i in np.flatnonzero(self.odd | self.lost.any(axis=1)):
             motors = [robot.motor_names[k] for k in np.flatnonzero(self.lost[i])]
-            reason = "did not get its command" if motors else "is far off its target"
+            reason = "is far off its target"
+            if motors:
+                reason = f"did not get {'its command' if len(motors) == 1 else 'their commands'}"
             name = " and ".join(motors)
             found.append(LeftOut(seen.runs[seen.run[i]], int(seen.number[i]) + 1, name, reason))
         return tuple(found)
@@ -64,11 +73,7 @@ def fit_settled_part(observations: Observations, robot: Robot, payload: float = 
     """
     settling = Settling.ideal(len(robot.motors))
     for _ in range(ROUNDS):
-        expected = observations.target + settling.offset(
-            robot, observations.target, observations.direction
-        )
-        lost = stayed(observations, robot, expected)
-        odd = _odd(observations, robot, np.where(lost, observations.origin, expected))
+        lost, odd = sort_movements(observations, robot, settling)
         kept = ~odd
         if kept.sum() < FEWEST_MOVEMENTS:
             raise InputError(
@@ -77,8 +82,25 @@ def fit_settled_part(observations: Observations, robot: Robot, payload: float = 
             )
         arrived = (~lost[kept]).astype(np.float64)
         fit = fit_settling(observations[kept], robot, arrived, payload)
-        settling = fit.settling("fit")
-    return SettledPart(observations, lost, odd, fit)
+        part = SettledPart(observations, lost, odd, fit, payload)
+        settling = part.settling
+    return part
+
+
+def sort_movements(
+    observations: Observations, robot: Robot, settling: Settling
+) -> tuple[BoolArray, BoolArray]:
+    """Return motors without their commands, (movement, motor), and odd movements, (movement,).
+
+    Args:
+        observations: Settled movements.
+        robot: The robot.
+        settling: Where its motors settle, as far as is known.
+    """
+    target, direction = observations.target, observations.direction
+    expected = target + settling.offset(robot, target, direction)
+    lost = stayed(observations, robot, expected)
+    return lost, _odd(observations, robot, np.where(lost, observations.origin, expected))
 
 
 def _odd(observations: Observations, robot: Robot, expected: FloatArray) -> BoolArray:

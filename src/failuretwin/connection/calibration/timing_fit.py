@@ -18,7 +18,7 @@ from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
 LAGS_S = np.array([0.0, 0.01, 0.02, 0.03, 0.045, 0.06, 0.08])
-"""Lags tried [s]; a parabola through the best and its neighbours refines the choice."""
+"""Lags tried [s]; a spline through their costs refines the choice."""
 DELAY_STEP_S, SHARE_STEP = 0.005, 0.01
 """Steps of the numerical derivatives by delay [s] and by shortening [-]."""
 ROUNDS = 6
@@ -113,12 +113,15 @@ def _some(transients: Transients, runs: np.ndarray) -> Transients:
 
 
 def _least(costs: FloatArray) -> float:
-    """Return the lag [s] at the least of costs at `LAGS_S`, by a parabola through three points."""
-    i = int(np.clip(np.argmin(costs), 1, len(LAGS_S) - 2))
-    a, b, _ = np.polyfit(LAGS_S[i - 1 : i + 2], costs[i - 1 : i + 2], 2)
-    if a <= 0.0:
-        return float(LAGS_S[int(np.argmin(costs))])
-    return float(np.clip(-b / (2.0 * a), LAGS_S[0], LAGS_S[-1]))
+    """Return the lag [s] at the least of a cubic spline through costs at `LAGS_S`.
+
+    The costs bend too unevenly for a parabola: through three of them it is off by up to 3 ms.
+    """
+    from scipy.interpolate import CubicSpline
+
+    spline = CubicSpline(LAGS_S, costs)
+    lags = np.append(spline.derivative().roots(extrapolate=False), LAGS_S[[0, -1]])
+    return float(lags[np.argmin(spline(lags))])
 
 
 def _fit_runs(
@@ -148,15 +151,36 @@ def _fit_runs(
 
 def _residual(transients: Transients, robot: Robot, values: FloatArray, lag: float) -> FloatArray:
     """Return predicted minus read, (run, time, motor or axis); 0 where a reading does not count."""
-    movements, time = transients.movements, transients.time
-    moved = replace(
-        movements,
-        start=movements.start + values[:, :1],
-        ramp_duration=movements.ramp_duration * (1.0 - values[:, 1])[:, None, None],
-    )
-    reference = lagged(moved.reference(time), time, np.full(len(values), lag))
     twin = DigitalTwin(robot)
-    position = twin.respond(reference, time)
+    delay, shortening = values.T
+    position = motion(transients.movements, transients.time, twin, delay, shortening, lag)
     predicted = position if transients.of_motors else twin.path(position)
     residual = np.where(transients.used[..., None], predicted - transients.reading, 0.0)
     return np.nan_to_num(residual)
+
+
+def motion(
+    movements: Movements,
+    time: FloatArray,
+    twin: DigitalTwin,
+    delay: FloatArray,
+    shortening: FloatArray,
+    lag: float,
+) -> FloatArray:
+    """Return how motors make movements late and short, (run, time, motor) [rad].
+
+    Args:
+        movements: Movements between the angles at which the motors settle.
+        time: Uniform grid, (time,) [s].
+        twin: The servo loops.
+        delay: Dead time of each run, (run,) [s].
+        shortening: Share by which the ramps of each run end early, (run,).
+        lag: Time constant of the lag on top of the servo loops [s].
+    """
+    moved = replace(
+        movements,
+        start=movements.start + delay[:, None],
+        ramp_duration=movements.ramp_duration * (1.0 - shortening)[:, None, None],
+    )
+    reference = lagged(moved.reference(time), time, np.full(len(delay), lag))
+    return twin.respond(reference, time)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from failuretwin.connection.calibration.settled_fit import largest_load
-from failuretwin.connection.calibration.settled_part import SettledPart, fit_settled_part
+from failuretwin.connection.calibration.settled_fit import fit_settling, largest_load
+from failuretwin.connection.calibration.settled_part import SettledPart
 from failuretwin.digital_model.robot import Robot
 
 SURE_NATS = 5.0
@@ -22,32 +23,47 @@ def sense_remarks(part: SettledPart, robot: Robot) -> list[str]:
     A motor that turns the other way sags the other way; where gravity hardly loads it, nothing can
     be said.
     """
+    loaded = np.flatnonzero(largest_load(robot, 0.0) > 1e-6).tolist()
+    best, odds = _best_senses(part, robot, loaded)
     remarks = []
-    load = largest_load(robot, 0.0)
     for k, motor in enumerate(robot.motors):
-        if load[k] <= 1e-6:
-            remarks.append(f"sense of {motor.name}: cannot be told, gravity does not load it")
-            continue
-        other = _with_sense(robot, k, -motor.sense)
-        odds = part.fit.log_posterior - _refit(part, other, 0.0)
-        if odds > SURE_NATS:
-            remarks.append(
-                f"sense of {motor.name}: {motor.sense:+.0f} as in the profile, {odds:.0f} nats "
-                "better than the other way"
-            )
-        elif odds < -SURE_NATS:
-            remarks.append(
-                f"sense of {motor.name}: the logs speak for {-motor.sense:+.0f} by {-odds:.0f} "
-                f"nats, the profile says {motor.sense:+.0f}; check it"
-            )
+        sense = best.motors[k].sense
+        if k not in odds:
+            told = "cannot be told, gravity does not load it"
+        elif odds[k] <= SURE_NATS:
+            told = f"the logs do not tell ({odds[k]:+.1f} nats for {sense:+.0f})"
+        elif sense == motor.sense:
+            told = f"{sense:+.0f} as in the profile, {odds[k]:.0f} nats better than the other way"
         else:
-            remarks.append(f"sense of {motor.name}: the logs do not tell ({odds:+.1f} nats)")
+            told = (
+                f"the logs speak for {sense:+.0f} by {odds[k]:.0f} nats, the profile says "
+                f"{motor.sense:+.0f}; check it"
+            )
+        remarks.append(f"sense of {motor.name}: {told}")
     return remarks
 
 
-def _with_sense(robot: Robot, index: int, sense: float) -> Robot:
+def _best_senses(
+    part: SettledPart, robot: Robot, loaded: Sequence[int]
+) -> tuple[Robot, dict[int, float]]:
+    """Return the robot with the senses that fit best, and how much worse each other way is [nats].
+
+    The sense that gains most is turned first: a wrong one bends the loads of the motors before it,
+    and makes theirs look wrong too.
+    """
+    best, posterior = robot, part.fit.log_posterior
+    while True:
+        turned = {k: _refit(part, _with_turned(best, k), part.payload) for k in loaded}
+        k = max(turned, key=lambda motor: turned[motor], default=None)
+        if k is None or turned[k] - posterior <= SURE_NATS:
+            return best, {motor: posterior - other for motor, other in turned.items()}
+        best, posterior = _with_turned(best, k), turned[k]
+
+
+def _with_turned(robot: Robot, index: int) -> Robot:
     motors = tuple(
-        replace(motor, sense=sense) if k == index else motor for k, motor in enumerate(robot.motors)
+        replace(motor, sense=-motor.sense) if k == index else motor
+        for k, motor in enumerate(robot.motors)
     )
     return replace(robot, profile=replace(robot.profile, motors=motors))
 
@@ -70,4 +86,7 @@ def best_payload(part: SettledPart, robot: Robot) -> tuple[float, str]:
 
 
 def _refit(part: SettledPart, robot: Robot, payload: float) -> float:
-    return fit_settled_part(part.observations, robot, payload).fit.log_posterior
+    """Return the log posterior of another description on the very same movements."""
+    kept = ~part.odd
+    arrived = (~part.lost[kept]).astype(np.float64)
+    return fit_settling(part.observations[kept], robot, arrived, payload).log_posterior

@@ -1,0 +1,132 @@
+"""The step tests of a robot told as parameters, and what each of them cannot say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from failuretwin.connection.calibration.calibration import LeftOut, LoopFit, Parameter
+from failuretwin.connection.calibration.parameters import LEARNED, Z_95
+from failuretwin.connection.calibration.step_fit import (
+    PRIOR_DEVIATION,
+    SharedFit,
+    fit_shared,
+    sizes_differ,
+)
+from failuretwin.connection.calibration.step_shape import mean_interval, overshoot, settling_time
+from failuretwin.data_knowledge.step_tests import StepTest
+from failuretwin.digital_model.robot import Motor, Robot
+
+NAMES = ("loop gain P", "loop gain I", "filter time", "speed limit", "dead time")
+UNITS = ("-", "1/s", "s", "rad/s", "s")
+WELL_ABOVE = 5.0
+"""A step of this many times speed limit / I is at the limit for most of its way."""
+COARSE = 0.05
+"""Overshoots are told from rounding if a count is less than this share of the travel."""
+
+
+@dataclass(frozen=True)
+class StepFit:
+    """What step tests say of one motor.
+
+    Attributes:
+        motor: Its name.
+        steps: Number of steps that count.
+        loop: Best values of loop and speed limit.
+        parameters: Every figure with its 95 % interval.
+        residual: Root mean square of the readings about the fitted motion [rad].
+    """
+
+    motor: str
+    steps: int
+    loop: LoopFit
+    parameters: tuple[Parameter, ...]
+    residual: float
+
+
+def fit_steps(
+    steps: Sequence[StepTest], robot: Robot
+) -> tuple[tuple[StepFit, ...], tuple[LeftOut, ...]]:
+    """Fit every motor that has sound steps.
+
+    Args:
+        steps: Steps of any of the robot's motors.
+        robot: The robot.
+
+    Returns:
+        The fits in chain order and the steps left out, each with its reason.
+    """
+    sound = [step for step in steps if not step.flaw]
+    fits = tuple(
+        _fit_motor([step for step in sound if step.motor == motor.name], motor, robot)
+        for motor in robot.motors
+        if any(step.motor == motor.name for step in sound)
+    )
+    flawed = (step for step in steps if step.flaw)
+    return fits, tuple(LeftOut(s.source, s.number, s.motor, s.flaw) for s in flawed)
+
+
+def _fit_motor(steps: list[StepTest], motor: Motor, robot: Robot) -> StepFit:
+    quantum = robot.servo_units.rad_per_count
+    fit = fit_shared(steps, motor, quantum)
+    P, (I, tau, limit) = float(fit.mode[0]), np.exp(fit.mode[1:4]).tolist()  # noqa: E741
+    return StepFit(
+        motor=motor.name,
+        steps=len(steps),
+        loop=LoopFit(motor.name, P, I, tau, limit),
+        parameters=(
+            *(_shared_parameter(k, fit, steps, motor.name) for k in range(len(NAMES))),
+            _overshoot(steps, motor.name, quantum),
+            _settling(steps, motor.name, quantum),
+        ),
+        residual=fit.residual,
+    )
+
+
+def _shared_parameter(k: int, fit: SharedFit, steps: list[StepTest], motor: str) -> Parameter:
+    deviation = float(fit.deviation[k])
+    if NAMES[k] == "speed limit" and not sizes_differ(steps):
+        deviation = float(PRIOR_DEVIATION[k])
+    ends = np.array([0.0, -Z_95, Z_95]) * deviation + fit.mode[k]
+    if k in (1, 2, 3):
+        ends = np.exp(ends)
+    if NAMES[k] == "loop gain P":
+        ends = np.maximum(ends, 0.0)
+    learned = deviation < LEARNED * float(PRIOR_DEVIATION[k])
+    note = "" if learned else _note(k, fit, steps)
+    value, low, high = ends.tolist()
+    return Parameter(NAMES[k], motor, UNITS[k], value, low, high, learned, note)
+
+
+def _note(k: int, fit: SharedFit, steps: list[StepTest]) -> str:
+    """Return why the steps do not say a shared parameter and which would."""
+    gain, limit = np.exp(fit.mode[[1, 3]])
+    largest = np.rad2deg(max(abs(step.travel) for step in steps))
+    large = np.rad2deg(WELL_ABOVE * limit / gain)
+    quick = 1e3 * min(step.duration for step in steps)
+    if NAMES[k] == "speed limit":
+        return (
+            f"no step is seen to run at it, the largest is {largest:.0f} deg in {quick:.0f} ms; it "
+            f"takes one of {large:.0f} deg or more in 5 ms beside a small one"
+        )
+    read = 1e3 * float(np.median(np.diff(steps[0].time)))
+    return (
+        f"{len(steps)} steps read every {read:.0f} ms do not say; it takes more steps of different "
+        f"sizes up to {np.rad2deg(limit / gain):.0f} deg in 5 ms, there and back, or faster reading"
+    )
+
+
+def _overshoot(steps: list[StepTest], motor: str, quantum: float) -> Parameter:
+    blur = [quantum / abs(step.travel) for step in steps]
+    mean, low, high = mean_interval([overshoot(step) for step in steps], blur)
+    learned = min(blur) < COARSE
+    note = "" if learned else "a count is much of such small steps; it takes larger ones"
+    return Parameter("overshoot", motor, "share", mean, max(low, 0.0), high, learned, note)
+
+
+def _settling(steps: list[StepTest], motor: str, quantum: float) -> Parameter:
+    blur = [float(np.median(np.diff(step.time))) for step in steps]
+    mean, low, high = mean_interval([settling_time(step, quantum) for step in steps], blur)
+    return Parameter("settling time after the ramp", motor, "s", mean, max(low, 0.0), high)

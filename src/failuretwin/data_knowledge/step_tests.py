@@ -1,0 +1,186 @@
+"""Step tests: one motor sent there and back, read fast; CSV files known by their header.
+
+Rows with a `command` are commands: there `position` is the target and `command` the duration [ms].
+They may stand a little after their time. The file's name says which servo it is (`motor_6`).
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.types import BoolArray, FloatArray, frozen_array
+from failuretwin.core.units import MS_PER_S, ServoUnits
+from failuretwin.data_knowledge.step_flaws import REST_S, flaw_of_motion, flaw_of_readings
+from failuretwin.digital_model.robot import Robot
+
+HEADER = "timestamp,position,command,time_since_start,position_degree"
+SERVO = re.compile(r"motor_\d+")
+BEFORE_S, AFTER_S = 0.4, 1.5
+"""Time that counts before and after a command [s]."""
+GLITCH_COUNTS, GLITCH_SPEED = 10.0, 3.0
+"""A reading is spoilt if it lies this far outside the range [counts], or this far and what the
+motor covers between readings at this multiple of its speed limit from the median of five."""
+
+
+@dataclass(frozen=True)
+class StepTest:
+    """One command of a step test and what followed.
+
+    Attributes:
+        source: Folder and name of the file.
+        number: Number of the command in it, from 1.
+        motor: Name of the motor; empty where it is none of the robot's.
+        target: Where it was sent [rad].
+        duration: In which time [s].
+        start: Where it rested before [rad].
+        settled: Where it rested after [rad].
+        time: Times of the readings since the stamp of the command, (reading,) [s].
+        position: Readings without spoilt ones, (reading,) [rad].
+        flaw: Why it tells nothing of a healthy motor; empty where it does.
+    """
+
+    source: str
+    number: int
+    motor: str
+    target: float
+    duration: float
+    start: float
+    settled: float
+    time: FloatArray
+    position: FloatArray
+    flaw: str
+
+    @property
+    def travel(self) -> float:
+        """Distance covered, signed [rad]."""
+        return self.settled - self.start
+
+
+def is_step_test(path: Path) -> bool:
+    """Return whether a file has exactly the header of a step test."""
+    if path.suffix != ".csv" or not path.is_file():
+        return False
+    try:
+        with path.open(encoding="utf-8") as file:
+            return file.readline().strip() == HEADER
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def find_step_tests(path: Path) -> list[Path]:
+    """Return every step test at or below `path`, in order of their names."""
+    files = sorted(path.rglob("*.csv")) if path.is_dir() else [path]
+    return [file for file in files if is_step_test(file)]
+
+
+def read_step_test(path: Path, robot: Robot) -> list[StepTest]:
+    """Read the steps of one file; those that tell nothing carry the reason.
+
+    Raises:
+        InputError: If the file cannot be read, holds something that is no number, or no command.
+    """
+    table = _read_table(path)
+    command = table[:, 2] != 0.0
+    if not command.any():
+        raise InputError(
+            f"{path}: no row has a command. Expected rows whose `command` is the duration [ms] and "
+            "whose `position` is the target."
+        )
+    motor, flaw = _motor(path, robot)
+    readings = table[~command, :2]
+    sound = readings[_sound(readings, robot, motor)]
+    stamps = np.append(table[command, 0], np.inf)
+    source = f"{path.parent.name}/{path.name}"
+    return [
+        _step((source, i + 1, motor), row, stamps[i + 1], sound, robot.servo_units, flaw)
+        for i, row in enumerate(table[command])
+    ]
+
+
+def _read_table(path: Path) -> FloatArray:
+    """Return the rows in order of their stamps, (row, 3): stamp, position, command."""
+    import pandas as pd
+
+    try:
+        table = pd.read_csv(path, dtype=str, usecols=["timestamp", "position", "command"])
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as a step test ({error}).") from error
+    numbers = table.apply(pd.to_numeric, errors="coerce").to_numpy(dtype=np.float64)
+    bad = np.argwhere(~np.isfinite(numbers))
+    if len(bad):
+        row, column = bad[0]
+        got = table.iloc[row, column]
+        raise InputError(
+            f"{path}: line {row + 2}, column {table.columns[column]}: got {got!r}, expected a "
+            "number."
+        )
+    return numbers[np.argsort(numbers[:, 0], kind="stable")]
+
+
+def _motor(path: Path, robot: Robot) -> tuple[str, str]:
+    """Return the motor that the name of a file speaks of, or what is wrong with it."""
+    named = SERVO.search(path.stem)
+    if named is None:
+        return "", "is in a file whose name does not say which servo it is (motor_N)"
+    for motor in robot.motors:
+        if motor.log_column == named.group():
+            return motor.name, ""
+    return "", f"is of servo {named.group()}, which is none of the robot's motors"
+
+
+def _sound(readings: FloatArray, robot: Robot, motor: str) -> BoolArray:
+    """Return which readings are not spoilt: near the servo's range and near their neighbours."""
+    from scipy.ndimage import median_filter
+
+    units, time, counts = robot.servo_units, readings[:, 0], readings[:, 1]
+    fastest = max(m.speed_limit for m in robot.motors if motor in (m.name, ""))
+    period = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    reach = GLITCH_COUNTS + GLITCH_SPEED * fastest / units.rad_per_count * period
+    inside = (counts > units.low - GLITCH_COUNTS) & (counts < units.high + GLITCH_COUNTS)
+    near = np.abs(counts - median_filter(counts, 5, mode="nearest")) < reach
+    return np.asarray(inside & near)
+
+
+def _step(
+    origin: tuple[str, int, str],
+    row: FloatArray,
+    until: float,
+    readings: FloatArray,
+    units: ServoUnits,
+    flaw: str,
+) -> StepTest:
+    """Return one step.
+
+    Args:
+        origin: File, number of the command and motor.
+        row: Stamp [s], target [counts] and duration [ms] of the command, (3,).
+        until: Stamp of the next command [s].
+        readings: Stamps [s] and sound readings [counts] of the whole file, (reading, 2).
+        units: Scale of the counts.
+        flaw: What is wrong with the file.
+    """
+    time, counts = readings[:, 0] - row[0], readings[:, 1]
+    end = min(until - row[0], AFTER_S)
+    before = counts[(time > -BEFORE_S) & (time <= 0.0)]
+    after = (time > -BEFORE_S) & (time <= end)
+    rest = counts[after & (time > end - REST_S)]
+    start, settled = (float(np.median(x)) if len(x) else np.nan for x in (before, rest))
+    own = flaw_of_readings(time[after], rest) or flaw_of_motion(start, settled, row[1])
+    source, number, motor = origin
+    return StepTest(
+        source=source,
+        number=number,
+        motor=motor,
+        target=float(units.to_rad(row[1])),
+        duration=float(row[2]) / MS_PER_S,
+        start=float(units.to_rad(start)),
+        settled=float(units.to_rad(settled)),
+        time=frozen_array(time[after]),
+        position=frozen_array(units.to_rad(counts[after])),
+        flaw=" and ".join(part for part in (own, flaw) if part),
+    )

@@ -1,0 +1,146 @@
+"""A few runs at a time through MuJoCo: controls in, angles out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.digital_model.engine import Drive
+from failuretwin.digital_model.physics.extra import load_mujoco
+from failuretwin.digital_model.physics.model import PhysicsModel, build_model
+from failuretwin.digital_model.physics.parameters import PhysicsParameters
+from failuretwin.digital_model.physics.setpoint import filtered, limit_speed, refine
+from failuretwin.digital_model.physics.statics import rest_state
+from failuretwin.digital_model.robot import Robot
+
+SAMPLES_AT_ONCE = 250
+"""Bounds what is in memory: states and controls of 64 runs at two steps each take about 10 MB."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """How runs are simulated.
+
+    Attributes:
+        robot: The robot.
+        parameters: Its motors and gears.
+        grid_step: Step of the caller's time grid [s].
+        substeps: Steps of the simulation in each of these.
+    """
+
+    robot: Robot
+    parameters: PhysicsParameters
+    grid_step: float
+    substeps: int
+
+    @property
+    def step(self) -> float:
+        """Step of the simulation [s]."""
+        return self.grid_step / self.substeps
+
+    def run(self, drive: Drive, pool: Any, threads: int, out: FloatArray) -> None:
+        """Simulate runs.
+
+        Args:
+            drive: What the motors of these runs are told, and what hampers them.
+            pool: A `mujoco.rollout.Rollout`.
+            threads: How many threads it has, 1 for none.
+            out: Filled with the output sides' angles, physical sense, (run, time, motor) [rad].
+
+        Raises:
+            InputError: If the simulation becomes unstable.
+        """
+        mujoco = load_mujoco()
+        models = self._models(drive.payload, len(out))
+        data = [mujoco.MjData(models[0].compiled) for _ in range(threads)]
+        speed = np.array([motor.speed_limit for motor in self.robot.motors])
+        reference = limit_speed(drive.reference * self.robot.sense, self.grid_step, speed)
+        strength = _strength(drive)
+        state = np.array(
+            [
+                rest_state(model, data[0], self.parameters, reference[i, 0], strength[i, 0])
+                for i, model in enumerate(models)
+            ]
+        )
+        out[:, 0] = self._angle(models[0], state[:, None])[:, 0]
+        setpoint = reference[:, 0]
+        compiled = [model.compiled for model in models]
+        for part in chunks(out.shape[1] - 1, SAMPLES_AT_ONCE):
+            span = slice(part.start, part.stop + 1)
+            held = None if drive.held is None else drive.held[:, part]
+            control, setpoint = self._control(reference[:, span], strength[:, span], held, setpoint)
+            states, _ = pool.rollout(compiled, data, state, control)
+            _check_warnings(data, self.step)
+            state = states[:, -1].copy()
+            out[:, part.start + 1 : part.stop + 1] = self._angle(
+                models[0], states[:, self.substeps - 1 :: self.substeps]
+            )
+
+    def _models(self, payload: FloatArray | None, runs: int) -> list[PhysicsModel]:
+        masses = np.zeros(runs) if payload is None else payload
+        unique, which = np.unique(masses, return_inverse=True)
+        models = [
+            build_model(self.robot, self.parameters, self.step, float(mass)) for mass in unique
+        ]
+        return [models[i] for i in which]
+
+    def _angle(self, model: PhysicsModel, states: FloatArray) -> FloatArray:
+        """Return the output sides' angles, (run, time, motor), of states (run, time, state)."""
+        before = 1  # a state begins with the time
+        return states[..., before + model.drive] + states[..., before + model.flex]
+
+    def _control(
+        self,
+        reference: FloatArray,
+        strength: FloatArray,
+        held: BoolArray | None,
+        setpoint: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return controls (run, step, 3 * motor) and the filters' output after them (run, motor).
+
+        Args:
+            reference: References at both ends of every sample, (run, time + 1, motor) [rad].
+            strength: Shares of their stiffness that the servos have, like `reference`.
+            held: Whether gears are held, (run, time, motor).
+            setpoint: Output of the filters at the first of these samples, (run, motor) [rad].
+        """
+        stiffness, derivative, filter_s = (
+            np.array([getattr(motor, name) for motor in self.parameters.motors])
+            for name in ("stiffness", "derivative", "filter_s")
+        )
+        fine = refine(reference, self.substeps)
+        followed = filtered(fine, setpoint, self.step, filter_s)
+        share = refine(strength, self.substeps)[:, :-1]
+        control = np.zeros((*share.shape[:2], 3, share.shape[2]))
+        if held is not None:  # the servo would only push against the brake
+            brake = np.repeat(held, self.substeps, axis=1)
+            control[:, :, 2] = brake
+            share = np.where(brake, 0.0, share)
+        speed = (fine - followed)[:, :-1] / filter_s
+        control[:, :, 0] = share * (stiffness * followed[:, :-1] + derivative * speed)
+        control[:, :, 1] = share
+        return control.reshape(*control.shape[:2], -1), followed[:, -1]
+
+
+def chunks(count: int, size: int) -> Iterator[slice]:
+    """Return slices of at most `size` that cover `count`."""
+    return (slice(start, min(start + size, count)) for start in range(0, count, size))
+
+
+def _strength(drive: Drive) -> FloatArray:
+    if drive.weakness is None:
+        return np.ones_like(drive.reference)
+    return 1.0 - drive.weakness
+
+
+def _check_warnings(data: list[Any], step: float) -> None:
+    if any(warning.number for thread in data for warning in thread.warning):
+        raise InputError(
+            f"the physics engine became unstable at a step of {step} s. Give a smaller step_s, or "
+            "parameters with more inertia or less stiffness."
+        )

@@ -1,0 +1,420 @@
+from __future__ import annotations
+
+import base64
+import json
+import os
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from failuretwin import load_robot
+from failuretwin.app.calibration_rows import figure, parameter_groups
+from failuretwin.app.calibration_tables import left_out_line, mean_gain, verdict_line
+from failuretwin.connection.calibration.calibration import Calibration, HeldOut, LeftOut, Parameter
+from failuretwin.connection.calibration.calibration_file import load_calibration, save_calibration
+from failuretwin.core.errors import InputError, OutputError
+from failuretwin.data_knowledge.reading import ReadOptions, read_runs
+from failuretwin.data_knowledge.store import save_run_set
+from failuretwin.digital_model.imperfections import generic_imperfections, load_imperfections
+
+COUNT = np.deg2rad(0.24)
+REPORT = "report"
+
+
+@pytest.fixture(scope="module")
+def learned(failuretwin, data, tmp_path_factory):
+    """A calibration from one real session, judged on another, with its page."""
+    folder = tmp_path_factory.mktemp("learned")
+    logs = [data / "real_robot_b_20241003" / label for label in ("label_0", "label_1")]
+    answer = failuretwin(
+        "calibrate",
+        *logs,
+        *("--hold-out", "label_1", "--out", "twin.toml", "--report", REPORT),
+        folder=folder,
+    )
+    assert answer.returncode == 0, answer.stderr
+    return folder, answer.stdout
+
+
+def held_out(gain, error, movements=30):
+    return HeldOut("day", movements, (0.01,) * 4, (0.005,) * 4, gain, error)
+
+
+@pytest.fixture
+def small(armpi):
+    """A calibration made by hand."""
+    return Calibration(
+        imperfections=replace(generic_imperfections(armpi), name="small", source="made up"),
+        parameters=(
+            Parameter("bias", "motor_1", "rad", 2.0 * COUNT, COUNT, 3.0 * COUNT),
+            Parameter("bias", "motor_2", "rad", 0.0, -1.0, 1.0, False, "the logs do not say"),
+            Parameter("lost commands", "motor_1", "share", 0.02, 0.0, 0.04),
+            Parameter("lag", "", "s", 0.031, 0.028, 0.034),
+            Parameter("lost commands", "motor_1+motor_2", "share", 0.01, 0.0, 0.03),
+        ),
+        sessions=("day_0",),
+        runs=4,
+        movements=20,
+        used_readings=True,
+    )
+
+
+# Learning
+
+
+def test_a_real_robot_is_learned(learned, armpi):
+    folder, told = learned
+    found = load_calibration(folder / "twin.toml", armpi)
+    assert found.sessions == ("20241003_220728_label_0",)
+    assert [entry.session for entry in found.held_out] == ["20241003_222107_label_1"]
+    assert found.used_readings
+    assert found.runs == 10
+    settling = found.imperfections.settling
+    # Least squares by hand over five sessions, in raw counts: friction 1.54 1.01 2.49 2.64; the
+    # scatter of a Student t is smaller than the standard deviation of what is left.
+    np.testing.assert_allclose(np.divide(settling.friction, COUNT), [1.5, 1.0, 2.5, 2.6], atol=0.7)
+    assert np.all(np.divide(settling.scatter, COUNT) < [1.8, 1.8, 1.8, 1.2])
+    assert "on unseen sessions the calibrated twin beats the uncalibrated one" in told
+    assert "compliance, motor_1: gravity does not load this motor" in told
+    assert "sense of motor_3: -1 as in the profile" in told
+    (judged,) = found.held_out
+    assert np.all(np.divide(judged.after, COUNT) <= [1.6, 1.9, 1.5, 1.1])
+    assert np.all(np.array(judged.after) < judged.before)
+
+
+def test_diagnose_uses_it(learned, failuretwin, data):
+    folder, _ = learned
+    session = data / "real_robot_b_20241003" / "label_6"
+    answer = failuretwin(
+        *("diagnose", session, "--calibration", folder / "twin.toml", "--json", "out.jsonl"),
+        folder=folder,
+    )
+    assert answer.returncode == 0, answer.stderr
+    records = [json.loads(line) for line in (folder / "out.jsonl").read_text().splitlines()]
+    assert len(records) == 10
+    assert {"twin" in record["method"] for record in records} == {True}
+    right = [record["diagnosis"] == "motor_2:steady_state_error" for record in records]
+    assert sum(right) >= 8
+
+
+def test_labelled_faults_are_left_out(failuretwin, data, tmp_path):
+    logs = [data / "real_robot_b_20241003" / label for label in ("label_0", "label_3")]
+    answer = failuretwin(
+        "calibrate", *logs, "--published-labels", "--out", "twin.toml", folder=tmp_path
+    )
+    assert answer.returncode == 0, answer.stderr
+    assert "10 runs: labelled motor_3:stuck" in answer.stdout
+    assert "not checked on unseen logs" in answer.stdout
+
+
+def test_a_faulty_session_among_healthy_ones_is_left_out(failuretwin, data, armpi, tmp_path):
+    labels = ("label_0", "label_1", "label_2", "label_6")
+    logs = [data / "real_robot_b_20241003" / label for label in labels]
+    answer = failuretwin("calibrate", *logs, "--out", "twin.toml", folder=tmp_path)
+    assert answer.returncode == 0, answer.stderr
+    found = load_calibration(tmp_path / "twin.toml", armpi)
+    runs = [entry.run for entry in found.left_out if entry.movement == 0]
+    assert len(runs) >= 8
+    assert all("label_6" in run for run in runs)
+
+
+# The page
+
+
+class Page(HTMLParser):
+    """What a page shows and what it loads."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.unpaired, self.loaded, self.words = [], [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in ("meta", "img", "col", "link", "br"):
+            self.open.append(tag)
+        self.loaded += [value for name, value in attrs if name in ("src", "href")]
+
+    def handle_endtag(self, tag):
+        if self.open.pop() != tag:
+            self.unpaired.append(tag)
+
+    def handle_data(self, text):
+        self.words += text.split()
+
+
+def test_the_report_is_one_page_that_needs_nothing_else(learned, listing):
+    folder, _ = learned
+    assert listing(folder / REPORT) == ["index.html"]
+    text = (folder / REPORT / "index.html").read_text()
+    page = Page(text)
+    assert page.open == page.unpaired == []
+    assert len(page.loaded) == 5
+    for source in page.loaded:
+        kind, _, data = source.partition(",")
+        assert kind == "data:image/png;base64"
+        assert base64.b64decode(data, validate=True).startswith(b"\x89PNG\r\n")
+    assert re.search(r"url\(|@import|<script|https?:", text) is None
+
+
+def test_the_page_says_what_an_engineer_asks(learned, armpi):
+    folder, _ = learned
+    words = " ".join(Page((folder / REPORT / "index.html").read_text()).words)
+    found = load_calibration(folder / "twin.toml", armpi)
+    assert "On unseen sessions the calibrated twin beats the uncalibrated one" in words
+    assert found.imperfections.source in words
+    assert "20241003_222107_label_1" in words
+    assert f"{found.movements} settled movements of 10 runs, by the motors' own readings" in words
+    assert "not identified: gravity does not load this motor" in words
+    assert "sense of motor_3: -1 as in the profile" in words
+    assert left_out_line(found) in words
+    for entry in found.left_out:
+        assert f"{entry.run} {entry.movement}" in words
+    friction = found.imperfections.settling.friction[0] / COUNT
+    assert f"{friction:.2f}" in words
+
+
+def test_the_page_works_with_the_tool_path_alone(failuretwin, data, armpi, tmp_path):
+    logs = data / "real_robot_b_20241003" / "label_0"
+    runs = read_runs([logs], armpi, ReadOptions()).drop_vars("position")
+    save_run_set(runs, tmp_path / "tool.nc")
+    answer = failuretwin(
+        *("calibrate", "tool.nc", "--out", "twin.toml", "--report", REPORT), folder=tmp_path
+    )
+    assert answer.returncode == 0, answer.stderr
+    page = Page((tmp_path / REPORT / "index.html").read_text())
+    words = " ".join(page.words)
+    assert "by the tool path alone" in words
+    assert "Not checked on unseen logs" in words
+    assert "there is no other session" in words
+    assert len(page.loaded) == 3  # without sessions to compare and motors to load
+
+
+def test_parameters_are_told_in_counts_with_bars(small, armpi):
+    bias, lost, lag = parameter_groups(small, armpi)
+    assert (bias.title, bias.unit, lost.unit, lag.unit) == ("bias", "counts", "%", "ms")
+    first, second = bias.rows
+    assert (first.who, first.value, first.interval) == ("motor 1", "2.0", "1.0 to 3.0")
+    # On a bar from 0 to 3 counts and a margin of 4 %.
+    np.testing.assert_allclose(
+        [first.left, first.width, first.tick], np.array([1.0, 2.0, 2.0]) / 3.12 * 100.0
+    )
+    assert bias.zero == 0.0
+    assert (second.identified, second.value, second.note) == (False, "", "the logs do not say")
+    assert [row.who for row in lost.rows] == ["motor 1", "motor 1, motor 2"]
+    assert lag.rows[0].value == "31.0"
+
+
+def test_motors_without_counts_are_told_in_degrees(small):
+    bias, *_ = parameter_groups(small, load_robot("ur5e"))
+    assert bias.unit == "deg"
+    assert bias.rows[0].value == "0.48"
+
+
+@pytest.mark.parametrize(
+    ("value", "width", "text"),
+    [
+        (32.7812, 3.1, "32.8"),
+        (32.7812, 300.0, "33"),
+        (0.00351, 0.018, "0.0035"),
+        (-0.0, 1.0, "0.00"),
+        (5.123456, 0.0, "5.12"),
+    ],
+)
+def test_figures_have_as_many_digits_as_are_known(value, width, text):
+    assert figure(value, width) == text
+
+
+# What is said of it
+
+
+def test_sessions_count_by_their_movements():
+    gain, half = mean_gain((held_out(1.0, 0.1, 30), held_out(2.0, 0.2, 10)))
+    assert gain == pytest.approx(1.25)
+    assert half == pytest.approx(1.96 * np.hypot(0.75 * 0.1, 0.25 * 0.2))
+
+
+def test_a_fit_that_does_not_beat_none_is_said_to_be_so(small):
+    assert "does NOT beat" in verdict_line(replace(small, held_out=(held_out(0.1, 0.1),)))
+    assert "does NOT beat" in verdict_line(replace(small, held_out=(held_out(-1.0, 0.1),)))
+    assert " beats " in verdict_line(replace(small, held_out=(held_out(1.0, 0.1),)))
+    assert "not checked" in verdict_line(small)
+
+
+def test_what_was_left_out_is_counted(small):
+    entries = (
+        LeftOut("a", 1, "motor_1", "did not get its command"),
+        LeftOut("b", 3, "motor_1", "did not get its command"),
+        LeftOut("c", 0, "", "looks faulty"),
+    )
+    told = left_out_line(replace(small, left_out=entries))
+    assert told == "2 movements: motor_1 did not get its command; 1 run: looks faulty"
+
+
+# Refusals
+
+
+@pytest.mark.parametrize("label", ["label_5", "label_6", "label_7", "label_8"])
+def test_faulty_sessions_are_refused(failuretwin, data, tmp_path, label, listing):
+    log = data / "real_robot_b_20241003" / label
+    answer = failuretwin(
+        "calibrate", log, "--out", "twin.toml", "--report", REPORT, folder=tmp_path
+    )
+    assert answer.returncode == 2
+    motor = f"motor_{int(label[-1]) - 4}"
+    assert f"error: {motor} settles anew with every movement" in answer.stderr
+    assert "give logs of a healthy robot" in answer.stderr
+    assert listing(tmp_path) == []
+
+
+def test_too_many_suspects_among_healthy_runs_are_refused(failuretwin, data, tmp_path, listing):
+    logs = [data / "real_robot_b_20241003" / label for label in ("label_0", "label_1", "label_7")]
+    answer = failuretwin("calibrate", *logs, "--out", "twin.toml", folder=tmp_path)
+    assert answer.returncode == 2
+    found = re.search(r"error: (\d+) of 30 runs look faulty \((.*), \.\.\.\)", answer.stderr)
+    assert 7 < int(found.group(1)) <= 10
+    assert all("label_7" in run for run in found.group(2).split(", "))
+    assert listing(tmp_path) == []
+
+
+def test_logs_labelled_faulty_are_refused(failuretwin, data, tmp_path, listing):
+    log = data / "real_robot_b_20241003" / "label_2"
+    answer = failuretwin(
+        "calibrate", log, "--published-labels", "--out", "twin.toml", folder=tmp_path
+    )
+    assert answer.returncode == 2
+    assert "every run is labelled faulty. Expected healthy logs" in answer.stderr
+    assert listing(tmp_path) == []
+
+
+@pytest.fixture(scope="module")
+def two_days(write_session, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("days")
+    for day in range(2):
+        write_session(folder / f"day_{day}", seed=day)
+    return folder
+
+
+def refused(answer, *texts):
+    assert answer.returncode == 2
+    assert answer.stdout == ""
+    assert answer.stderr.startswith("error: ")
+    assert answer.stderr.count("\n") == 1
+    for text in texts:
+        assert text in answer.stderr
+
+
+def test_too_short_logs_are_refused(failuretwin, two_days, tmp_path, listing):
+    answer = failuretwin("calibrate", two_days / "day_0", "--out", tmp_path / "twin.toml")
+    refused(answer, "only 5 of 5 movements", "expected 6 at least", "Give longer logs")
+    assert listing(tmp_path) == []
+
+
+def test_an_unknown_session_to_hold_out_is_refused(failuretwin, two_days, tmp_path):
+    answer = failuretwin(
+        "calibrate", two_days, "--hold-out", "Monday", "--out", tmp_path / "twin.toml"
+    )
+    refused(answer, "--hold-out 'Monday' is in no session's name", "day_0, day_1")
+    answer = failuretwin(
+        "calibrate", two_days, "--hold-out", "day", "--out", tmp_path / "twin.toml"
+    )
+    refused(answer, "--hold-out 'day' leaves nothing to learn from")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("twin.json", "twin.json: a calibration ends in .toml"),
+        ("nowhere/twin.toml", "does not exist. Make it first"),
+        ("folder.toml", "is a folder. Give the name of a file"),
+    ],
+)
+def test_a_bad_destination_is_refused_before_any_work(failuretwin, tmp_path, name, text):
+    (tmp_path / "folder.toml").mkdir()
+    answer = failuretwin("calibrate", tmp_path / "no_log", "--out", name, folder=tmp_path)
+    refused(answer, text)
+
+
+def test_a_robot_has_its_own_calibration(failuretwin, learned, two_days, small, armpi, tmp_path):
+    path = tmp_path / "small.toml"
+    other = replace(armpi, profile=replace(armpi.profile, name="armpi_two"))
+    save_calibration(small, other, path)
+    answer = failuretwin("diagnose", two_days, "--calibration", path)
+    refused(answer, "is a calibration of robot 'armpi_two', not of 'armpi_fpv'", "--robot")
+    with pytest.raises(InputError, match="calibration of robot 'armpi_two'"):
+        load_calibration(path, armpi)
+
+
+def test_imperfections_are_no_calibration(armpi, tmp_path):
+    path = tmp_path / "typed.toml"
+    path.write_text('name = "typed"\nsource = "by hand"\n')
+    assert load_imperfections(str(path), armpi).name == "typed"
+    with pytest.raises(InputError, match="holds imperfections without a calibration"):
+        load_calibration(path, armpi)
+
+
+# The file
+
+
+def test_a_file_holds_what_was_learned_and_is_read_as_imperfections(small, armpi, tmp_path):
+    entries = (LeftOut("a", 1, "motor_1", "did not get its command"),)
+    full = replace(small, held_out=(held_out(1.0, 0.1),), left_out=entries, remarks=("a remark",))
+    save_calibration(full, armpi, tmp_path / "twin.toml")
+    found = load_calibration(tmp_path / "twin.toml", armpi)
+    for before, after in zip(full.parameters, found.parameters, strict=True):
+        assert after.value == pytest.approx(before.value, rel=1e-5)
+        assert replace(after, value=0.0, low=0.0, high=0.0) == replace(
+            before, value=0.0, low=0.0, high=0.0
+        )
+    assert replace(found, parameters=()) == replace(full, parameters=())
+    assert load_imperfections(str(tmp_path / "twin.toml"), armpi) == found.imperfections
+
+
+def test_a_write_that_dies_leaves_the_old_file(small, armpi, tmp_path, listing, monkeypatch):
+    path = tmp_path / "twin.toml"
+    save_calibration(small, armpi, path)
+    before = path.read_bytes()
+
+    def half(self, text, encoding):
+        with self.open("w", encoding=encoding) as file:
+            file.write(text[: len(text) // 2])
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", half)
+    with pytest.raises(OutputError, match="No space left on device"):
+        save_calibration(replace(small, runs=99), armpi, path)
+    assert path.read_bytes() == before
+    assert listing(tmp_path) == ["twin.toml"]
+
+
+def test_a_process_killed_while_writing_leaves_the_old_file(small, armpi, tmp_path):
+    path = tmp_path / "twin.toml"
+    save_calibration(small, armpi, path)
+    before = path.read_bytes()
+    child = os.fork()
+    if child == 0:
+        write = Path.write_text
+
+        def die(self, text, encoding):
+            write(self, text[: len(text) // 2], encoding)
+            os._exit(9)
+
+        Path.write_text = die
+        save_calibration(replace(small, runs=99), armpi, path)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
+    assert path.read_bytes() == before
+    assert load_calibration(path, armpi).runs == 4
+
+
+def test_a_full_disk_leaves_the_old_file(failuretwin, two_days, small, armpi, tmp_path, listing):
+    path = tmp_path / "twin.toml"
+    save_calibration(small, armpi, path)
+    before = path.read_bytes()
+    answer = failuretwin("calibrate", two_days, "--out", path, disk_full=True)
+    refused(answer, "could not be written")
+    assert path.read_bytes() == before
+    assert listing(tmp_path) == ["twin.toml"]

@@ -1,0 +1,478 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import special, stats
+
+from failuretwin import DigitalTwin
+from failuretwin.connection.calibration.held_out import held_out_sessions, judge
+from failuretwin.connection.calibration.motion_part import gap_starts, glitch_rates, lateness
+from failuretwin.connection.calibration.observations import Observations, stayed
+from failuretwin.connection.calibration.rates import (
+    Rate,
+    loss_rates,
+    median_interval,
+    spread_of,
+)
+from failuretwin.connection.calibration.settled_fit import fit_settling, rounding
+from failuretwin.connection.calibration.settled_part import fit_settled_part
+from failuretwin.connection.calibration.timing_fit import Transients, fit_timing
+from failuretwin.connection.calibration.what_if import best_payload, sense_remarks
+from failuretwin.connection.healthy import PATH_NOISE_M
+from failuretwin.core.errors import InputError
+from failuretwin.core.movements import Movements
+from failuretwin.core.runs import RunTable
+from failuretwin.digital_model.imperfect import lagged
+from failuretwin.digital_model.imperfections import GENERIC_SCATTER_RAD
+from failuretwin.digital_model.settling import Settling
+
+COUNT = np.deg2rad(0.24)
+NAMES = ["motor_1", "motor_2", "motor_3", "motor_4"]
+TYPICAL = Settling(
+    bias=(0.002, 0.005, 0.0, -0.003),
+    compliance=(0.0, 0.137, 0.168, 0.194),
+    friction=(0.0065, 0.005, 0.01, 0.011),
+    scatter=(0.005, 0.006, 0.005, 0.003),
+    tail_dof=5.0,
+    source="made up",
+)
+
+
+@pytest.fixture(scope="module")
+def settle(armpi):
+    """Draw settled movements from the model; motors are read in whole counts."""
+
+    def draw(settling, seed, movements=120, sessions=1, readings=True, robot=armpi):
+        rng = np.random.default_rng(seed)
+        low, high = np.array([motor.movement_range for motor in robot.motors]).T
+        angles = rng.uniform(low, high, (movements + 1, 4))
+        origin, target = angles[:-1], angles[1:]
+        unit = rng.standard_t(settling.tail_dof, (movements, 4))
+        wanted = target + np.asarray(settling.scatter) * unit
+        pose = wanted
+        for _ in range(6):  # the sag depends on the pose that it leads to
+            pose = wanted + settling.offset(robot, pose, np.sign(target - origin))
+        units = robot.servo_units
+        pose = units.to_rad(np.rint(units.to_counts(pose)))
+        number = np.arange(movements)
+        return Observations(
+            run=number // 5,
+            session=number % sessions,
+            number=number % 5,
+            origin=origin,
+            target=target,
+            point=DigitalTwin(robot).path(pose),
+            position=pose if readings else None,
+            sessions=tuple(f"day_{i}" for i in range(sessions)),
+            runs=tuple(f"run_{i}" for i in range(movements // 5 + 1)),
+        )
+
+    return draw
+
+
+def random_settling(seed):
+    rng = np.random.default_rng(seed)
+    return Settling(
+        bias=tuple(rng.normal(0.0, 0.01, 4)),
+        compliance=(0.0, *rng.uniform(0.05, 0.3, 3)),
+        friction=tuple(rng.uniform(0.0, 0.015, 4)),
+        scatter=tuple(np.exp(rng.normal(np.log(0.006), 0.3, 4))),
+        tail_dof=float(rng.uniform(3.0, 12.0)),
+        source="drawn",
+    )
+
+
+def as_vector(settling):
+    lists = (settling.bias, settling.compliance, settling.friction, np.log(settling.scatter))
+    return np.concatenate([*lists, [np.log(settling.tail_dof)]])
+
+
+# Rates and ranges
+
+
+@pytest.mark.parametrize("count", [6, 9, 40])
+def test_interval_of_a_median_holds_it_whatever_the_distribution(count):
+    rng = np.random.default_rng(count)
+    for draws, truth in (
+        (rng.uniform(0.3, 1.7, (4000, count)), 1.0),
+        (rng.standard_exponential((4000, count)), np.log(2.0)),
+    ):
+        found = np.array([median_interval(values) for values in draws])
+        inside = np.mean((found[:, 1] <= truth) & (truth <= found[:, 2]))
+        # As many lie below the median as coins show heads: the interval can be too wide, by one
+        # order statistic, never too narrow.
+        below = stats.binom.ppf(0.025, count, 0.5)
+        expected = 1.0 - 2.0 * stats.binom.cdf(below - 1, count, 0.5)
+        assert expected >= 0.95
+        assert abs(inside - expected) < 4.0 * np.sqrt(0.95 * 0.05 / 4000)
+
+
+def test_spread_of_uniform_draws_is_their_range_whatever_stands_out():
+    values = np.random.default_rng(3).uniform(0.2, 0.8, 4000)
+    np.testing.assert_allclose(spread_of(values), (0.2, 0.8), atol=0.03)
+    spoilt = np.concatenate([values, np.full(40, 1e3)])
+    np.testing.assert_allclose(spread_of(spoilt), (0.2, 0.8), atol=0.05)
+
+
+@pytest.mark.parametrize(("hits", "trials"), [(3, 40), (1, 2), (17, 400)])
+def test_interval_of_a_rate_is_that_of_the_jeffreys_posterior(hits, trials):
+    low, high = Rate(hits, trials).interval
+    below = special.betainc(hits + 0.5, trials - hits + 0.5, [low, high])
+    np.testing.assert_allclose(below, [0.025, 0.975], rtol=1e-9)
+    assert Rate(hits, trials).mean == pytest.approx((hits + 0.5) / (trials + 1.0), rel=1e-15)
+
+
+def test_interval_of_a_rate_holds_the_truth():
+    hits = np.arange(401)
+    for rate in (0.02, 0.08, 0.3):
+        inside = [low <= rate <= high for low, high in (Rate(int(h), 400).interval for h in hits)]
+        assert 0.92 < stats.binom.pmf(hits, 400, rate) @ inside < 0.985
+
+
+def test_what_never_or_always_happened_may_never_or_always_happen():
+    assert Rate(0, 50).interval[0] == 0.0
+    assert Rate(0, 50).interval[1] > 0.03
+    assert Rate(50, 50).interval[1] == 1.0
+    assert Rate(0, 0).interval == (0.0, 1.0)
+
+
+def test_lost_commands_are_counted_by_set_of_motors_and_lateness(settle):
+    seen = settle(TYPICAL, seed=1, movements=10)
+    near = np.abs(seen.target - seen.origin) < 0.1
+    lost = np.zeros((10, 4), dtype=bool)
+    lost[0, :2] = lost[1, 0] = lost[2, 0] = True
+    late = np.arange(10) < 2
+    found = {loss.motors: loss for loss in loss_rates(seen, lost, late, NAMES)}
+    assert set(found) == {("motor_1", "motor_2"), *((name,) for name in NAMES)}
+    first = found["motor_1",]
+    assert (first.late.hits, first.punctual.hits) == (1, 1)
+    assert first.late.trials == 2 - near[:2, 0].sum()
+    assert first.punctual.trials == 8 - near[2:, 0].sum()
+    both = found["motor_1", "motor_2"]
+    assert (both.late.hits, both.punctual.hits) == (1, 0)
+    assert found["motor_3",].late.hits == found["motor_3",].punctual.hits == 0
+
+
+# Late starts, gaps, glitches
+
+
+def movements_at(start, motors=4):
+    start = np.asarray(start, dtype=float)
+    target = np.tile(np.where(np.arange(start.shape[1]) % 2, -0.3, 0.4)[:, None], (1, motors))
+    return Movements(
+        initial=np.zeros((len(start), motors)),
+        target=np.where(np.isfinite(start)[..., None], target, np.nan),
+        ramp_duration=np.where(np.isfinite(start)[..., None], 0.8, np.nan) * np.ones(motors),
+        start=start,
+    )
+
+
+def test_a_late_start_holds_up_the_next_command():
+    start = [[0.1, 2.11, 4.13, 6.93, 8.93], [0.05, 2.05, 4.06, 6.06, np.nan]]
+    found = lateness(movements_at(start))
+    assert found.known
+    assert found.period == pytest.approx(2.01, abs=0.011)
+    expected = [[0.0, 0.0, 2.80 - found.period, 0.0, np.nan], [0.0, 0.0, 0.0, np.nan, np.nan]]
+    np.testing.assert_allclose(found.late, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("start", [[[0.0, 1.1, 3.9, 5.0, 8.7]], [[0.0, 2.0, 4.0]]])
+def test_commands_at_no_steady_pace_tell_of_no_late_start(start):
+    found = lateness(movements_at(start))
+    assert not found.known
+    assert np.isnan(found.late).all()
+
+
+def runs_at(movements, position=None, silent=((0.0, 0.0),)):
+    """Return runs read at 10 Hz, with silence from one time to another."""
+    time = np.arange(1000) * 0.01
+    count = len(movements.start)
+    measured = np.zeros((count, 1000, 3))
+    measured[:, np.arange(1000) % 10 != 0] = np.nan
+    for begin, end in silent:
+        measured[:, (time > begin) & (time < end)] = np.nan
+    return RunTable(
+        run=[f"run_{i}" for i in range(count)],
+        motor=NAMES,
+        time=time,
+        command=movements.reference(time),
+        measured=measured,
+        position=position,
+        measured_rate_hz=10.0,
+    ).to_dataset()
+
+
+def test_gaps_before_late_starts_are_dated_from_the_movement_before():
+    movements = movements_at([[0.1, 2.11, 5.31, 7.32]])
+    late = np.array([[0.0, 1.2, 0.0, np.nan]])
+    runs = runs_at(movements, silent=((0.85, 3.31), (6.0, 6.15)))
+    np.testing.assert_allclose(gap_starts(runs, movements, late), [0.85 - 0.1], atol=0.051)
+    assert len(gap_starts(runs_at(movements), movements, late)) == 0
+    assert len(gap_starts(runs, movements, np.zeros((1, 4)))) == 0
+
+
+def test_spoilt_readings_are_counted_by_motor_among_the_rows_read():
+    position = np.full((2, 1000, 4), np.nan)
+    position[:, ::10] = 0.3
+    position[0, [10, 20, 30], 3] = np.nan
+    position[1, 500, 1] = np.nan
+    runs = runs_at(movements_at([[0.0, 2.0], [0.0, 2.0]]), position)
+    assert [(r.hits, r.trials) for r in glitch_rates(runs)] == [
+        (0, 200),
+        (1, 200),
+        (0, 200),
+        (3, 200),
+    ]
+    assert glitch_rates(runs.drop_vars("position")) is None
+
+
+# Lost commands
+
+
+@pytest.mark.parametrize("readings", [True, False])
+def test_motors_that_stay_are_seen(settle, armpi, twin, readings):
+    seen = settle(TYPICAL, seed=5, movements=60)
+    clear = (np.abs(seen.target - seen.origin) > 0.3).all(axis=1)
+    seen = seen[clear]
+    held = np.zeros((len(seen), 4), dtype=bool)
+    held[0, 0] = held[1, 1] = held[2, 2] = held[3, :2] = True
+    pose = np.where(held, seen.origin, seen.position)
+    moved = replace(seen, point=twin.path(pose), position=pose if readings else None)
+    np.testing.assert_array_equal(stayed(moved, armpi, seen.target), held)
+
+
+def test_a_motor_that_hardly_had_to_move_lost_nothing(settle, armpi):
+    seen = settle(TYPICAL, seed=5, movements=1)
+    target = seen.origin + np.array([[0.02, -0.02, 0.5, -0.5]])
+    near = replace(seen, target=target, position=seen.origin)
+    np.testing.assert_array_equal(stayed(near, armpi, target), [[False, False, True, True]])
+
+
+# Where motors settle
+
+
+@pytest.mark.parametrize(("readings", "shares"), [(True, 1.0), (False, 1.6)])
+def test_settling_of_a_known_robot_comes_back(settle, armpi, readings, shares):
+    seen = settle(TYPICAL, seed=2, movements=600, readings=readings)
+    fit = fit_settling(seen, armpi, np.ones((600, 4)))
+    found = fit.settling("fit")
+    # Four standard errors of a mean, and of a slope over the loads that the movements meet.
+    error = 4.0 * shares * np.asarray(TYPICAL.scatter) * np.sqrt(5.0 / 3.0) / np.sqrt(600)
+    load = np.std(armpi.loads.torque(seen.target * armpi.sense, 0.0), axis=0)[1:]
+    assert np.all(np.abs(np.subtract(found.bias, TYPICAL.bias)) < error)
+    assert np.all(np.abs(np.subtract(found.friction, TYPICAL.friction)) < error)
+    off = np.abs(np.subtract(found.compliance, TYPICAL.compliance))
+    assert np.all(off[1:] < 1.5 * error[1:] / load)
+    assert off[0] < 1e-6
+    np.testing.assert_allclose(found.scatter, TYPICAL.scatter, rtol=0.25)
+    assert 3.0 < found.tail_dof < 9.0
+
+
+@pytest.mark.parametrize(("readings", "draws"), [(True, 60), (False, 20)])
+def test_settling_intervals_hold_the_truth(settle, armpi, readings, draws):
+    inside = []
+    for seed in range(draws):
+        truth = random_settling(seed)
+        seen = settle(truth, 1000 + seed, movements=80, readings=readings)
+        fit = fit_settling(seen, armpi, np.ones((80, 4)))
+        told = fit.deviation < 0.3 * fit.prior_deviation
+        told[4] = False  # gravity does not load motor 1
+        off = np.abs(fit.mode - as_vector(truth)) / fit.deviation
+        inside += (off[told] < 1.96).tolist()
+    assert len(inside) > 13 * draws
+    assert 0.88 < np.mean(inside) < 0.995
+
+
+def test_what_the_logs_do_not_say_keeps_its_prior(settle, armpi):
+    fit = fit_settling(settle(TYPICAL, seed=3, movements=40), armpi, np.ones((40, 4)))
+    share = fit.deviation / fit.prior_deviation
+    assert share[4] == pytest.approx(1.0, rel=1e-3)  # compliance of motor 1
+    assert share[[5, 6, 7]].max() < 0.3
+    idle = np.ones((40, 4))
+    idle[:, 2] = 0.0
+    fit = fit_settling(settle(TYPICAL, seed=3, movements=40), armpi, idle)
+    share = (fit.deviation / fit.prior_deviation)[:-1].reshape(4, 4)
+    np.testing.assert_allclose(share[:, 2], 1.0, rtol=1e-3)
+    assert share[:, 3].max() < 0.4
+
+
+def test_lost_commands_and_odd_movements_do_not_bend_the_fit(settle, armpi, twin):
+    seen = settle(TYPICAL, seed=4, movements=80)
+    clean = fit_settled_part(seen, armpi)
+    pose = seen.position.copy()
+    stay = np.flatnonzero(np.abs(seen.target - seen.origin)[:, 0] > 0.3)[:6]
+    pose[stay, 0] = seen.origin[stay, 0]
+    odd = np.setdiff1d(np.arange(80), stay)[:5]
+    pose[odd, 2] += 0.2
+    part = fit_settled_part(replace(seen, position=pose, point=twin.path(pose)), armpi)
+    assert {(e.motor, e.reason) for e in part.left_out(armpi)} == {
+        ("motor_1", "did not get its command"),
+        ("", "is far off its target"),
+    }
+    np.testing.assert_array_equal(np.flatnonzero(part.lost[:, 0]), stay)
+    np.testing.assert_array_equal(np.flatnonzero(part.odd), odd)
+    assert np.all(np.abs(part.fit.mode - clean.fit.mode) < 2.0 * clean.fit.deviation + 1e-12)
+
+
+def test_too_few_movements_are_refused(settle, armpi):
+    with pytest.raises(InputError, match=r"only 5 of 5 movements .* expected 6 at least"):
+        fit_settled_part(settle(TYPICAL, seed=6, movements=5), armpi)
+
+
+# Timing
+
+TIME = np.arange(1000) * 0.01
+DELAY = np.array([0.0, 0.01, 0.02, 0.03, 0.04, 0.015])
+SHORTENING = np.array([0.02, 0.05, 0.0, 0.03, 0.04, 0.01])
+
+
+def ramps(armpi, lag, rate, read):
+    """Return six runs made with known timing and read at `rate` through `read`."""
+    rng = np.random.default_rng(8)
+    movements = Movements(
+        initial=np.zeros((6, 4)),
+        target=rng.uniform(-0.8, 0.8, (6, 5, 4)),
+        ramp_duration=np.repeat(rng.choice([0.6, 0.8, 1.0], (6, 5, 1)), 4, axis=2),
+        start=0.05 + 2.0 * np.arange(5) * np.ones((6, 1)),
+    )
+    real = replace(
+        movements,
+        start=movements.start + DELAY[:, None],
+        ramp_duration=movements.ramp_duration * (1.0 - SHORTENING)[:, None, None],
+    )
+    reference = lagged(real.reference(TIME), TIME, np.full(6, lag))
+    reading = read(DigitalTwin(armpi).respond(reference, TIME))
+    used = np.broadcast_to(np.arange(1000) % round(100 / rate) == 0, (6, 1000))
+    of_motors = reading.shape[2] == 4
+    return Transients(movements, np.where(used[..., None], reading, np.nan), of_motors, used, TIME)
+
+
+@pytest.mark.parametrize("lag", [0.015, 0.03, 0.05])
+@pytest.mark.parametrize("tool", [False, True])
+def test_timing_comes_back_from_clean_motion(armpi, twin, lag, tool):
+    clean = ramps(armpi, lag, 100.0, twin.path if tool else np.array)
+    fit = fit_timing(clean, armpi, np.random.default_rng(0))
+    assert fit.lag == pytest.approx(lag, abs=0.002)
+    np.testing.assert_allclose(fit.delay, DELAY, atol=0.002)
+    np.testing.assert_allclose(fit.shortening, SHORTENING, atol=0.003)
+
+
+def test_timing_comes_back_from_whole_counts_ten_times_a_second(armpi):
+    rounded = ramps(armpi, 0.03, 10.0, lambda angle: np.rint(angle / COUNT) * COUNT)
+    fit = fit_timing(rounded, armpi, np.random.default_rng(0))
+    assert fit.lag == pytest.approx(0.03, abs=0.005)
+    np.testing.assert_allclose(fit.delay, DELAY, atol=0.006)
+    np.testing.assert_allclose(fit.shortening, SHORTENING, atol=0.008)
+    # Rounding alone leaves residuals that are uniform within half a count.
+    assert fit.residual == pytest.approx(1.4826 * 0.25 * COUNT, rel=0.25)
+
+
+def test_two_runs_tell_no_timing(armpi):
+    clean = ramps(armpi, 0.03, 100.0, np.array)
+    few = replace(clean, used=clean.used & (np.arange(6) < 2)[:, None])
+    assert fit_timing(few, armpi, np.random.default_rng(0)) is None
+
+
+# What the robot might be instead
+
+
+def test_senses_of_the_profile_are_confirmed(settle, armpi):
+    remarks = sense_remarks(fit_settled_part(settle(TYPICAL, seed=9), armpi), armpi)
+    assert remarks[0] == "sense of motor_1: cannot be told, gravity does not load it"
+    for remark, sense in zip(remarks[1:], ("+1", "-1", "+1"), strict=True):
+        assert f"{sense} as in the profile" in remark
+
+
+def test_a_wrong_sense_is_found_and_blames_no_other_motor(settle, armpi):
+    motors = tuple(replace(motor, sense=1.0) for motor in armpi.motors)
+    straight = replace(armpi, profile=replace(armpi.profile, motors=motors))
+    seen = settle(TYPICAL, seed=9, robot=straight)
+    remarks = sense_remarks(fit_settled_part(seen, armpi), armpi)
+    assert "motor_3: the logs speak for +1" in remarks[2]
+    assert "the profile says -1; check it" in remarks[2]
+    assert "+1 as in the profile" in remarks[1]
+    assert "+1 as in the profile" in remarks[3]
+
+
+def test_no_payload_is_told_where_there_is_none(settle, armpi):
+    payload, told = best_payload(fit_settled_part(settle(TYPICAL, seed=10), armpi), armpi)
+    assert payload == 0.0
+    assert "do not tell one from a softer motor" in told
+
+
+def test_a_heavy_payload_on_a_precise_arm_is_told(settle, armpi):
+    loaded = replace(TYPICAL, compliance=(0.0, 0.05, 0.05, 0.05), scatter=(3e-4,) * 4, payload=0.5)
+    payload, told = best_payload(
+        fit_settled_part(settle(loaded, seed=10, movements=300), armpi), armpi
+    )
+    assert payload == 0.5
+    assert "about 0.5 kg at the tool point" in told
+
+
+# Unseen sessions
+
+
+def test_unseen_sessions_are_left_with_the_scatter_alone(settle, armpi):
+    entries = held_out_sessions(settle(TYPICAL, seed=11, movements=450, sessions=3), armpi)
+    assert [entry.session for entry in entries] == ["day_0", "day_1", "day_2"]
+    # 1.48 times the median size of a Student t of this scale, plus what counts round off.
+    size = 1.4826 * stats.t.ppf(0.75, TYPICAL.tail_dof)
+    expected = np.hypot(size * np.asarray(TYPICAL.scatter), rounding(armpi))
+    after = np.mean([entry.after for entry in entries], axis=0)
+    np.testing.assert_allclose(after, expected, rtol=0.15)
+    for entry in entries:
+        assert entry.before[1] > 2.5 * entry.after[1]
+        assert entry.gain - 1.96 * entry.gain_error > 0.5
+
+
+def test_gain_is_the_mean_difference_of_log_densities(settle, armpi, twin):
+    part = fit_settled_part(settle(TYPICAL, seed=12), armpi)
+    seen = settle(TYPICAL, seed=13, movements=40)
+    entry = judge(seen, part, armpi, "other day")
+    generic = Settling((0.0,) * 4, (0.0,) * 4, (0.0,) * 4, (GENERIC_SCATTER_RAD,) * 4, 4.0, "")
+    gain = log_densities(seen, part.settling, armpi, twin) - log_densities(
+        seen, generic, armpi, twin
+    )
+    assert entry.movements == 40
+    assert entry.gain == pytest.approx(gain.mean(), rel=1e-9)
+    assert entry.gain_error == pytest.approx(stats.sem(gain), rel=1e-9)
+
+
+def log_densities(seen, settling, robot, twin):
+    direction = np.sign(seen.target - seen.origin)
+    near = seen.target + settling.offset(robot, seen.target, direction)
+    pose = seen.target + settling.offset(robot, near, direction)
+    mean, jacobian = twin.path_and_jacobian(pose)
+    spread = jacobian @ np.diag(np.square(settling.scatter)) @ jacobian.transpose(0, 2, 1)
+    spread += PATH_NOISE_M**2 * np.eye(3)
+    return np.array(
+        [
+            stats.multivariate_t(m, s, df=settling.tail_dof).logpdf(x)
+            for m, s, x in zip(mean, spread, seen.point, strict=True)
+        ]
+    )
+
+
+def test_a_shift_of_the_whole_session_counts_as_error(settle, armpi, twin):
+    part = fit_settled_part(settle(TYPICAL, seed=12), armpi)
+    shifted = replace(TYPICAL, bias=tuple(np.add(TYPICAL.bias, 0.03)))
+    entry = judge(settle(shifted, seed=13), part, armpi, "shifted")
+    np.testing.assert_allclose(entry.after, 0.03 * 1.4826, rtol=0.15)
+    assert entry.gain < 0.0
+
+
+def test_a_fit_to_another_robot_does_not_beat_none(settle, armpi):
+    ideal = Settling((0.0,) * 4, (0.0,) * 4, (0.0,) * 4, (0.003,) * 4, 10.0, "straight")
+    soft = replace(TYPICAL, compliance=(0.0, 0.3, 0.3, 0.3))
+    part = fit_settled_part(settle(soft, seed=14), armpi)
+    entry = judge(settle(ideal, seed=15), part, armpi, "another robot")
+    assert entry.gain + 1.96 * entry.gain_error < 0.0
+
+
+def test_one_session_or_one_movement_judges_nothing(settle, armpi):
+    seen = settle(TYPICAL, seed=16)
+    assert held_out_sessions(seen, armpi) == ()
+    part = fit_settled_part(seen, armpi)
+    assert judge(seen[np.array([0])], part, armpi, "short") is None
