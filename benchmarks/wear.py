@@ -23,7 +23,8 @@ from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.runs import concatenate
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.generation import Plan, simulate, simulate_runs
+from failuretwin.data_knowledge.generation import simulate, simulate_runs
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.digital_model.imperfections import Imperfections, load_imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import loads_in_range

@@ -12,6 +12,7 @@ from failuretwin.core.movements import Movements
 from failuretwin.core.quadrature import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
+from failuretwin.digital_model.engine import SAG_ROUNDS
 from failuretwin.digital_model.imperfections import Imperfections
 from failuretwin.digital_model.settling import Settling, loads_in_range
 from failuretwin.digital_model.twin import DigitalTwin
@@ -130,8 +131,11 @@ class HealthyModel:
             held: Motors that stay exactly at `base`, (motor,).
         """
         robot = self.twin.robot
-        offset = self.settling.offset(robot, base, direction)
-        return base + np.where(held, 0.0, offset)
+        near = base
+        for _ in range(SAG_ROUNDS):
+            offset = self.settling.offset(robot, near, direction)
+            near = base + np.where(held, 0.0, offset)
+        return near
 
     def log_density(
         self,

@@ -13,6 +13,9 @@ from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import sag
 from failuretwin.digital_model.twin import DigitalTwin
 
+SAG_ROUNDS = 2
+"""Rounds in which sag and pose settle together; each takes off all but a few hundredths."""
+
 
 @dataclass(frozen=True)
 class Drive:
@@ -72,10 +75,12 @@ class ServoEngine:
         if drive.compliance is None:
             return position
         payload = 0.0 if drive.payload is None else drive.payload[:, None]
-        yielding = sag(self.robot, position, drive.compliance[:, None], payload)
-        if drive.weakness is not None:
-            yielding /= 1.0 - drive.weakness
-        return self._hold(free + yielding, drive, time)
+        for _ in range(SAG_ROUNDS):
+            yielding = sag(self.robot, position, drive.compliance[:, None], payload)
+            if drive.weakness is not None:
+                yielding /= 1.0 - drive.weakness
+            position = self._hold(free + yielding, drive, time)
+        return position
 
     def _hold(self, position: FloatArray, drive: Drive, time: FloatArray) -> FloatArray:
         if drive.held is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,7 +32,7 @@ class Observations:
         run: Index of the run, (movement,).
         session: Index of the session, (movement,).
         number: Number of the movement within its run, from 0, (movement,).
-        origin: Commanded angles before, (movement, motor) [rad].
+        origin: Angles that the motors were last told to go to, and went, (movement, motor) [rad].
         target: Commanded angles, (movement, motor) [rad].
         point: Settled tool position, (movement, axis) [m].
         position: Settled angles by the motors' readings, (movement, motor) [rad]; None where the
@@ -126,6 +126,32 @@ def _settled_position(
         seen = np.isfinite(window).any(axis=0)
         settled[i, seen] = np.nanmedian(window[:, seen], axis=0)
     return settled
+
+
+def follows_seen(observations: Observations) -> BoolArray:
+    """Return which movements follow one that was seen, or begin a run, (movement,).
+
+    After an unseen movement it is not known where a motor came from.
+    """
+    run, number = observations.run, observations.number
+    seen = number == 0
+    seen[1:] |= (run[1:] == run[:-1]) & (number[1:] == number[:-1] + 1)
+    return np.asarray(seen)
+
+
+def obeyed(observations: Observations, lost: BoolArray) -> Observations:
+    """Return the observations with the origins of motors that had missed the command before.
+
+    Args:
+        observations: Settled movements with the commanded origins, in order.
+        lost: Motors that did not get their command, (movement, motor).
+    """
+    origin = observations.origin.copy()
+    for i in range(1, len(origin)):
+        follows = observations.run[i] == observations.run[i - 1]
+        if follows and observations.number[i] == observations.number[i - 1] + 1:
+            origin[i] = np.where(lost[i - 1], origin[i - 1], origin[i])
+    return replace(observations, origin=origin)
 
 
 def stayed(observations: Observations, robot: Robot, expected: FloatArray) -> BoolArray:

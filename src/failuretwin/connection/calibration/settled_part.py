@@ -7,7 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from failuretwin.connection.calibration.calibration import LeftOut
-from failuretwin.connection.calibration.observations import Observations, stayed
+from failuretwin.connection.calibration.observations import (
+    Observations,
+    follows_seen,
+    obeyed,
+    stayed,
+)
 from failuretwin.connection.calibration.settled_fit import SettledFit, fit_settling
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray
@@ -72,14 +77,19 @@ def fit_settled_part(observations: Observations, robot: Robot, payload: float = 
         InputError: If too few movements are left.
     """
     settling = Settling.ideal(len(robot.motors))
+    commanded = observations
     for _ in range(ROUNDS):
         lost, odd = sort_movements(observations, robot, settling)
         kept = ~odd
+        known = follows_seen(observations[kept])
+        if known.sum() >= FEWEST_MOVEMENTS:
+            kept[kept] = known
         if kept.sum() < FEWEST_MOVEMENTS:
             raise InputError(
                 f"only {int(kept.sum())} of {len(kept)} movements come to rest near their targets, "
                 f"expected {FEWEST_MOVEMENTS} at least. Give longer logs of a healthy robot."
             )
+        observations = obeyed(commanded, lost)
         arrived = (~lost[kept]).astype(np.float64)
         fit = fit_settling(observations[kept], robot, arrived, payload)
         part = SettledPart(observations, lost, odd, fit, payload)
