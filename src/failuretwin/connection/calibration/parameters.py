@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,6 +19,8 @@ LEARNED = 0.3
 """A parameter is identified if the logs bring its deviation below this share of the prior's."""
 LOAD_FLOOR_NM = 1e-6
 DRAWS = 400
+FEW_TOGETHER = 3
+"""A set of motors seen to lose commands together fewer times than this says little of how often."""
 
 ADVICE = {
     "bias": "more movements that come to rest, to targets all over the range",
@@ -81,7 +84,12 @@ def loss_parameters(losses: Sequence[LossRates]) -> list[Parameter]:
     found = []
     for loss in losses:
         motors = "+".join(loss.motors)
-        found.append(rate_parameter("lost commands", motors, loss.punctual))
+        rates = [rate_parameter("lost commands", motors, loss.punctual)]
         if loss.late.trials:
-            found.append(rate_parameter("lost commands when late", motors, loss.late))
+            rates.append(rate_parameter("lost commands when late", motors, loss.late))
+        hits = loss.punctual.hits + loss.late.hits
+        if len(loss.motors) > 1 and hits < FEW_TOGETHER:
+            note = f"seen {hits} times, and listed only because it was; it takes longer logs"
+            rates = [replace(rate, identified=False, note=note) for rate in rates]
+        found += rates
     return found
