@@ -21,6 +21,8 @@ PATH_NOISE_M = 0.001
 """Noise of a settled tool position [m]: one count of rounding in each motor moves it about 1 mm."""
 OUTLIER_RATE = 0.01
 """Share of movements after which the tool may be anywhere in its workspace [-]."""
+RARE = 1e-3
+"""Two losses in a row that are less probable than this are left to the outliers [-]."""
 LATE_MARGIN_S = 0.15
 """A movement that lasts this much longer than the schedule allows started late [s]."""
 
@@ -30,18 +32,20 @@ class Alternatives:
     """What may become of each movement: every set of motors that may lose its command.
 
     Attributes:
+        lost: Motors that lose their command, (alternative, motor).
         base: Angles that the motors then go for, (run, movement, alternative, motor) [rad].
         direction: Sign of their last travel, (run, movement, alternative, motor).
         log_weight: Log probability of each, (run, movement, alternative).
     """
 
+    lost: BoolArray
     base: FloatArray
     direction: FloatArray
     log_weight: FloatArray
 
     def __getitem__(self, runs: slice) -> Alternatives:
         """Return the alternatives of some of the runs."""
-        return Alternatives(self.base[runs], self.direction[runs], self.log_weight[runs])
+        return Alternatives(self.lost, self.base[runs], self.direction[runs], self.log_weight[runs])
 
 
 @dataclass(frozen=True)
@@ -90,24 +94,44 @@ class HealthyModel:
     def alternatives(self, movements: Movements) -> Alternatives:
         """Return what may become of each movement; the first is that every command arrives.
 
-        Padding is filled with zeros; no evidence belongs to it.
+        A motor that misses a command stays where it went last: at the target before, or, if it
+        had missed that one too, at the target before that. Padding is filled with zeros; no
+        evidence belongs to it.
+        """
+        origin, target = np.nan_to_num(movements.origin()), np.nan_to_num(movements.target)
+        travel = np.sign(target - origin)
+        lost, rates, again = self._losses(self._late(movements))
+        twice = self._in_a_row
+        weights = [rates * (1.0 - again * twice), (rates * again)[..., twice]]
+        older, earlier = _before(origin), _before(travel)
+        return Alternatives(
+            lost=np.concatenate([lost, lost[twice]]),
+            base=_choose(target, (lost, origin), (lost[twice], older)),
+            direction=_choose(travel, (lost, earlier), (lost[twice], _before(earlier))),
+            log_weight=log_of(np.concatenate(weights, axis=2) * (1.0 - OUTLIER_RATE)),
+        )
+
+    def _losses(self, late: FloatArray) -> tuple[BoolArray, FloatArray, FloatArray]:
+        """Return which motors each alternative loses, how probable it is, and that they had before.
+
+        (alternative, motor), and twice (run, movement, alternative). The first loses none.
         """
         robot, entries = self.twin.robot, self.imperfections.lost_commands
-        late = self._late(movements)
         lost = np.zeros((1 + len(entries), len(robot.motors)), dtype=bool)
         rates = np.zeros((*late.shape, 1 + len(entries)))
         for i, entry in enumerate(entries, start=1):
             lost[i, [robot.motor_names.index(motor) for motor in entry.motors]] = True
             rates[..., i] = entry.rate + (entry.rate_when_late - entry.rate) * late
         rates[..., 0] = 1.0 - rates.sum(axis=-1)
-        origin, target = np.nan_to_num(movements.origin()), np.nan_to_num(movements.target)
-        travel = np.sign(target - origin)
-        before = np.concatenate([np.zeros_like(travel[:, :1]), travel[:, :-1]], axis=1)
-        return Alternatives(
-            base=np.where(lost, origin[:, :, None], target[:, :, None]),
-            direction=np.where(lost, before[:, :, None], travel[:, :, None]),
-            log_weight=log_of(rates * (1.0 - OUTLIER_RATE)),
-        )
+        return lost, rates, _before(rates @ _covers(lost).T)
+
+    @cached_property
+    def _in_a_row(self) -> BoolArray:
+        """Alternatives whose motors may well miss two commands in a row, (alternative,)."""
+        lost, rates, _ = self._losses(np.ones((1, 1)))
+        _, punctual, _ = self._losses(np.zeros((1, 1)))
+        most = np.maximum(rates, punctual)[0, 0]
+        return np.asarray(most * (most @ _covers(lost).T) > RARE)
 
     def _late(self, movements: Movements) -> FloatArray:
         """Return the probability that each movement started late, (run, movement).
@@ -200,6 +224,29 @@ class HealthyModel:
         """Return the log density of each position if no motor is faulty, (run, movement)."""
         pose = self.settle(alternatives.base, alternatives.direction, self.none_held)
         return self.log_density(evidence, alternatives, pose[:, :, None], self.none_held)[..., 0]
+
+
+def _covers(lost: BoolArray) -> FloatArray:
+    """Return 1 where the motors of one alternative are among those of another, (one, other)."""
+    covers = np.array([[np.all(other >= one) for other in lost] for one in lost], dtype=float)
+    covers[0] = 0.0  # the first loses none
+    return covers
+
+
+def _choose(arrived: FloatArray, *missed: tuple[BoolArray, FloatArray]) -> FloatArray:
+    """Return the values of each alternative, (run, movement, alternative, motor).
+
+    Args:
+        arrived: Value of a motor that got its command, (run, movement, motor).
+        missed: Motors that did not, (alternative, motor), and their value, (run, movement, motor).
+    """
+    chosen = [np.where(mask, value[:, :, None], arrived[:, :, None]) for mask, value in missed]
+    return np.concatenate(chosen, axis=2)
+
+
+def _before(values: FloatArray) -> FloatArray:
+    """Return the values of the movement before, (run, movement, ...); zero before the first."""
+    return np.concatenate([np.zeros_like(values[:, :1]), values[:, :-1]], axis=1)
 
 
 def _spread(deviation: tuple[float, ...]) -> FloatArray:

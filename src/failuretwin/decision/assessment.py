@@ -6,10 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.log_quality import LogQuality
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
-from failuretwin.digital_model.imperfections import LostCommand
 
 UNEXPLAINED_NATS = 1.0
 """A movement whose density is within this of "anywhere within reach" is not explained [nats]."""
@@ -70,22 +69,21 @@ def why_undecided(
 
 
 def lost_commands(
-    became: FloatArray, entries: Sequence[LostCommand], faulty: str | None
+    became: FloatArray, lost: BoolArray, motors: Sequence[str], faulty: str | None
 ) -> list[str]:
     """Return the commands of a run that seem not to have arrived, a line each.
 
     Args:
-        became: Probability of each alternative, (movement, alternative); the first is that all
-            commands arrived, the others are `entries`.
-        entries: Sets of motors that may lose a command.
+        became: Probability of each alternative, (movement, alternative).
+        lost: Motors that lose their command in it, (alternative, motor).
+        motors: Names of the motors.
         faulty: Motor whose fault is told anyway.
     """
     lines = []
     for movement, share in enumerate(became):
-        best = int(np.argmax(share))
-        if best == 0 or share[best] < LIKELY:
-            continue
-        motors = [m.replace("_", " ") for m in entries[best - 1].motors if m != faulty]
-        if motors:
-            lines.append(f"movement {movement + 1}: {' and '.join(motors)} did not get the command")
+        missing = share @ lost > LIKELY
+        names = [m.replace("_", " ") for m, gone in zip(motors, missing, strict=True) if gone]
+        told = [name for name in names if name != (faulty or "").replace("_", " ")]
+        if told:
+            lines.append(f"movement {movement + 1}: {' and '.join(told)} did not get the command")
     return lines

@@ -270,7 +270,7 @@ class BayesDiagnoser:
                 base[..., motor] += found.offset[one, :, None]
         pose = model.settle(base, alternatives.direction, held)
         became = model.became(evidence, alternatives, pose, held)[0]
-        return lost_commands(became, model.imperfections.lost_commands, faulty)
+        return lost_commands(became, alternatives.lost, self.twin.robot.motor_names, faulty)
 
 
 def _evidence(weighed: _Weighed, run: int, order: IntArray) -> tuple[MovementEvidence, ...]:
