@@ -18,7 +18,9 @@ from failuretwin.digital_model.settling import Settling, loads_in_range
 from failuretwin.digital_model.twin import DigitalTwin
 
 PATH_NOISE_M = 0.001
-"""Noise of a settled tool position [m]: one count of rounding in each motor moves it about 1 mm."""
+"""Noise assumed of a settled tool position where the sensor is not known [m]."""
+LEAST_NOISE_M = 0.0003
+"""What a calibration leaves unsaid of the tool's path: bending links, bearings [m]; assumed."""
 OUTLIER_RATE = 0.01
 """Share of movements after which the tool may be anywhere in its workspace [-]."""
 RARE = 1e-3
@@ -70,13 +72,29 @@ class HealthyModel:
         """Scale of the settled scatter and of what is not known of the robot, (motor,) [rad]."""
         scatter, doubt = np.asarray(self.settling.scatter), self.imperfections.variation
         if doubt is None:
-            return scatter
+            return np.hypot(scatter, self._rounding)
         robot, settling = self.twin.robot, self.settling
         load = np.sqrt(np.mean(loads_in_range(robot, settling.payload) ** 2, axis=0))
-        variance = scatter**2 * np.exp(2.0 * _spread(doubt.scatter) ** 2)
+        variance = scatter**2 * np.exp(2.0 * _spread(doubt.scatter) ** 2) + self._rounding**2
         variance = variance + _spread(doubt.bias) ** 2 + _spread(doubt.friction) ** 2
         yielding = np.asarray(settling.compliance) * load * _spread(doubt.compliance)
         return np.sqrt(variance + yielding**2)
+
+    @property
+    def _rounding(self) -> float:
+        """Standard deviation of what whole servo counts round off [rad]."""
+        readings = self.imperfections.readings
+        if readings is None or not readings.whole_counts:
+            return 0.0
+        return abs(self.twin.robot.servo_units.rad_per_count) / np.sqrt(12.0)
+
+    @cached_property
+    def path_noise(self) -> float:
+        """Noise of a settled tool position that belongs to no motor [m]."""
+        readings = self.imperfections.readings
+        if readings is None or self.imperfections.settling is None:
+            return PATH_NOISE_M
+        return float(np.hypot(readings.noise_m, LEAST_NOISE_M))
 
     @cached_property
     def none_held(self) -> BoolArray:
@@ -216,7 +234,7 @@ class HealthyModel:
         predicted, jacobian = self.twin.path_and_jacobian(pose)
         scaled = jacobian * np.where(held, 0.0, self.scatter)
         error = evidence.point[:, :, None, None] - predicted
-        density = log_student(error, scaled, PATH_NOISE_M**2, self.settling.tail_dof)
+        density = log_student(error, scaled, self.path_noise**2, self.settling.tail_dof)
         weighed = density + alternatives.log_weight[:, :, None]
         return weighed, np.logaddexp(log_sum(weighed, axis=-1), self.outlier_log_density)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln
 
-from failuretwin.connection.healthy import PATH_NOISE_M, Alternatives, HealthyModel
+from failuretwin.connection.healthy import Alternatives, HealthyModel
 from failuretwin.core.quadrature import (
     log_of,
     log_sum,
@@ -185,7 +185,7 @@ def _best_angle(
         toward = evidence.point - centre
         best = np.arctan2(np.sum(toward * sine, axis=-1), np.sum(toward * cosine, axis=-1))
         lever = np.linalg.norm(cosine, axis=-1)
-    width = np.hypot(model.scatter.max(), PATH_NOISE_M / np.maximum(lever, 0.02))
+    width = np.hypot(model.scatter.max(), model.path_noise / np.maximum(lever, 0.02))
     return best, width
 
 
