@@ -37,19 +37,20 @@ def right(diagnoses):
 
 
 @BOTH
-def test_at_least_78_of_90_in_sample(diagnose, how):
-    assert right(diagnose(how)) >= 78
+def test_at_least_84_of_90_in_sample(diagnose, how):
+    assert right(diagnose(how)) >= 84
 
 
 @BOTH
-def test_at_least_81_of_90_with_known_error_range_in_sample(diagnose, how):
-    assert right(diagnose(how, (4, 21))) >= 81
+def test_at_least_84_of_90_with_known_error_range_in_sample(diagnose, how):
+    assert right(diagnose(how, (4, 21))) >= 84
 
 
-@BOTH
-def test_at_most_one_false_alarm_in_ten_in_sample(diagnose, how):
+@pytest.mark.parametrize(("how", "most"), [("measured", 0), ("published", 2)])
+def test_false_alarms_in_ten_healthy_runs_in_sample(diagnose, how, most):
+    """Gaps drawn out by straight lines can look like a motor that stops."""
     healthy = [d for d in diagnose(how) if d.truth == "healthy"]
-    assert sum(d.diagnosis != "healthy" for d in healthy) <= 1
+    assert sum(d.diagnosis != "healthy" for d in healthy) <= most
 
 
 @BOTH
@@ -70,5 +71,5 @@ def test_readings_drawn_out_by_lines_make_nobody_surer_in_sample(diagnose):
         how: -np.mean([np.log(d.posterior[d.truth]) for d in diagnose(how)])
         for how in ("measured", "published")
     }
-    assert all(0.05 < value < 0.6 for value in surprise.values())
+    assert all(0.0 < value < 0.3 for value in surprise.values())
     assert abs(surprise["measured"] - surprise["published"]) < 0.3
