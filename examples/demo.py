@@ -1,9 +1,10 @@
 """Nine robots, one for each state of the paper, diagnosed from commands and tool path alone.
 
 The robots are simulated with the imperfections of a real ArmPi FPV: they sag, stick, lag, lose
-commands and glitch. Run with `make demo`.
+commands and glitch. Run with `make demo`; the picture is demo.png, or what the argument says.
 """
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from failuretwin.data_knowledge.plan import Plan
 from failuretwin.digital_model.imperfections import load_imperfections
 
 RUNS_PER_CLASS = 10
-PICTURE = Path(__file__).parents[1] / "docs" / "images" / "demo.png"
+PICTURE = Path(sys.argv[1] if len(sys.argv) > 1 else "demo.png")
 
 robot = load_robot("armpi_fpv")
 plan = Plan(
@@ -44,6 +45,5 @@ figure = run_figure(
     np.asarray(run["measured"].values),
     diagnoses[shown],
 )
-PICTURE.parent.mkdir(parents=True, exist_ok=True)
 figure.savefig(PICTURE, dpi=110)
 print(f"\npicture of run {diagnoses[shown].run}: {PICTURE}")

@@ -164,6 +164,11 @@ def check_writable(path: Path) -> None:
         raise OutputError(f"{path}: folder {folder} is not writable. Choose another.")
     if path.is_dir() and path.suffix != ".zarr":
         raise OutputError(f"{path}: is a folder. Give the name of a file.")
+    if path.is_dir() and not (path / "zarr.json").is_file() and any(path.iterdir()):
+        raise OutputError(
+            f"{path}: is a folder that holds something else than a Zarr store. It is left alone; "
+            "choose another name."
+        )
     if path.is_file() and path.suffix == ".zarr":
         raise OutputError(f"{path}: is a file, and a Zarr store is a folder. Choose another name.")
 

@@ -6,15 +6,21 @@ are drawn anew for each run, rates apply to each movement or reading.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from failuretwin.core.bounds import check_number, check_range, check_share
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling
 
 Range = tuple[float, float]
+
+PROTOCOLS = ("P0", "P0c", "P1", "P2")
+"""How much real data was used: none, healthy logs, unlabelled or labelled runs of the test set."""
+SETTLING_LISTS = ("bias", "compliance", "friction", "scatter")
+"""Figures of `Settling` and `Variation` that have one value for each motor."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +44,13 @@ class Timing:
     late_s: Range = (0.0, 0.0)
     gap_start_s: Range = (0.0, 0.0)
 
+    def __post_init__(self) -> None:
+        check_range("timing: delay_s", self.delay_s, low=-1.0)
+        check_range("timing: ramp_shortening", self.ramp_shortening, low=-1.0, high=0.99)
+        check_share("timing: late_rate", self.late_rate)
+        for name in ("lag_s", "late_s", "gap_start_s"):
+            check_range(f"timing: {name}", getattr(self, name))
+
 
 @dataclass(frozen=True)
 class LostCommand:
@@ -53,6 +66,10 @@ class LostCommand:
     rate: float
     rate_when_late: float
 
+    def __post_init__(self) -> None:
+        check_share("lost_commands: rate", self.rate)
+        check_share("lost_commands: rate_when_late", self.rate_when_late)
+
 
 @dataclass(frozen=True)
 class Schedule:
@@ -67,6 +84,10 @@ class Schedule:
     first_start_s: Range = (0.0, 0.0)
     period_s: Range = (2.0, 2.0)
     whole_counts: bool = False
+
+    def __post_init__(self) -> None:
+        check_range("schedule: first_start_s", self.first_start_s)
+        check_range("schedule: period_s", self.period_s, low=0.05)
 
 
 @dataclass(frozen=True)
@@ -91,6 +112,13 @@ class Readings:
     noise_m: float = 0.0
     drawn_out: bool = False
 
+    def __post_init__(self) -> None:
+        check_number("readings: rate_hz", self.rate_hz, low=0.1, high=1e5)
+        check_number("readings: jitter_s", self.jitter_s)
+        check_number("readings: noise_m", self.noise_m)
+        for rate in self.glitch_rate:
+            check_share("readings: glitch_rate", rate)
+
 
 @dataclass(frozen=True)
 class Variation:
@@ -114,6 +142,13 @@ class Variation:
     scatter: tuple[float, ...] = ()
     rates: float = 0.0
     payload: Range = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name in SETTLING_LISTS:
+            for value in getattr(self, name):
+                check_number(f"variation: {name}", value)
+        check_number("variation: rates", self.rates)
+        check_range("variation: payload", self.payload)
 
 
 @dataclass(frozen=True)
@@ -142,11 +177,18 @@ class Imperfections:
     readings: Readings | None = None
     variation: Variation | None = None
 
+    def __post_init__(self) -> None:
+        if self.protocol not in PROTOCOLS:
+            raise unknown_name("protocol", self.protocol, PROTOCOLS)
+        for late in (False, True):
+            rates = [e.rate_when_late if late else e.rate for e in self.lost_commands]
+            if sum(rates) > 1.0 + 1e-9:
+                raise InputError(
+                    f"lost_commands: the rates add up to {sum(rates):g}, expected 1 at most."
+                )
+
 
 NO_IMPERFECTIONS = Imperfections("none", "the published twin")
-
-SETTLING_LISTS = ("bias", "compliance", "friction", "scatter")
-"""Figures of `Settling` and `Variation` that have one value for each motor."""
 
 CALIBRATION_TABLE = "calibration"
 """Table of such a file that says of which robot and how the figures were found."""
@@ -175,7 +217,8 @@ def load_imperfections(name_or_path: str, robot: Robot) -> Imperfections:
     """Load imperfections.
 
     Args:
-        name_or_path: ``none``, the name of `robot` for those of its profile, or a TOML file.
+        name_or_path: ``none``, the name of `robot` for those of its profile, the name of another
+            file beside those, or a TOML file.
         robot: The robot they are for.
 
     Raises:
@@ -184,17 +227,49 @@ def load_imperfections(name_or_path: str, robot: Robot) -> Imperfections:
     """
     if name_or_path == "none":
         return NO_IMPERFECTIONS
-    path: Path | None = Path(name_or_path)
-    if name_or_path == robot.name:
-        path = robot.imperfections_file
-    if path is None or (path.suffix != ".toml" and not path.exists()):
-        own = f", {robot.name!r}" if robot.imperfections_file else ""
-        raise InputError(f"no imperfections {name_or_path!r}. Expected 'none'{own} or a TOML file.")
+    path, known = Path(name_or_path), _known_files(robot)
+    if name_or_path in known:
+        path = known[name_or_path]
+    elif path.suffix != ".toml" and not path.exists():
+        names = ", ".join(repr(name) for name in ("none", *known))
+        raise InputError(
+            f"no imperfections {name_or_path!r} of robot {robot.name!r}. Expected {names} or a "
+            "TOML file, such as `failuretwin calibrate` writes."
+        )
     table = read_toml(path)
     _check_robot(table.pop(CALIBRATION_TABLE, None), robot, path)
-    imperfections = from_table(Imperfections, table, str(path))
+    try:
+        imperfections = from_table(Imperfections, table, str(path))
+    except InputError as error:
+        where = "" if str(error).startswith(str(path)) else f"{path}: "
+        raise InputError(f"{where}{error}") from error
+    imperfections = _completed(imperfections, len(robot.motors))
     _check_fit(imperfections, robot, path)
     return imperfections
+
+
+def _known_files(robot: Robot) -> dict[str, Path]:
+    """Return the files that go by a name: that of the profile, and those that lie beside it."""
+    own = robot.imperfections_file
+    if own is None:
+        return {}
+    return {robot.name: own} | {path.stem: path for path in sorted(own.parent.glob("*.toml"))}
+
+
+def _completed(imperfections: Imperfections, motors: int) -> Imperfections:
+    """Return the imperfections with zeros for what is left out of the settling."""
+    settling = imperfections.settling
+    if settling is None:
+        return imperfections
+    zero = (0.0,) * motors
+    whole = replace(
+        settling,
+        bias=settling.bias or zero,
+        compliance=settling.compliance or zero,
+        friction=settling.friction or zero,
+        scatter=settling.scatter or zero,
+    )
+    return replace(imperfections, settling=whole)
 
 
 def _check_robot(calibration: object, robot: Robot, path: Path) -> None:
@@ -209,7 +284,7 @@ def _check_robot(calibration: object, robot: Robot, path: Path) -> None:
 def _check_fit(imperfections: Imperfections, robot: Robot, path: Path) -> None:
     count = len(robot.motors)
     for name, values in _motor_lists(imperfections).items():
-        if len(values) not in (0, count) or (not values and name.startswith("settling")):
+        if len(values) not in (0, count):
             raise InputError(
                 f"{path}: {name} has {len(values)} values, expected {count}, one for each motor "
                 f"of {robot.name!r}."

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from failuretwin.core.bounds import check_number
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.robot import Robot
 
@@ -27,13 +28,20 @@ class Settling:
         payload: Mass carried at the tool point beside what the URDF knows [kg].
     """
 
-    bias: tuple[float, ...]
-    compliance: tuple[float, ...]
-    friction: tuple[float, ...]
-    scatter: tuple[float, ...]
-    tail_dof: float
-    source: str
+    bias: tuple[float, ...] = ()
+    compliance: tuple[float, ...] = ()
+    friction: tuple[float, ...] = ()
+    scatter: tuple[float, ...] = ()
+    tail_dof: float = np.inf
+    source: str = ""
     payload: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, low in (("bias", -7.0), ("compliance", -1e3), ("friction", -7.0), ("scatter", 0)):
+            for value in getattr(self, name):
+                check_number(f"settling: {name}", value, low=low, high=1e3)
+        check_number("settling: tail_dof", self.tail_dof, low=0.1, high=np.inf)
+        check_number("settling: payload", self.payload)
 
     @classmethod
     def ideal(cls, motors: int) -> Settling:
