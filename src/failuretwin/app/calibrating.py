@@ -13,7 +13,7 @@ from failuretwin.connection.calibration.calibration import Calibration, LeftOut
 from failuretwin.connection.calibration.learn import SUSPECT, calibrate
 from failuretwin.connection.calibration.observations import session_names
 from failuretwin.core.errors import InputError
-from failuretwin.core.runs import truth_of
+from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.suspicion import suspicion
 from failuretwin.digital_model.robot import Robot
@@ -50,6 +50,7 @@ def learn_robot(
     Raises:
         InputError: If the logs are labelled faulty or look so, or too few movements are left.
     """
+    check_motors(runs, robot.name, robot.motor_names)
     runs, labelled = _without_faulty_labels(runs)
     inside = _held_out_runs(runs, hold_out)
     learning = runs.isel(run=np.flatnonzero(~inside))

@@ -86,6 +86,14 @@ def _counted(count: int, whole_run: bool, motor: str, reason: str) -> str:
     return f"{count} {what}: {motor} {reason}" if motor else f"{count} {what}: {reason}"
 
 
+def beats_uncalibrated(found: Calibration) -> bool:
+    """Return False if unseen sessions say that the calibration is no better than none."""
+    if not found.held_out:
+        return True
+    gain, error = mean_gain(found.held_out)
+    return gain - error > 0.0
+
+
 def verdict_line(found: Calibration) -> str:
     """Return whether the fit beats the uncalibrated twin on sessions that it has not seen."""
     if not found.held_out:
@@ -95,7 +103,7 @@ def verdict_line(found: Calibration) -> str:
         )
     gain, error = mean_gain(found.held_out)
     told = f"{gain:+.2f} nats a movement (95 % interval {gain - error:+.2f} to {gain + error:+.2f})"
-    if gain - error > 0.0:
+    if beats_uncalibrated(found):
         return f"on unseen sessions the calibrated twin beats the uncalibrated one: {told}"
     return (
         f"on unseen sessions the calibration does NOT beat the uncalibrated twin: {told}. Do not "

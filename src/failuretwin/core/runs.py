@@ -159,6 +159,16 @@ def check_runs(runs: xr.Dataset, where: str) -> xr.Dataset:
     return runs
 
 
+def check_motors(runs: xr.Dataset, robot: str, names: Sequence[str]) -> None:
+    """Raise InputError unless the runs are of a robot with these motors."""
+    motors = [str(name) for name in runs["motor"].values]
+    if motors != list(names):
+        raise InputError(
+            f"the run set has motors {', '.join(motors)}; robot {robot!r} has "
+            f"{', '.join(names)}. Name the right robot (--robot)."
+        )
+
+
 def _check_variables(runs: xr.Dataset, where: str) -> None:
     for name in REQUIRED:
         if name not in runs:

@@ -14,7 +14,7 @@ from failuretwin.core.diagnosis import Diagnosis, MovementEvidence
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
 from failuretwin.core.quadrature import log_sum
-from failuretwin.core.runs import check_runs, truth_of
+from failuretwin.core.runs import check_motors, check_runs, truth_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.data_knowledge.knowledge import prior_odds
 from failuretwin.data_knowledge.log_quality import LogQuality, log_quality, without_spoilt
@@ -170,12 +170,7 @@ class BayesDiagnoser:
 
     def _check(self, runs: xr.Dataset) -> None:
         check_runs(runs, "the run set")
-        motors = [str(name) for name in runs["motor"].values]
-        if motors != self.twin.robot.motor_names:
-            raise InputError(
-                f"the run set has motors {', '.join(motors)}; robot {self.twin.robot.name!r} has "
-                f"{', '.join(self.twin.robot.motor_names)}. Name the right robot (--robot)."
-            )
+        check_motors(runs, self.twin.robot.name, self.twin.robot.motor_names)
 
     def _weigh_all(self, evidence: SettledEvidence) -> _Weighed:
         model = self.healthy_model

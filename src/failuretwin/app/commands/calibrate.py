@@ -43,7 +43,7 @@ def calibrate(
     """
     del seed  # nothing here depends on chance
     from failuretwin.app.calibrating import learn_robot
-    from failuretwin.app.calibration_tables import print_calibration
+    from failuretwin.app.calibration_tables import beats_uncalibrated, print_calibration
     from failuretwin.app.inputs import read_inputs
     from failuretwin.app.step_inputs import learn_loops, split_step_tests, with_step_tests
     from failuretwin.connection.calibration.calibration_file import (
@@ -68,4 +68,6 @@ def calibrate(
             write_calibration_page(found, judged, model, folder)
     save_calibration(found, model, out)
     print_calibration(found, model)
-    click.echo(f"written to {out}; use it with `failuretwin diagnose --calibration {out}`")
+    click.echo(f"written to {out}")
+    if beats_uncalibrated(found):
+        click.echo(f"use it with `failuretwin diagnose --calibration {out}`")

@@ -125,11 +125,11 @@ def calibrate(
         ),
         sessions=part.observations.sessions,
         runs=int(trusted.sum()),
-        movements=int(np.sum(~part.odd)),
+        movements=int(np.sum(part.fitted)),
         used_readings=part.observations.position is not None,
         left_out=(*left_out, *part.left_out(robot)),
         held_out=_held_out(part, robot, judged) if thorough else (),
-        remarks=tuple(remarks),
+        remarks=(*remarks, *part.remarks()),
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from failuretwin.connection.calibration.calibration import Parameter
 from failuretwin.connection.calibration.rates import LossRates, Rate
 from failuretwin.connection.calibration.settled_fit import SettledFit, largest_load
-from failuretwin.connection.calibration.timing_fit import TimingFit
+from failuretwin.connection.calibration.timing_fit import BOUNDS, TimingFit
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.robot import Robot
 
@@ -19,6 +19,8 @@ LEARNED = 0.3
 """A parameter is identified if the logs bring its deviation below this share of the prior's."""
 LOAD_FLOOR_NM = 1e-6
 DRAWS = 400
+DELAY_BOUNDS = BOUNDS[0]
+"""Where a delay that the logs do not tell may lie [s]."""
 FEW_TOGETHER = 3
 """A set of motors seen to lose commands together fewer times than this says little of how often."""
 
@@ -59,7 +61,7 @@ def timing_parameters(fit: TimingFit | None, rng: np.random.Generator) -> list[P
     """Return mean and spread of delay and shortening over runs, and the lag."""
     if fit is None:
         note = "fewer than three runs show ramps that begin on time at a known place"
-        return [Parameter("delay", "", "s", 0.0, 0.0, 0.0, False, note)]
+        return [Parameter("delay", "", "s", 0.0, *DELAY_BOUNDS, False, note)]
     low, high = fit.lag_interval
     return [
         _mean("delay, mean over runs", "s", fit.delay, rng),

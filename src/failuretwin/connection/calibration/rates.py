@@ -12,6 +12,8 @@ from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.imperfections import LostCommand, Range
 
 LEVEL = (0.025, 0.975)
+PRIOR_MOVEMENTS = 2.0
+"""Late movements that the rate of the punctual ones is worth."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +60,13 @@ class LossRates:
     late: Rate
 
     def entry(self) -> LostCommand:
-        """Return it as a value of the digital model."""
-        return LostCommand(self.motors, self.punctual.mean, self.late.mean)
+        """Return it as a value of the digital model.
+
+        Where few movements were late, the punctual ones say what they can.
+        """
+        punctual = self.punctual.mean if self.punctual.trials else 0.0
+        late = (self.late.hits + PRIOR_MOVEMENTS * punctual) / (self.late.trials + PRIOR_MOVEMENTS)
+        return LostCommand(self.motors, punctual, late)
 
 
 def loss_rates(

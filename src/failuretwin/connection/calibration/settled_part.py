@@ -36,6 +36,7 @@ class SettledPart:
         observations: All settled movements.
         lost: Motors that did not get their command, (movement, motor).
         odd: Movements that look like no healthy ones, (movement,).
+        fitted: Movements that the fit is to: not odd, and after one that was seen, (movement,).
         fit: Where motors settle.
         payload: Mass at the tool point that the fit knows of [kg].
     """
@@ -43,6 +44,7 @@ class SettledPart:
     observations: Observations
     lost: BoolArray
     odd: BoolArray
+    fitted: BoolArray
     fit: SettledFit
     payload: float = 0.0
 
@@ -50,6 +52,16 @@ class SettledPart:
     def settling(self) -> Settling:
         """Where motors settle, payload included."""
         return replace(self.fit.settling("fit"), payload=self.payload)
+
+    def remarks(self) -> list[str]:
+        """Return what else did not count, a sentence each."""
+        unseen = int(np.sum(~self.odd & ~self.fitted))
+        if unseen == 0:
+            return []
+        return [
+            f"{unseen} movements follow one that was not seen at rest, so where their motors came "
+            "from is not known: they count for losses alone"
+        ]
 
     def left_out(self, robot: Robot) -> tuple[LeftOut, ...]:
         """Return the movements that did not count, each with its reason."""
@@ -92,7 +104,7 @@ def fit_settled_part(observations: Observations, robot: Robot, payload: float = 
         observations = obeyed(commanded, lost)
         arrived = (~lost[kept]).astype(np.float64)
         fit = fit_settling(observations[kept], robot, arrived, payload)
-        part = SettledPart(observations, lost, odd, fit, payload)
+        part = SettledPart(observations, lost, odd, kept, fit, payload)
         settling = part.settling
     return part
 

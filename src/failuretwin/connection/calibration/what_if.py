@@ -13,6 +13,8 @@ from failuretwin.digital_model.robot import Robot
 
 SURE_NATS = 5.0
 """Log odds from which one description of the robot is told to be better than another."""
+LEAST_SAG_RAD = 1e-3
+"""Sag below which nothing is said of a payload [rad]: a quarter of a servo count."""
 PAYLOADS_KG = (0.02, 0.1, 0.5, 2.0)
 """Masses at the tool point that are tried [kg]."""
 
@@ -73,6 +75,9 @@ def best_payload(part: SettledPart, robot: Robot) -> tuple[float, str]:
 
     Compliance can take up most of what a payload does, so it is 0 unless the logs are sure.
     """
+    sag = np.abs(np.asarray(part.settling.compliance) * largest_load(robot, 0.0))
+    if sag.max() < LEAST_SAG_RAD:
+        return 0.0, "payload: the motors do not give way, so none can be told"
     gain = np.array([_refit(part, robot, kg) for kg in PAYLOADS_KG]) - part.fit.log_posterior
     best = int(np.argmax(gain))
     if gain[best] > SURE_NATS:
@@ -87,6 +92,5 @@ def best_payload(part: SettledPart, robot: Robot) -> tuple[float, str]:
 
 def _refit(part: SettledPart, robot: Robot, payload: float) -> float:
     """Return the log posterior of another description on the very same movements."""
-    kept = ~part.odd
-    arrived = (~part.lost[kept]).astype(np.float64)
-    return fit_settling(part.observations[kept], robot, arrived, payload).log_posterior
+    arrived = (~part.lost[part.fitted]).astype(np.float64)
+    return fit_settling(part.observations[part.fitted], robot, arrived, payload).log_posterior
