@@ -64,13 +64,11 @@ class Workforce:
                 or cannot run the work.
             FailureTwinError: If workers keep dying.
         """
-        items = list(items)
-        workers = min(self.workers, max(len(items), 1))  # more would have nothing to do
-        if workers == 1 and self.scheduler is None:
+        if self.workers == 1 and self.scheduler is None:
             yield ((item, work(item)) for item in items)
             return
         with (
-            dask_client(workers, self.scheduler) as client,
+            dask_client(self.workers, self.scheduler) as client,
             closing(_spread(client, work, items)) as results,
         ):
             yield results
