@@ -143,7 +143,9 @@ def test_it_takes_a_calibration_of_ones_own(failuretwin, few, listing, tmp_path)
 
 def test_a_history_of_another_calibration_is_refused(track, calibration, few):
     track(few)
-    calibration.write_text(calibration.read_text().replace("0.001772", "0.002"))
+    text = calibration.read_text()
+    calibration.write_text(text.replace("tail_dof = ", "tail_dof = 1", 1))
+    assert calibration.read_text() != text
     answer = track(few)
     assert answer.returncode == 2
     assert "history of another calibration" in answer.stderr
