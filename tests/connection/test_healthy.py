@@ -9,11 +9,12 @@ from hypothesis import strategies as st
 from scipy import integrate, stats
 
 from failuretwin import BayesDiagnoser
-from failuretwin.connection.healthy import OUTLIER_RATE, PATH_NOISE_M, HealthyModel, log_student
+from failuretwin.connection.healthy import OUTLIER_RATE, PATH_NOISE_M, HealthyModel
+from failuretwin.core.ellipsoid import log_student
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision.bayes import priors_of
+from failuretwin.decision.priors import priors_of
 from failuretwin.digital_model.imperfections import Imperfections, LostCommand, Timing, Variation
 from failuretwin.digital_model.settling import Settling
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import gammaln
 
+from failuretwin.core.ellipsoid import log_student
 from failuretwin.core.movements import Movements
-from failuretwin.core.quadrature import log_of, log_sum
+from failuretwin.core.quadrature import log_of
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
 from failuretwin.digital_model.engine import SAG_ROUNDS
@@ -104,10 +104,14 @@ class HealthyModel:
     @cached_property
     def outlier_log_density(self) -> float:
         """Log of the outlier rate times the density of "anywhere within reach" [1/m3]."""
+        return float(np.log(OUTLIER_RATE) - np.log(4.0 / 3.0 * np.pi * self.reach**3))
+
+    @cached_property
+    def reach(self) -> float:
+        """How far the tool can be from the base at most [m]: the links laid end to end."""
         chain = self.twin.robot.chain
-        reach = sum(np.linalg.norm(joint.T_pj[:3, 3]) for joint in chain.joints)
-        reach += np.linalg.norm(chain.T_jt[:3, 3])
-        return float(np.log(OUTLIER_RATE) - np.log(4.0 / 3.0 * np.pi * reach**3))
+        links = sum(float(np.linalg.norm(joint.T_pj[:3, 3])) for joint in chain.joints)
+        return links + float(np.linalg.norm(chain.T_jt[:3, 3]))
 
     def alternatives(self, movements: Movements) -> Alternatives:
         """Return what may become of each movement; the first is that every command arrives.
@@ -179,69 +183,21 @@ class HealthyModel:
             near = base + np.where(held, 0.0, offset)
         return near
 
-    def log_density(
-        self,
-        evidence: SettledEvidence,
-        alternatives: Alternatives,
-        pose: FloatArray,
-        held: BoolArray,
-    ) -> FloatArray:
-        """Return the log density of each settled position, whatever became of the commands.
+    def log_terms(self, evidence: SettledEvidence, alternatives: Alternatives) -> FloatArray:
+        """Return log weight times density of each alternative if no motor is faulty.
 
         Args:
             evidence: Settled positions.
-            alternatives: What may become of each movement.
-            pose: Predicted settled angles, (run, movement, node, alternative, motor) [rad], for
-                as many nodes of some unknown as are wanted.
-            held: Motors that do not scatter, (motor,).
+            alternatives: What may have become of each movement.
 
         Returns:
-            (run, movement, node) [log 1/m3]; 0 for movements that are not usable.
+            (run, movement, alternative) [log 1/m3].
         """
-        _, mixed = self._weighed(evidence, alternatives, pose, held)
-        return np.where(evidence.usable[..., None], mixed, 0.0)
-
-    def became(
-        self,
-        evidence: SettledEvidence,
-        alternatives: Alternatives,
-        pose: FloatArray,
-        held: BoolArray,
-    ) -> FloatArray:
-        """Return the probability of each alternative, (run, movement, alternative).
-
-        Args:
-            evidence: Settled positions.
-            alternatives: What may become of each movement.
-            pose: Predicted settled angles, (run, movement, alternative, motor) [rad].
-            held: Motors that do not scatter, (motor,).
-        """
-        weighed, mixed = self._weighed(evidence, alternatives, pose[:, :, None], held)
-        share = np.exp(weighed - mixed[..., None])[:, :, 0]
-        return np.where(evidence.usable[..., None], share, 0.0)
-
-    def _weighed(
-        self,
-        evidence: SettledEvidence,
-        alternatives: Alternatives,
-        pose: FloatArray,
-        held: BoolArray,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return log weight times density of each alternative, and of all with outliers.
-
-        (run, movement, node, alternative) and (run, movement, node).
-        """
-        predicted, jacobian = self.twin.path_and_jacobian(pose)
-        scaled = jacobian * np.where(held, 0.0, self.scatter)
-        error = evidence.point[:, :, None, None] - predicted
-        density = log_student(error, scaled, self.path_noise**2, self.settling.tail_dof)
-        weighed = density + alternatives.log_weight[:, :, None]
-        return weighed, np.logaddexp(log_sum(weighed, axis=-1), self.outlier_log_density)
-
-    def log_healthy(self, evidence: SettledEvidence, alternatives: Alternatives) -> FloatArray:
-        """Return the log density of each position if no motor is faulty, (run, movement)."""
         pose = self.settle(alternatives.base, alternatives.direction, self.none_held)
-        return self.log_density(evidence, alternatives, pose[:, :, None], self.none_held)[..., 0]
+        predicted, jacobian = self.twin.path_and_jacobian(pose)
+        error = evidence.point[:, :, None] - predicted
+        scaled, noise = jacobian * self.scatter, self.path_noise**2
+        return alternatives.log_weight + log_student(error, scaled, noise, self.settling.tail_dof)
 
 
 def _covers(lost: BoolArray) -> FloatArray:
@@ -270,33 +226,3 @@ def _before(values: FloatArray) -> FloatArray:
 def _spread(deviation: tuple[float, ...]) -> FloatArray:
     """Return standard deviations as an array that fits any number of motors; none are zero."""
     return np.asarray(deviation or 0.0)
-
-
-def log_student(
-    error: FloatArray, scaled_jacobian: FloatArray, noise: float, dof: float
-) -> FloatArray:
-    """Return log densities of a 3-variate Student t distribution with S = A A^T + noise I.
-
-    Args:
-        error: Deviations, (..., 3).
-        scaled_jacobian: A, the Jacobian times the scale of each motor, (..., 3, motor).
-        noise: Variance added on each axis.
-        dof: Degrees of freedom; infinite: normal.
-
-    Returns:
-        (...).
-    """
-    ax, ay, az = (scaled_jacobian[..., axis, :] for axis in range(3))
-    dot = "...i,...i->..."
-    xx, yy, zz = (np.einsum(dot, a, a) + noise for a in (ax, ay, az))
-    xy, xz, yz = np.einsum(dot, ax, ay), np.einsum(dot, ax, az), np.einsum(dot, ay, az)
-    cxx, cyy, czz = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
-    cxy, cxz, cyz = xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz
-    det = xx * cxx + xy * cxy + xz * cxz
-    x, y, z = error[..., 0], error[..., 1], error[..., 2]
-    square = cxx * x * x + cyy * y * y + czz * z * z
-    square = (square + 2.0 * (cxy * x * y + cxz * x * z + cyz * y * z)) / det
-    if np.isinf(dof):
-        return -0.5 * (3.0 * np.log(2.0 * np.pi) + np.log(det) + square)
-    constant = gammaln((dof + 3.0) / 2.0) - gammaln(dof / 2.0) - 1.5 * np.log(dof * np.pi)
-    return constant - 0.5 * np.log(det) - 0.5 * (dof + 3.0) * np.log1p(square / dof)

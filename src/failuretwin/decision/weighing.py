@@ -1,0 +1,102 @@
+"""From a hypothesis to what runs say of it: the one place that knows the law of each mode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Fault, Hypothesis
+from failuretwin.core.types import FloatArray
+from failuretwin.data_knowledge.knowledge import prior_odds
+from failuretwin.decision.law import Law, Scene, Weight, weigh
+from failuretwin.decision.laws.lasting import AMOUNTS, drift_law, lasting_law
+from failuretwin.decision.laws.stays import MISSES, weigh_misses
+from failuretwin.decision.laws.steady_state_error import error_law
+from failuretwin.decision.laws.stuck import stuck_law
+from failuretwin.decision.laws.unknown import weigh_unknown
+from failuretwin.decision.pairs import weigh_pair
+from failuretwin.decision.priors import Priors
+
+UNKNOWN_ODDS = 0.05
+"""Odds of `unknown` against healthy: assumed; rare, as the table of failure modes is long."""
+UNKNOWN_BEFORE_RUN = 0.9
+"""Probability that an unknown fault was there before the run; as for most known ones."""
+MOST_FAULTS = 2
+"""Faults that can be weighed at once."""
+
+
+def _lasting(mode: str) -> Callable[[Scene, int, Priors], Law]:
+    return lambda scene, motor, priors: lasting_law(
+        scene, motor, mode, priors.onset.before_run(mode)
+    )
+
+
+LAWS: Mapping[str, Callable[[Scene, int, Priors], Law]] = {
+    "stuck": lambda scene, motor, priors: stuck_law(scene, motor, priors.onset),
+    "steady_state_error": lambda scene, motor, priors: error_law(
+        scene, motor, priors.error_ranges, priors.onset.before_run("steady_state_error")
+    ),
+    "drift": lambda scene, motor, priors: drift_law(scene, motor, priors.onset.before_run("drift")),
+    **{mode: _lasting(mode) for mode in AMOUNTS},
+}
+"""Law of each mode that makes a motor settle beside its target."""
+WEIGHABLE = (*LAWS, *MISSES)
+"""Modes that can be weighed."""
+
+
+def check_weighable(hypothesis: Hypothesis) -> None:
+    """Refuse a hypothesis that cannot be weighed.
+
+    Raises:
+        InputError: If a mode cannot be weighed, or not together with another.
+    """
+    if len(hypothesis.faults) > MOST_FAULTS:
+        raise InputError(
+            f"hypothesis '{hypothesis}' has {len(hypothesis.faults)} faults. Expected "
+            f"{MOST_FAULTS} at most."
+        )
+    known = WEIGHABLE if len(hypothesis.faults) == 1 else tuple(LAWS)
+    for fault in hypothesis.faults:
+        if fault.mode not in known:
+            raise InputError(
+                f"fault mode {fault.mode!r} cannot be weighed in '{hypothesis}'. Expected one of "
+                f"{', '.join(known)}."
+            )
+
+
+def log_prior(hypotheses: Sequence[Hypothesis]) -> FloatArray:
+    """Return the log prior probability of each hypothesis, (hypothesis,)."""
+    odds = np.array([prior_odds(h) if h.known else UNKNOWN_ODDS for h in hypotheses])
+    return np.asarray(np.log(odds / odds.sum()))
+
+
+def weigh_hypothesis(scene: Scene, hypothesis: Hypothesis, priors: Priors) -> Weight:
+    """Return what runs say of one hypothesis."""
+    if not hypothesis.known:
+        return weigh_unknown(scene, UNKNOWN_BEFORE_RUN)
+    if hypothesis.is_healthy:
+        return _weigh_healthy(scene)
+    if len(hypothesis.faults) == 2:
+        scenes = [scene[run] for run in range(len(scene.log_healthy))]
+        one, two = hypothesis.faults
+        laws = [(_law(alone, one, priors), _law(alone, two, priors)) for alone in scenes]
+        return weigh_pair(scenes, laws)
+    fault = hypothesis.faults[0]
+    if fault.mode in MISSES:
+        motor = scene.model.twin.robot.motor_names.index(fault.motor)
+        return weigh_misses(scene, motor, fault.mode, priors.onset.before_run(fault.mode))
+    return weigh(scene, _law(scene, fault, priors))
+
+
+def _law(scene: Scene, fault: Fault, priors: Priors) -> Law:
+    motor = scene.model.twin.robot.motor_names.index(fault.motor)
+    return LAWS[fault.mode](scene, motor, priors)
+
+
+def _weigh_healthy(scene: Scene) -> Weight:
+    """Return what runs say of no motor being faulty."""
+    healthy = scene.log_healthy
+    nothing = np.full((len(healthy), 3), np.nan)
+    return Weight(healthy.sum(axis=1), healthy, nothing, nothing, scene.became)
