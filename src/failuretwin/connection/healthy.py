@@ -7,13 +7,13 @@ from functools import cached_property
 
 import numpy as np
 
-from failuretwin.core.ellipsoid import log_student
+from failuretwin.core.ellipsoid import Ellipsoid, log_fall
 from failuretwin.core.movements import Movements
 from failuretwin.core.quadrature import log_of
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
 from failuretwin.digital_model.engine import SAG_ROUNDS
-from failuretwin.digital_model.imperfections import Imperfections
+from failuretwin.digital_model.imperfections import Imperfections, Timing
 from failuretwin.digital_model.settling import Settling, loads_in_range
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -96,6 +96,12 @@ class HealthyModel:
             return PATH_NOISE_M
         return float(np.hypot(readings.noise_m, LEAST_NOISE_M))
 
+    @property
+    def knows_timing(self) -> bool:
+        """Whether it is known how late and how evenly this robot starts to move."""
+        exact = self.imperfections.settling is None
+        return exact or self.imperfections.timing != Timing()
+
     @cached_property
     def none_held(self) -> BoolArray:
         """The mask that holds no motor, (motor,)."""
@@ -122,7 +128,7 @@ class HealthyModel:
         """
         origin, target = np.nan_to_num(movements.origin()), np.nan_to_num(movements.target)
         travel = np.sign(target - origin)
-        lost, rates, again = self._losses(self._late(movements))
+        lost, rates, again = self._losses(self.late(movements))
         twice = self._in_a_row
         weights = [rates * (1.0 - again * twice), (rates * again)[..., twice]]
         older, earlier = _before(origin), _before(travel)
@@ -155,7 +161,7 @@ class HealthyModel:
         most = np.maximum(rates, punctual)[0, 0]
         return np.asarray(most * (most @ _covers(lost).T) > RARE)
 
-    def _late(self, movements: Movements) -> FloatArray:
+    def late(self, movements: Movements) -> FloatArray:
         """Return the probability that each movement started late, (run, movement).
 
         A late start holds up the next command, so the time between commands betrays it; for the
@@ -183,21 +189,48 @@ class HealthyModel:
             near = base + np.where(held, 0.0, offset)
         return near
 
-    def log_terms(self, evidence: SettledEvidence, alternatives: Alternatives) -> FloatArray:
-        """Return log weight times density of each alternative if no motor is faulty.
+    def explain(
+        self, evidence: SettledEvidence, alternatives: Alternatives
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return how well each alternative explains the settled positions, and with which pose.
 
         Args:
             evidence: Settled positions.
             alternatives: What may have become of each movement.
 
         Returns:
-            (run, movement, alternative) [log 1/m3].
+            Log weight times density of each alternative if no motor is faulty,
+            (run, movement, alternative) [log 1/m3], and the pose, scattered so as to meet the
+            position, (run, movement, alternative, motor) [rad].
         """
         pose = self.settle(alternatives.base, alternatives.direction, self.none_held)
         predicted, jacobian = self.twin.path_and_jacobian(pose)
         error = evidence.point[:, :, None] - predicted
-        scaled, noise = jacobian * self.scatter, self.path_noise**2
-        return alternatives.log_weight + log_student(error, scaled, noise, self.settling.tail_dof)
+        spread = Ellipsoid.of(jacobian * self.scatter, self.path_noise**2)
+        dof = self.settling.tail_dof
+        density = spread.log_norm(dof) + log_fall(spread.product(error, error), dof)
+        return (
+            alternatives.log_weight + density,
+            pose + scattered(spread, jacobian, self.scatter, error),
+        )
+
+
+def scattered(
+    spread: Ellipsoid, jacobian: FloatArray, scale: FloatArray, error: FloatArray
+) -> FloatArray:
+    """Return by how much motors scatter, at the most probable, to meet a settled position.
+
+    Args:
+        spread: Covariance of the position, (...).
+        jacobian: Its derivative by the angles, (..., 3, motor) [m/rad].
+        scale: Scatter of each motor, (motor,) [rad].
+        error: Position minus expected position, (..., 3) [m].
+
+    Returns:
+        (..., motor) [rad].
+    """
+    pull = spread.solve(error)
+    return np.asarray(scale**2 * np.einsum("...ak,...a->...k", jacobian, pull))
 
 
 def _covers(lost: BoolArray) -> FloatArray:

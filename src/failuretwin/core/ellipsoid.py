@@ -42,11 +42,17 @@ class Ellipsoid:
 
     def product(self, a: FloatArray, b: FloatArray) -> FloatArray:
         """Return a^T S^-1 b of vectors (..., 3), as (...)."""
+        return np.asarray(np.sum(a * self.solve(b), axis=-1))
+
+    def solve(self, b: FloatArray) -> FloatArray:
+        """Return S^-1 b of vectors (..., 3), as (..., 3)."""
         xx, yy, zz, xy, xz, yz = self.adjugate
-        first = xx * b[..., 0] + xy * b[..., 1] + xz * b[..., 2]
-        second = xy * b[..., 0] + yy * b[..., 1] + yz * b[..., 2]
-        third = xz * b[..., 0] + yz * b[..., 1] + zz * b[..., 2]
-        return (a[..., 0] * first + a[..., 1] * second + a[..., 2] * third) / self.determinant
+        rows = (
+            xx * b[..., 0] + xy * b[..., 1] + xz * b[..., 2],
+            xy * b[..., 0] + yy * b[..., 1] + yz * b[..., 2],
+            xz * b[..., 0] + yz * b[..., 1] + zz * b[..., 2],
+        )
+        return np.stack(rows, axis=-1) / self.determinant[..., None]
 
     def log_norm(self, dof: float) -> FloatArray:
         """Return the log density at the centre of a Student t with this scale matrix, (...)."""

@@ -10,11 +10,12 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Fault, Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.knowledge import prior_odds
-from failuretwin.decision.law import Law, Scene, Weight, weigh
+from failuretwin.decision.law import Estimate, Law, Scene, Weight, weigh
 from failuretwin.decision.laws.lasting import AMOUNTS, drift_law, lasting_law
 from failuretwin.decision.laws.stays import MISSES, weigh_misses
 from failuretwin.decision.laws.steady_state_error import error_law
 from failuretwin.decision.laws.stuck import stuck_law
+from failuretwin.decision.laws.timed import lag_law, slow_law
 from failuretwin.decision.laws.unknown import weigh_unknown
 from failuretwin.decision.pairs import weigh_pair
 from failuretwin.decision.priors import Priors
@@ -42,7 +43,9 @@ LAWS: Mapping[str, Callable[[Scene, int, Priors], Law]] = {
     **{mode: _lasting(mode) for mode in AMOUNTS},
 }
 """Law of each mode that makes a motor settle beside its target."""
-WEIGHABLE = (*LAWS, *MISSES)
+TIMED: Mapping[str, Callable[[Scene, int, float], Law]] = {"lag": lag_law, "slow": slow_law}
+"""Law of each mode that shows on the way."""
+WEIGHABLE = (*LAWS, *TIMED, *MISSES)
 """Modes that can be weighed."""
 
 
@@ -84,19 +87,28 @@ def weigh_hypothesis(scene: Scene, hypothesis: Hypothesis, priors: Priors) -> We
         laws = [(_law(alone, one, priors), _law(alone, two, priors)) for alone in scenes]
         return weigh_pair(scenes, laws)
     fault = hypothesis.faults[0]
+    motor, early = _motor(scene, fault), priors.onset.before_run(fault.mode)
     if fault.mode in MISSES:
-        motor = scene.model.twin.robot.motor_names.index(fault.motor)
-        return weigh_misses(scene, motor, fault.mode, priors.onset.before_run(fault.mode))
+        return weigh_misses(scene, motor, fault.mode, early)
+    if fault.mode in TIMED:
+        return weigh(scene, TIMED[fault.mode](scene, motor, early))
     return weigh(scene, _law(scene, fault, priors))
 
 
+def _motor(scene: Scene, fault: Fault) -> int:
+    return scene.model.twin.robot.motor_names.index(fault.motor)
+
+
 def _law(scene: Scene, fault: Fault, priors: Priors) -> Law:
-    motor = scene.model.twin.robot.motor_names.index(fault.motor)
-    return LAWS[fault.mode](scene, motor, priors)
+    return LAWS[fault.mode](scene, _motor(scene, fault), priors)
 
 
 def _weigh_healthy(scene: Scene) -> Weight:
     """Return what runs say of no motor being faulty."""
-    healthy = scene.log_healthy
-    nothing = np.full((len(healthy), 3), np.nan)
-    return Weight(healthy.sum(axis=1), healthy, nothing, nothing, scene.became)
+    by_movement = scene.log_healthy + scene.on_way
+    nothing = np.full(3, np.nan)
+
+    def estimate(run: int) -> Estimate:
+        return Estimate(nothing, nothing, scene.became[run])
+
+    return Weight(by_movement.sum(axis=1), by_movement, scene.log_healthy, estimate)

@@ -44,18 +44,24 @@ def stuck_law(scene: Scene, motor: int, prior: OnsetPrior) -> Law:
     angle = _angle_nodes(scene, motor, prior)
     parts = _log_prior(scene, motor, angle, prior)  # (run, movement, plateau | ramp, node)
     log_prior = log_sum(parts, axis=2)
-    onset, share = _onsets(evidence, motor, angle, prior.known_s)
-    of_part = np.exp(parts - np.where(np.isfinite(log_prior), log_prior, 0.0)[:, :, None])
-    plateau = np.repeat(of_part[:, :, 0, :, None], len(SHARES), axis=-1)
-    ramp = np.repeat(of_part[:, :, 1, :, None], len(LAG_SPREAD_S), axis=-1)
+
+    def of_run(run: int) -> tuple[FloatArray, FloatArray]:
+        one = evidence[run : run + 1]
+        onset, share = _onsets(one, motor, angle[run : run + 1], prior.known_s)
+        whole = np.where(np.isfinite(log_prior[run]), log_prior[run], 0.0)
+        of_part = np.exp(parts[run] - whole[:, None])
+        plateau = np.repeat(of_part[:, 0, :, None], len(SHARES), axis=-1)
+        ramp = np.repeat(of_part[:, 1, :, None], len(LAG_SPREAD_S), axis=-1)
+        share = share[0] * np.nan_to_num(np.concatenate([plateau, ramp], axis=-1))
+        return onset[0], share
+
     return Law(
         motor=motor,
         held=True,
         angle=angle[:, None, :, None],
         log_prior=log_prior,
         size=angle,
-        onset=onset,
-        onset_share=share * np.concatenate([plateau, ramp], axis=-1),
+        onsets=of_run,
     )
 
 

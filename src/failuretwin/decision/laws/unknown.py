@@ -11,7 +11,7 @@ import numpy as np
 from failuretwin.core.ellipsoid import log_fall, log_norm
 from failuretwin.core.quadrature import log_of, weighted_quantiles
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.law import LEVELS, Scene, Weight, posterior_of
+from failuretwin.decision.law import LEVELS, Estimate, Scene, Weight, posterior_of
 from failuretwin.decision.onsets import at_movement_starts
 
 SCALES = (0.03, 0.1, 0.3)
@@ -42,18 +42,25 @@ def weigh_unknown(scene: Scene, early: float) -> Weight:
     density = np.where(scene.usable[..., None], density, 0.0)
     stretches = at_movement_starts(scene.evidence.movements)
     log_first = log_of(stretches.weights(early))[..., None] - np.log(len(SCALES))
-    found = posterior_of(scene.log_healthy, density, np.repeat(log_first, len(SCALES), axis=2))
-    return Weight(
-        log_evidence=found.log_evidence,
-        by_movement=found.by_movement,
-        onset=_onset(stretches.samples(early), np.exp(found.log_share).sum(axis=2)),
-        size=np.full((len(square), 3), np.nan),
-        became=scene.became,
-    )
+    log_first = np.repeat(log_first, len(SCALES), axis=2)
+    on_way = (scene.on_way, _on_way(scene)[..., None])
+    found = posterior_of(scene.log_healthy, density, log_first, on_way)
+
+    def estimate(run: int) -> Estimate:
+        onset, part = stretches.samples(early, run)
+        when = np.exp(found.log_share[run]).sum(axis=1)[:, None] * part
+        return Estimate(
+            onset=weighted_quantiles(onset.ravel(), when.ravel(), LEVELS),
+            size=np.full(3, np.nan),
+            became=scene.became[run],
+        )
+
+    return Weight(found.log_evidence, found.by_movement, found.settled, estimate)
 
 
-def _onset(samples: tuple[FloatArray, FloatArray], share: FloatArray) -> FloatArray:
-    """Return quantiles of the onset, (run, 3) [s]."""
-    onset, part = samples
-    weight = (share[..., None] * part).reshape(len(share), -1)
-    return weighted_quantiles(onset.reshape(len(share), -1), weight, LEVELS)
+def _on_way(scene: Scene) -> FloatArray:
+    """Return the log density of the readings on the way, (run, movement)."""
+    if scene.transients is None:
+        return scene.on_way
+    astray = scene.transients.astray
+    return np.logaddexp(np.log(SOUND) + scene.on_way, np.log1p(-SOUND) + astray)
