@@ -128,21 +128,29 @@ class HealthyModel:
         """
         origin, target = np.nan_to_num(movements.origin()), np.nan_to_num(movements.target)
         travel = np.sign(target - origin)
-        lost, rates, again = self._losses(self.late(movements))
-        twice = self._in_a_row
-        weights = [rates * (1.0 - again * twice), (rates * again)[..., twice]]
-        older, earlier = _before(origin), _before(travel)
+        lost, rates = self._losses(self.late(movements))
+        again = self._in_a_row
+        before = _before(rates)
+        # Chance that of the motors that miss a command now, these had missed the one before too.
+        chances = [before @ _meets(lost, lost[now], had) for now, had in again]
+        twice = [rates[..., now] * chance for (now, _), chance in zip(again, chances, strict=True)]
+        single = rates.copy()
+        for (now, _), weight in zip(again, twice, strict=True):
+            single[..., now] -= weight
+        missing = np.array([*lost, *(lost[now] for now, _ in again)])
+        had = np.array([*np.zeros_like(lost), *(had for _, had in again)])
+        weights = np.stack([*np.moveaxis(single, -1, 0), *twice], axis=-1)
         return Alternatives(
-            lost=np.concatenate([lost, lost[twice]]),
-            base=_choose(target, (lost, origin), (lost[twice], older)),
-            direction=_choose(travel, (lost, earlier), (lost[twice], _before(earlier))),
-            log_weight=log_of(np.concatenate(weights, axis=2) * (1.0 - OUTLIER_RATE)),
+            lost=missing,
+            base=_choose(target, (missing, origin), (had, _before(origin))),
+            direction=_choose(travel, (missing, _before(travel)), (had, _before(_before(travel)))),
+            log_weight=log_of(weights * (1.0 - OUTLIER_RATE)),
         )
 
-    def _losses(self, late: FloatArray) -> tuple[BoolArray, FloatArray, FloatArray]:
-        """Return which motors each alternative loses, how probable it is, and that they had before.
+    def _losses(self, late: FloatArray) -> tuple[BoolArray, FloatArray]:
+        """Return which motors each alternative loses, and how probable it is.
 
-        (alternative, motor), and twice (run, movement, alternative). The first loses none.
+        (alternative, motor), and (run, movement, alternative). The first loses none.
         """
         robot, entries = self.twin.robot, self.imperfections.lost_commands
         lost = np.zeros((1 + len(entries), len(robot.motors)), dtype=bool)
@@ -151,15 +159,19 @@ class HealthyModel:
             lost[i, [robot.motor_names.index(motor) for motor in entry.motors]] = True
             rates[..., i] = entry.rate + (entry.rate_when_late - entry.rate) * late
         rates[..., 0] = 1.0 - rates.sum(axis=-1)
-        return lost, rates, _before(rates @ _covers(lost).T)
+        return lost, rates
 
     @cached_property
-    def _in_a_row(self) -> BoolArray:
-        """Alternatives whose motors may well miss two commands in a row, (alternative,)."""
-        lost, rates, _ = self._losses(np.ones((1, 1)))
-        _, punctual, _ = self._losses(np.zeros((1, 1)))
-        most = np.maximum(rates, punctual)[0, 0]
-        return np.asarray(most * (most @ _covers(lost).T) > RARE)
+    def _in_a_row(self) -> list[tuple[int, BoolArray]]:
+        """Losses that may well follow on another: which one, and who had missed two, (motor,)."""
+        lost, rates = self._losses(np.array([[0.0, 1.0]]))
+        most = rates[0].max(axis=0)
+        found = []
+        for now in range(1, len(lost)):
+            for had in np.unique(lost[1:] & lost[now], axis=0):
+                if had.any() and most[now] * (most @ _meets(lost, lost[now], had)) > RARE:
+                    found.append((now, had))
+        return found
 
     def late(self, movements: Movements) -> FloatArray:
         """Return the probability that each movement started late, (run, movement).
@@ -233,11 +245,9 @@ def scattered(
     return np.asarray(scale**2 * np.einsum("...ak,...a->...k", jacobian, pull))
 
 
-def _covers(lost: BoolArray) -> FloatArray:
-    """Return 1 where the motors of one alternative are among those of another, (one, other)."""
-    covers = np.array([[np.all(other >= one) for other in lost] for one in lost], dtype=float)
-    covers[0] = 0.0  # the first loses none
-    return covers
+def _meets(lost: BoolArray, now: BoolArray, had: BoolArray) -> FloatArray:
+    """Return 1 for the losses that hit exactly `had` of the motors `now`, (alternative,)."""
+    return np.asarray((lost & now == had).all(axis=1), dtype=np.float64)
 
 
 def _choose(arrived: FloatArray, *missed: tuple[BoolArray, FloatArray]) -> FloatArray:
@@ -245,10 +255,13 @@ def _choose(arrived: FloatArray, *missed: tuple[BoolArray, FloatArray]) -> Float
 
     Args:
         arrived: Value of a motor that got its command, (run, movement, motor).
-        missed: Motors that did not, (alternative, motor), and their value, (run, movement, motor).
+        missed: Motors that did not, (alternative, motor), and their value, (run, movement, motor);
+            the last that names a motor counts.
     """
-    chosen = [np.where(mask, value[:, :, None], arrived[:, :, None]) for mask, value in missed]
-    return np.concatenate(chosen, axis=2)
+    chosen = arrived[:, :, None]
+    for mask, value in missed:
+        chosen = np.where(mask, value[:, :, None], chosen)
+    return np.asarray(chosen)
 
 
 def _before(values: FloatArray) -> FloatArray:

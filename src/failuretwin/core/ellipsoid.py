@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import lgamma, log, pi
 
 import numpy as np
-from scipy.special import gammaln
 
 from failuretwin.core.types import FloatArray
 
@@ -66,8 +66,8 @@ def log_norm(dof: float) -> float:
         dof: Degrees of freedom; infinite: normal.
     """
     if np.isinf(dof):
-        return float(-1.5 * np.log(2.0 * np.pi))
-    return float(gammaln((dof + 3.0) / 2.0) - gammaln(dof / 2.0) - 1.5 * np.log(dof * np.pi))
+        return -1.5 * log(2.0 * pi)
+    return lgamma((dof + 3.0) / 2.0) - lgamma(dof / 2.0) - 1.5 * log(dof * pi)
 
 
 def log_fall(square: FloatArray, dof: float) -> FloatArray:

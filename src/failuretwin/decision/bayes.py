@@ -146,6 +146,7 @@ class BayesDiagnoser:
         )
         # Without a verdict nothing is learnt: the prior stands.
         posterior = np.exp(log_prior(self._hypotheses) if undecided else weighed.log_posterior[run])
+        used = "settled poses" if weighed.scene.moving is None else "whole run"
         diagnosis = Diagnosis(
             run=name,
             truth=truth,
@@ -153,7 +154,7 @@ class BayesDiagnoser:
             quality=(*quality.remarks, *unused_movements(evidence, run)),
             undecided=undecided,
             protocol=imperfections.protocol,
-            method=f"bayes, settled poses; healthy behaviour: {imperfections.name}",
+            method=f"bayes, {used}; healthy behaviour: {imperfections.name}",
         )
         losses: list[str] = []
         if not undecided:
