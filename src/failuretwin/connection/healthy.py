@@ -103,6 +103,21 @@ class HealthyModel:
         return exact or self.imperfections.timing != Timing()
 
     @cached_property
+    def lag_s(self) -> float:
+        """Mean lag of the motion behind the command [s]: servo loops, dead time, first-order lag.
+
+        A loop follows a ramp one over its integral gain late.
+        """
+        timing = self.imperfections.timing
+        loops = [1.0 / motor.loop.I for motor in self.twin.robot.motors]
+        return float(np.mean(loops) + np.mean(timing.delay_s) + np.mean(timing.lag_s))
+
+    @cached_property
+    def shortening(self) -> float:
+        """Mean share by which ramps end early [-]."""
+        return float(np.mean(self.imperfections.timing.ramp_shortening))
+
+    @cached_property
     def none_held(self) -> BoolArray:
         """The mask that holds no motor, (motor,)."""
         return np.zeros(len(self.scatter), dtype=bool)

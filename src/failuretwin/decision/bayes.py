@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 CHUNK_RUNS = 64
 """Runs at a time: keeps the work on nodes in about 100 MB."""
 
+LEVELS = (0.05, 0.5, 0.95)
+"""Quantiles that are told: the ends of a 90 % interval and the median."""
+
 
 @dataclass(frozen=True)
 class _Weighed:
@@ -186,16 +189,13 @@ def _evidence(weighed: _Weighed, run: int, order: IntArray) -> tuple[MovementEvi
 
 def _with_estimate(diagnosis: Diagnosis, hypothesis: Hypothesis, estimate: Estimate) -> Diagnosis:
     """Return the diagnosis with onset and magnitude of the fault that is most probable."""
-    if hypothesis.is_healthy:
-        return diagnosis
-    early, middle, late = (float(value) for value in estimate.onset)
-    diagnosis = replace(diagnosis, onset_s=middle, onset_90=(early, late))
-    if len(hypothesis.faults) != 1:
-        return diagnosis
-    low, half, high = (float(value) for value in estimate.size)
-    return replace(
-        diagnosis,
-        magnitude=half,
-        magnitude_unit=hypothesis.faults[0].magnitude_unit,
-        magnitude_90=(low, high),
-    )
+    if estimate.onset is not None:
+        early, middle, late = estimate.onset.quantiles(LEVELS).tolist()
+        diagnosis = replace(diagnosis, onset_s=middle, onset_90=(early, late))
+    if estimate.size is not None:
+        low, half, high = estimate.size.quantiles(LEVELS).tolist()
+        unit = hypothesis.faults[0].magnitude_unit
+        diagnosis = replace(
+            diagnosis, magnitude=half, magnitude_unit=unit, magnitude_90=(low, high)
+        )
+    return diagnosis

@@ -14,16 +14,13 @@ from functools import cached_property
 import numpy as np
 
 from failuretwin.connection.healthy import Alternatives, HealthyModel
-from failuretwin.core.quadrature import log_sum, weighted_quantiles
+from failuretwin.core.quadrature import Weighted, log_sum
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.moving_evidence import MovingEvidence
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
 from failuretwin.decision.motor_profile import MotorProfile, motor_profile
 from failuretwin.decision.ramps import RampModel
 from failuretwin.decision.transients import Transients
-
-LEVELS = (0.05, 0.5, 0.95)
-"""Quantiles that are told: the ends of a 90 % interval and the median."""
 
 
 @dataclass(frozen=True)
@@ -139,13 +136,13 @@ class Estimate:
     """What one run says of a fault that is taken to be there.
 
     Attributes:
-        onset: Quantiles 5, 50, 95 % of the onset, (3,) [s]; NaN without a fault.
-        size: Quantiles 5, 50, 95 % of the magnitude, (3,); NaN where it has none.
+        onset: Distribution of the onset [s]; None without a fault.
+        size: Distribution of the magnitude; None where it has none.
         became: Probability of each alternative, (movement, alternative).
     """
 
-    onset: FloatArray
-    size: FloatArray
+    onset: Weighted | None
+    size: Weighted | None
     became: FloatArray
 
 
@@ -227,14 +224,14 @@ def weigh(scene: Scene, law: Law) -> Weight:
         share = np.exp(found.log_share[run])
         if law.redrawn is None:
             cells = share.sum(axis=0)
-            size = weighted_quantiles(law.size[run if len(law.size) > 1 else 0], cells, LEVELS)
+            size = Weighted(_of_run(law.size, run), cells)
             nodes = np.broadcast_to(cells, by_node[run].shape)
         else:
             of_node = np.exp(by_node[run][:, None] + law.redrawn - density[run][..., None])
-            size = _rms_quantiles(scene.evidence.movements.exists[run], of_node, share, law.size[0])
+            size = _rms(scene.evidence.movements.exists[run], of_node, share, law.size[0])
             nodes = np.einsum("fg,mgn->mn", share, of_node)
         became = _became(profile, law, run, share, nodes)
-        return Estimate(_onset_quantiles(law, run, share), size, became)
+        return Estimate(_onset(law, run, share), size, became)
 
     return Weight(found.log_evidence, found.by_movement, found.settled, estimate)
 
@@ -257,19 +254,17 @@ def _of_run(values: FloatArray, run: int) -> FloatArray:
     return np.asarray(values[run if len(values) > 1 else 0])
 
 
-def _onset_quantiles(law: Law, run: int, share: FloatArray) -> FloatArray:
-    """Return quantiles of the onset of a run, (3,) [s]."""
+def _onset(law: Law, run: int, share: FloatArray) -> Weighted:
+    """Return the distribution of the onset of a run [s]."""
     onset, part = law.onsets(run)
     if onset.shape[1] == 1:
         share = share.sum(axis=1, keepdims=True)
     weight = share[..., None] * part
-    return weighted_quantiles(np.broadcast_to(onset, weight.shape).ravel(), weight.ravel(), LEVELS)
+    return Weighted(np.broadcast_to(onset, weight.shape).ravel(), weight.ravel())
 
 
-def _rms_quantiles(
-    exists: BoolArray, nodes: FloatArray, share: FloatArray, offset: FloatArray
-) -> FloatArray:
-    """Return quantiles of the rms of redrawn offsets over the movements spoilt, (3,).
+def _rms(exists: BoolArray, nodes: FloatArray, share: FloatArray, offset: FloatArray) -> Weighted:
+    """Return the distribution of the rms of redrawn offsets over the movements spoilt.
 
     The mean square is a sum of independent terms; it is taken as normal with their mean and
     variance, for every first movement and group.
@@ -292,7 +287,7 @@ def _rms_quantiles(
     steps = np.linspace(-2.4, 2.4, 25)
     squares = mean[..., None] + spread[..., None] * steps
     weight = share[..., None] * np.exp(-0.5 * steps**2)
-    return weighted_quantiles(np.sqrt(np.maximum(squares, 0.0)).ravel(), weight.ravel(), LEVELS)
+    return Weighted(np.sqrt(np.maximum(squares, 0.0)).ravel(), weight.ravel())
 
 
 def _became(

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from failuretwin.core.quadrature import log_sum, weighted_quantiles
+from failuretwin.core.quadrature import Weighted, log_sum
 from failuretwin.core.types import FloatArray, IntArray
-from failuretwin.decision.law import LEVELS, Estimate, Law, Scene, Weight
+from failuretwin.decision.law import Estimate, Law, Scene, Weight
 from failuretwin.decision.motor_profile import MotorProfile, motor_profile
 
 FEWEST_NATS = 14.0
@@ -69,7 +69,7 @@ def _weigh_one(scene: Scene, one: Law, two: Law) -> Weight:
     onset = _earliest(one, two, share)
 
     def estimate(run: int) -> Estimate:
-        return Estimate(onset, np.full(3, np.nan), np.zeros_like(scene.became[run]))
+        return Estimate(onset, None, np.zeros_like(scene.became[run]))
 
     return Weight(
         log_evidence=np.atleast_1d(log_evidence),
@@ -170,8 +170,8 @@ def _by_movement(
     )
 
 
-def _earliest(one: Law, two: Law, share: FloatArray) -> FloatArray:
-    """Return quantiles of the earlier onset, (3,) [s].
+def _earliest(one: Law, two: Law, share: FloatArray) -> Weighted:
+    """Return the distribution of the earlier onset [s].
 
     Args:
         one: A fault.
@@ -185,4 +185,4 @@ def _earliest(one: Law, two: Law, share: FloatArray) -> FloatArray:
         weight = earlier[:, None, None] * part / part.sum(axis=(1, 2), keepdims=True).clip(1e-300)
         values.append(np.broadcast_to(onset, weight.shape).ravel())
         weights.append(weight.ravel())
-    return weighted_quantiles(np.concatenate(values), np.concatenate(weights), LEVELS)
+    return Weighted(np.concatenate(values), np.concatenate(weights))

@@ -89,28 +89,16 @@ class RampModel:
     moving: MovingEvidence
 
     @cached_property
-    def lag(self) -> float:
-        """Lag of the motion behind the command [s]: servo loops, dead time, first-order lag."""
-        timing = self.model.imperfections.timing
-        loops = [1.0 / motor.loop.I for motor in self.model.twin.robot.motors]
-        return float(np.mean(loops) + np.mean(timing.delay_s) + np.mean(timing.lag_s))
-
-    @cached_property
-    def shortening(self) -> float:
-        """Share by which ramps end early [-]."""
-        return float(np.mean(self.model.imperfections.timing.ramp_shortening))
-
-    @cached_property
     def _punctual(self) -> tuple[FloatArray, FloatArray]:
         """Punctual starts to sum over (shift,) [s], and their log prior (shift,)."""
         weight = np.exp(-0.5 * (LAG_STEPS_S / LAG_SPREAD_S) ** 2)
-        return np.maximum(self.lag + LAG_STEPS_S, 0.0), np.log(weight / weight.sum())
+        return np.maximum(self.model.lag_s + LAG_STEPS_S, 0.0), np.log(weight / weight.sum())
 
     @cached_property
     def _delayed(self) -> tuple[FloatArray, FloatArray]:
         """Late starts to sum over (shift,) [s], and their log prior (shift,)."""
         low, high = self.model.imperfections.timing.late_s
-        shift = np.arange(low, high + 0.5 * LATE_STEP_S, LATE_STEP_S) + self.lag
+        shift = np.arange(low, high + 0.5 * LATE_STEP_S, LATE_STEP_S) + self.model.lag_s
         return shift, np.full(len(shift), -np.log(len(shift)))
 
     @cached_property
@@ -189,7 +177,7 @@ class RampModel:
 
         The latter is (item, case) [s].
         """
-        duration = ramps.duration * (1.0 - self.shortening)
+        duration = ramps.duration * (1.0 - self.model.shortening)
         longest = np.maximum((duration + ramps.delay).max(axis=-1), 0.05)
         at = longest[..., None] * np.linspace(0.0, 1.0, KNOTS)
         since = at[..., None] - ramps.delay[:, None]  # (item, case, knot, motor)

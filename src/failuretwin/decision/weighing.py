@@ -106,9 +106,8 @@ def _law(scene: Scene, fault: Fault, priors: Priors) -> Law:
 def _weigh_healthy(scene: Scene) -> Weight:
     """Return what runs say of no motor being faulty."""
     by_movement = scene.log_healthy + scene.on_way
-    nothing = np.full(3, np.nan)
 
     def estimate(run: int) -> Estimate:
-        return Estimate(nothing, nothing, scene.became[run])
+        return Estimate(None, None, scene.became[run])
 
     return Weight(by_movement.sum(axis=1), by_movement, scene.log_healthy, estimate)

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from failuretwin.core.quadrature import log_of, log_sum, weighted_quantiles
+from failuretwin.core.quadrature import Weighted, log_of, log_sum
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.knowledge import magnitude_range
-from failuretwin.decision.law import LEVELS, Estimate, Scene, Weight
+from failuretwin.decision.law import Estimate, Scene, Weight
 from failuretwin.decision.onsets import at_movement_starts
 
 SHARES = 12
@@ -70,8 +70,8 @@ def weigh_misses(scene: Scene, motor: int, mode: str, early: float) -> Weight:
         onset, part = stretches.samples(early, run)
         when = (share[run].sum(axis=1)[:, None] * part).ravel()
         return Estimate(
-            onset=weighted_quantiles(onset.ravel(), when, LEVELS),
-            size=weighted_quantiles(sizes, share[run].sum(axis=0), LEVELS),
+            onset=Weighted(onset.ravel(), when),
+            size=Weighted(sizes, share[run].sum(axis=0)),
             became=scene.became[run],
         )
 

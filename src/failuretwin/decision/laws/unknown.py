@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from failuretwin.core.ellipsoid import log_fall, log_norm
-from failuretwin.core.quadrature import log_of, weighted_quantiles
+from failuretwin.core.quadrature import Weighted, log_of
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.law import LEVELS, Estimate, Scene, Weight, posterior_of
+from failuretwin.decision.law import Estimate, Scene, Weight, posterior_of
 from failuretwin.decision.onsets import at_movement_starts
 
 SCALES = (0.03, 0.1, 0.3)
@@ -50,8 +50,8 @@ def weigh_unknown(scene: Scene, early: float) -> Weight:
         onset, part = stretches.samples(early, run)
         when = np.exp(found.log_share[run]).sum(axis=1)[:, None] * part
         return Estimate(
-            onset=weighted_quantiles(onset.ravel(), when.ravel(), LEVELS),
-            size=np.full(3, np.nan),
+            onset=Weighted(onset.ravel(), when.ravel()),
+            size=None,
             became=scene.became[run],
         )
 
