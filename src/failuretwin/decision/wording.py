@@ -14,6 +14,13 @@ SURE = 0.95
 """Posterior mass that the hypotheses named as possible hold together."""
 TELLING_NATS = 1.0
 """Evidence of a movement worth telling [nats]: it changes the odds by a factor of 2.7."""
+SHOWN_UNITS = {
+    "rad": (float(np.rad2deg(1.0)), "deg"),
+    "rad/s": (float(np.rad2deg(1.0)), "deg/s"),
+    "ratio": (100.0, "%"),
+    "s": (1.0, "s"),
+}
+"""How the unit of a magnitude is shown: factor and name."""
 
 
 def percent(probability: float) -> str:
@@ -45,11 +52,14 @@ def verdict(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> str:
 
 
 def _size_and_onset(diagnosis: Diagnosis, hypothesis: Hypothesis) -> str:
-    degrees = float(np.rad2deg(diagnosis.magnitude or 0.0))
+    if len(hypothesis.faults) != 1 or diagnosis.magnitude is None:
+        return ""
+    factor, unit = SHOWN_UNITS[hypothesis.faults[0].magnitude_unit]
+    size = factor * diagnosis.magnitude
     if hypothesis.faults[0].mode == "stuck":
         since = f"{diagnosis.onset_s:.1f} s" if diagnosis.onset_s else "before the run"
-        return f" at {round(degrees)} deg since {since}"
-    return f" by about {degrees:.1f} deg"
+        return f" at {round(size)} {unit} since {since}"
+    return f" by about {size:.1f} {unit}"
 
 
 def possible_hypotheses(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> Sequence[Hypothesis]:
