@@ -105,7 +105,8 @@ def report(name: str, listed: Sequence[TrueRun], records: Sequence[Record]) -> N
             print(f"  {row.name}: {hits} of {row.runs} ({100 * low:.0f} to {100 * high:.0f} %)")
     healthy = [r for r in records if r["truth"] == "healthy"]
     alarms = sum(r["diagnosis"] not in ("healthy", None) for r in healthy)
-    print(f"  false alarms: {alarms} of {len(healthy)} healthy runs")
+    silent = sum(r["diagnosis"] is None for r in healthy)
+    print(f"  {len(healthy)} healthy runs: {alarms} false alarms, {silent} without a verdict")
     for run, record in zip(listed, records, strict=True):
         if record["diagnosis"] != record["truth"]:
             asked = "" if run.judged or run.truth == "healthy" else " (not judged)"
