@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import lgamma, log, pi
 
 import numpy as np
-from scipy.special import gammaln
 
 from failuretwin.core.types import FloatArray
 
@@ -42,11 +42,17 @@ class Ellipsoid:
 
     def product(self, a: FloatArray, b: FloatArray) -> FloatArray:
         """Return a^T S^-1 b of vectors (..., 3), as (...)."""
+        return np.asarray(np.sum(a * self.solve(b), axis=-1))
+
+    def solve(self, b: FloatArray) -> FloatArray:
+        """Return S^-1 b of vectors (..., 3), as (..., 3)."""
         xx, yy, zz, xy, xz, yz = self.adjugate
-        first = xx * b[..., 0] + xy * b[..., 1] + xz * b[..., 2]
-        second = xy * b[..., 0] + yy * b[..., 1] + yz * b[..., 2]
-        third = xz * b[..., 0] + yz * b[..., 1] + zz * b[..., 2]
-        return (a[..., 0] * first + a[..., 1] * second + a[..., 2] * third) / self.determinant
+        rows = (
+            xx * b[..., 0] + xy * b[..., 1] + xz * b[..., 2],
+            xy * b[..., 0] + yy * b[..., 1] + yz * b[..., 2],
+            xz * b[..., 0] + yz * b[..., 1] + zz * b[..., 2],
+        )
+        return np.stack(rows, axis=-1) / self.determinant[..., None]
 
     def log_norm(self, dof: float) -> FloatArray:
         """Return the log density at the centre of a Student t with this scale matrix, (...)."""
@@ -60,8 +66,8 @@ def log_norm(dof: float) -> float:
         dof: Degrees of freedom; infinite: normal.
     """
     if np.isinf(dof):
-        return float(-1.5 * np.log(2.0 * np.pi))
-    return float(gammaln((dof + 3.0) / 2.0) - gammaln(dof / 2.0) - 1.5 * np.log(dof * np.pi))
+        return -1.5 * log(2.0 * pi)
+    return lgamma((dof + 3.0) / 2.0) - lgamma(dof / 2.0) - 1.5 * log(dof * pi)
 
 
 def log_fall(square: FloatArray, dof: float) -> FloatArray:

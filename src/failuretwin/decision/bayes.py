@@ -17,11 +17,12 @@ from failuretwin.core.quadrature import log_sum
 from failuretwin.core.runs import check_motors, check_runs, truth_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.data_knowledge.log_quality import LogQuality, log_quality, without_spoilt
+from failuretwin.data_knowledge.moving_evidence import MovingEvidence, moving_evidence
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence, settled_evidence
 from failuretwin.decision.assessment import lost_commands, unused_movements, why_undecided
-from failuretwin.decision.law import Scene, Weight
+from failuretwin.decision.law import Estimate, Scene, Weight
 from failuretwin.decision.priors import Priors
-from failuretwin.decision.weighing import check_weighable, log_prior, weigh_hypothesis
+from failuretwin.decision.weighing import check_weighable, log_prior, weigh_all
 from failuretwin.decision.wording import explanation, verdict
 from failuretwin.digital_model.imperfections import Imperfections, default_imperfections
 from failuretwin.digital_model.twin import DigitalTwin
@@ -31,6 +32,9 @@ if TYPE_CHECKING:
 
 CHUNK_RUNS = 64
 """Runs at a time: keeps the work on nodes in about 100 MB."""
+
+LEVELS = (0.05, 0.5, 0.95)
+"""Quantiles that are told: the ends of a 90 % interval and the median."""
 
 
 @dataclass(frozen=True)
@@ -58,12 +62,15 @@ class BayesDiagnoser:
         hypotheses: What may be the case, with the prior odds of the table of
             failure modes; None: the paper's classes.
         priors: Beliefs about onset and size.
+        whole_run: Whether readings on the way count beside settled poses, where it is known how
+            late this robot starts to move.
     """
 
     twin: DigitalTwin
     imperfections: Imperfections | None = None
     hypotheses: Sequence[Hypothesis] | None = None
     priors: Priors = field(default_factory=Priors)
+    whole_run: bool = True
 
     def __post_init__(self) -> None:
         for hypothesis in self._hypotheses:
@@ -89,18 +96,22 @@ class BayesDiagnoser:
         """
         self._check(runs)
         quality = log_quality(runs)
-        evidence = settled_evidence(without_spoilt(runs, quality))
+        sound = without_spoilt(runs, quality)
+        evidence = settled_evidence(sound)
         if evidence.movements.start.shape[1] == 0:
             raise InputError(
                 "no run holds a movement: `command` never leaves its first value. Expected runs "
                 "of one movement at least."
             )
+        use_way = self.whole_run and self.healthy_model.knows_timing
+        moving = moving_evidence(sound, evidence) if use_way else None
         names = [str(name) for name in runs["run"].values]
         faults = truth_of(runs)
         truth: list[str | None] = [None] * len(names) if faults is None else list(faults)
         results = []
         for first in range(0, len(names), CHUNK_RUNS):
-            weighed = self._weigh(evidence[first : first + CHUNK_RUNS])
+            rows = slice(first, first + CHUNK_RUNS)
+            weighed = self._weigh(evidence[rows], None if moving is None else moving[rows])
             for run in range(len(weighed.log_posterior)):
                 at = first + run
                 results.append(self._conclude(weighed, run, names[at], truth[at], quality[at]))
@@ -113,9 +124,9 @@ class BayesDiagnoser:
         if known is not None and known > end:
             raise InputError(f"the onset is given as {known:g} s, but the runs end at {end:g} s.")
 
-    def _weigh(self, evidence: SettledEvidence) -> _Weighed:
-        scene = Scene(evidence, self.healthy_model)
-        weights = [weigh_hypothesis(scene, h, self.priors) for h in self._hypotheses]
+    def _weigh(self, evidence: SettledEvidence, moving: MovingEvidence | None) -> _Weighed:
+        scene = Scene(evidence, self.healthy_model, moving)
+        weights = weigh_all(scene, self._hypotheses, self.priors)
         log_joint = np.stack([w.log_evidence for w in weights], axis=1) + log_prior(
             self._hypotheses
         )
@@ -133,11 +144,12 @@ class BayesDiagnoser:
             evidence,
             run,
             float(np.exp(weighed.log_posterior[run, order[0]])),
-            best.by_movement[run],
+            best.settled[run],
             self.healthy_model.outlier_log_density,
         )
         # Without a verdict nothing is learnt: the prior stands.
         posterior = np.exp(log_prior(self._hypotheses) if undecided else weighed.log_posterior[run])
+        used = "settled poses" if weighed.scene.moving is None else "whole run"
         diagnosis = Diagnosis(
             run=name,
             truth=truth,
@@ -145,26 +157,25 @@ class BayesDiagnoser:
             quality=(*quality.remarks, *unused_movements(evidence, run)),
             undecided=undecided,
             protocol=imperfections.protocol,
-            method=f"bayes, settled poses; healthy behaviour: {imperfections.name}",
+            method=f"bayes, {used}; healthy behaviour: {imperfections.name}",
         )
         losses: list[str] = []
         if not undecided:
             diagnosis = replace(diagnosis, evidence=_evidence(weighed, run, order))
-            losses = self._losses(weighed, run, best, ranked[0])
-            diagnosis = _estimate(diagnosis, ranked[0], best, run)
+            estimate = best.estimate(run)
+            losses = self._losses(weighed, estimate, ranked[0])
+            diagnosis = _with_estimate(diagnosis, ranked[0], estimate)
         return replace(
             diagnosis,
             verdict=verdict(diagnosis, ranked),
             explanation=explanation(diagnosis, ranked, losses),
         )
 
-    def _losses(
-        self, weighed: _Weighed, run: int, best: Weight, hypothesis: Hypothesis
-    ) -> list[str]:
+    def _losses(self, weighed: _Weighed, estimate: Estimate, hypothesis: Hypothesis) -> list[str]:
         """Return the commands that seem not to have arrived if `hypothesis` is true."""
         lost = weighed.scene.alternatives.lost
         faulty = [fault.motor for fault in hypothesis.faults]
-        return lost_commands(best.became[run], lost, self.twin.robot.motor_names, faulty)
+        return lost_commands(estimate.became, lost, self.twin.robot.motor_names, faulty)
 
 
 def _evidence(weighed: _Weighed, run: int, order: IntArray) -> tuple[MovementEvidence, ...]:
@@ -176,18 +187,15 @@ def _evidence(weighed: _Weighed, run: int, order: IntArray) -> tuple[MovementEvi
     return tuple(MovementEvidence(int(m) + 1, float(best[m] - second[m])) for m in usable)
 
 
-def _estimate(diagnosis: Diagnosis, hypothesis: Hypothesis, found: Weight, run: int) -> Diagnosis:
+def _with_estimate(diagnosis: Diagnosis, hypothesis: Hypothesis, estimate: Estimate) -> Diagnosis:
     """Return the diagnosis with onset and magnitude of the fault that is most probable."""
-    if hypothesis.is_healthy:
-        return diagnosis
-    early, middle, late = (float(value) for value in found.onset[run])
-    diagnosis = replace(diagnosis, onset_s=middle, onset_90=(early, late))
-    if len(hypothesis.faults) != 1:
-        return diagnosis
-    low, half, high = (float(value) for value in found.size[run])
-    return replace(
-        diagnosis,
-        magnitude=half,
-        magnitude_unit=hypothesis.faults[0].magnitude_unit,
-        magnitude_90=(low, high),
-    )
+    if estimate.onset is not None:
+        early, middle, late = estimate.onset.quantiles(LEVELS).tolist()
+        diagnosis = replace(diagnosis, onset_s=middle, onset_90=(early, late))
+    if estimate.size is not None:
+        low, half, high = estimate.size.quantiles(LEVELS).tolist()
+        unit = hypothesis.faults[0].magnitude_unit
+        diagnosis = replace(
+            diagnosis, magnitude=half, magnitude_unit=unit, magnitude_90=(low, high)
+        )
+    return diagnosis

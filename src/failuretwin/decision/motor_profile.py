@@ -7,11 +7,11 @@ numbers say all that a movement can say of this motor, and any fault of it is we
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.connection.healthy import Alternatives, HealthyModel
+from failuretwin.connection.healthy import Alternatives, HealthyModel, scattered
 from failuretwin.core.ellipsoid import Ellipsoid, log_norm
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
@@ -40,6 +40,8 @@ class MotorProfile:
         dof: Degrees of freedom of the scatter.
         outlier: Log density of the tool being anywhere, times its rate.
         usable: Movements with evidence, (run, movement).
+        pose: Angles of all motors that explain the position best, with this motor at `best` and
+            the others scattered, (..., alternative, motor) [rad].
     """
 
     best: FloatArray
@@ -51,6 +53,20 @@ class MotorProfile:
     dof: float
     outlier: float
     usable: BoolArray
+    pose: FloatArray
+
+    def __getitem__(self, run: int) -> MotorProfile:
+        """Return what one of the runs says, without the axis of runs."""
+        return replace(
+            self,
+            best=self.best[run],
+            precision=self.precision[run],
+            square=self.square[run],
+            log_weight=self.log_weight[run],
+            expected=self.expected[run],
+            usable=self.usable[run],
+            pose=self.pose[run],
+        )
 
     def log_terms(self, angle: FloatArray, held: bool) -> FloatArray:
         """Return log weight times density of each alternative.
@@ -145,7 +161,8 @@ def motor_profile(
     pose = base.copy()
     for _ in range(REFINEMENTS):
         pose[..., motor] = angle
-        predicted, jacobian = model.twin.path_and_jacobian(model.settle(pose, direction, fixed))
+        settled = model.settle(pose, direction, fixed)
+        predicted, jacobian = model.twin.path_and_jacobian(settled)
         spread = Ellipsoid.of(jacobian * scale, model.path_noise**2)
         lever, error = jacobian[..., motor], point - predicted
         precision = spread.product(lever, lever)
@@ -154,6 +171,8 @@ def motor_profile(
         angle = angle + np.clip(step, -LONGEST_STEP_RAD, LONGEST_STEP_RAD)
     taken = np.clip(step, -LONGEST_STEP_RAD, LONGEST_STEP_RAD)
     square = spread.product(error, error) - taken * (2.0 * slope - precision * taken)
+    settled = settled + scattered(spread, jacobian, scale, error - lever * taken[..., None])
+    settled[..., motor] = angle
     dof = model.settling.tail_dof
     return MotorProfile(
         best=angle,
@@ -165,6 +184,7 @@ def motor_profile(
         dof=dof,
         outlier=model.outlier_log_density,
         usable=evidence.usable,
+        pose=settled,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,20 +65,28 @@ class Stretches:
         weights[:, 0] += share[:, 0]
         return weights
 
-    def samples(self, early: float) -> tuple[FloatArray, FloatArray]:
-        """Return onsets [s] and their share of their stretch, each (run, movement, sample).
+    def samples(self, early: float, run: int) -> tuple[FloatArray, FloatArray]:
+        """Return onsets in a run [s] and their share of their stretch, each (movement, sample).
 
         A fault that was there before the run counts as an onset at 0.
         """
-        begin, end = np.nan_to_num(self.begin), np.nan_to_num(self.end)
-        length = np.maximum(end - begin, 0.0)
-        late = begin[..., None] + SHARES * length[..., None]
-        onset = np.concatenate([np.zeros_like(late[..., :1]), late], axis=-1)
-        before = np.zeros_like(length)
-        weight = self.weights(early)[:, 0]
-        before[:, 0] = np.divide(early, weight, out=np.ones_like(weight), where=weight > early)
-        inside = np.repeat((1.0 - before)[..., None] / len(SHARES), len(SHARES), axis=-1)
-        return onset, np.concatenate([before[..., None], inside], axis=-1)
+        begin, end = np.nan_to_num(self.begin[run]), np.nan_to_num(self.end[run])
+        late = begin[:, None] + SHARES * np.maximum(end - begin, 0.0)[:, None]
+        onset = np.concatenate([np.zeros_like(late[:, :1]), late], axis=1)
+        before = np.zeros_like(begin)
+        weight = self.weights(early)[run, 0]
+        before[0] = early / weight if weight > early else 1.0
+        inside = np.repeat((1.0 - before)[:, None] / len(SHARES), len(SHARES), axis=1)
+        return onset, np.concatenate([before[:, None], inside], axis=1)
+
+    def onsets(self, early: float) -> Callable[[int], tuple[FloatArray, FloatArray]]:
+        """Return `samples` of a run by its index, with an axis for nodes: (movement, 1, sample)."""
+
+        def of_run(run: int) -> tuple[FloatArray, FloatArray]:
+            onset, share = self.samples(early, run)
+            return onset[:, None], share[:, None]
+
+        return of_run
 
 
 def at_movement_starts(movements: Movements) -> Stretches:

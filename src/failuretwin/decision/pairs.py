@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from failuretwin.core.quadrature import log_sum, weighted_quantiles
+from failuretwin.core.quadrature import Weighted, log_sum
 from failuretwin.core.types import FloatArray, IntArray
-from failuretwin.decision.law import LEVELS, Law, Scene, Weight
+from failuretwin.decision.law import Estimate, Law, Scene, Weight
 from failuretwin.decision.motor_profile import MotorProfile, motor_profile
 
 FEWEST_NATS = 14.0
@@ -17,7 +18,7 @@ MOST_NODES = 48
 """Nodes of the first fault to sum over; the others of its law are thinned out."""
 
 
-def weigh_pair(scenes: list[Scene], laws: list[tuple[Law, Law]]) -> Weight:
+def weigh_pair(scenes: Sequence[Scene], laws: Sequence[tuple[Law, Law]]) -> Weight:
     """Return what runs say of two faults at once.
 
     Args:
@@ -28,9 +29,8 @@ def weigh_pair(scenes: list[Scene], laws: list[tuple[Law, Law]]) -> Weight:
     return Weight(
         log_evidence=np.concatenate([w.log_evidence for w in found]),
         by_movement=np.concatenate([w.by_movement for w in found]),
-        onset=np.concatenate([w.onset for w in found]),
-        size=np.concatenate([w.size for w in found]),
-        became=np.concatenate([w.became for w in found]),
+        settled=np.concatenate([w.settled for w in found]),
+        estimate=lambda run: found[run].estimate(0),
     )
 
 
@@ -38,7 +38,12 @@ def _weigh_one(scene: Scene, one: Law, two: Law) -> Weight:
     one, two = _thinned(scene, one), _thinned(scene, two)
     alone = [_cells(_alone(scene, law), law) for law in (one, two)]  # (movement, cell)
     both = _both(scene, one, two)  # (movement, cell of one, cell of two)
-    healthy, count = scene.log_healthy[0], len(both)
+    settled = scene.log_healthy[0], alone, both
+    ways = [scene.on_way_with(law.motor, law.held)[0] for law in (one, two)]
+    alone = [values + way[:, None] for values, way in zip(alone, ways, strict=True)]
+    # The way with both faults is not computed: it is no less probable than with one of them.
+    both = both + np.maximum(*ways)[:, None, None]
+    healthy, count = settled[0] + scene.on_way[0], len(both)
     prior = [law.log_prior[0] for law in (one, two)]  # (movement, cell)
 
     before = _sums(healthy)
@@ -59,12 +64,18 @@ def _weigh_one(scene: Scene, one: Law, two: Law) -> Weight:
     log_evidence = log_sum(terms, axis=(0, 1))
     share = np.exp(terms - log_evidence)
     at = np.unravel_index(np.argmax(share), share.shape)
+    first_two = int(at[0]), int(at[1])
+    by_movement = _by_movement(healthy, alone, both, *first_two)
+    onset = _earliest(one, two, share)
+
+    def estimate(run: int) -> Estimate:
+        return Estimate(onset, None, np.zeros_like(scene.became[run]))
+
     return Weight(
         log_evidence=np.atleast_1d(log_evidence),
-        by_movement=_by_movement(healthy, alone, both, int(at[0]), int(at[1]))[None],
-        onset=_earliest(one, two, share)[None],
-        size=np.full((1, 3), np.nan),
-        became=np.zeros_like(scene.became),
+        by_movement=by_movement[None],
+        settled=_by_movement(*settled, *first_two)[None],
+        estimate=estimate,
     )
 
 
@@ -120,15 +131,17 @@ def _thinned(scene: Scene, law: Law) -> Law:
     prior = np.full((*law.log_prior.shape[:2], len(kept)), -np.inf)
     for node, cell in enumerate(owner):  # the mass of a node left out goes to its neighbour
         prior[..., cell] = np.logaddexp(prior[..., cell], law.log_prior[..., node])
+
+    def of_run(run: int) -> tuple[FloatArray, FloatArray]:
+        parts = law.onsets(run)
+        return parts if parts[0].shape[1] == 1 else (parts[0][:, kept], parts[1][:, kept])
+
     return replace(
         law,
         angle=law.angle[:, :, kept],
         log_prior=prior,
         size=law.size[:, kept],
-        onset=law.onset if law.onset.shape[2] == 1 else law.onset[:, :, kept],
-        onset_share=law.onset_share
-        if law.onset_share.shape[2] == 1
-        else law.onset_share[:, :, kept],
+        onsets=of_run,
     )
 
 
@@ -157,17 +170,19 @@ def _by_movement(
     )
 
 
-def _earliest(one: Law, two: Law, share: FloatArray) -> FloatArray:
-    """Return quantiles of the earlier onset, (3,) [s]."""
+def _earliest(one: Law, two: Law, share: FloatArray) -> Weighted:
+    """Return the distribution of the earlier onset [s].
+
+    Args:
+        one: A fault.
+        two: The other.
+        share: Posterior of the first movement that each spoils, (movement of one, of two).
+    """
     values, weights = [], []
-    for axis, law in enumerate((one, two)):
-        onset = np.broadcast_to(law.onset, (1, len(share), *law.onset.shape[2:]))[0]
-        part = np.broadcast_to(law.onset_share, law.onset.shape)[0]
-        mean_part = part.mean(axis=1) if part.shape[1] == 1 else part.sum(axis=1)
-        mean_part = mean_part / np.maximum(mean_part.sum(axis=-1, keepdims=True), 1e-300)
-        earlier = np.triu(share if axis == 0 else share.T, k=0 if axis == 0 else 1).sum(axis=1)
-        values.append(onset.mean(axis=1).ravel())
-        weights.append((earlier[:, None] * mean_part).ravel())
-    return weighted_quantiles(np.concatenate(values)[None], np.concatenate(weights)[None], LEVELS)[
-        0
-    ]
+    for law, earlier in ((one, np.triu(share).sum(axis=1)), (two, np.tril(share, -1).sum(axis=0))):
+        onset, part = law.onsets(0)
+        onset, part = np.broadcast_arrays(onset, part)
+        weight = earlier[:, None, None] * part / part.sum(axis=(1, 2), keepdims=True).clip(1e-300)
+        values.append(np.broadcast_to(onset, weight.shape).ravel())
+        weights.append(weight.ravel())
+    return Weighted(np.concatenate(values), np.concatenate(weights))

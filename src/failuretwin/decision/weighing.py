@@ -7,22 +7,21 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import Fault, Hypothesis
+from failuretwin.core.hypothesis import UNKNOWN, Fault, Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.knowledge import prior_odds
-from failuretwin.decision.law import Law, Scene, Weight, weigh
+from failuretwin.decision.law import Estimate, Law, Scene, Weight, weigh
 from failuretwin.decision.laws.lasting import AMOUNTS, drift_law, lasting_law
 from failuretwin.decision.laws.stays import MISSES, weigh_misses
 from failuretwin.decision.laws.steady_state_error import error_law
 from failuretwin.decision.laws.stuck import stuck_law
+from failuretwin.decision.laws.timed import lag_law, slow_law
 from failuretwin.decision.laws.unknown import weigh_unknown
 from failuretwin.decision.pairs import weigh_pair
 from failuretwin.decision.priors import Priors
 
-UNKNOWN_ODDS = 0.05
-"""Odds of `unknown` against healthy: assumed; rare, as the table of failure modes is long."""
-UNKNOWN_BEFORE_RUN = 0.9
-"""Probability that an unknown fault was there before the run; as for most known ones."""
+UNKNOWN_ODDS = 0.3
+"""Odds of `unknown` against healthy: assumed, like those of the rarer fault modes."""
 MOST_FAULTS = 2
 """Faults that can be weighed at once."""
 
@@ -42,7 +41,9 @@ LAWS: Mapping[str, Callable[[Scene, int, Priors], Law]] = {
     **{mode: _lasting(mode) for mode in AMOUNTS},
 }
 """Law of each mode that makes a motor settle beside its target."""
-WEIGHABLE = (*LAWS, *MISSES)
+TIMED: Mapping[str, Callable[[Scene, int, float], Law]] = {"lag": lag_law, "slow": slow_law}
+"""Law of each mode that shows on the way."""
+WEIGHABLE = (*LAWS, *TIMED, *MISSES)
 """Modes that can be weighed."""
 
 
@@ -72,10 +73,18 @@ def log_prior(hypotheses: Sequence[Hypothesis]) -> FloatArray:
     return np.asarray(np.log(odds / odds.sum()))
 
 
+def weigh_all(scene: Scene, hypotheses: Sequence[Hypothesis], priors: Priors) -> list[Weight]:
+    """Return what runs say of each hypothesis, in their order."""
+    known = [h for h in hypotheses if h.known]
+    weights = {h: weigh_hypothesis(scene, h, priors) for h in known}
+    if len(known) < len(hypotheses):
+        ways = [lambda blurred, h=h: weigh_hypothesis(blurred, h, priors) for h in known]
+        weights[UNKNOWN] = weigh_unknown(scene, ways, log_prior(known))
+    return [weights[h] for h in hypotheses]
+
+
 def weigh_hypothesis(scene: Scene, hypothesis: Hypothesis, priors: Priors) -> Weight:
-    """Return what runs say of one hypothesis."""
-    if not hypothesis.known:
-        return weigh_unknown(scene, UNKNOWN_BEFORE_RUN)
+    """Return what runs say of one known hypothesis."""
     if hypothesis.is_healthy:
         return _weigh_healthy(scene)
     if len(hypothesis.faults) == 2:
@@ -84,19 +93,27 @@ def weigh_hypothesis(scene: Scene, hypothesis: Hypothesis, priors: Priors) -> We
         laws = [(_law(alone, one, priors), _law(alone, two, priors)) for alone in scenes]
         return weigh_pair(scenes, laws)
     fault = hypothesis.faults[0]
+    motor, early = _motor(scene, fault), priors.onset.before_run(fault.mode)
     if fault.mode in MISSES:
-        motor = scene.model.twin.robot.motor_names.index(fault.motor)
-        return weigh_misses(scene, motor, fault.mode, priors.onset.before_run(fault.mode))
+        return weigh_misses(scene, motor, fault.mode, early)
+    if fault.mode in TIMED:
+        return weigh(scene, TIMED[fault.mode](scene, motor, early))
     return weigh(scene, _law(scene, fault, priors))
 
 
+def _motor(scene: Scene, fault: Fault) -> int:
+    return scene.model.twin.robot.motor_names.index(fault.motor)
+
+
 def _law(scene: Scene, fault: Fault, priors: Priors) -> Law:
-    motor = scene.model.twin.robot.motor_names.index(fault.motor)
-    return LAWS[fault.mode](scene, motor, priors)
+    return LAWS[fault.mode](scene, _motor(scene, fault), priors)
 
 
 def _weigh_healthy(scene: Scene) -> Weight:
     """Return what runs say of no motor being faulty."""
-    healthy = scene.log_healthy
-    nothing = np.full((len(healthy), 3), np.nan)
-    return Weight(healthy.sum(axis=1), healthy, nothing, nothing, scene.became)
+    by_movement = scene.log_healthy + scene.on_way
+
+    def estimate(run: int) -> Estimate:
+        return Estimate(None, None, scene.became[run])
+
+    return Weight(by_movement.sum(axis=1), by_movement, scene.log_healthy, estimate)

@@ -14,13 +14,6 @@ SURE = 0.95
 """Posterior mass that the hypotheses named as possible hold together."""
 TELLING_NATS = 1.0
 """Evidence of a movement worth telling [nats]: it changes the odds by a factor of 2.7."""
-SHOWN_UNITS = {
-    "rad": (float(np.rad2deg(1.0)), "deg"),
-    "rad/s": (float(np.rad2deg(1.0)), "deg/s"),
-    "ratio": (100.0, "%"),
-    "s": (1.0, "s"),
-}
-"""How the unit of a magnitude is shown: factor and name."""
 
 
 def percent(probability: float) -> str:
@@ -51,15 +44,29 @@ def verdict(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> str:
     return text
 
 
+_SIZES = {
+    "steady_state_error": " by about {size:.1f} deg",
+    "encoder_bias": " by {size:+.1f} deg",
+    "backlash": " of {size:.1f} deg",
+    "drift": " by {size:+.2f} deg/s",
+    "lag": " by {size:.2f} s",
+    "encoder_scale": " by {size:+.0%}",
+}
+"""How the magnitude of a mode is told; angles in degrees. Those left out are shares."""
+
+
 def _size_and_onset(diagnosis: Diagnosis, hypothesis: Hypothesis) -> str:
+    onset = diagnosis.onset_s or 0.0
+    since = f" since {onset:.1f} s" if onset else " since before the run"
     if len(hypothesis.faults) != 1 or diagnosis.magnitude is None:
-        return ""
-    factor, unit = SHOWN_UNITS[hypothesis.faults[0].magnitude_unit]
-    size = factor * diagnosis.magnitude
-    if hypothesis.faults[0].mode == "stuck":
-        since = f"{diagnosis.onset_s:.1f} s" if diagnosis.onset_s else "before the run"
-        return f" at {round(size)} {unit} since {since}"
-    return f" by about {size:.1f} {unit}"
+        return since if onset else ""
+    fault, size = hypothesis.faults[0], diagnosis.magnitude
+    if fault.magnitude_unit in ("rad", "rad/s"):
+        size = float(np.rad2deg(size))
+    if fault.mode == "stuck":
+        return f" at {round(size)} deg{since}"
+    text = _SIZES.get(fault.mode, " ({size:.0%})").format(size=size)
+    return text + (since if onset else "")
 
 
 def possible_hypotheses(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> Sequence[Hypothesis]:

@@ -103,15 +103,13 @@ def lasting_law(scene: Scene, motor: int, mode: str, early: float) -> Law:
     )
     offset = gain[:, :, None] * amount.of_size(size)[:, None, :, None]
     stretches = at_once(scene.evidence)
-    onset, share = stretches.samples(early)
     return Law(
         motor=motor,
         held=False,
         angle=settled[:, :, None] + offset,
         log_prior=log_of(stretches.weights(early))[..., None] + log_size[:, None],
         size=size,
-        onset=onset[:, :, None],
-        onset_share=share[:, :, None],
+        onsets=stretches.onsets(early),
     )
 
 
@@ -173,14 +171,17 @@ def drift_law(scene: Scene, motor: int, early: float) -> Law:
     own = np.repeat(np.eye(movements), onsets, axis=1)
     log_first = log_of(own) + log_onset.reshape(runs, 1, -1)
     log_prior = np.repeat(log_first, len(rate), axis=2) - np.log(len(rate))
+
+    def of_run(run: int) -> tuple[FloatArray, FloatArray]:
+        return np.repeat(onset[run].reshape(1, -1, 1), len(rate), axis=1), np.ones((1, 1, 1))
+
     return Law(
         motor=motor,
         held=False,
         angle=scene.profile(motor).expected[:, :, None] + offset[..., None],
         log_prior=log_prior,
         size=np.tile(rate, (runs, movements * onsets)),
-        onset=np.repeat(onset.reshape(runs, 1, -1, 1), len(rate), axis=2),
-        onset_share=np.ones((1, 1, 1, 1)),
+        onsets=of_run,
     )
 
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from failuretwin.core.quadrature import log_of, log_sum, weighted_quantiles
+from failuretwin.core.quadrature import Weighted, log_of, log_sum
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.knowledge import magnitude_range
-from failuretwin.decision.law import LEVELS, Scene, Weight
+from failuretwin.decision.law import Estimate, Scene, Weight
 from failuretwin.decision.onsets import at_movement_starts
 
 SHARES = 12
@@ -58,23 +58,25 @@ def weigh_misses(scene: Scene, motor: int, mode: str, early: float) -> Weight:
     place = _densities(scene, motor)
     stretches = at_movement_starts(scene.evidence.movements)
     log_first = log_of(stretches.weights(early)) - np.log(SHARES)
-    after = _chain(place, scene.log_healthy, MISSES[mode], sizes)  # (run, movement, first, size)
+    healthy = scene.log_healthy + scene.on_way
+    after = _chain(place, healthy, MISSES[mode], sizes)  # (run, movement, first, size)
     joint = after[:, -1] + log_first[..., None]
     log_evidence = log_sum(joint, axis=(1, 2))
     share = np.exp(joint - log_evidence[:, None, None])
     so_far = log_sum(after + log_first[:, None, :, None], axis=(2, 3))
     by_movement = np.diff(so_far, axis=1, prepend=log_sum(log_first, axis=1)[:, None] + 0.0)
-    onset, part = stretches.samples(early)
-    weight = (share.sum(axis=2)[..., None] * part).reshape(len(share), -1)
-    return Weight(
-        log_evidence=log_evidence,
-        by_movement=by_movement,
-        onset=weighted_quantiles(onset.reshape(len(share), -1), weight, LEVELS),
-        size=weighted_quantiles(
-            np.broadcast_to(sizes, (len(share), SHARES)), share.sum(axis=1), LEVELS
-        ),
-        became=scene.became,
-    )
+
+    def estimate(run: int) -> Estimate:
+        onset, part = stretches.samples(early, run)
+        when = (share[run].sum(axis=1)[:, None] * part).ravel()
+        return Estimate(
+            onset=Weighted(onset.ravel(), when),
+            size=Weighted(sizes, share[run].sum(axis=0)),
+            became=scene.became[run],
+        )
+
+    settled = by_movement - np.maximum(scene.on_way, scene.on_way_with(motor, held=True))
+    return Weight(log_evidence, by_movement, settled, estimate)
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,10 @@ def _densities(scene: Scene, motor: int) -> _Places:
     runs, count, _, steps = way.shape
     on_way = profile.log_density(way.reshape(runs, count, -1, 1), False)
     on_way = log_sum(on_way.reshape(runs, count, -1, steps), axis=3) - np.log(steps)
-    return _Places(at, on_way)
+    arrives = np.eye(count, count + 1, 1, dtype=bool)
+    held = scene.on_way_with(motor, held=True)[..., None]
+    off = scene.on_way_with(motor, held=False)[..., None]
+    return _Places(at + np.where(arrives, off, held), on_way + held)
 
 
 def _chain(

@@ -40,7 +40,6 @@ def error_law(scene: Scene, motor: int, ranges: Sequence[Range], early: float) -
     """
     offset, log_weight = offset_nodes(ranges)
     stretches = at_movement_starts(scene.evidence.movements)
-    onset, share = stretches.samples(early)
     log_first = log_of(stretches.weights(early))
     return Law(
         motor=motor,
@@ -48,8 +47,7 @@ def error_law(scene: Scene, motor: int, ranges: Sequence[Range], early: float) -
         angle=scene.profile(motor).expected[:, :, None] + offset[:, None],
         log_prior=np.repeat(log_first[..., None] - np.log(len(ranges)), len(ranges), axis=2),
         size=offset[None],
-        onset=onset[:, :, None],
-        onset_share=share[:, :, None],
+        onsets=stretches.onsets(early),
         redrawn=log_weight,
     )
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import gammaln
 
+from failuretwin.connection.healthy import HealthyModel
 from failuretwin.core.quadrature import log_of, log_sum, log_trapezoid_weights
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
@@ -24,10 +25,10 @@ PRIOR_STEPS = np.array([-5, -2.5, -1, 0, 1, 2.5, 5.0])
 SETTLED_SCALE, ON_THE_WAY_SCALE = 2.0, 8.0
 """How sharply the prior ties the held angle to where the motor had settled, and to where its ramp
 was at a known onset, in scatters of the motor."""
-LAG_S = 0.045
-"""Lag of the motion behind the command [s]: the servo loop's 0.025 s and a delay of 0 to 0.04 s."""
-LAG_SPREAD_S = np.array([-0.02, 0.0, 0.02])
+LAG_STEPS_S = np.array([-0.03, -0.015, 0.0, 0.015, 0.03])
 """Steps by which the lag may differ from run to run [s]."""
+LATE_SHARES = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
+"""Points at which late starts are sampled, as shares of their range."""
 FREE_IF_KNOWN = 0.05
 """Probability that the held angle is unrelated to the commands where the onset is known."""
 
@@ -40,22 +41,25 @@ def stuck_law(scene: Scene, motor: int, prior: OnsetPrior) -> Law:
         motor: Index of the motor.
         prior: When and where it may have got stuck.
     """
-    evidence = scene.evidence
     angle = _angle_nodes(scene, motor, prior)
     parts = _log_prior(scene, motor, angle, prior)  # (run, movement, plateau | ramp, node)
     log_prior = log_sum(parts, axis=2)
-    onset, share = _onsets(evidence, motor, angle, prior.known_s)
-    of_part = np.exp(parts - np.where(np.isfinite(log_prior), log_prior, 0.0)[:, :, None])
-    plateau = np.repeat(of_part[:, :, 0, :, None], len(SHARES), axis=-1)
-    ramp = np.repeat(of_part[:, :, 1, :, None], len(LAG_SPREAD_S), axis=-1)
+
+    def of_run(run: int) -> tuple[FloatArray, FloatArray]:
+        onset, share = _onsets(scene[run], motor, angle[run], prior.known_s)
+        whole = np.where(np.isfinite(log_prior[run]), log_prior[run], 0.0)
+        of_part = np.exp(parts[run] - whole[:, None])
+        plateau = np.repeat(of_part[:, 0, :, None], len(SHARES), axis=-1)
+        ramp = np.repeat(of_part[:, 1, :, None], onset.shape[-1] - len(SHARES), axis=-1)
+        return onset, share * np.concatenate([plateau, ramp], axis=-1)
+
     return Law(
         motor=motor,
         held=True,
         angle=angle[:, None, :, None],
         log_prior=log_prior,
         size=angle,
-        onset=onset,
-        onset_share=share * np.concatenate([plateau, ramp], axis=-1),
+        onsets=of_run,
     )
 
 
@@ -75,7 +79,7 @@ def _angle_nodes(scene: Scene, motor: int, prior: OnsetPrior) -> FloatArray:
     scale = max(profile.scatter, 1e-4)
     tied = [settled[..., None] + SETTLED_SCALE * scale * PRIOR_STEPS]
     if prior.known_s is not None:
-        way = _position_at(scene.evidence, motor, prior.known_s)
+        way = _position_at(scene, motor, prior.known_s)
         tied.append(way[..., None] + ON_THE_WAY_SCALE * scale * PRIOR_STEPS)
     nodes = [coarse, local, *(peaks.reshape(runs, -1) for peaks in tied)]
     return np.sort(np.clip(np.concatenate(nodes, axis=1), low, high), axis=1)
@@ -100,7 +104,7 @@ def _log_prior(scene: Scene, motor: int, angle: FloatArray, prior: OnsetPrior) -
     low, high = _range(scene, motor)
     plateau = _student(angle[:, None] - origin[..., None], SETTLED_SCALE * scale, 4.0)
     if prior.known_s is not None:
-        way = _position_at(evidence, motor, prior.known_s)
+        way = _position_at(scene, motor, prior.known_s)
         ramp = _student(angle[:, None] - way[..., None], ON_THE_WAY_SCALE * scale, 4.0)
     else:
         ramp = _between(angle[:, None], origin[..., None], target[..., None], 4.0 * scale)
@@ -109,7 +113,7 @@ def _log_prior(scene: Scene, motor: int, angle: FloatArray, prior: OnsetPrior) -
     mixed = np.logaddexp(np.log1p(-share) + tied, np.log(share) - np.log(high - low))
     mass = mixed + log_trapezoid_weights(angle)[:, None, None]
     mass -= log_sum(mass, axis=-1)[..., None]
-    return mass + log_of(_onset_weights(evidence, motor, prior))[..., None]
+    return mass + log_of(_onset_weights(scene, motor, prior))[..., None]
 
 
 def _student(error: FloatArray, scale: float, dof: float) -> FloatArray:
@@ -123,12 +127,12 @@ def _between(x: FloatArray, a: FloatArray, b: FloatArray, margin: float) -> Floa
     return np.where((x >= low) & (x <= high), -np.log(high - low), -np.inf)
 
 
-def _position_at(evidence: SettledEvidence, motor: int, onset_s: float) -> FloatArray:
+def _position_at(scene: Scene, motor: int, onset_s: float) -> FloatArray:
     """Return where each ramp has come to at `onset_s`, lag counted, (run, movement) [rad]."""
-    movements = evidence.movements
-    origin, target = _ends(evidence, motor)
+    movements = scene.evidence.movements
+    origin, target = _ends(scene.evidence, motor)
     duration = np.maximum(movements.ramp_duration[..., motor], 1e-6)
-    done = np.clip((onset_s - LAG_S - movements.start) / duration, 0.0, 1.0)
+    done = np.clip((onset_s - scene.model.lag_s - movements.start) / duration, 0.0, 1.0)
     return origin + (target - origin) * np.nan_to_num(done)
 
 
@@ -139,21 +143,24 @@ def _ends(evidence: SettledEvidence, motor: int) -> tuple[FloatArray, FloatArray
     return np.nan_to_num(origin), np.nan_to_num(target)
 
 
-def _stretches(evidence: SettledEvidence, motor: int) -> tuple[FloatArray, FloatArray]:
+def _stretches(scene: Scene, motor: int) -> tuple[FloatArray, FloatArray]:
     """Return begin and end of plateau and ramp of each movement, (run, movement, 2) [s].
 
-    The plateau of the first movement is the time before it, from the start of the run.
+    The plateau of the first movement is the time before it, from the start of the run. Movements
+    that are likely to have started late count as begun by so much later.
     """
-    start = evidence.movements.start
-    reached = start + evidence.movements.ramp_duration[..., motor] + LAG_S
+    movements, model = scene.evidence.movements, scene.model
+    late_s = float(np.mean(model.imperfections.timing.late_s))
+    start = movements.start + model.lag_s + model.late(movements) * late_s
+    reached = start + movements.ramp_duration[..., motor] * (1.0 - model.shortening)
     plateau_begin = np.concatenate([np.zeros_like(start[:, :1]), reached[:, :-1]], axis=1)
     begin = np.stack([np.minimum(plateau_begin, start), start], axis=-1)
     return begin, np.stack([start, reached], axis=-1)
 
 
-def _onset_weights(evidence: SettledEvidence, motor: int, prior: OnsetPrior) -> FloatArray:
+def _onset_weights(scene: Scene, motor: int, prior: OnsetPrior) -> FloatArray:
     """Return the prior probability of each stretch, (run, movement, plateau | ramp)."""
-    begin, end = _stretches(evidence, motor)
+    begin, end = _stretches(scene, motor)
     length = np.nan_to_num(np.maximum(end - begin, 0.0))
     if prior.known_s is not None:
         inside = (begin <= prior.known_s) & (prior.known_s < end)
@@ -170,28 +177,50 @@ def _onset_weights(evidence: SettledEvidence, motor: int, prior: OnsetPrior) -> 
 
 
 def _onsets(
-    evidence: SettledEvidence, motor: int, angle: FloatArray, known_s: float | None
+    scene: Scene, motor: int, angle: FloatArray, known_s: float | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return onsets [s] and their share of their stretch, (run, movement, node, sample).
+    """Return onsets of one run [s] and their share of their stretch, (movement, node, sample).
 
     The first samples are for the plateau, where any time is as likely (before the first movement:
     before the run); the others for the ramp, where the held angle says when.
+
+    Args:
+        scene: A single run.
+        motor: Index of the motor.
+        angle: Held angles, (node,) [rad].
+        known_s: The onset, where it is known [s].
     """
-    begin, end = (np.nan_to_num(x) for x in _stretches(evidence, motor))
-    origin, target = _ends(evidence, motor)
+    movements, model = scene.evidence.movements, scene.model
+    begin, end = (np.nan_to_num(x[0]) for x in _stretches(scene, motor))
+    origin, target = (x[0] for x in _ends(scene.evidence, motor))
     travel = target - origin
     span = np.where(np.abs(travel) > 1e-6, travel, np.inf)
-    done = np.clip((angle[:, None] - origin[..., None]) / span[..., None], 0.0, 1.0)
-    duration = np.nan_to_num(evidence.movements.ramp_duration[..., motor])
-    on_ramp = begin[..., 1, None] + LAG_S + done * duration[..., None]
-    on_ramp = np.maximum(on_ramp[..., None] + LAG_SPREAD_S, 0.0)
-    on_plateau = begin[..., 0, None] + SHARES * (end - begin)[..., 0, None]
-    on_plateau[:, 0] = 0.0
-    on_plateau = np.repeat(on_plateau[:, :, None], angle.shape[1], axis=2)
+    done = np.clip((angle - origin[:, None]) / span[:, None], 0.0, 1.0)
+    shift, shift_share = _starts(model, model.late(movements)[0])
+    ramp = np.nan_to_num(movements.ramp_duration[0, :, motor]) * (1.0 - model.shortening)
+    on_ramp = np.nan_to_num(movements.start[0])[:, None] + done * ramp[:, None]
+    on_ramp = np.maximum(on_ramp[..., None] + shift, 0.0)
+    on_plateau = begin[:, 0, None] + SHARES * (end - begin)[:, 0, None]
+    on_plateau[0, :-2] = 0.0  # before the run; the rest: before the first ramp
+    on_plateau = np.repeat(on_plateau[:, None], len(angle), axis=1)
     onset = np.concatenate([on_plateau, on_ramp], axis=-1)
     if known_s is not None:
         onset = np.full_like(onset, known_s)
-    share = np.concatenate(
-        [np.full(len(SHARES), 1 / len(SHARES)), np.full(len(LAG_SPREAD_S), 1 / len(LAG_SPREAD_S))]
-    )
-    return onset, np.broadcast_to(share, onset.shape)
+    share = np.concatenate([np.full((len(begin), len(SHARES)), 1 / len(SHARES)), shift_share], -1)
+    return onset, np.broadcast_to(share[:, None], onset.shape)
+
+
+def _starts(model: HealthyModel, late: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return by how much motions start after their command, (start,) [s], and how probable it is.
+
+    (movement, start).
+
+    Args:
+        model: The healthy robot.
+        late: Probability that each movement starts late, (movement,).
+    """
+    low, high = model.imperfections.timing.late_s
+    shift = model.lag_s + np.concatenate([LAG_STEPS_S, low + LATE_SHARES * (high - low)])
+    punctual = np.repeat((1.0 - late)[:, None] / len(LAG_STEPS_S), len(LAG_STEPS_S), axis=1)
+    held_up = np.repeat(late[:, None] / len(LATE_SHARES), len(LATE_SHARES), axis=1)
+    return shift, np.concatenate([punctual, held_up], axis=1)
