@@ -18,8 +18,11 @@ from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.decision.motor_profile import MotorProfile
 from failuretwin.decision.ramps import RampModel, Ramps
 
-LARGEST_OFFSET_RAD = 0.3
-"""Furthest from its target that a motor is taken to have settled without being stuck [rad]."""
+LARGEST_OFFSET_RAD = 0.9
+"""Furthest from its target that a motor is taken to have settled without being stuck [rad]; the
+largest encoder faults that are considered."""
+STARTS_RAD = np.linspace(-LARGEST_OFFSET_RAD, LARGEST_OFFSET_RAD, 13)
+"""Where a motor that settles off its targets may stand before the run, beside where it should."""
 TRUST = 0.1
 """Power to which what the way says is taken: its readings share errors of timing and of both ends
 that the model of the way does not know, so that all of a movement count for about one. Chosen on
@@ -128,7 +131,22 @@ class Transients:
         ends = np.where(self._usable[..., None, None], profile.pose, self._expected)
         ends[..., motor] = np.where(self._usable[..., None], near, self._expected[..., motor])
         course, luck = self._settle(_Course(ends, seen, self.alternatives.lost, self._first))
-        return self._trusted(self._judge(course.origin(), course.destination()) + luck)
+        says = self._judge(course.origin(), course.destination())
+        says[:, 0] = np.logaddexp(says[:, 0], self._from_anywhere(course, motor)) - np.log(2.0)
+        return self._trusted(says + luck)
+
+    def _from_anywhere(self, course: _Course, motor: int) -> FloatArray:
+        """Return the log density of the first movement if a motor was off before it, (run,)."""
+        run = np.flatnonzero(self.ramps.moving.seen[:, 0].any(axis=-1))
+        begin, end = (
+            np.repeat(pose[run, 0][:, None], len(STARTS_RAD), axis=1)
+            for pose in (course.origin(), course.destination())
+        )
+        begin[..., motor] += STARTS_RAD
+        found = np.zeros(len(self._usable))
+        says = self._weigh(run, np.zeros_like(run), begin, end)
+        found[run] = log_sum(says, axis=-1) - np.log(len(STARTS_RAD))
+        return found
 
     @cached_property
     def astray(self) -> FloatArray:
