@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+import xarray as xr
 from rich.progress import track
 
 import failuretwin as ft
@@ -42,8 +43,11 @@ PRIORS = Priors(onset=OnsetPrior(early=EARLY, free=0.01))
 """Half of the faults were there before the run; held angles come from where the motor was."""
 CHUNK = 500
 DRAWS = 199
-FIRST_RAMP_S, LAST_RAMP_S = 0.8, 9.0
-"""End of the first and of the last ramp, on average; late starts push the latter [s]."""
+FIRST_RAMP_S, LATEST_S = 0.8, 12.0
+"""End of the first ramp, on average, and the latest onset drawn [s]. Runs whose fault begins after
+the last movement cannot show it; they are left out, as the diagnoser does not consider them."""
+EARLY_DRAWN = 0.43
+"""Share of early onsets drawn, so that a half is left once those runs are out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,8 +59,8 @@ class PriorStuck(Stuck):
     ) -> FaultValue:
         """Return the fault as it strikes one run."""
         value = super().draw(motor, movements, duration, rng)
-        early, first = rng.random() < EARLY, rng.random() < 0.5
-        late = rng.uniform(FIRST_RAMP_S, LAST_RAMP_S)
+        early, first = rng.random() < EARLY_DRAWN, rng.random() < 0.5
+        late = rng.uniform(FIRST_RAMP_S, LATEST_S)
         onset = (0.0 if first else rng.uniform(0.05, FIRST_RAMP_S)) if early else late
         return replace(value, course=replace(value.course, onset_s=onset))
 
@@ -72,7 +76,7 @@ class PriorError(SteadyStateError):
         low, high = PRIORS.error_ranges[int(rng.integers(len(PRIORS.error_ranges)))]
         value = super().draw(motor, movements, duration, rng)
         sizes = rng.uniform(low, high, movements) * rng.choice([-1.0, 1.0], movements)
-        onset = 0.0 if rng.random() < EARLY else float(rng.uniform(0.0, 8.1))
+        onset = 0.0 if rng.random() < EARLY_DRAWN else float(rng.uniform(0.0, LATEST_S))
         course = replace(value.course, onset_s=onset)
         return replace(value, course=course, per_movement={"offset_rad": sizes})
 
@@ -96,8 +100,16 @@ def main() -> None:
         plan = ft.Plan(
             robot, hypotheses, per_class, 1000 * options.seed + seed, imperfections, modes=modes
         )
-        found += outcomes(ft.simulate(plan), diagnoser, np.random.default_rng(seed))
+        found += outcomes(_showing(ft.simulate(plan)), diagnoser, np.random.default_rng(seed))
     report(found, np.random.default_rng(options.seed))
+
+
+def _showing(runs: xr.Dataset) -> xr.Dataset:
+    """Return the runs whose fault begins in time to show."""
+    last = runs["movement_start"].values[:, -1]
+    stuck = np.char.find(runs["fault"].values.astype(str), "stuck") >= 0
+    last = last + np.where(stuck, runs["ramp_duration"].values[:, -1].max(axis=-1), 0.0)
+    return runs.isel(run=np.flatnonzero(~(runs["onset"].values > last)))
 
 
 @dataclass(frozen=True)
@@ -113,12 +125,9 @@ class Outcome:
 
 
 def outcomes(
-    runs: object, diagnoser: ft.BayesDiagnoser, rng: np.random.Generator
+    runs: xr.Dataset, diagnoser: ft.BayesDiagnoser, rng: np.random.Generator
 ) -> Iterator[Outcome]:
     """Diagnose runs, and draw onset and size from their posterior given the true hypothesis."""
-    import xarray as xr
-
-    assert isinstance(runs, xr.Dataset)
     diagnoses = diagnoser.diagnose(runs)
     sound = without_spoilt(runs, log_quality(runs))
     evidence = settled_evidence(sound)

@@ -57,10 +57,12 @@ class HealthyModel:
     Attributes:
         twin: Kinematics.
         imperfections: Offsets, scatter and rates of lost commands.
+        blur: Factor on all scatter and noise; 1 for a robot as it is.
     """
 
     twin: DigitalTwin
     imperfections: Imperfections
+    blur: float = 1.0
 
     @cached_property
     def settling(self) -> Settling:
@@ -70,6 +72,10 @@ class HealthyModel:
     @cached_property
     def scatter(self) -> FloatArray:
         """Scale of the settled scatter and of what is not known of the robot, (motor,) [rad]."""
+        return self.blur * self._sharp_scatter
+
+    @property
+    def _sharp_scatter(self) -> FloatArray:
         scatter, doubt = np.asarray(self.settling.scatter), self.imperfections.variation
         if doubt is None:
             return np.hypot(scatter, self._rounding)
@@ -93,8 +99,8 @@ class HealthyModel:
         """Noise of a settled tool position that belongs to no motor [m]."""
         readings = self.imperfections.readings
         if readings is None or self.imperfections.settling is None:
-            return PATH_NOISE_M
-        return float(np.hypot(readings.noise_m, LEAST_NOISE_M))
+            return self.blur * PATH_NOISE_M
+        return self.blur * float(np.hypot(readings.noise_m, LEAST_NOISE_M))
 
     @property
     def knows_timing(self) -> bool:

@@ -22,7 +22,7 @@ from failuretwin.data_knowledge.settled_evidence import SettledEvidence, settled
 from failuretwin.decision.assessment import lost_commands, unused_movements, why_undecided
 from failuretwin.decision.law import Estimate, Scene, Weight
 from failuretwin.decision.priors import Priors
-from failuretwin.decision.weighing import check_weighable, log_prior, weigh_hypothesis
+from failuretwin.decision.weighing import check_weighable, log_prior, weigh_all
 from failuretwin.decision.wording import explanation, verdict
 from failuretwin.digital_model.imperfections import Imperfections, default_imperfections
 from failuretwin.digital_model.twin import DigitalTwin
@@ -126,7 +126,7 @@ class BayesDiagnoser:
 
     def _weigh(self, evidence: SettledEvidence, moving: MovingEvidence | None) -> _Weighed:
         scene = Scene(evidence, self.healthy_model, moving)
-        weights = [weigh_hypothesis(scene, h, self.priors) for h in self._hypotheses]
+        weights = weigh_all(scene, self._hypotheses, self.priors)
         log_joint = np.stack([w.log_evidence for w in weights], axis=1) + log_prior(
             self._hypotheses
         )

@@ -8,7 +8,7 @@ profile of the motor.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -31,21 +31,25 @@ class Scene:
         evidence: Settled positions.
         model: The healthy robot.
         moving: Readings on the way; None: they are left aside.
+        way_blur: Factor on the scatter of the way alone; 1 for a robot as it is.
     """
 
     evidence: SettledEvidence
     model: HealthyModel
     moving: MovingEvidence | None = None
-    _profiles: dict[int, MotorProfile] = field(default_factory=dict, compare=False, repr=False)
+    way_blur: float = 1.0
+    _profiles: dict[int, MotorProfile] = field(
+        default_factory=dict, init=False, compare=False, repr=False
+    )
     _ways: dict[tuple[int, bool], FloatArray] = field(
-        default_factory=dict, compare=False, repr=False
+        default_factory=dict, init=False, compare=False, repr=False
     )
 
     def __getitem__(self, run: int) -> Scene:
         """Return the scene of one of the runs."""
         rows = slice(run, run + 1)
         moving = None if self.moving is None else self.moving[rows]
-        return Scene(self.evidence[rows], self.model, moving)
+        return Scene(self.evidence[rows], self.model, moving, self.way_blur)
 
     @cached_property
     def alternatives(self) -> Alternatives:
@@ -61,7 +65,8 @@ class Scene:
         """What the readings on the way say; None where they are left aside."""
         if self.moving is None:
             return None
-        ramps = RampModel(self.model, self.evidence, self.moving)
+        model = replace(self.model, blur=self.model.blur * self.way_blur)
+        ramps = RampModel(model, self.evidence, self.moving)
         return Transients(ramps, self.alternatives, *self._explained)
 
     @cached_property

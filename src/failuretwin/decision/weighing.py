@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import Fault, Hypothesis
+from failuretwin.core.hypothesis import UNKNOWN, Fault, Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.knowledge import prior_odds
 from failuretwin.decision.law import Estimate, Law, Scene, Weight, weigh
@@ -20,10 +20,8 @@ from failuretwin.decision.laws.unknown import weigh_unknown
 from failuretwin.decision.pairs import weigh_pair
 from failuretwin.decision.priors import Priors
 
-UNKNOWN_ODDS = 0.05
-"""Odds of `unknown` against healthy: assumed; rare, as the table of failure modes is long."""
-UNKNOWN_BEFORE_RUN = 0.9
-"""Probability that an unknown fault was there before the run; as for most known ones."""
+UNKNOWN_ODDS = 0.3
+"""Odds of `unknown` against healthy: assumed, like those of the rarer fault modes."""
 MOST_FAULTS = 2
 """Faults that can be weighed at once."""
 
@@ -75,10 +73,18 @@ def log_prior(hypotheses: Sequence[Hypothesis]) -> FloatArray:
     return np.asarray(np.log(odds / odds.sum()))
 
 
+def weigh_all(scene: Scene, hypotheses: Sequence[Hypothesis], priors: Priors) -> list[Weight]:
+    """Return what runs say of each hypothesis, in their order."""
+    known = [h for h in hypotheses if h.known]
+    weights = {h: weigh_hypothesis(scene, h, priors) for h in known}
+    if len(known) < len(hypotheses):
+        ways = [lambda blurred, h=h: weigh_hypothesis(blurred, h, priors) for h in known]
+        weights[UNKNOWN] = weigh_unknown(scene, ways, log_prior(known))
+    return [weights[h] for h in hypotheses]
+
+
 def weigh_hypothesis(scene: Scene, hypothesis: Hypothesis, priors: Priors) -> Weight:
-    """Return what runs say of one hypothesis."""
-    if not hypothesis.known:
-        return weigh_unknown(scene, UNKNOWN_BEFORE_RUN)
+    """Return what runs say of one known hypothesis."""
     if hypothesis.is_healthy:
         return _weigh_healthy(scene)
     if len(hypothesis.faults) == 2:

@@ -47,10 +47,8 @@ def size_nodes(
     local = nodes_around(best, width, usable, low)
     coarse = np.broadcast_to(grid, (len(best), len(grid)))
     nodes = np.concatenate([local, coarse], axis=1)
-    if signed:  # what points between the two sides stands for the smallest size
-        nodes = np.copysign(np.clip(np.abs(nodes), low, high), nodes)
-    nodes = np.sort(np.clip(nodes, -high if signed else low, high), axis=1)
-    mass = log_trapezoid_weights(np.clip(nodes, low, high))
-    if signed:
-        mass = np.logaddexp(mass, log_trapezoid_weights(np.clip(nodes, -high, -low)))
+    side = np.where(signed & (nodes < 0.0), -1.0, 1.0)
+    nodes = np.sort(side * np.clip(side * nodes, low, high), axis=1)
+    # Both sides moved together: what lies between the lowest sizes has no mass.
+    mass = log_trapezoid_weights(nodes - np.sign(nodes) * low)
     return nodes, mass - log_sum(mass, axis=1)[:, None]

@@ -201,7 +201,7 @@ def _onsets(
     on_ramp = np.nan_to_num(movements.start[0])[:, None] + done * ramp[:, None]
     on_ramp = np.maximum(on_ramp[..., None] + shift, 0.0)
     on_plateau = begin[:, 0, None] + SHARES * (end - begin)[:, 0, None]
-    on_plateau[0, : len(SHARES) // 2] = 0.0  # before the run
+    on_plateau[0, :-2] = 0.0  # before the run; the rest: before the first ramp
     on_plateau = np.repeat(on_plateau[:, None], len(angle), axis=1)
     onset = np.concatenate([on_plateau, on_ramp], axis=-1)
     if known_s is not None:

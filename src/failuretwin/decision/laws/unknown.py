@@ -1,66 +1,57 @@
-"""What none of the known faults explains: the tool settles somewhere near, but not where it should.
+"""What none of the known faults explains: nearest to one of them, yet off by much.
 
-Its distance from the healthy place is of an unknown scale, in any direction, anew for each
-movement; some movements are as if all were well.
+The robot does what some known hypothesis says, healthy included, but settles and moves off it by
+many times what a healthy robot scatters, or only moves off it; how much more is unknown, the same
+for the whole run.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
 import numpy as np
 
-from failuretwin.core.ellipsoid import log_fall, log_norm
-from failuretwin.core.quadrature import Weighted, log_of
+from failuretwin.core.quadrature import log_sum
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.law import Estimate, Scene, Weight, posterior_of
-from failuretwin.decision.onsets import at_movement_starts
+from failuretwin.decision.law import Estimate, Scene, Weight
 
-SCALES = (0.03, 0.1, 0.3)
-"""Scales of the distance, as shares of the arm's reach."""
-DOF = 4.0
-"""Degrees of freedom of the distance: heavy tails."""
-SOUND = 0.2
-"""Share of movements that are as if all were well."""
+BLURS = (3.0, 8.0, 25.0)
+"""Factors on the scatter: just more than tails allow, to anywhere near."""
+WAY_BLUR = 8.0
+"""The same where the motors settle as they should, but get there in another way."""
 
 
-def weigh_unknown(scene: Scene, early: float) -> Weight:
+def weigh_unknown(
+    scene: Scene, known: Sequence[Callable[[Scene], Weight]], log_prior: FloatArray
+) -> Weight:
     """Return what the runs say of a fault that is not among the known ones.
 
     Args:
         scene: The runs.
-        early: Probability that it was there before the run.
+        known: What weighs each known hypothesis.
+        log_prior: Their log prior probability, (hypothesis,).
     """
-    model, alternatives = scene.model, scene.alternatives
-    pose = model.settle(
-        alternatives.base[:, :, 0], alternatives.direction[:, :, 0], model.none_held
-    )
-    away = scene.evidence.point - model.twin.path(pose)
-    square = np.sum(away**2, axis=-1)
-    scales = np.asarray(SCALES) * model.reach
-    off = log_norm(DOF) - 3.0 * np.log(scales) + log_fall(square[..., None] / scales**2, DOF)
-    healthy = scene.log_healthy[..., None]
-    density = np.logaddexp(np.log(SOUND) + healthy, np.log1p(-SOUND) + off)
-    density = np.where(scene.usable[..., None], density, 0.0)
-    stretches = at_movement_starts(scene.evidence.movements)
-    log_first = log_of(stretches.weights(early))[..., None] - np.log(len(SCALES))
-    log_first = np.repeat(log_first, len(SCALES), axis=2)
-    on_way = (scene.on_way, _on_way(scene)[..., None])
-    found = posterior_of(scene.log_healthy, density, log_first, on_way)
+    blurred = [replace(scene, model=replace(scene.model, blur=blur)) for blur in BLURS]
+    if scene.moving is not None:
+        blurred.append(replace(scene, way_blur=WAY_BLUR))
+    found = [weigh(other) for other in blurred for weigh in known]
+    prior = np.tile(log_prior - np.log(len(blurred)), len(blurred))
+    joint = np.stack([weight.log_evidence for weight in found], axis=1) + prior
+    log_evidence = log_sum(joint, axis=1)
+    best = np.argmax(joint, axis=1)
+    run = np.arange(len(best))
+
+    def of_best(values: list[FloatArray]) -> FloatArray:
+        return np.stack(values)[best, run]
 
     def estimate(run: int) -> Estimate:
-        onset, part = stretches.samples(early, run)
-        when = np.exp(found.log_share[run]).sum(axis=1)[:, None] * part
-        return Estimate(
-            onset=Weighted(onset.ravel(), when.ravel()),
-            size=None,
-            became=scene.became[run],
-        )
+        nearest = found[best[run]].estimate(run)
+        return replace(nearest, size=None)
 
-    return Weight(found.log_evidence, found.by_movement, found.settled, estimate)
-
-
-def _on_way(scene: Scene) -> FloatArray:
-    """Return the log density of the readings on the way, (run, movement)."""
-    if scene.transients is None:
-        return scene.on_way
-    astray = scene.transients.astray
-    return np.logaddexp(np.log(SOUND) + scene.on_way, np.log1p(-SOUND) + astray)
+    return Weight(
+        log_evidence=log_evidence,
+        by_movement=of_best([weight.by_movement for weight in found]),
+        settled=of_best([weight.settled for weight in found]),
+        estimate=estimate,
+    )
