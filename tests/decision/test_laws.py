@@ -11,7 +11,8 @@ from failuretwin.data_knowledge.knowledge import magnitude_range
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
 from failuretwin.decision import pairs
 from failuretwin.decision.law import Scene
-from failuretwin.decision.laws.lasting import AMOUNTS, drift_law, lasting_law
+from failuretwin.decision.laws.drift import drift_law
+from failuretwin.decision.laws.lasting import AMOUNTS, lasting_law
 from failuretwin.decision.laws.nodes import size_nodes
 from failuretwin.decision.laws.steady_state_error import error_law, offset_nodes
 from failuretwin.decision.laws.stuck import stuck_law
@@ -31,8 +32,7 @@ LAWS = {
     "lag": lambda scene, early: lag_law(scene, 1, early),
     "slow": lambda scene, early: slow_law(scene, 1, early),
     **{
-        mode: lambda scene, early, mode=mode: lasting_law(scene, 1, mode, early)
-        for mode in AMOUNTS
+        mode: lambda scene, early, mode=mode: lasting_law(scene, 1, mode, early) for mode in AMOUNTS
     },
 }
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 CHUNK_RUNS = 64
-"""Runs at a time: keeps the work on nodes in about 100 MB."""
+"""Runs of five movements at a time: keeps the work on nodes in about 100 MB."""
 
 LEVELS = (0.05, 0.5, 0.95)
 """Quantiles that are told: the ends of a 90 % interval and the median."""
@@ -109,8 +109,9 @@ class BayesDiagnoser:
         faults = truth_of(runs)
         truth: list[str | None] = [None] * len(names) if faults is None else list(faults)
         results = []
-        for first in range(0, len(names), CHUNK_RUNS):
-            rows = slice(first, first + CHUNK_RUNS)
+        chunk = _runs_at_a_time(evidence.movements.start.shape[1])
+        for first in range(0, len(names), chunk):
+            rows = slice(first, first + chunk)
             weighed = self._weigh(evidence[rows], None if moving is None else moving[rows])
             for run in range(len(weighed.log_posterior)):
                 at = first + run
@@ -176,6 +177,11 @@ class BayesDiagnoser:
         lost = weighed.scene.alternatives.lost
         faulty = [fault.motor for fault in hypothesis.faults]
         return lost_commands(estimate.became, lost, self.twin.robot.motor_names, faulty)
+
+
+def _runs_at_a_time(movements: int) -> int:
+    """Return how many runs of so many movements to weigh at a time: nodes grow with the square."""
+    return max(1, min(CHUNK_RUNS, 25 * CHUNK_RUNS // max(movements, 1) ** 2))
 
 
 def _evidence(weighed: _Weighed, run: int, order: IntArray) -> tuple[MovementEvidence, ...]:

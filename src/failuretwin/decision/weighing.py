@@ -11,7 +11,8 @@ from failuretwin.core.hypothesis import UNKNOWN, Fault, Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.knowledge import prior_odds
 from failuretwin.decision.law import Estimate, Law, Scene, Weight, weigh
-from failuretwin.decision.laws.lasting import AMOUNTS, drift_law, lasting_law
+from failuretwin.decision.laws.drift import drift_law
+from failuretwin.decision.laws.lasting import AMOUNTS, lasting_law
 from failuretwin.decision.laws.stays import MISSES, weigh_misses
 from failuretwin.decision.laws.steady_state_error import error_law
 from failuretwin.decision.laws.stuck import stuck_law
