@@ -15,8 +15,9 @@ from failuretwin.decision.motor_profile import MotorProfile, motor_profile
 FEWEST_NATS = 14.0
 """Nodes of the first fault this far below its best, given any movement, are left out."""
 MOST_NODES = 400
-"""Nodes of each fault to sum over; of laws with more, such as drift, the others are thinned out. What
-one fault alone makes of a movement says little of its size beside another, so few can be spared."""
+"""Nodes of each fault to sum over; of laws with more, such as drift, the others are thinned out.
+What one fault alone makes of a movement says little of its size beside another, so few can be
+spared."""
 
 
 def weigh_pair(scenes: Sequence[Scene], laws: Sequence[tuple[Law, Law]]) -> Weight:
