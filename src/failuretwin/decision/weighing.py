@@ -67,6 +67,11 @@ def check_weighable(hypothesis: Hypothesis) -> None:
             )
 
 
+def shows_on_way(hypothesis: Hypothesis) -> bool:
+    """Return whether a hypothesis shows in how the motors move more than in where they settle."""
+    return not hypothesis.known or any(fault.mode in TIMED for fault in hypothesis.faults)
+
+
 def log_prior(hypotheses: Sequence[Hypothesis]) -> FloatArray:
     """Return the log prior probability of each hypothesis, (hypothesis,)."""
     odds = np.array([prior_odds(h) if h.known else UNKNOWN_ODDS for h in hypotheses])

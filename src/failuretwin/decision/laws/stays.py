@@ -75,7 +75,7 @@ def weigh_misses(scene: Scene, motor: int, mode: str, early: float) -> Weight:
             became=scene.became[run],
         )
 
-    settled = by_movement - np.maximum(scene.on_way, scene.on_way_with(motor, held=True))
+    settled = by_movement - np.maximum(scene.on_way, scene.on_way_off(motor))
     return Weight(log_evidence, by_movement, settled, estimate)
 
 
@@ -104,8 +104,8 @@ def _densities(scene: Scene, motor: int) -> _Places:
     on_way = profile.log_density(way.reshape(runs, count, -1, 1), False)
     on_way = log_sum(on_way.reshape(runs, count, -1, steps), axis=3) - np.log(steps)
     arrives = np.eye(count, count + 1, 1, dtype=bool)
-    held = scene.on_way_with(motor, held=True)[..., None]
-    off = scene.on_way_with(motor, held=False)[..., None]
+    held = scene.on_way_held(motor, places)
+    off = scene.on_way_off(motor)[..., None]
     return _Places(at + np.where(arrives, off, held), on_way + held)
 
 
