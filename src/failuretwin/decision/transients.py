@@ -143,9 +143,16 @@ class Transients:
         )
         seen = np.argmax(profile.log_terms(near, False), axis=-1)
         ends = np.where(self._usable[..., None, None], profile.pose, self._expected)
-        ends[..., motor] = np.where(self._usable[..., None], near, self._expected[..., motor])
+        unseen = self._expected[..., motor] + self._usually_off(_at(near - profile.expected, seen))
+        ends[..., motor] = np.where(self._usable[..., None], near, unseen)
         course, luck = self._settle(_Course(ends, seen, self.alternatives.lost, self._first))
         return self._trusted(self._from_anywhere(course, self._judge(course), motor) + luck)
+
+    def _usually_off(self, offset: FloatArray) -> FloatArray:
+        """Return the median of offsets (run, movement) over the movements seen, (run, 1, 1)."""
+        some = self._usable.any(axis=1, keepdims=True)
+        seen = np.where(self._usable, offset, np.where(some, np.nan, 0.0))
+        return np.asarray(np.nanmedian(seen, axis=1))[:, None, None]
 
     def _from_anywhere(
         self, course: _Course, says: FloatArray, off: int | None = None
