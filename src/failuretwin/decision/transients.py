@@ -13,13 +13,18 @@ from functools import cached_property
 import numpy as np
 
 from failuretwin.connection.healthy import Alternatives
-from failuretwin.core.quadrature import log_sum
+from failuretwin.core.quadrature import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.decision.motor_profile import MotorProfile
 from failuretwin.decision.ramps import RampModel, Ramps
 
-LARGEST_OFFSET_RAD = 0.3
-"""Furthest from its target that a motor is taken to have settled without being stuck [rad]."""
+LARGEST_OFFSET_RAD = 0.9
+"""Furthest from its target that a motor is taken to have settled without being stuck [rad]; the
+largest encoder faults that are considered."""
+STARTS_RAD = np.linspace(-LARGEST_OFFSET_RAD, LARGEST_OFFSET_RAD, 13)
+"""Where a motor may stand before the run if not where it should, from there."""
+RARELY_ELSEWHERE = 0.01
+"""Motors that do so less often are taken to stand where they should [-]."""
 TRUST = 0.1
 """Power to which what the way says is taken: its readings share errors of timing and of both ends
 that the model of the way does not know, so that all of a movement count for about one. Chosen on
@@ -84,7 +89,7 @@ class Transients:
     def healthy(self) -> FloatArray:
         """Log density if no motor is faulty, (run, movement)."""
         course, luck = self._healthy
-        return self._trusted(self._judge(course) + luck)
+        return self._trusted(self._from_anywhere(course, self._judge(course)) + luck)
 
     def held(self, motor: int, profile: MotorProfile, angle: FloatArray) -> FloatArray:
         """Return the log density if a motor is held all the way or gets stuck on it.
@@ -113,13 +118,12 @@ class Transients:
         begin = np.repeat(course.origin()[item][:, None], cases, axis=1)
         begin[..., motor] = at
         stays = self._weigh(*item, begin, end)
-        begin[..., motor] = replace(course, lost=self.alternatives.lost).origin()[item][
-            :, None, motor
-        ]
+        moving = replace(course, lost=self.alternatives.lost).origin()
+        begin[..., motor] = moving[item][:, None, motor]
         stops = self._weigh(*item, begin, end, stops=motor)
         found = np.zeros((*self._usable.shape, cases))
         found[item] = np.logaddexp(stays, stops) - np.log(2.0)
-        return self._trusted(found + luck[..., None])
+        return self._trusted(self._from_anywhere(course, found) + luck[..., None])
 
     def off(self, motor: int, profile: MotorProfile) -> FloatArray:
         """Return the log density if a motor goes to where it was seen to settle.
@@ -140,7 +144,47 @@ class Transients:
         ends = np.where(self._usable[..., None, None], profile.pose, self._expected)
         ends[..., motor] = np.where(self._usable[..., None], near, self._expected[..., motor])
         course, luck = self._settle(_Course(ends, seen, self.alternatives.lost, self._first))
-        return self._trusted(self._judge(course) + luck)
+        return self._trusted(self._from_anywhere(course, self._judge(course), motor) + luck)
+
+    def _from_anywhere(
+        self, course: _Course, says: FloatArray, off: int | None = None
+    ) -> FloatArray:
+        """Return log densities if a motor may have stood elsewhere before the run.
+
+        A healthy one does if it missed the command before.
+
+        Args:
+            course: Where the movements led.
+            says: Log density of each movement if all stood where they should, (run, movement) or
+                (run, movement, node).
+            off: Motor that is as likely to have been off as not.
+        """
+        chance = np.exp(self.alternatives.log_weight[:, 0]) @ self.alternatives.lost  # (run, motor)
+        if off is not None:
+            chance = 0.5 * chance
+            chance[:, off] = 0.5
+        shape = (-1,) + (1,) * (says.ndim - 2)
+        usual = np.log1p(-np.minimum(chance.sum(axis=1), 0.9))
+        terms = [says[:, 0] + usual.reshape(shape)]
+        for motor in np.flatnonzero(chance.max(axis=0) > RARELY_ELSEWHERE):
+            other = self._elsewhere(course, int(motor)) + log_of(chance[:, motor])
+            terms.append(np.broadcast_to(other.reshape(shape), terms[0].shape))
+        says = says.copy()
+        says[:, 0] = np.logaddexp.reduce(terms, axis=0)
+        return says
+
+    def _elsewhere(self, course: _Course, motor: int) -> FloatArray:
+        """Return the log density of the first movement if a motor was off before it, (run,)."""
+        run = np.flatnonzero(self.ramps.moving.seen[:, 0].any(axis=-1))
+        begin, end = (
+            np.repeat(pose[run, 0][:, None], len(STARTS_RAD), axis=1)
+            for pose in (course.origin(), course.destination())
+        )
+        begin[..., motor] += STARTS_RAD
+        found = np.zeros(len(self._usable))
+        says = self._weigh(run, np.zeros_like(run), begin, end)
+        found[run] = log_sum(says, axis=-1) - np.log(len(STARTS_RAD))
+        return found
 
     @cached_property
     def astray(self) -> FloatArray:
