@@ -130,9 +130,10 @@ def _chain(
         moved = np.full_like(state, -np.inf)
         moved[..., :-1] = state[..., :-1] + log_stay[:, None] + place.at[:, m, None, None]
         from_way = log_sum(state[..., :-1] + place.way[:, m, None, None], axis=-1)
-        lying = place.way[:, m].max(axis=-1)[:, None, None]  # where it stuck before is not known
+        # Where it stuck before is not known: on the way from any place that it may have left.
+        lying = log_sum(place.way[:, m, : m + 1], axis=-1)[:, None, None] - np.log(m + 1)
         moved[..., -1] = np.logaddexp(
-            log_midway + from_way, log_stay + state[..., -1] + lying - np.log(len(WAY))
+            log_midway + from_way, np.logaddexp(log_midway, log_stay) + state[..., -1] + lying
         )
         arrives = np.where(
             spoilt[..., 0], log_arrive + total + place.at[:, m, m + 1][:, None, None], -np.inf
