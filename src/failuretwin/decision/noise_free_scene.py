@@ -12,8 +12,6 @@ from functools import cached_property
 
 import numpy as np
 
-from failuretwin.core.ellipsoid import Ellipsoid, log_fall
-from failuretwin.core.quadrature import log_sum
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.law import Scene
 from failuretwin.decision.motor_profile import MotorProfile
@@ -44,16 +42,14 @@ class NoiseFreeScene(Scene):
 
     @cached_property
     def log_healthy(self) -> FloatArray:
-        """Expected log density of each settled position if no motor is faulty, (run, movement)."""
-        model, alternatives = self.model, self.alternatives
-        pose = model.settle(alternatives.base, alternatives.direction, model.none_held)
-        predicted, jacobian = model.twin.path_and_jacobian(pose)
-        spread = Ellipsoid.of(jacobian * model.scatter, model.path_noise**2)
-        error = self.evidence.point[:, :, None] - predicted
-        dof = model.settling.tail_dof
-        fall = log_fall(spread.product(error, error) * shrink(dof), dof)
-        terms = log_sum(_relative(alternatives.log_weight) + fall, axis=-1)
-        return np.where(self.usable, np.logaddexp(terms, -MOST_NATS), 0.0)
+        """Expected log density of each settled position if no motor is faulty, (run, movement).
+
+        The tool strays along the circle of the motor that strays, not along its tangent: so that
+        of the motor counts that explains the position best.
+        """
+        profiles = [self.profile(motor) for motor in range(len(self.model.scatter))]
+        says = [p.log_density(p.expected[:, :, None], False)[..., 0] for p in profiles]
+        return np.asarray(np.max(says, axis=0))
 
     def profile(self, motor: int) -> MotorProfile:
         """Return what each movement is expected to say of one motor, computed once."""

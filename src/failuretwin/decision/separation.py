@@ -107,14 +107,14 @@ class Judge:
     def _fits(
         self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]], onset: FloatArray
     ) -> FloatArray:
-        silent = self._silent(runs, faults)
+        silent = self.silent(runs, faults)
         settled = settled_evidence(silent)
         moving = moving_evidence(silent, settled) if self._needs_way else None
         scene = NoiseFreeScene(settled, self.model, moving)
         first = first_spoilt(settled.movements, onset)
         return np.stack([best_fit(scene, h, self.priors, first) for h in self.hypotheses], axis=1)
 
-    def _silent(self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]]) -> xr.Dataset:
+    def silent(self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]]) -> xr.Dataset:
         """Return the runs as they would be seen if nothing were left to chance."""
         twin, time = self.model.twin, as_floats(runs["time"].values)
         path = noise_free_path(
@@ -166,7 +166,7 @@ def separation(
     """
     check_runs(runs, "the run set")
     check_motors(runs, twin.robot.name, twin.robot.motor_names)
-    truth, faults = _truth(runs)
+    truth, faults = truth_and_faults(runs)
     asked = tuple(hypotheses or paper_hypotheses(twin.robot.motor_names))
     model = HealthyModel(twin, imperfections or default_imperfections(twin.robot))
     everything = tuple(dict.fromkeys((*asked, *truth)))
@@ -176,7 +176,14 @@ def separation(
     return Separation(asked, truth, own[:, None] - fit[:, : len(asked)])
 
 
-def _truth(runs: xr.Dataset) -> tuple[tuple[Hypothesis, ...], list[list[FaultValue]]]:
+def truth_and_faults(
+    runs: xr.Dataset,
+) -> tuple[tuple[Hypothesis, ...], list[list[FaultValue]]]:
+    """Return what is true of each run, and its faults as they strike it.
+
+    Raises:
+        InputError: If the run set does not tell.
+    """
     for name in ("fault", "fault_detail", "onset"):
         if name not in runs:
             raise InputError(
