@@ -32,9 +32,7 @@ def movements(late):
 def model(twin, entries, late_rate):
     losses = tuple(LostCommand(*entry) for entry in entries)
     timing = Timing(late_rate=late_rate)
-    return HealthyModel(
-        twin, Imperfections("lossy", "test", timing=timing, lost_commands=losses)
-    )
+    return HealthyModel(twin, Imperfections("lossy", "test", timing=timing, lost_commands=losses))
 
 
 def by_base(masks, bases, weights):

@@ -23,9 +23,7 @@ def tool(time):
 
 
 def reference():
-    return Movements(
-        np.zeros((1, 2)), TARGETS[None], np.full((1, 3, 2), 0.8), STARTS[None]
-    )
+    return Movements(np.zeros((1, 2)), TARGETS[None], np.full((1, 3, 2), 0.8), STARTS[None])
 
 
 def run_set(measured, rate_hz, step_s=0.01):

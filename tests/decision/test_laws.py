@@ -31,8 +31,7 @@ LAWS = {
     "lag": lambda scene, early: lag_law(scene, 1, early),
     "slow": lambda scene, early: slow_law(scene, 1, early),
     **{
-        mode: lambda scene, early, mode=mode: lasting_law(scene, 1, mode, early)
-        for mode in AMOUNTS
+        mode: lambda scene, early, mode=mode: lasting_law(scene, 1, mode, early) for mode in AMOUNTS
     },
 }
 

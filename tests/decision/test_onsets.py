@@ -48,16 +48,16 @@ def test_onsets_are_spread_as_their_prior_says(parts, early):
         assert mass[onset == 0.0].sum() == pytest.approx(1.0)
         return
     assert mass[:, 0].sum() == pytest.approx(early, abs=1e-9)
-    assert np.sum(mass * onset) == pytest.approx((1.0 - early) * total / 2.0, abs=1e-6 + 1e-9 * total)
+    assert np.sum(mass * onset) == pytest.approx(
+        (1.0 - early) * total / 2.0, abs=1e-6 + 1e-9 * total
+    )
     assert onset.min() >= 0.0
     assert onset.max() <= total
 
 
 def test_a_run_has_the_onsets_that_it_has_among_longer_ones():
     start = np.array([[0.5, 2.0, np.nan], [0.0, 2.0, 4.0]])
-    movements = Movements(
-        np.zeros((2, 1)), np.zeros((2, 3, 1)), np.full((2, 3, 1), 0.5), start
-    )
+    movements = Movements(np.zeros((2, 1)), np.zeros((2, 3, 1)), np.full((2, 3, 1), 0.5), start)
     found = at_movement_starts(movements)
     np.testing.assert_allclose(found.weights(0.4), [[0.4 + 0.15, 0.45, 0.0], [0.4, 0.3, 0.3]])
     onset, share = found.samples(0.4, 0)
