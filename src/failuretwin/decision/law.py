@@ -248,15 +248,38 @@ def posterior_of(
     )
 
 
-def weigh(scene: Scene, law: Law) -> Weight:
-    """Return what the runs say of a fault of one motor."""
-    profile = scene.profile(law.motor)
-    density = by_node = profile.log_density(law.angle, law.held)
+@dataclass(frozen=True)
+class Densities:
+    """Log densities of each movement with a fault.
+
+    Attributes:
+        by_node: Of its settled position at each node, (run, movement, node).
+        by_cell: The same with nodes that are redrawn summed in their groups,
+            (run, movement, cell).
+        way: Of its readings on the way, (run, movement, cell) or the same for all cells,
+            (run, movement, 1).
+    """
+
+    by_node: FloatArray
+    by_cell: FloatArray
+    way: FloatArray
+
+
+def densities(scene: Scene, law: Law) -> Densities:
+    """Return what each movement says of a fault of one motor."""
+    by_node = by_cell = scene.profile(law.motor).log_density(law.angle, law.held)
     if law.redrawn is not None:  # (run, movement, group, node) summed over nodes
-        density = log_sum(by_node[:, :, None] + law.redrawn, axis=-1)
+        by_cell = log_sum(by_node[:, :, None] + law.redrawn, axis=-1)
     way = law.on_way
     if way is None:
         way = scene.on_way_off(law.motor)[..., None]
+    return Densities(by_node, by_cell, way)
+
+
+def weigh(scene: Scene, law: Law) -> Weight:
+    """Return what the runs say of a fault of one motor."""
+    profile, says = scene.profile(law.motor), densities(scene, law)
+    by_node, density, way = says.by_node, says.by_cell, says.way
     found = posterior_of(scene.log_healthy, density, law.log_prior, (scene.on_way, way))
 
     def estimate(run: int) -> Estimate:

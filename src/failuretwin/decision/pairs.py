@@ -140,8 +140,8 @@ def _thinned(scene: Scene, law: Law) -> Law:
         prior[..., cell] = np.logaddexp(prior[..., cell], law.log_prior[..., node])
 
     def of_run(run: int) -> tuple[FloatArray, FloatArray]:
-        parts = law.onsets(run)
-        return parts if parts[0].shape[1] == 1 else (parts[0][:, kept], parts[1][:, kept])
+        onset, part = law.onsets(run)
+        return _of_nodes(onset, kept), _of_nodes(part, kept)
 
     return replace(
         law,
@@ -151,6 +151,11 @@ def _thinned(scene: Scene, law: Law) -> Law:
         onsets=of_run,
         on_way=None if law.on_way is None else law.on_way[:, :, kept],
     )
+
+
+def _of_nodes(values: FloatArray, nodes: IntArray) -> FloatArray:
+    """Return the values (movement, node, sample) of some nodes; a node axis of 1 is for all."""
+    return values if values.shape[1] == 1 else values[:, nodes]
 
 
 def _nearest(values: FloatArray, kept: FloatArray) -> IntArray:

@@ -118,9 +118,8 @@ class Transients:
         begin = np.repeat(course.origin()[item][:, None], cases, axis=1)
         begin[..., motor] = at
         stays = self._weigh(*item, begin, end)
-        begin[..., motor] = replace(course, lost=self.alternatives.lost).origin()[item][
-            :, None, motor
-        ]
+        moving = replace(course, lost=self.alternatives.lost).origin()
+        begin[..., motor] = moving[item][:, None, motor]
         stops = self._weigh(*item, begin, end, stops=motor)
         found = np.zeros((*self._usable.shape, cases))
         found[item] = np.logaddexp(stays, stops) - np.log(2.0)
@@ -157,27 +156,28 @@ class Transients:
     def _from_anywhere(
         self, course: _Course, says: FloatArray, off: int | None = None
     ) -> FloatArray:
-        """Return log densities if motors may have stood elsewhere before, (run, movement, ...).
+        """Return log densities if a motor may have stood elsewhere before the run.
 
         A healthy one does if it missed the command before.
 
         Args:
             course: Where the movements led.
-            says: Log density of each movement if all stood where they should,
-                (run, movement, ...).
+            says: Log density of each movement if all stood where they should, (run, movement) or
+                (run, movement, node).
             off: Motor that is as likely to have been off as not.
         """
         chance = np.exp(self.alternatives.log_weight[:, 0]) @ self.alternatives.lost  # (run, motor)
         if off is not None:
             chance = 0.5 * chance
             chance[:, off] = 0.5
-        each = (-1,) + (1,) * (says.ndim - 2)
-        first = says[:, 0] + np.log1p(-np.minimum(chance.sum(axis=1), 0.9)).reshape(each)
+        shape = (-1,) + (1,) * (says.ndim - 2)
+        usual = np.log1p(-np.minimum(chance.sum(axis=1), 0.9))
+        terms = [says[:, 0] + usual.reshape(shape)]
         for motor in np.flatnonzero(chance.max(axis=0) > RARELY_ELSEWHERE):
-            moved = self._elsewhere(course, int(motor)) + log_of(chance[:, motor])
-            first = np.logaddexp(first, moved.reshape(each))
+            other = self._elsewhere(course, int(motor)) + log_of(chance[:, motor])
+            terms.append(np.broadcast_to(other.reshape(shape), terms[0].shape))
         says = says.copy()
-        says[:, 0] = first
+        says[:, 0] = np.logaddexp.reduce(terms, axis=0)
         return says
 
     def _elsewhere(self, course: _Course, motor: int) -> FloatArray:
