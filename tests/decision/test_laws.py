@@ -53,7 +53,7 @@ def scene(twin, runs):
 
 @pytest.fixture(scope="module")
 def blind(twin, runs):
-    return Scene(settled_evidence(runs.assign(measured=np.nan * runs["measured"])), 
+    return Scene(settled_evidence(runs.assign(measured=np.nan * runs["measured"])),
                  BayesDiagnoser(twin).healthy_model)  # fmt: skip
 
 
