@@ -44,7 +44,9 @@ class Scene:
     _profiles: dict[int, MotorProfile] = field(
         default_factory=dict, init=False, compare=False, repr=False
     )
-    _off: dict[int, FloatArray] = field(default_factory=dict, init=False, compare=False, repr=False)
+    _off: dict[tuple[int, bool], FloatArray] = field(
+        default_factory=dict, init=False, compare=False, repr=False
+    )
     _held: dict[int, FloatArray] = field(
         default_factory=dict, init=False, compare=False, repr=False
     )
@@ -78,13 +80,19 @@ class Scene:
         """Log density of the readings on the way if no motor is faulty, (run, movement)."""
         return np.zeros(self.usable.shape) if self.transients is None else self.transients.healthy
 
-    def on_way_off(self, motor: int) -> FloatArray:
-        """Return the same with one motor that settles off its target, (run, movement)."""
+    def on_way_off(self, motor: int, lasting: bool = False) -> FloatArray:
+        """Return the same with one motor that settles off its target, (run, movement).
+
+        Args:
+            motor: Index of the motor.
+            lasting: Whether it is off by about the same in all movements.
+        """
         if self.transients is None:
             return self.on_way
-        if motor not in self._off:
-            self._off[motor] = self.transients.off(motor, self.profile(motor))
-        return self._off[motor]
+        key = (motor, lasting)
+        if key not in self._off:
+            self._off[key] = self.transients.off(motor, self.profile(motor), lasting)
+        return self._off[key]
 
     def on_way_held(self, motor: int, angle: FloatArray) -> FloatArray:
         """Return the same with one motor that is held at some angle or gets stuck there.
@@ -158,6 +166,7 @@ class Law:
             its own node; None: one node holds for the whole run.
         on_way: Log density of the readings on the way at each node, (run, movement, node); None:
             as for any motor that settles off its target.
+        lasting: Whether the motor is off by about the same in all movements.
     """
 
     motor: int
@@ -168,6 +177,7 @@ class Law:
     onsets: Callable[[int], tuple[FloatArray, FloatArray]]
     redrawn: FloatArray | None = None
     on_way: FloatArray | None = None
+    lasting: bool = False
 
 
 @dataclass(frozen=True)
@@ -272,7 +282,7 @@ def densities(scene: Scene, law: Law) -> Densities:
         by_cell = log_sum(by_node[:, :, None] + law.redrawn, axis=-1)
     way = law.on_way
     if way is None:
-        way = scene.on_way_off(law.motor)[..., None]
+        way = scene.on_way_off(law.motor, law.lasting)[..., None]
     return Densities(by_node, by_cell, way)
 
 

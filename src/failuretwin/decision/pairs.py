@@ -83,7 +83,7 @@ def _way(scene: Scene, law: Law) -> FloatArray:
     """Return log densities of the way with one of the faults alone, (movement, node or 1)."""
     if law.on_way is not None:
         return law.on_way[0]
-    return scene.on_way_off(law.motor)[0][:, None]
+    return scene.on_way_off(law.motor, law.lasting)[0][:, None]
 
 
 def _alone(scene: Scene, law: Law) -> FloatArray:
