@@ -1,4 +1,4 @@
-"""An answer as the statuses of a `diagnostic_msgs/DiagnosticArray`: one a motor, one for the arm."""
+"""An answer as statuses of a `diagnostic_msgs/DiagnosticArray`: one a motor, one for the arm."""
 
 from __future__ import annotations
 

@@ -6,7 +6,6 @@ a log like any other.
 
 from __future__ import annotations
 
-import os
 import struct
 from io import FileIO
 from pathlib import Path
@@ -85,7 +84,12 @@ class McapFile:
         self._saved = 0
         self._stream = _Unbuffered(self._file)
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES)  # type: ignore[arg-type]
-        self._writer.start(profile="ros2", library=f"failuretwin {__version__}")
+        try:
+            self._writer.start(profile="ros2", library=f"failuretwin {__version__}")
+        except OSError:
+            self._file.close()
+            path.unlink()
+            raise
         self._saved = self._stream.tell()
 
     def write(self, message: Outgoing, time_ns: int) -> bool:
@@ -123,10 +127,10 @@ class McapFile:
             self._file.truncate(self._saved)
             self._file.seek(self._saved)
             self._stream.write(_END)
-        except OSError:
+        except OSError:  # `mcap recover` repairs it
             return
         finally:
-            os.close(self._file.fileno()) if self._file.closed else self._file.close()
+            self._file.close()
 
     def _register(self, topic: str, type_: str) -> int:
         text, _ = self._store.generate_msgdef(type_, ros_version=2)

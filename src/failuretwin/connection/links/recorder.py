@@ -64,8 +64,6 @@ class Recorder:
         try:
             self._file: McapFile | None = McapFile(path)
         except OSError as error:
-            if isinstance(error, ValueError):
-                raise
             raise OutputError(f"{path}: cannot be written ({error.strerror}).") from error
 
     @property
@@ -140,7 +138,6 @@ class Recorder:
         except OSError as error:
             self._trouble = f"{path}: cannot be written ({error.strerror})"
             self._retry_s = time.monotonic() + RETRY_S
-            path.unlink(missing_ok=True)
             return
         self._part += 1
         self._trouble = ""

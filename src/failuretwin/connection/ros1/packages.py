@@ -17,10 +17,10 @@ from typing import Any
 from failuretwin.core.errors import InputError
 
 DEBIAN_FOLDER = "/usr/lib/python3/dist-packages"
-ROS_MODULES = frozenset(
-    "catkin catkin_pkg defusedxml diagnostic_msgs distro genmsg genpy geometry_msgs netifaces "
-    "roscpp rosgraph rosgraph_msgs roslib rospkg rospy sensor_msgs six std_msgs trajectory_msgs "
-    "yaml".split()
+ROS_MODULES = (
+    *("catkin", "catkin_pkg", "defusedxml", "distro", "netifaces", "rospkg", "six", "yaml"),
+    *("genmsg", "genpy", "roscpp", "rosgraph", "rosgraph_msgs", "roslib", "rospy"),
+    *("diagnostic_msgs", "geometry_msgs", "sensor_msgs", "std_msgs", "trajectory_msgs"),
 )
 """Modules that ROS 1 consists of or needs, and that are taken from Debian if nowhere else found."""
 INSTALL = (

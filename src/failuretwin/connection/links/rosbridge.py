@@ -1,0 +1,183 @@
+"""A robot behind a rosbridge server, ROS 1 or ROS 2, over a web socket."""
+
+from __future__ import annotations
+
+import time
+from threading import Lock
+from types import SimpleNamespace
+from typing import Any, Self
+
+from failuretwin.connection.links.diagnostic_status import Beat, statuses
+from failuretwin.connection.links.event_queue import EventQueue
+from failuretwin.connection.links.ros_reader import RosReader
+from failuretwin.connection.links.ros_topics import RosTopics, kind_of_type
+from failuretwin.connection.links.ros_writer import DIAGNOSTICS_TYPE, Outgoing, diagnostics_message
+from failuretwin.connection.links.values import Answer, Event, Item, LinkCounts
+from failuretwin.core.errors import InputError
+from failuretwin.data_knowledge.bags.messages import Kind
+from failuretwin.data_knowledge.bags.topics import Role
+from failuretwin.digital_model.robot import Robot
+
+CONNECT_S = 5.0
+"""Longest wait for the server at the start [s]."""
+RECONNECT_S = 2.0
+"""Longest pause between two attempts to reach a server that has gone [s]."""
+_ROS1_TIME = {"secs": "sec", "nsecs": "nanosec"}
+"""What ROS 1 calls the parts of a time, and what ROS 2 does."""
+
+
+def connect(host: str, port: int) -> Any:
+    """Return a connection to a rosbridge server, a `roslibpy.Ros`.
+
+    Raises:
+        InputError: If roslibpy is missing or no server answers.
+    """
+    try:
+        import roslibpy
+    except ImportError as error:
+        raise InputError(
+            f"rosbridge needs roslibpy ({error}). Install it: pip install 'failuretwin[live]'."
+        ) from error
+    ros = roslibpy.Ros(host, port, transport="asyncio")
+    ros.factory.set_max_delay(RECONNECT_S)
+    try:
+        ros.run(CONNECT_S)
+    except roslibpy.core.RosTimeoutError as error:
+        ros.terminate()
+        raise InputError(
+            f"no rosbridge server answers at {host}:{port}. Start one there, such as "
+            "`roslaunch rosbridge_server rosbridge_websocket.launch`."
+        ) from error
+    return ros
+
+
+class RosbridgeSource:
+    """Listens to the topics of a robot; a server that goes away and comes back is no trouble.
+
+    Args:
+        robot: The robot.
+        topics: Its topics, with their types.
+        ros: The connection, see `connect`.
+        queue: Where events wait to be fetched.
+    """
+
+    ended = False
+
+    def __init__(
+        self, robot: Robot, topics: RosTopics, ros: Any, queue: EventQueue | None = None
+    ) -> None:
+        import roslibpy
+
+        self.name = f"rosbridge {ros.factory.url}"
+        self._ros = ros
+        self._queue = queue or EventQueue()
+        self._lock = Lock()
+        self._garbage, self._last_garbage, self._reconnects = 0, "", -1
+        self._readers = {role: RosReader(robot, role, name) for role, name, _ in topics.subscribed}
+        self._topics = []
+        self._count_connections(None)
+        for role, name, type_ in topics.subscribed:
+            topic = roslibpy.Topic(ros, name, type_)
+            topic.subscribe(
+                lambda message, r=role, k=kind_of_type(type_): self._take(message, r, k)
+            )
+            self._topics.append(topic)
+
+    @property
+    def counts(self) -> LinkCounts:
+        """What it has seen so far."""
+        return LinkCounts(
+            self._queue.received,
+            self._garbage,
+            self._queue.dropped,
+            self._reconnects,
+            self._last_garbage,
+        )
+
+    def poll(self, timeout_s: float) -> Event | None:
+        """Return the next event; None if none came within `timeout_s` [s]."""
+        return self._queue.get(timeout_s)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._ros.is_connected:
+            for topic in self._topics:
+                topic.unsubscribe()
+
+    def _count_connections(self, _: Any) -> None:
+        self._reconnects += 1
+        self._ros.factory.once("close", self._await_next)
+
+    def _await_next(self, _: Any) -> None:
+        self._ros.factory.once("ready", self._count_connections)
+
+    def _take(self, message: Any, role: Role, kind: Kind) -> None:
+        received_ns = time.time_ns()
+        with self._lock:
+            try:
+                events = self._readers[role].events(_as_object(message), kind, received_ns)
+            # Anyone may publish anything here. It is counted; the next one may be sound.
+            except Exception as error:
+                self._garbage += 1
+                self._last_garbage = f"{type(error).__name__}: {error}"
+                return
+            for event in events:
+                self._queue.put(event)
+
+
+class RosbridgeDiagnostics:
+    """Publishes answers as diagnostics: every second, and at once when a status gets worse.
+
+    Args:
+        robot: The robot.
+        topics: Names the topic.
+        ros: The connection, see `connect`.
+    """
+
+    def __init__(self, robot: Robot, topics: RosTopics, ros: Any) -> None:
+        import roslibpy
+
+        self.name = f"rosbridge {ros.factory.url} diagnostics"
+        self._robot = robot
+        self._topics = topics
+        self._ros = ros
+        self._beat = Beat()
+        self._topic = roslibpy.Topic(ros, topics.diagnostics, DIAGNOSTICS_TYPE)
+        self._topic.advertise()
+
+    @property
+    def trouble(self) -> str:
+        """What keeps items from arriving just now."""
+        return "" if self._ros.is_connected else "the rosbridge server is gone"
+
+    def put(self, item: Item) -> None:
+        """Publish an answer if it is time to and the server is there."""
+        if not isinstance(item, Answer) or self.trouble:
+            return
+        found = statuses(item, self._robot.motor_names)
+        if self._beat.due(found, time.monotonic()):
+            self._send(diagnostics_message(found, item.time, self._topics, self._robot))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._ros.is_connected:
+            self._topic.unadvertise()
+
+    def _send(self, message: Outgoing) -> None:
+        import roslibpy
+
+        self._topic.publish(roslibpy.Message(message.content))
+
+
+def _as_object(value: Any) -> Any:
+    """Return JSON as objects with fields, times under their ROS 2 names."""
+    if isinstance(value, dict):
+        fields = {_ROS1_TIME.get(name, name): _as_object(part) for name, part in value.items()}
+        return SimpleNamespace(**fields)
+    if isinstance(value, list):
+        return [_as_object(part) for part in value]
+    return value
