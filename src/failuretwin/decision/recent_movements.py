@@ -92,7 +92,7 @@ class RecentMovements:
 
     def _diagnose(self, time: float) -> Diagnosis:
         begin = self._commands[0][0]
-        grid = np.arange(max(2, round((time - begin) / STEP_S) + 1)) * STEP_S
+        grid = as_floats(np.arange(max(2, round((time - begin) / STEP_S) + 1)) * STEP_S)
         at, value = np.array([t for t, _ in self._commands]) - begin, self._commands
         command = np.stack(
             [np.interp(grid, at, [v[k] for _, v in value]) for k in range(len(value[0][1]))], axis=1

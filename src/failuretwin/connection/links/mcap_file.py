@@ -118,7 +118,7 @@ class McapFile:
         Raises:
             OSError: If the disk is full or gone.
         """
-        self._writer.finish()
+        self._writer.finish()  # type: ignore[no-untyped-call]
         self._file.close()
 
     def abandon(self) -> None:

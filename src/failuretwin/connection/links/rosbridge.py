@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from threading import Lock
 from types import SimpleNamespace
 from typing import Any, Self
@@ -78,9 +79,7 @@ class RosbridgeSource:
         self._count_connections(None)
         for role, name, type_ in topics.subscribed:
             topic = roslibpy.Topic(ros, name, type_)
-            topic.subscribe(
-                lambda message, r=role, k=kind_of_type(type_): self._take(message, r, k)
-            )
+            topic.subscribe(partial(self._take, role, kind_of_type(type_)))
             self._topics.append(topic)
 
     @property
@@ -113,7 +112,7 @@ class RosbridgeSource:
     def _await_next(self, _: Any) -> None:
         self._ros.factory.once("ready", self._count_connections)
 
-    def _take(self, message: Any, role: Role, kind: Kind) -> None:
+    def _take(self, role: Role, kind: Kind, message: Any) -> None:
         received_ns = time.time_ns()
         with self._lock:
             try:
@@ -176,8 +175,10 @@ class RosbridgeDiagnostics:
 def _as_object(value: Any) -> Any:
     """Return JSON as objects with fields, times under their ROS 2 names."""
     if isinstance(value, dict):
-        fields = {_ROS1_TIME.get(name, name): _as_object(part) for name, part in value.items()}
-        return SimpleNamespace(**fields)
+        found = SimpleNamespace()
+        for name, part in value.items():
+            setattr(found, _ROS1_TIME.get(name, name), _as_object(part))
+        return found
     if isinstance(value, list):
         return [_as_object(part) for part in value]
     return value
