@@ -6,7 +6,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from failuretwin.app.live.shadow import Moment
-from failuretwin.connection.links.diagnostic_status import LEVEL_ERROR, LEVEL_OK, statuses
+from failuretwin.connection.links.diagnostic_status import SURE, statuses
 from failuretwin.connection.links.values import STALE, LinkCounts
 
 KEPT = 1000
@@ -79,13 +79,10 @@ class Changes:
             return []
         arm = statuses(answer, self._motors)[0]
         best, before = answer.diagnosis.ranked[0], self._alarm
-        if arm.level == LEVEL_ERROR and best not in (before, "healthy"):
-            self._alarm = best
-            return [arm.message]
-        if arm.level == LEVEL_OK and before != "healthy":
-            self._alarm = "healthy"
-            return [f"healthy again: {arm.message}" if before else arm.message]
-        return []
+        if best == before or answer.diagnosis.posterior[best] < SURE:
+            return []
+        self._alarm = best
+        return [f"healthy again: {arm.message}" if before and best == "healthy" else arm.message]
 
     def _link(
         self, at: float, counts: LinkCounts, jumps: int, troubles: tuple[str, ...]

@@ -177,7 +177,7 @@ def _as_object(value: Any) -> Any:
     if isinstance(value, dict):
         found = SimpleNamespace()
         for name, part in value.items():
-            setattr(found, _ROS1_TIME.get(name, name), _as_object(part))
+            setattr(found, _ROS1_TIME.get(name, str(name)), _as_object(part))
         return found
     if isinstance(value, list):
         return [_as_object(part) for part in value]
