@@ -17,9 +17,7 @@ TIME = np.arange(1000) * 0.01
 
 @pytest.fixture(scope="module")
 def reference(armpi):
-    return (
-        RandomMovements().draw(armpi, Schedule(), np.random.default_rng(3)).reference(TIME)[0]
-    )
+    return RandomMovements().draw(armpi, Schedule(), np.random.default_rng(3)).reference(TIME)[0]
 
 
 @pytest.mark.parametrize("cuts", [[], [1, 2, 700], [123, 500]])

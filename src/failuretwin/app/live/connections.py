@@ -136,7 +136,7 @@ def _rosbridge(text: str, robot: Robot, topics: RosTopics, stack: ExitStack) -> 
     if not host:
         raise InputError(f"{text!r} is no address. Expected {ROSBRIDGE}://HOST[:PORT].")
     ros = rosbridge.connect(host, port)
-    stack.callback(ros.terminate)
+    stack.callback(rosbridge.disconnect, ros)
     source = stack.enter_context(rosbridge.RosbridgeSource(robot, topics, ros))
     sink = stack.enter_context(rosbridge.RosbridgeDiagnostics(robot, topics, ros))
     return Connections(source, (sink,))

@@ -77,7 +77,6 @@ class _Leg:
         movement: The movement as commanded, one of one run.
         chance: Bad luck of this one run with one movement.
         late: How late it starts [s].
-        swallowed: Whether the next command will be late, so that readings stop before it.
         faults: The faults that are there, or were not long ago.
     """
 
@@ -85,7 +84,6 @@ class _Leg:
     movement: Movements
     chance: Disturbances
     late: float
-    swallowed: bool
     faults: Injection
 
 
@@ -148,7 +146,6 @@ class EmulatedArm:
             movement,
             chance,
             late,
-            bool(self._upcoming.late[1] > 0.0),
             self._injection(float(time[0]) - MEMORY_S, float(time[-1])),
         )
 
@@ -202,10 +199,11 @@ class EmulatedArm:
     def _live_through(self, leg: _Leg) -> list[Event]:
         position = self._move(leg)
         local = leg.time - leg.time[0]
-        start = leg.movement.start - leg.time[0]
+        # A bus that stalls twice in a row comes back between; else it would be silent for minutes.
+        start = leg.movement.start - leg.time[0] + leg.late
         readings = self._imperfections.readings
         measured, angle = sense(self._twin, readings, position[None], local, start, leg.chance)
-        stalled = float(start[0, 0]) + leg.late if leg.late > 0.0 else 0.0
+        stalled = float(start[0, 0]) if leg.late > 0.0 else 0.0
         seen = np.isfinite(angle[0]).any(axis=1) & (local > 0.0) & (local >= stalled)
         events: list[Event] = [
             Reading(float(leg.time[k]), measured[0, k], angle[0, k]) for k in np.flatnonzero(seen)

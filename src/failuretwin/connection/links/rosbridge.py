@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from functools import partial
-from threading import Lock
 from types import SimpleNamespace
 from typing import Any, Self
 
@@ -23,6 +23,8 @@ CONNECT_S = 5.0
 """Longest wait for the server at the start [s]."""
 RECONNECT_S = 2.0
 """Longest pause between two attempts to reach a server that has gone [s]."""
+GOODBYE_S = 2.0
+"""Longest wait for the server in the end [s]."""
 _ROS1_TIME = {"secs": "sec", "nsecs": "nanosec"}
 """What ROS 1 calls the parts of a time, and what ROS 2 does."""
 
@@ -52,6 +54,16 @@ def connect(host: str, port: int) -> Any:
     return ros
 
 
+def disconnect(ros: Any) -> None:
+    """Close a connection, and wait for a server that is there to agree."""
+    if ros.is_connected:
+        closed = threading.Event()
+        ros.factory.once("close", lambda _: closed.set())
+        ros.close()
+        closed.wait(GOODBYE_S)
+    ros.terminate()
+
+
 class RosbridgeSource:
     """Listens to the topics of a robot; a server that goes away and comes back is no trouble.
 
@@ -72,7 +84,7 @@ class RosbridgeSource:
         self.name = f"rosbridge {ros.factory.url}"
         self._ros = ros
         self._queue = queue or EventQueue()
-        self._lock = Lock()
+        self._lock = threading.Lock()
         self._garbage, self._last_garbage, self._reconnects = 0, "", -1
         self._readers = {role: RosReader(robot, role, name) for role, name, _ in topics.subscribed}
         self._topics = []
