@@ -63,8 +63,24 @@ class Roscore:
 
     def kill(self):
         """Kill it with all that it has started, without a goodbye."""
-        os.killpg(self._process.pid, signal.SIGKILL)
+        for pid in (self._process.pid, *self._children()):
+            os.kill(pid, signal.SIGKILL)
         self._process.wait()
+
+    def stop(self):
+        """Stop it as a user does."""
+        self._process.terminate()
+        self._process.wait(20)
+
+    def _children(self):
+        """Return the processes of the master and of the logger, each in a group of its own."""
+        with ServerProxy(self.uri) as master:
+            pids = [master.getPid("/test")[2]]
+            _, _, address = master.lookupNode("/test", "/rosout")
+        if address:
+            with ServerProxy(address) as rosout:
+                pids.append(rosout.getPid("/test")[2])
+        return pids
 
     def topic_types(self):
         with ServerProxy(self.uri) as master:

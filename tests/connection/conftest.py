@@ -23,4 +23,4 @@ def roscore(tmp_path_factory):
         for name in ("ROS_HOME", "ROS_IP", "ROS_MASTER_URI"):
             patch.setitem(os.environ, name, core.environment[name])
         yield core
-    core.kill()
+    core.stop()

@@ -122,15 +122,16 @@ class McapFile:
         self._file.close()
 
     def abandon(self) -> None:
-        """Cut off what is half-written and finish the file, as far as the disk allows."""
-        try:
-            self._file.truncate(self._saved)
-            self._file.seek(self._saved)
-            self._stream.write(_END)
-        except OSError:  # `mcap recover` repairs it
-            return
-        finally:
-            self._file.close()
+        """Cut off what is half-written and finish the file; may be tried again.
+
+        Raises:
+            OSError: If the disk has no room even for that; `mcap recover` would repair the file.
+        """
+        self._file.close()
+        with FileIO(self.path, "r+") as file:
+            file.truncate(self._saved)
+            file.seek(self._saved)
+            _Unbuffered(file).write(_END)
 
     def _register(self, topic: str, type_: str) -> int:
         text, _ = self._store.generate_msgdef(type_, ros_version=2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from itertools import count
 from pathlib import Path
 from typing import Self
 
@@ -57,10 +58,10 @@ class Recorder:
         self._robot = robot
         self._writer = RosWriter(robot, RECORDED)
         self._beat = Beat()
-        self._part = 1
         self._unsaved: deque[tuple[Outgoing, int]] = deque(maxlen=KEPT)
         self._trouble = ""
         self._retry_s = 0.0
+        self._broken: McapFile | None = None
         try:
             self._file: McapFile | None = McapFile(path)
         except OSError as error:
@@ -122,9 +123,7 @@ class Recorder:
             self._give_up(error)
 
     def _give_up(self, error: OSError) -> None:
-        if self._file is not None:
-            self._file.abandon()
-        self._file = None
+        self._broken, self._file = self._file, None
         self._trouble = f"{self._path}: cannot be written ({error.strerror})"
         self._retry_s = time.monotonic() + RETRY_S
 
@@ -132,16 +131,23 @@ class Recorder:
         """Begin a new part if it is time to, with the diagnoses that are not saved yet."""
         if time.monotonic() < self._retry_s:
             return
-        path = self._path.with_stem(f"{self._path.stem}-{self._part + 1}")
+        path = self._next_part()
         try:
+            if self._broken is not None:
+                self._broken.abandon()
+                self._broken = None
             self._file = McapFile(path)
         except OSError as error:
             self._trouble = f"{path}: cannot be written ({error.strerror})"
             self._retry_s = time.monotonic() + RETRY_S
             return
-        self._part += 1
         self._trouble = ""
         self._write(list(self._unsaved))
+
+    def _next_part(self) -> Path:
+        """Return the first name of a part that is free."""
+        parts = (self._path.with_stem(f"{self._path.stem}-{number}") for number in count(2))
+        return next(part for part in parts if not part.exists())
 
 
 def _is_diagnosis(message: Outgoing) -> bool:

@@ -83,7 +83,7 @@ class RosbridgeSource:
 
         self.name = f"rosbridge {ros.factory.url}"
         self._ros = ros
-        self._queue = queue or EventQueue()
+        self._queue = EventQueue() if queue is None else queue
         self._lock = threading.Lock()
         self._garbage, self._last_garbage, self._reconnects = 0, "", -1
         self._readers = {role: RosReader(robot, role, name) for role, name, _ in topics.subscribed}

@@ -1,22 +1,25 @@
 """This process as a ROS 1 node that outlives the master.
 
-rospy tells the master of its topics once. A master that is restarted knows nothing of them, so the
-node asks it every second whether it is still known, and tells it all again if not.
+rospy tells the master of its topics once. A master that is restarted knows nothing of them, so we
+ask it every second whether it still knows each of them, and tell it again if not.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from threading import Event, Thread
-from typing import Any
+from typing import Any, Literal, get_args
 
 from failuretwin.connection.ros1.master import ask_master
 from failuretwin.connection.ros1.packages import load_rospy
 from failuretwin.core.errors import InputError
 
 NAME = "failuretwin"
+Role = Literal["publisher", "subscriber"]
+ROLES: tuple[Role, ...] = get_args(Role)
+"""What a node may do with a topic, in the order in which the master lists them."""
 CHECK_S = 1.0
 """Time between two questions to the master [s]."""
 QUIET_LOGS = ("rospy", "rosout", "rosgraph", "rospy.internal", "rospy.topics", "rospy.registration")
@@ -56,14 +59,18 @@ def _check_master() -> None:
 
 
 class Registration:
-    """Keeps something registered with the master.
+    """Keeps topics registered with the master.
 
     Args:
-        register: Registers it; called from a thread of its own whenever the master has forgotten
-            the node.
+        role: What the node does with them.
+        topics: Their names.
+        register: Registers them; called from a thread of its own whenever the master has forgotten
+            one.
     """
 
-    def __init__(self, register: Callable[[], None]) -> None:
+    def __init__(self, role: Role, topics: Sequence[str], register: Callable[[], None]) -> None:
+        self._role = role
+        self._topics = topics
         self._register = register
         self._stop = Event()
         self._thread = Thread(target=self._watch, name="ROS registration", daemon=True)
@@ -79,7 +86,7 @@ class Registration:
     def _watch(self) -> None:
         while not self._stop.wait(CHECK_S):
             try:
-                if not _is_known():
+                if not _are_known(self._role, self._topics):
                     self._register()
                     self.renewals += 1
                 self.master_gone = False
@@ -89,9 +96,10 @@ class Registration:
                 self.master_gone = True
 
 
-def _is_known() -> bool:
-    """Return whether the master knows this node; raises OSError if none answers."""
+def _are_known(role: Role, topics: Sequence[str]) -> bool:
+    """Return whether the master knows this node by all topics; raises OSError if none answers."""
     import rospy
 
-    uri = ask_master("lookupNode", rospy.get_name())
-    return bool(uri == rospy.get_node_uri())
+    state = ask_master("getSystemState")[ROLES.index(role)]
+    known = {topic for topic, nodes in state if rospy.get_name() in nodes}
+    return known >= {rospy.resolve_name(topic) for topic in topics}

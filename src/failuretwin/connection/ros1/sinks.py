@@ -34,7 +34,7 @@ class _Publishers:
         self._classes = {name: message_class(type_) for name, type_ in topics}
         self._publishers: dict[str, Any] = {}
         self._advertise()
-        self._registration = Registration(self._advertise)
+        self._registration = Registration("publisher", list(self._classes), self._advertise)
 
     @property
     def trouble(self) -> str:

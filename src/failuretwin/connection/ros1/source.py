@@ -37,14 +37,15 @@ class Ros1Source:
     def __init__(self, robot: Robot, topics: RosTopics, queue: EventQueue | None = None) -> None:
         self._rospy = join()
         self._topics = topics
-        self._queue = queue or EventQueue()
+        self._queue = EventQueue() if queue is None else queue
         self._decoder = Decoder()
         self._readers = {role: RosReader(robot, role, name) for role, name, _ in topics.subscribed}
         self._lock = Lock()
         self._garbage, self._last_garbage = 0, ""
         self._subscribers: list[Any] = []
         self._subscribe()
-        self._registration = Registration(self._subscribe)
+        names = [name for _, name, _ in topics.subscribed]
+        self._registration = Registration("subscriber", names, self._subscribe)
 
     @property
     def counts(self) -> LinkCounts:
