@@ -17,8 +17,10 @@ from failuretwin.decision.bayes import BayesDiagnoser
 
 MOVEMENTS = 5
 """Movements that are looked at, the present one included."""
-EVERY_S = 0.4
+EVERY_S = 0.5
 """Time between two diagnoses [s]."""
+REST_S = 0.25
+"""Time after the end of a ramp from which the tool may be at rest [s]; before it nothing is new."""
 SILENCE_S = 5.0
 """Without a reading for so long the answer is stale [s]; the bus of the ArmPi stalls for 4 s."""
 STEP_S = 0.01
@@ -39,6 +41,7 @@ class RecentMovements:
         self._readings: list[tuple[float, FloatArray]] = []
         self._starts: deque[float] = deque(maxlen=MOVEMENTS)
         self._still = True
+        self._still_from = -np.inf
         self._answer = Answer(0.0, STALE, None)
         self._next_s = -np.inf
 
@@ -62,7 +65,8 @@ class RecentMovements:
         newest = self._readings[-1][0] if self._readings else -np.inf
         state = STALE if time - newest > SILENCE_S else OK
         diagnosis = self._answer.diagnosis
-        if measured is not None and self._starts and time >= self._next_s:
+        at_rest = self._still and time >= self._still_from + REST_S
+        if measured is not None and self._starts and at_rest and time >= self._next_s:
             diagnosis = self._diagnose(time)
             self._next_s = time + EVERY_S
         self._answer = Answer(time, state, diagnosis)
@@ -81,6 +85,8 @@ class RecentMovements:
             if self._still and not still:
                 self._starts.append(before[0])
                 self._forget(self._starts[0])
+            if not still:
+                self._still_from = time
             self._still = still
         self._commands.append((time, value))
 
