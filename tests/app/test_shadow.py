@@ -142,6 +142,15 @@ def test_commands_alone_are_silence(twin, clock):
     assert shadow.moment.answer.state == STALE
 
 
+def test_motor_readings_alone_are_silence(twin, clock):
+    script = Script([reading(0.0), *(reading(float(t), [np.nan] * 3) for t in range(1, 10))])
+    shadow = Shadow(script, Notebook(), twin)
+    for _ in range(9):
+        shadow.step(0.0)
+        clock[0] += 1.0
+    assert shadow.moment.answer.state == STALE
+
+
 def test_before_any_data_nothing_is_known(twin):
     assert Shadow(Script([]), Notebook(), twin).moment.answer == Answer(0.0, STALE, None)
 

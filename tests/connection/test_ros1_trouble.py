@@ -127,6 +127,7 @@ def test_messages_that_make_no_sense_are_counted_and_left_out(armpi, peer):
         event = source.poll(10.0)
         wait_for(lambda: source.counts.garbage >= 5)
     assert event.position.tolist() == [0.1, 0.2, 0.3, 0.4]
+    assert np.isnan(event.tool).all()  # another topic tells it
     assert source.poll(0.2) is None
     assert source.counts.last_garbage
 

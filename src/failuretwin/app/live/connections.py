@@ -13,6 +13,7 @@ from failuretwin.connection.links.pace import Pace
 from failuretwin.connection.links.ros_topics import RosTopics, load_topics
 from failuretwin.connection.links.values import Sink, Source
 from failuretwin.core.errors import InputError
+from failuretwin.data_knowledge.bags.topics import BagTopics
 from failuretwin.digital_model.imperfections import load_imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.schedule import ScheduledFault
@@ -114,7 +115,13 @@ def connect(
     path = Path(text)
     if not path.exists():
         raise InputError(f"source {text!r} does not exist. Expected {SOURCES}.")
-    return Connections(stack.enter_context(replay(path, robot, pace)))
+    named = None if topics == RosTopics() else _bag_topics(topics)
+    return Connections(stack.enter_context(replay(path, robot, pace, named)))
+
+
+def _bag_topics(topics: RosTopics) -> BagTopics:
+    """Return the topics of a network as those of a recording of it."""
+    return BagTopics(topics.command, topics.tool or None, topics.position or None)
 
 
 def _ros1(robot: Robot, topics: RosTopics, stack: ExitStack) -> Connections:

@@ -160,7 +160,7 @@ class Shadow:
                 self._feed(event)
 
     def _feed(self, reading: Reading) -> None:
-        self._fed_s = self._read_s = time.monotonic()
+        self._fed_s = time.monotonic()
         if reading.position is not None and np.isfinite(reading.position).all():
             self._reference.start_at(reading.position)
         seen = reading.tool if np.isfinite(reading.tool).all() else None
@@ -170,9 +170,11 @@ class Shadow:
                 self._diagnoser.update(at, angles, None)
             else:
                 command = angles
-        residual = np.full(3, np.nan)
-        if seen is not None and command is not None:
-            residual = seen - self._twin.path(command)
+        residual = self.moment.residual
+        if seen is not None:
+            self._read_s = self._fed_s
+            expected = np.full(3, np.nan) if command is None else self._twin.path(command)
+            residual = seen - expected
         self._say(self._diagnoser.update(reading.time, command, seen), residual)
 
     def _say(self, believed: Believed, residual: FloatArray) -> None:

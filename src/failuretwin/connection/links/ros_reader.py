@@ -11,6 +11,7 @@ import numpy as np
 
 from failuretwin.connection.links.commands import SampledCommands
 from failuretwin.connection.links.replay import motor_reading
+from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.connection.links.values import CommandSent, Event, Reading
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
@@ -40,14 +41,15 @@ class RosReader:
     Args:
         robot: The robot.
         role: What the topic says.
-        topic: Its name, for error texts.
+        topics: All topics. If one of them tells the tool's position, motor readings do not.
     """
 
-    def __init__(self, robot: Robot, role: Role, topic: str) -> None:
+    def __init__(self, robot: Robot, role: Role, topics: RosTopics) -> None:
         self._robot = robot
         self._twin = DigitalTwin(robot)
         self._role = role
-        self._where = f"topic {topic}"
+        self._sees_tool = bool(topics.tool)
+        self._where = next(f"topic {name}" for r, name, _ in topics.subscribed if r == role)
         self._samples = SampledCommands()
         self._target: FloatArray | None = None
 
@@ -78,10 +80,14 @@ class RosReader:
         return self._command_events(track) if command else self._position_events(track)
 
     def _position_events(self, track: Track) -> list[Event]:
-        return [
-            motor_reading(stamp / NS_PER_S, self._checked(angle, LARGEST_RAD), self._twin)
-            for stamp, angle in zip(track.stamp_ns.tolist(), track.value, strict=True)
-        ]
+        events: list[Event] = []
+        for stamp, angle in zip(track.stamp_ns.tolist(), track.value, strict=True):
+            angle = self._checked(angle, LARGEST_RAD)
+            if self._sees_tool:
+                events.append(Reading(stamp / NS_PER_S, np.full(3, np.nan), angle))
+            else:
+                events.append(motor_reading(stamp / NS_PER_S, angle, self._twin))
+        return events
 
     def _command_events(self, track: Track) -> list[Event]:
         events: list[Event] = []

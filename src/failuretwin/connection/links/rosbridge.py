@@ -86,7 +86,7 @@ class RosbridgeSource:
         self._queue = EventQueue() if queue is None else queue
         self._lock = threading.Lock()
         self._garbage, self._last_garbage, self._reconnects = 0, "", -1
-        self._readers = {role: RosReader(robot, role, name) for role, name, _ in topics.subscribed}
+        self._readers = {role: RosReader(robot, role, topics) for role, _, _ in topics.subscribed}
         self._topics = []
         self._count_connections(None)
         for role, name, type_ in topics.subscribed:

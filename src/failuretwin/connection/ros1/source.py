@@ -39,7 +39,7 @@ class Ros1Source:
         self._topics = topics
         self._queue = EventQueue() if queue is None else queue
         self._decoder = Decoder()
-        self._readers = {role: RosReader(robot, role, name) for role, name, _ in topics.subscribed}
+        self._readers = {role: RosReader(robot, role, topics) for role, _, _ in topics.subscribed}
         self._lock = Lock()
         self._garbage, self._last_garbage = 0, ""
         self._subscribers: list[Any] = []
