@@ -9,12 +9,12 @@ from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.bags.messages import Kind
 from failuretwin.data_knowledge.bags.topics import KINDS, Role
+from failuretwin.digital_model.robot import Robot
 
 AUTHORS_TYPE = "cm/msg_cm"
-"""Type of the message of the data set's authors; another package may define it, see `_kind`."""
-STANDARD_TYPES = {
-    kind.value.replace("/msg/", "/"): kind for kind in Kind if kind is not Kind.MONITORING
-}
+"""Type of the message of the data set's authors; another package may define it, see `kind_of_type`."""
+MONITORING = Kind.MONITORING
+STANDARD_TYPES = {kind.value.replace("/msg/", "/"): kind for kind in Kind if kind is not MONITORING}
 """Kinds of the standard types by their ROS 1 names."""
 
 
@@ -64,6 +64,17 @@ class RosTopics:
                     f"{', '.join(k.value for k in KINDS[role])}."
                 )
 
+    def check_fits(self, robot: Robot) -> None:
+        """Raise InputError if a message would hold servo counts and the robot has none."""
+        in_counts = [type_ for _, _, type_ in self.subscribed if kind_of_type(type_) is MONITORING]
+        has_counts = robot.profile.servo_units and all(motor.log_column for motor in robot.motors)
+        if in_counts and not has_counts:
+            raise InputError(
+                f"{in_counts[0]} holds servo counts, but the profile of robot {robot.name!r} has no "
+                "servo_units or no log_column for some motors. Name topics of standard types in a "
+                "file for --topics (docs/live.md)."
+            )
+
     @property
     def subscribed(self) -> list[tuple[Role, str, str]]:
         """Role, name and type of every topic that is listened to."""
@@ -77,7 +88,7 @@ class RosTopics:
 
 def kind_of_type(type_: str) -> Kind:
     """Return the kind of a message type; one that is not standard has the authors' fields."""
-    return STANDARD_TYPES.get(type_.replace("/msg/", "/"), Kind.MONITORING)
+    return STANDARD_TYPES.get(type_.replace("/msg/", "/"), MONITORING)
 
 
 def load_topics(path: Path) -> RosTopics:

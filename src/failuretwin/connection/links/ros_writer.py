@@ -67,7 +67,8 @@ class RosWriter:
         topics: Its topics.
 
     Raises:
-        InputError: If commands are to be a stream of samples, which single commands cannot be.
+        InputError: If commands are to be a stream of samples, which single commands cannot be, or
+            the robot has no servo counts where the messages have them.
     """
 
     def __init__(self, robot: Robot, topics: RosTopics) -> None:
@@ -76,6 +77,7 @@ class RosWriter:
                 "command_type is sensor_msgs/JointState, a stream of samples, which cannot be "
                 "published here. Expected trajectory_msgs/JointTrajectory or the authors' message."
             )
+        topics.check_fits(robot)
         self._robot = robot
         self._topics = topics
         self._origin = np.zeros(len(robot.motors))

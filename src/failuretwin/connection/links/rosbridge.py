@@ -81,6 +81,7 @@ class RosbridgeSource:
     ) -> None:
         import roslibpy
 
+        topics.check_fits(robot)
         self.name = f"rosbridge {ros.factory.url}"
         self._ros = ros
         self._queue = EventQueue() if queue is None else queue

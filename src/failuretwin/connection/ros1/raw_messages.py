@@ -15,9 +15,20 @@ Decoded = tuple[Any, Kind]
 
 
 class Decoder:
-    """Decodes messages of `rospy.AnyMsg`, and remembers the types that it has met."""
+    """Decodes messages of `rospy.AnyMsg`, and remembers the types that it has met.
+
+    Raises:
+        InputError: If rosbags is not installed.
+    """
 
     def __init__(self) -> None:
+        try:
+            import rosbags.typesys  # noqa: F401
+        except ImportError as error:
+            raise InputError(
+                f"messages are decoded by rosbags ({error}). Install it: "
+                "pip install 'failuretwin[live]'."
+            ) from error
         self._types: dict[str, tuple[Any, str, Kind]] = {}
 
     def decode(self, message: Any) -> Decoded:

@@ -35,6 +35,7 @@ class Ros1Source:
     ended = False
 
     def __init__(self, robot: Robot, topics: RosTopics, queue: EventQueue | None = None) -> None:
+        topics.check_fits(robot)
         self._rospy = join()
         self._topics = topics
         self._queue = EventQueue() if queue is None else queue
