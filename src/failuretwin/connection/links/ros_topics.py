@@ -12,7 +12,7 @@ from failuretwin.data_knowledge.bags.topics import KINDS, Role
 from failuretwin.digital_model.robot import Robot
 
 AUTHORS_TYPE = "cm/msg_cm"
-"""Type of the message of the data set's authors; another package may define it, see `kind_of_type`."""
+"""Type of the message of the data set's authors; any other package may define the same fields."""
 MONITORING = Kind.MONITORING
 STANDARD_TYPES = {kind.value.replace("/msg/", "/"): kind for kind in Kind if kind is not MONITORING}
 """Kinds of the standard types by their ROS 1 names."""
@@ -70,8 +70,8 @@ class RosTopics:
         has_counts = robot.profile.servo_units and all(motor.log_column for motor in robot.motors)
         if in_counts and not has_counts:
             raise InputError(
-                f"{in_counts[0]} holds servo counts, but the profile of robot {robot.name!r} has no "
-                "servo_units or no log_column for some motors. Name topics of standard types in a "
+                f"{in_counts[0]} holds servo counts, but the profile of robot {robot.name!r} lacks "
+                "servo_units or a log_column of some motor. Name topics of standard types in a "
                 "file for --topics (docs/live.md)."
             )
 
