@@ -10,6 +10,7 @@ from failuretwin.app.live import shadow as shadow_module
 from failuretwin.app.live.changes import Changes
 from failuretwin.app.live.shadow import Shadow
 from failuretwin.app.live.view import View
+from failuretwin.app.live.watching import watch_until_end
 from failuretwin.connection.links.values import OK, STALE, Answer, CommandSent, LinkCounts, Reading
 from failuretwin.core.diagnosis import Diagnosis
 
@@ -140,6 +141,18 @@ def test_commands_alone_are_silence(twin, clock):
     script.events.extend([None, None])
     shadow.step(0.0)
     assert shadow.moment.answer.state == STALE
+
+
+def test_the_user_is_told_how_late_commands_come(twin, armpi):
+    from rich.console import Console
+
+    events = [reading(0.0), reading(2.0), command(0.2, 0.8), reading(2.1), reading(2.2)]
+    script = Script(events)
+    shadow = Shadow(script, Notebook(), twin)
+    console = Console(file=StringIO())
+    told = watch_until_end(shadow, script, [], armpi.motor_names, console, np.inf)
+    late = "commands come late: put commands_late_s = 2.0 into the --topics file"
+    assert late in [change.text for change in told.lines]
 
 
 def test_motor_readings_alone_are_silence(twin, clock):

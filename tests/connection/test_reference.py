@@ -61,6 +61,7 @@ def test_a_command_that_comes_late_starts_late_and_still_arrives_in_time():
     (end, arrived), _ = reference.corners_to(11.0)
     assert end == pytest.approx(10.6)
     assert_allclose(arrived, [1.0])
+    assert reference.late_s == pytest.approx(0.4)
 
 
 def test_a_new_plan_replaces_what_is_still_to_come():

@@ -34,9 +34,13 @@ class LiveReference:
 
     A command that comes while another runs takes over from where the reference has come to. One
     that is still to come is replaced by any that is sent for the same time or earlier.
+
+    Attributes:
+        late_s: The longest time by which a command came too late to begin when it should [s].
     """
 
     def __init__(self) -> None:
+        self.late_s = 0.0
         self._ramp: _Ramp | None = None
         self._pending: list[CommandSent] = []
         self._known_until = -np.inf
@@ -78,6 +82,7 @@ class LiveReference:
                 corners.append((start, origin))
                 self._known_until = start
         lost = start - command.time
+        self.late_s = max(self.late_s, lost)
         duration = np.maximum(command.duration - lost, 0.0)
         self._ramp = _Ramp(start, origin, command.target, duration)
 

@@ -118,6 +118,11 @@ class Shadow:
         """How often the robot's clock was set while it ran."""
         return self._clock.jumps
 
+    @property
+    def late_s(self) -> float:
+        """The longest time by which a command came too late to be followed in time [s]."""
+        return self._reference.late_s
+
     def step(self, timeout_s: float) -> bool:
         """Take one event, or see that time goes on, and return whether there may be more.
 

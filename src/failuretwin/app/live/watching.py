@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -19,6 +20,8 @@ REFRESH_S = 0.25
 """Time between two drawings [s]."""
 POLL_S = 0.1
 """Longest wait for an event [s]."""
+LATE_S = 0.3
+"""A command that comes later than this spoils the diagnosis, and the user is told [s]."""
 
 
 def watch_until_end(
@@ -47,7 +50,7 @@ def watch_until_end(
     with live as shown:
         draw = _drawer(shown)
         while shadow.step(POLL_S) and time.monotonic() < until_s:
-            troubles = tuple(sink.trouble for sink in sinks if sink.trouble)
+            troubles = _troubles(shadow, sinks)
             found = changes.notice(shadow.moment, source.counts, shadow.clock_jumps, troubles)
             if shown is None:
                 _print(found)
@@ -56,6 +59,14 @@ def watch_until_end(
     if shown is None:
         _print(changes.notice(shadow.moment, source.counts, shadow.clock_jumps, ()))
     return changes
+
+
+def _troubles(shadow: Shadow, sinks: Sequence[Sink]) -> tuple[str, ...]:
+    found = tuple(sink.trouble for sink in sinks if sink.trouble)
+    if shadow.late_s < LATE_S:
+        return found
+    wait = math.ceil(2.0 * shadow.late_s) / 2.0
+    return (*found, f"commands come late: put commands_late_s = {wait} into the --topics file")
 
 
 def _drawer(live: Live | None) -> Callable[[Callable[[], RenderableType]], None]:

@@ -8,14 +8,10 @@ from itertools import count
 from pathlib import Path
 from typing import Self
 
-from failuretwin.connection.links.diagnostic_status import Beat, statuses
+from failuretwin.connection.links.bulletin import Bulletin
 from failuretwin.connection.links.mcap_file import McapFile
 from failuretwin.connection.links.ros_topics import RosTopics
-from failuretwin.connection.links.ros_writer import (
-    Outgoing,
-    RosWriter,
-    diagnostics_message,
-)
+from failuretwin.connection.links.ros_writer import Outgoing, RosWriter
 from failuretwin.connection.links.values import Answer, CommandSent, Item, Reading
 from failuretwin.core.errors import OutputError
 from failuretwin.data_knowledge.bags.messages import NS_PER_S
@@ -55,9 +51,8 @@ class Recorder:
     def __init__(self, path: Path, robot: Robot) -> None:
         self.name = str(path)
         self._path = path
-        self._robot = robot
         self._writer = RosWriter(robot, RECORDED)
-        self._beat = Beat()
+        self._bulletin = Bulletin(robot, RECORDED)
         self._unsaved: deque[tuple[Outgoing, int]] = deque(maxlen=KEPT)
         self._trouble = ""
         self._retry_s = 0.0
@@ -103,10 +98,8 @@ class Recorder:
         return self._answer(item)
 
     def _answer(self, answer: Answer) -> list[Outgoing]:
-        messages = []
-        found = statuses(answer, self._robot.motor_names)
-        if self._beat.due(found, time.monotonic()):
-            messages.append(diagnostics_message(found, answer.time, RECORDED, self._robot))
+        bulletin = self._bulletin.message(answer)
+        messages = [] if bulletin is None else [bulletin]
         if answer.diagnosis is not None:
             messages += [
                 Outgoing(_topic_of(name), "std_msgs/Float64", {"data": probability})

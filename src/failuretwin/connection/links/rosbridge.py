@@ -8,11 +8,11 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any, Self
 
-from failuretwin.connection.links.diagnostic_status import Beat, statuses
+from failuretwin.connection.links.bulletin import Bulletin
 from failuretwin.connection.links.event_queue import EventQueue
 from failuretwin.connection.links.ros_reader import RosReader
 from failuretwin.connection.links.ros_topics import RosTopics, kind_of_type
-from failuretwin.connection.links.ros_writer import DIAGNOSTICS_TYPE, Outgoing, diagnostics_message
+from failuretwin.connection.links.ros_writer import DIAGNOSTICS_TYPE
 from failuretwin.connection.links.values import Answer, Event, Item, LinkCounts
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.bags.messages import Kind
@@ -152,10 +152,8 @@ class RosbridgeDiagnostics:
         import roslibpy
 
         self.name = f"rosbridge {ros.factory.url} diagnostics"
-        self._robot = robot
-        self._topics = topics
         self._ros = ros
-        self._beat = Beat()
+        self._bulletin = Bulletin(robot, topics)
         self._topic = roslibpy.Topic(ros, topics.diagnostics, DIAGNOSTICS_TYPE)
         self._topic.advertise()
 
@@ -168,9 +166,11 @@ class RosbridgeDiagnostics:
         """Publish an answer if it is time to and the server is there."""
         if not isinstance(item, Answer) or self.trouble:
             return
-        found = statuses(item, self._robot.motor_names)
-        if self._beat.due(found, time.monotonic()):
-            self._send(diagnostics_message(found, item.time, self._topics, self._robot))
+        message = self._bulletin.message(item)
+        if message is not None:
+            import roslibpy
+
+            self._topic.publish(roslibpy.Message(message.content))
 
     def __enter__(self) -> Self:
         return self
@@ -178,11 +178,6 @@ class RosbridgeDiagnostics:
     def __exit__(self, *_: object) -> None:
         if self._ros.is_connected:
             self._topic.unadvertise()
-
-    def _send(self, message: Outgoing) -> None:
-        import roslibpy
-
-        self._topic.publish(roslibpy.Message(message.content))
 
 
 def _as_object(value: Any) -> Any:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any, Self
 
-from failuretwin.connection.links.diagnostic_status import Beat, statuses
+from failuretwin.connection.links.bulletin import Bulletin
 from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.connection.links.ros_writer import (
     DIAGNOSTICS_TYPE,
     Outgoing,
     RosWriter,
-    diagnostics_message,
 )
 from failuretwin.connection.links.values import Answer, CommandSent, Item, Reading
 from failuretwin.connection.ros1.message_class import message_class
@@ -121,9 +119,7 @@ class Ros1Diagnostics:
     name = "ROS 1 diagnostics"
 
     def __init__(self, robot: Robot, topics: RosTopics) -> None:
-        self._robot = robot
-        self._topics = topics
-        self._beat = Beat()
+        self._bulletin = Bulletin(robot, topics)
         self._publishers = _Publishers([(topics.diagnostics, DIAGNOSTICS_TYPE)])
 
     @property
@@ -133,11 +129,8 @@ class Ros1Diagnostics:
 
     def put(self, item: Item) -> None:
         """Publish an answer if it is time to."""
-        if not isinstance(item, Answer):
-            return
-        found = statuses(item, self._robot.motor_names)
-        if self._beat.due(found, time.monotonic()):
-            message = diagnostics_message(found, item.time, self._topics, self._robot)
+        message = self._bulletin.message(item) if isinstance(item, Answer) else None
+        if message is not None:
             self._publishers.send(message)
 
     def __enter__(self) -> Self:
