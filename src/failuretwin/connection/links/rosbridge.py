@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import threading
-import time
 from functools import partial
 from types import SimpleNamespace
 from typing import Any, Self
 
 from failuretwin.connection.links.bulletin import Bulletin
 from failuretwin.connection.links.event_queue import EventQueue
-from failuretwin.connection.links.ros_reader import RosReader
+from failuretwin.connection.links.inbox import Inbox
 from failuretwin.connection.links.ros_topics import RosTopics, kind_of_type
 from failuretwin.connection.links.ros_writer import DIAGNOSTICS_TYPE
 from failuretwin.connection.links.values import Answer, Event, Item, LinkCounts
@@ -81,13 +80,10 @@ class RosbridgeSource:
     ) -> None:
         import roslibpy
 
-        topics.check_fits(robot)
         self.name = f"rosbridge {ros.factory.url}"
         self._ros = ros
-        self._queue = EventQueue() if queue is None else queue
-        self._lock = threading.Lock()
-        self._garbage, self._last_garbage, self._reconnects = 0, "", -1
-        self._readers = {role: RosReader(robot, role, topics) for role, _, _ in topics.subscribed}
+        self._inbox = Inbox(robot, topics, queue)
+        self._reconnects = -1
         self._topics = []
         self._count_connections(None)
         for role, name, type_ in topics.subscribed:
@@ -98,17 +94,11 @@ class RosbridgeSource:
     @property
     def counts(self) -> LinkCounts:
         """What it has seen so far."""
-        return LinkCounts(
-            self._queue.received,
-            self._garbage,
-            self._queue.dropped,
-            self._reconnects,
-            self._last_garbage,
-        )
+        return self._inbox.counts(self._reconnects)
 
     def poll(self, timeout_s: float) -> Event | None:
         """Return the next event; None if none came within `timeout_s` [s]."""
-        return self._queue.get(timeout_s)
+        return self._inbox.poll(timeout_s)
 
     def __enter__(self) -> Self:
         return self
@@ -126,17 +116,7 @@ class RosbridgeSource:
         self._ros.factory.once("ready", self._count_connections)
 
     def _take(self, role: Role, kind: Kind, message: Any) -> None:
-        received_ns = time.time_ns()
-        with self._lock:
-            try:
-                events = self._readers[role].events(_as_object(message), kind, received_ns)
-            # Anyone may publish anything here. It is counted; the next one may be sound.
-            except Exception as error:
-                self._garbage += 1
-                self._last_garbage = f"{type(error).__name__}: {error}"
-                return
-            for event in events:
-                self._queue.put(event)
+        self._inbox.take(role, lambda: (_as_object(message), kind))
 
 
 class RosbridgeDiagnostics:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import time
-from threading import Lock
+from functools import partial
 from typing import Any, Self
 
 from failuretwin.connection.links.event_queue import EventQueue
-from failuretwin.connection.links.ros_reader import RosReader
+from failuretwin.connection.links.inbox import Inbox
 from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.connection.links.values import Event, LinkCounts
 from failuretwin.connection.ros1.node import Registration, join
@@ -28,21 +27,17 @@ class Ros1Source:
         queue: Where events wait to be fetched.
 
     Raises:
-        InputError: If rospy is missing or no master answers.
+        InputError: If rospy is missing, no master answers, or the robot does not fit the topics.
     """
 
     name = "ROS 1"
     ended = False
 
     def __init__(self, robot: Robot, topics: RosTopics, queue: EventQueue | None = None) -> None:
-        topics.check_fits(robot)
+        self._inbox = Inbox(robot, topics, queue)
         self._rospy = join()
         self._topics = topics
-        self._queue = EventQueue() if queue is None else queue
         self._decoder = Decoder()
-        self._readers = {role: RosReader(robot, role, topics) for role, _, _ in topics.subscribed}
-        self._lock = Lock()
-        self._garbage, self._last_garbage = 0, ""
         self._subscribers: list[Any] = []
         self._subscribe()
         names = [name for _, name, _ in topics.subscribed]
@@ -51,17 +46,11 @@ class Ros1Source:
     @property
     def counts(self) -> LinkCounts:
         """What it has seen so far."""
-        return LinkCounts(
-            self._queue.received,
-            self._garbage,
-            self._queue.dropped,
-            self._registration.renewals,
-            self._last_garbage,
-        )
+        return self._inbox.counts(self._registration.renewals)
 
     def poll(self, timeout_s: float) -> Event | None:
         """Return the next event; None if none came within `timeout_s` [s]."""
-        return self._queue.get(timeout_s)
+        return self._inbox.poll(timeout_s)
 
     def __enter__(self) -> Self:
         return self
@@ -83,16 +72,4 @@ class Ros1Source:
         self._subscribers = []
 
     def _take(self, message: Any, role: Role) -> None:
-        received_ns = time.time_ns()
-        with self._lock:  # each publisher has a thread
-            try:
-                content, kind = self._decoder.decode(message)
-                events = self._readers[role].events(content, kind, received_ns)
-            # Anyone may publish anything here, and a message of wrong bytes fails in struct, numpy
-            # or rosbags. It is counted; the next one may be sound.
-            except Exception as error:
-                self._garbage += 1
-                self._last_garbage = f"{type(error).__name__}: {error}"
-                return
-            for event in events:
-                self._queue.put(event)
+        self._inbox.take(role, partial(self._decoder.decode, message))
