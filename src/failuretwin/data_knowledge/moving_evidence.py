@@ -36,6 +36,10 @@ class MovingEvidence:
         """Return the evidence of some of the runs."""
         return MovingEvidence(self.since[runs], self.point[runs], self.seen[runs])
 
+    def where(self, wanted: BoolArray) -> MovingEvidence:
+        """Return the evidence of some of the movements alone, (run, movement)."""
+        return MovingEvidence(self.since, self.point, self.seen & wanted[..., None])
+
 
 def moving_evidence(runs: xr.Dataset, settled: SettledEvidence) -> MovingEvidence:
     """Return the readings of each movement before those that `settled` has used.
