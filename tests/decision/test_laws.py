@@ -162,7 +162,8 @@ def test_drifts_of_all_rates_and_both_signs_are_as_likely(scene):
 
 
 @pytest.mark.parametrize("mode", ["stuck", "encoder_bias", "drift"])
-def test_thinning_a_law_for_pairs_loses_no_mass(scene, mode):
+def test_thinning_a_law_for_pairs_loses_no_mass(scene, monkeypatch, mode):
+    monkeypatch.setattr(pairs, "MOST_NODES", 48)
     alone = scene[3]
     law = LAWS[mode](alone, 0.3)
     few = pairs._thinned(alone, law)
