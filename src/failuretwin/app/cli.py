@@ -18,6 +18,7 @@ from failuretwin.app.commands.evaluate import evaluate
 from failuretwin.app.commands.import_ import import_
 from failuretwin.app.commands.robot import robot
 from failuretwin.app.commands.simulate import simulate
+from failuretwin.app.commands.study import study
 from failuretwin.core.errors import FailureTwinError
 
 
@@ -27,7 +28,7 @@ def cli() -> None:
     """Tell from commands and the tool path alone which motor of a robot arm failed, and how."""
 
 
-for command in (import_, simulate, diagnose, evaluate, calibrate, robot):
+for command in (import_, simulate, diagnose, evaluate, calibrate, study, robot):
     cli.add_command(command)
 
 
