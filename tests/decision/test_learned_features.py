@@ -14,6 +14,7 @@ from failuretwin.decision.learned.robust_features import (
     DISTANCE_M,
     PER_MOTOR,
     TURN_RAD,
+    expectation_of,
     joint_frames,
 )
 from failuretwin.decision.learned.signals import signals_of
@@ -82,7 +83,7 @@ def test_gaps_are_filled_by_straight_lines(armpi):
 
 @pytest.mark.parametrize("name", ["original", "augmented", "robust"])
 def test_channels_are_as_announced(armpi, name):
-    encoder = Encoder(name, armpi, SAGGING)
+    encoder = Encoder(name, armpi)
     features = encoder.encode(signals_of(some_runs(armpi, "healthy")))
     assert features.shape == (5, 100, encoder.channels)
     assert np.isfinite(features).all()
@@ -105,7 +106,7 @@ def test_joint_axes_are_those_that_the_tool_turns_about(armpi, twin):
 
 def test_nothing_is_off_on_a_healthy_arm_at_rest(armpi):
     runs = some_runs(armpi, "healthy")
-    features = Encoder("robust", armpi, SAGGING).encode(signals_of(runs))
+    features = Encoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(signals_of(runs))
     turn = undo(channel(armpi, features, "turn")[:, settled()], TURN_RAD)
     plain = Encoder("robust", armpi).encode(signals_of(runs))
     without = undo(channel(armpi, plain, "turn")[:, settled()], TURN_RAD)
@@ -116,7 +117,7 @@ def test_nothing_is_off_on_a_healthy_arm_at_rest(armpi):
 @pytest.mark.parametrize("motor", [0, 1, 2, 3])
 def test_a_stuck_motor_explains_all_and_keeps_its_angle(armpi, motor):
     runs = some_runs(armpi, f"motor_{motor + 1}:stuck")
-    features = Encoder("robust", armpi, SAGGING).encode(signals_of(runs))
+    features = Encoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(signals_of(runs))
     misfit = undo(channel(armpi, features, "misfit")[:, settled()], DISTANCE_M)
     angle = channel(armpi, features, "angle")[:, settled(), motor]
     median = np.median(misfit, axis=(0, 1))
@@ -128,7 +129,7 @@ def test_a_stuck_motor_explains_all_and_keeps_its_angle(armpi, motor):
 
 def test_errors_of_a_motor_are_read_off_its_channel(armpi):
     runs = some_runs(armpi, "motor_2:steady_state_error")
-    features = Encoder("robust", armpi, SAGGING).encode(signals_of(runs))
+    features = Encoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(signals_of(runs))
     turn = undo(channel(armpi, features, "turn")[..., 1], TURN_RAD)[:, 19::20]
     true = [json.loads(text)["faults"][0]["offset_rad"] for text in runs["fault_detail"].values]
     assert np.median(np.abs(turn - true)) < 0.01
@@ -138,7 +139,7 @@ def test_errors_of_a_motor_are_read_off_its_channel(armpi):
 def test_points_without_a_reading_are_marked_and_say_nothing(armpi):
     runs = some_runs(armpi, "motor_1:stuck")
     runs["measured"].values[:, 300:600] = np.nan
-    features = Encoder("robust", armpi, SAGGING).encode(signals_of(runs))
+    features = Encoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(signals_of(runs))
     missing = slice(31, 59)
     assert not features[:, missing, -1].any()
     assert features[:, :30, -1].all()
@@ -150,7 +151,7 @@ def test_points_without_a_reading_are_marked_and_say_nothing(armpi):
 def test_a_glitch_counts_little_more_than_a_fault(armpi):
     runs = some_runs(armpi, "healthy")
     runs["measured"].values[:, 500] = 5.0  # far outside the workspace
-    features = Encoder("robust", armpi, SAGGING).encode(signals_of(runs))
+    features = Encoder("robust", armpi, expectation_of(armpi, SAGGING)).encode(signals_of(runs))
     assert np.abs(features).max() < 4.0
 
 
@@ -158,6 +159,8 @@ def test_long_runs_fill_the_same_points(armpi, measured_armpi):
     """Bus stalls make runs longer than ten seconds; the points then lie further apart."""
     runs = some_runs(armpi, "healthy", measured_armpi)
     assert runs["duration"].values.max() > 11.0
-    features = Encoder("robust", armpi, measured_armpi).encode(signals_of(runs))
+    features = Encoder("robust", armpi, expectation_of(armpi, measured_armpi)).encode(
+        signals_of(runs)
+    )
     last = features[np.argmax(runs["duration"].values), -10:, -1]
     assert last.any()

@@ -8,6 +8,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.decision.learned.encoder import Encoder
 from failuretwin.decision.learned.networks import NETWORKS, Shape, build_network
 from failuretwin.decision.learned.recipe import VARIANTS, Recipe, widened
+from failuretwin.decision.learned.robust_features import expectation_of
 from failuretwin.decision.learned.training import (
     Pace,
     Standard,
@@ -104,7 +105,7 @@ def recipe(armpi, measured_armpi):
 
 
 def test_chunks_depend_on_seed_and_number_alone(armpi, measured_armpi, recipe):
-    encoder = Encoder("robust", armpi, measured_armpi)
+    encoder = Encoder("robust", armpi, expectation_of(armpi, measured_armpi))
     first, classes = recipe.chunk(0, 12, encoder)
     again, same = Recipe(armpi, measured_armpi, seed=4).chunk(0, 12, encoder)
     np.testing.assert_array_equal(first, again)

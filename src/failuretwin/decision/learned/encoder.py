@@ -10,9 +10,15 @@ from numpy.typing import NDArray
 
 from failuretwin.core.errors import unknown_name
 from failuretwin.decision.learned.paper_features import augmented_features, original_features
-from failuretwin.decision.learned.robust_features import PER_MOTOR, SHARED, RobustFeatures
+from failuretwin.decision.learned.robust_features import (
+    PER_MOTOR,
+    SHARED,
+    Expectation,
+    RobustFeatures,
+    expectation_of,
+)
 from failuretwin.decision.learned.signals import Signals
-from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, Imperfections
+from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -27,13 +33,13 @@ class Encoder:
     Attributes:
         features: One of `FEATURE_SETS`: the paper's two, and the one for real robots.
         robot: The robot.
-        imperfections: Healthy behaviour that the robust features compare with; the paper's
-            features know of none.
+        expected: Healthy behaviour that the robust features compare with; None: that of the
+            published twin. The paper's features know of none.
     """
 
     features: str
     robot: Robot
-    imperfections: Imperfections = NO_IMPERFECTIONS
+    expected: Expectation | None = None
 
     def __post_init__(self) -> None:
         if self.features not in FEATURE_SETS:
@@ -46,6 +52,11 @@ class Encoder:
         robust = len(PER_MOTOR) * motors + len(SHARED)
         return {"original": motors + 3, "augmented": 6, "robust": robust}[self.features]
 
+    @property
+    def protocol(self) -> str:
+        """How much real data the features have seen."""
+        return "P0" if self.expected is None else self.expected.protocol
+
     def encode(self, signals: Signals) -> Floats:
         """Return what a network sees, (run, point, channel)."""
         if self.features == "robust":
@@ -56,4 +67,5 @@ class Encoder:
 
     @cached_property
     def _robust(self) -> RobustFeatures:
-        return RobustFeatures(self.robot, self.imperfections)
+        expected = self.expected or expectation_of(self.robot, NO_IMPERFECTIONS)
+        return RobustFeatures(self.robot, expected)

@@ -19,6 +19,8 @@ DROPOUT = 0.1
 """Share of units left out in training, as published."""
 CNN_WIDTH = 96
 MOTORWISE_WIDTH = 64
+STRIDES = (1, 2, 2, 1)
+"""Points by which each convolution moves on: 100 points become 50, then 25."""
 KERNEL = 5
 """Points that a convolution sees, half a second of a run of ten."""
 
@@ -65,7 +67,7 @@ class Cnn(nn.Module):
         wide = CNN_WIDTH
         self.convolutions = nn.ModuleList(
             nn.Conv1d(taken, wide, KERNEL, stride=stride, padding=KERNEL // 2)
-            for taken, stride in ((shape.channels, 1), (wide, 2), (wide, 2), (wide, 1))
+            for taken, stride in zip((shape.channels, wide, wide, wide), STRIDES, strict=True)
         )
         self.dropout = nn.Dropout(DROPOUT)
         self.hidden = nn.Linear(2 * wide, wide)
@@ -90,9 +92,9 @@ class MotorWise(nn.Module):
     def __init__(self, shape: Shape) -> None:
         super().__init__()
         self.motors, self.shared = shape.motors, shape.shared
-        own = (shape.channels - shape.shared) // shape.motors
+        self.each = (shape.channels - shape.shared) // shape.motors
         wide = MOTORWISE_WIDTH
-        sizes = ((own + shape.shared, 1), (wide, 2), (wide, 2), (wide, 1))
+        sizes = list(zip((self.each + shape.shared, wide, wide, wide), STRIDES, strict=True))
         self.own = nn.ModuleList(
             nn.Conv1d(taken, wide, KERNEL, stride=stride, padding=KERNEL // 2)
             for taken, stride in sizes
@@ -107,9 +109,9 @@ class MotorWise(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return scores (run, class)."""
-        runs, points, channels = x.shape
-        own = channels - self.shared
-        motor = x[:, :, :own].reshape(runs, points, self.motors, own // self.motors)
+        runs, points, _ = x.shape
+        own = self.motors * self.each
+        motor = x[:, :, :own].reshape(runs, points, self.motors, self.each)
         common = x[:, :, None, own:].expand(runs, points, self.motors, self.shared)
         x = torch.cat([motor, common], dim=3).permute(0, 2, 3, 1)  # run, motor, channel, point
         for own_part, all_part in zip(self.own, self.all, strict=True):

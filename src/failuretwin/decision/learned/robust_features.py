@@ -10,10 +10,10 @@ reading are zero and marked by a mask.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
+from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.decision.learned.paper_features import POINTS
 from failuretwin.decision.learned.signals import Signals
@@ -35,24 +35,51 @@ DAMPING_M = 0.003
 
 
 @dataclass(frozen=True)
+class Expectation:
+    """Where a healthy arm is expected to be: all of a calibration that features make use of.
+
+    Attributes:
+        name: Name of the calibration.
+        protocol: How much real data it has seen.
+        lag_s: Mean time by which each motor runs behind its command, (motor,) [s].
+        settling: Where motors settle.
+    """
+
+    name: str
+    protocol: str
+    lag_s: tuple[float, ...]
+    settling: Settling
+
+
+def expectation_of(robot: Robot, imperfections: Imperfections) -> Expectation:
+    """Return what is expected of a healthy robot with some imperfections."""
+    timing = imperfections.timing
+    common = float(np.mean(timing.delay_s) + np.mean(timing.lag_s))
+    # 1 / I: delay of the loop (P s + I) / (s (tau s + 1)^2 + P s + I) at low frequency.
+    lag = tuple(common + 1.0 / motor.loop.I for motor in robot.motors)
+    settling = imperfections.settling or Settling.ideal(len(lag))
+    return Expectation(imperfections.name, imperfections.protocol, lag, settling)
+
+
+@dataclass(frozen=True)
 class RobustFeatures:
     """Turns a run into 100 points of residuals in motor space.
 
     Attributes:
-        robot: Kinematics, masses and servo loops.
-        imperfections: How the healthy robot lags, sags and sticks.
+        robot: Kinematics and masses.
+        expected: Where a healthy arm is expected to be.
     """
 
     robot: Robot
-    imperfections: Imperfections
+    expected: Expectation
 
-    @cached_property
-    def lag(self) -> FloatArray:
-        """Mean time by which each motor runs behind its command, (motor,) [s]."""
-        timing = self.imperfections.timing
-        common = float(np.mean(timing.delay_s) + np.mean(timing.lag_s))
-        # The delay of a closed loop (P s + I) / (s (tau s + 1)^2 + P s + I) at low frequency.
-        return common + np.array([1.0 / motor.loop.I for motor in self.robot.motors])
+    def __post_init__(self) -> None:
+        sliding = [joint.name for joint in self.robot.chain.joints if joint.prismatic]
+        if sliding:
+            raise InputError(
+                f"robust features know joints that turn, and {', '.join(sliding)} of "
+                f"{self.robot.name!r} slides. Use another method."
+            )
 
     def __call__(self, signals: Signals) -> FloatArray:
         """Return the features, (run, point, channel), each of about unit size."""
@@ -79,15 +106,15 @@ class RobustFeatures:
 
     def _healthy_pose(self, signals: Signals, index: IntArray) -> FloatArray:
         """Return where a healthy arm would be at some samples, (run, point, motor) [rad]."""
-        command = signals.command
-        place = np.maximum(index[..., None] - self.lag / signals.step, 0.0)
+        command, lag = signals.command, np.asarray(self.expected.lag_s)
+        place = np.maximum(index[..., None] - lag / signals.step, 0.0)
         low = place.astype(np.int64)
         high = np.minimum(low + 1, command.shape[1] - 1)
         run, motor = np.arange(len(index))[:, None, None], np.arange(command.shape[2])
         before, after = command[run, low, motor], command[run, high, motor]
         pose = before + (place - low) * (after - before)
-        settling = self.imperfections.settling or Settling.ideal(len(self.lag))
-        return pose + settling.offset(self.robot, pose, _direction(command)[run, low, motor])
+        direction = _direction(command)[run, low, motor]
+        return pose + self.expected.settling.offset(self.robot, pose, direction)
 
 
 def _points(signals: Signals) -> tuple[IntArray, FloatArray]:
@@ -96,9 +123,9 @@ def _points(signals: Signals) -> tuple[IntArray, FloatArray]:
     Points divide the length of a run evenly; of several readings in one the last counts.
     """
     runs = len(signals.command)
-    share = signals.time / np.maximum(signals.duration[:, None], signals.step)
-    centre = (np.arange(POINTS) + 0.5) / POINTS * signals.duration[:, None] / signals.step
-    index = np.minimum(centre.astype(np.int64), len(signals.time) - 1)
+    last = np.floor(signals.duration[:, None] / signals.step + 1e-6)  # sample of each run
+    share = np.arange(len(signals.time)) / np.maximum(last, 1.0)
+    index = ((np.arange(POINTS) + 0.5) / POINTS * last).astype(np.int64)
     seen = np.zeros((runs, POINTS))
     run, sample = np.nonzero(signals.seen)
     point = np.minimum((share[run, sample] * POINTS).astype(np.int64), POINTS - 1)
