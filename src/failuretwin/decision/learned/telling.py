@@ -62,6 +62,11 @@ def _diagnosis(
     )
     if log.fatal:
         return replace(diagnosis, verdict=f"cannot tell, because {log.fatal}")
+    return told(diagnosis)
+
+
+def told(diagnosis: Diagnosis) -> Diagnosis:
+    """Return a diagnosis with the words that its probabilities deserve."""
     return replace(diagnosis, verdict=_verdict(diagnosis), explanation=_explanation(diagnosis))
 
 
