@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import json
+from functools import partial
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from failuretwin import load_robot, read_runs
+from failuretwin.app import training
+from failuretwin.app.cli import cli
+from failuretwin.decision.learned.storage import load_network
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory):
+    """A network that has seen four batches, and what training it printed."""
+    path = tmp_path_factory.mktemp("network") / "network.npz"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "TrainingPlan", partial(training.TrainingPlan, validation_runs=36))
+        arguments = ["train", "--out", str(path), "--iterations", "4", "--seed", "3"]
+        answer = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+    assert answer.exit_code == 0
+    return path, answer.output
+
+
+def test_a_trained_network_is_calibrated_on_the_other_engine(network, armpi):
+    path, told = network
+    loaded = load_network(path, armpi)
+    assert "18 simulated runs of the physics engine" in told
+    assert f"temperature {loaded.temperature_:.2f}" in told
+    assert loaded.temperature_ != 1.0
+    assert loaded.encoder.expected.name == "armpi_fpv"
+    assert list(loaded.classes_)[0] == "healthy"
+
+
+def test_a_network_diagnoses_as_bayes_does(failuretwin, network, simulated, tmp_path):
+    path, _ = network
+    out = tmp_path / "out.jsonl"
+    answer = failuretwin("diagnose", simulated, "--method", path, "--json", out)
+    assert answer.returncode == 0, answer.stderr
+    records = [json.loads(line) for line in out.read_text().splitlines()]
+    expected = load_network(path, load_robot("armpi_fpv")).predict_proba(read_runs(simulated))
+    got = [list(record["posterior"].values()) for record in records]
+    np.testing.assert_allclose(got, expected, atol=1e-9)
+    assert {record["protocol"] for record in records} == {"P0c"}
+    assert "network cnn" in records[0]["method"]
+    assert "of 9 runs right" in answer.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--method", "nothing.npz"], "failuretwin train --out nothing.npz"),
+        (["--method", "NETWORK", "--onset", "0.49"], "--onset"),
+        (["--method", "NETWORK", "--hypotheses", "healthy"], "--hypotheses"),
+        (["--method", "RUNS"], "cannot be read as a network"),
+    ],
+)
+def test_methods_that_cannot_be_used_are_refused(failuretwin, network, simulated, arguments, words):
+    given = [{"NETWORK": network[0], "RUNS": simulated}.get(a, a) for a in arguments]
+    answer = failuretwin("diagnose", simulated, *given)
+    assert answer.returncode == 2
+    assert words in answer.stderr
+    assert answer.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--out", "network.pt"], "ends in .npz"),
+        (["--out", "nowhere/network.npz"], "does not exist"),
+        (["--out", "network.npz", "--network", "lstms"], "is not one of"),
+        (["--out", "network.npz", "--calibration", "none.toml"], "none.toml"),
+    ],
+)
+def test_training_that_cannot_work_is_refused_at_once(failuretwin, tmp_path, arguments, words):
+    answer = failuretwin("train", *arguments, folder=tmp_path)
+    assert answer.returncode == 2
+    assert words in answer.stderr
+    assert list(tmp_path.iterdir()) == []
