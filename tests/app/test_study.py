@@ -5,7 +5,9 @@ import math
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from failuretwin.app.cli import cli
 from failuretwin.app.study.data import Exam, stand_in_test_set
 from failuretwin.app.study.plan import FEATURES, Job, StudyPlan, quick_plan
 from failuretwin.app.study.published import TABLE_2, TABLE_3
@@ -127,20 +129,23 @@ def test_features_are_those_of_the_paper(studied):
     }
 
 
-def test_the_command_refuses_a_folder_that_is_taken(failuretwin, studied, tmp_path):
+def run(*arguments):
+    """Run `study` in this process; errors meant for users are raised."""
+    given = ["study", *map(str, arguments)]
+    return CliRunner().invoke(cli, given, catch_exceptions=False, standalone_mode=False)
+
+
+def test_the_command_refuses_a_folder_that_is_taken(studied, tmp_path):
     folder, _ = studied
-    answer = failuretwin("study", "--out", folder)
-    assert answer.returncode == 2
-    assert "--resume" in answer.stderr
+    with pytest.raises(InputError, match="--resume"):
+        run("--out", folder)
     (tmp_path / "mine.txt").write_text("mine")
-    answer = failuretwin("study", "--out", tmp_path, "--resume")
-    assert answer.returncode == 2
-    assert PLAN_FILE in answer.stderr
+    with pytest.raises(InputError, match=PLAN_FILE):
+        run("--out", tmp_path, "--resume")
 
 
-def test_test_runs_without_a_truth_are_refused(failuretwin, write_session, tmp_path):
+def test_test_runs_without_a_truth_are_refused(write_session, tmp_path):
     session = write_session(tmp_path / "session")
-    answer = failuretwin("study", "--out", tmp_path / "out", "--test", session)
-    assert answer.returncode == 2
-    assert "--published-labels" in answer.stderr
+    with pytest.raises(InputError, match="--published-labels"):
+        run("--out", tmp_path / "out", "--test", session)
     assert not (tmp_path / "out").exists()
