@@ -74,7 +74,7 @@ def share_waited(name: str, encoder: Encoder, recipe: Recipe) -> tuple[float, fl
         diagnoser = LearnedDiagnoser(name, encoder, iterations=STREAMED, random_state=0)
         classes = [str(h) for h in recipe.hypotheses]
         begun = time.perf_counter()
-        diagnoser.fit_batches(stream.batches(timed(chunks)), standard, classes)
+        diagnoser.fit_batches(stream.batches(timed(chunks)), standard, classes, recipe.movements)
         whole = time.perf_counter() - begun
     return whole / STREAMED, waited[0] / whole
 

@@ -114,7 +114,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="where the networks are kept")
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--iterations", type=int, default=8000)
+    parser.add_argument("--iterations", type=int, default=6000)
     parser.add_argument("--real", type=Path, help="real runs whose folders end in _label_K")
     arguments = parser.parse_args()
     robot = load_robot("armpi_fpv")

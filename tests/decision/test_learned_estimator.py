@@ -77,6 +77,15 @@ def test_a_log_without_readings_gets_no_verdict(runs, trained):
     assert set(diagnosis.posterior.values()) == {1 / 9}
 
 
+def test_runs_of_an_unknown_kind_are_told(runs, trained):
+    """Half of the movements: the network says something, and that it means little."""
+    short = runs.isel(run=[0], time=slice(0, 450))[["command", "measured"]]
+    (diagnosis,) = trained.diagnose(short)
+    assert any("learned from runs of 5" in remark for remark in diagnosis.quality)
+    (whole,) = trained.diagnose(runs.isel(run=[0]))
+    assert not any("learned from" in remark for remark in whole.quality)
+
+
 def test_run_sets_need_an_encoder(runs):
     with pytest.raises(InputError, match="takes arrays"):
         LearnedDiagnoser(iterations=1).fit(runs)
@@ -160,7 +169,7 @@ def test_learning_from_a_stream_is_repeatable(stream, encoder, runs):
     def learn():
         diagnoser = LearnedDiagnoser("cnn", encoder, iterations=5, random_state=1)
         batches = stream.batches(itertools.repeat(chunk))
-        return diagnoser.fit_batches(batches, Standard.of(chunk[0]), names)
+        return diagnoser.fit_batches(batches, Standard.of(chunk[0]), names, (5, 5))
 
     first, second = learn(), learn()
     np.testing.assert_array_equal(first.predict_proba(runs), second.predict_proba(runs))

@@ -86,9 +86,9 @@ def train_network(
     stream = Stream(recipe, encoder, diagnoser.batch_runs)
     classes = [str(hypothesis) for hypothesis in recipe.hypotheses]
     with stream.chunks() as chunks:
-        first = next(chunks)
-        standard = Standard.of(first[0])
-        diagnoser.fit_batches(stream.batches(chunks), standard, classes, on_iteration)
+        standard = Standard.of(next(chunks)[0])
+        batches = stream.batches(chunks)
+        diagnoser.fit_batches(batches, standard, classes, recipe.movements, on_iteration)
     return diagnoser, _calibrate(diagnoser, recipe, plan, imperfections)
 
 

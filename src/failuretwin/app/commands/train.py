@@ -27,7 +27,7 @@ from failuretwin.app.commands.options import PATH, common_options
 @click.option(
     "--iterations",
     type=click.IntRange(min=1),
-    default=8000,
+    default=6000,
     show_default=True,
     help="Batches of 64 runs to learn from.",
 )

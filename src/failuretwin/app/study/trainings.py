@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import os
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import numpy as np
 
 from failuretwin.app.study.data import load_arrays
 from failuretwin.app.study.plan import BATCH_RUNS, VALIDATION_SHARE, Job, StudyPlan
+from failuretwin.core.errors import FailureTwinError
 from failuretwin.core.types import IntArray
 from failuretwin.data_knowledge.store import replacing
 
@@ -83,7 +84,9 @@ def processes(jobs: int) -> int:
 
     if torch.cuda.is_available():
         return 1
-    return min(jobs, len(os.sched_getaffinity(0)))
+    from failuretwin.decision.learned.stream import cores
+
+    return min(jobs, cores())
 
 
 def _spread(
@@ -108,6 +111,11 @@ def _spread(
                 told = done.value
                 for future in finished:
                     future.result()
+        except BrokenProcessPool as error:
+            raise FailureTwinError(
+                "a training has died. Look for what ended it, such as too little memory, and go "
+                "on with --resume."
+            ) from error
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise

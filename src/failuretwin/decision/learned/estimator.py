@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,8 +16,9 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.errors import InputError
+from failuretwin.core.movements import find_movements
 from failuretwin.core.runs import check_motors, check_runs, truth_of
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.decision.learned.encoder import Encoder, Floats
 from failuretwin.decision.learned.networks import Shape, build_network
 from failuretwin.decision.learned.paper_features import POINTS
@@ -59,6 +61,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         network_: The trained network.
         standard_: Mean and spread of each channel.
         temperature_: What scores are divided by before they become probabilities.
+        movements_: Fewest and most movements of a run that it learned from; None: not known.
     """
 
     def __init__(
@@ -96,6 +99,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         """
         if _is_run_set(X) and y is None:
             y = truth_of(X)
+        self.movements_ = _movement_range(X) if _is_run_set(X) else None
         features, classes = validate_data(
             self, self._features(X), y, allow_nd=True, dtype=np.float32
         )
@@ -118,6 +122,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         batches: Iterable[Batch],
         standard: Standard,
         classes: Sequence[str],
+        movements: tuple[int, int],
         on_iteration: Callable[[int], None] = lambda done: None,
     ) -> LearnedDiagnoser:
         """Learn from batches that somebody else makes, such as a `Stream`.
@@ -126,10 +131,11 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             batches: Features, not standardised, and numbers of the classes.
             standard: Mean and spread of the features.
             classes: Names of the classes.
+            movements: Fewest and most movements of a run.
             on_iteration: Called after each batch with the number of those done.
         """
         seed = check_random_state(self.random_state).randint(2**31)
-        self.n_features_in_ = POINTS
+        self.n_features_in_, self.movements_ = POINTS, movements
         standardised = ((standard(features), index) for features, index in batches)
         self._learn(standardised, standard, np.array(classes), seed, on_iteration)
         return self
@@ -201,7 +207,23 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         encoder = self._encoder()
         check_runs(runs, "the run set")
         check_motors(runs, encoder.robot.name, encoder.robot.motor_names)
-        return tell(runs, self.predict_proba, [str(name) for name in self.classes_], self.about)
+        diagnoses = tell(
+            runs, self.predict_proba, [str(name) for name in self.classes_], self.about
+        )
+        counts = _movement_counts(runs)
+        return [self._doubted(d, int(n)) for d, n in zip(diagnoses, counts, strict=True)]
+
+    def _doubted(self, diagnosis: Diagnosis, movements: int) -> Diagnosis:
+        """Return the diagnosis with a remark if the network knows no such runs."""
+        low, high = self.movements_ or (movements, movements)
+        if low <= movements <= high:
+            return diagnosis
+        known = f"{low}" if low == high else f"{low} to {high}"
+        remark = (
+            f"{movements} movements, and the network learned from runs of {known}: its "
+            "probabilities mean little here"
+        )
+        return replace(diagnosis, quality=(*diagnosis.quality, remark))
 
     @property
     def about(self) -> tuple[str, str]:
@@ -232,6 +254,17 @@ def network_shape(encoder: Encoder | None, channels: int, classes: int) -> Shape
     if encoder is None or encoder.features != "robust":
         return Shape(channels, classes)
     return Shape(channels, classes, len(encoder.robot.motors), len(SHARED))
+
+
+def _movement_counts(runs: xr.Dataset) -> IntArray:
+    """Return the number of movements of each run, (run,)."""
+    signals = signals_of(runs)
+    return find_movements(signals.command, signals.time).exists.sum(axis=1)
+
+
+def _movement_range(runs: xr.Dataset) -> tuple[int, int]:
+    counts = _movement_counts(runs)
+    return int(counts.min()), int(counts.max())
 
 
 def _is_run_set(X: Runs) -> bool:

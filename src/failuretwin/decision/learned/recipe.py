@@ -16,6 +16,7 @@ from failuretwin.decision.learned.signals import signals_of_table
 from failuretwin.digital_model.imperfections import Imperfections, Variation
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.modes import MODES, FaultMode, SteadyStateError, Stuck
+from failuretwin.failure_behavior.random_movements import RandomMovements
 
 Range = tuple[float, float]
 
@@ -74,6 +75,12 @@ class Recipe:
     def __post_init__(self) -> None:
         object.__setattr__(self, "hypotheses", paper_hypotheses(self.robot.motor_names))
 
+    @property
+    def movements(self) -> tuple[int, int]:
+        """Fewest and most movements of a run."""
+        count = RandomMovements().count
+        return count, count
+
     def chunk(self, number: int, runs: int, encoder: Encoder) -> tuple[Floats, IntArray]:
         """Return some runs as features, with their classes, in random order.
 
@@ -86,7 +93,7 @@ class Recipe:
         classes = rng.integers(0, len(self.hypotheses), runs)
         parts = []
         for kind, variant in enumerate(self.variants):
-            plan = self._plan(variant, kind)
+            plan = self._plan(variant)
             mine = range(kind, runs, len(self.variants))
             numbers = [int(classes[i]) * RUNS_PER_CLASS + number * runs + i for i in mine]
             if numbers:
@@ -96,14 +103,14 @@ class Recipe:
         shuffled = rng.permutation(runs)
         return made[shuffled], classes[order.astype(np.int64)[shuffled]]
 
-    def _plan(self, variant: Variant, kind: int) -> Plan:
-        del kind
+    def _plan(self, variant: Variant) -> Plan:
         return Plan(
             robot=_with_range(self.robot, variant.first_motor_deg),
             hypotheses=self.hypotheses,
             runs_per_class=RUNS_PER_CLASS,
             seed=self.seed,
             imperfections=self.imperfections,
+            movements=RandomMovements(),
             modes=_modes(variant),
             engine=self.engine,
         )

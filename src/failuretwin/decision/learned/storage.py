@@ -69,6 +69,7 @@ def _configuration(diagnoser: LearnedDiagnoser) -> dict[str, Any]:
         "encoder": None if diagnoser.encoder is None else _encoder_table(diagnoser.encoder),
         "arguments": {key: v for key, v in arguments.items() if key not in _NOT_STORED},
         "features_in": int(diagnoser.n_features_in_),
+        "movements": diagnoser.movements_,
         "classes": diagnoser.classes_.tolist(),
         "temperature": float(diagnoser.temperature_),
         "versions": {
@@ -148,6 +149,8 @@ def _restored(
     diagnoser.standard_ = Standard(arrays["mean"], arrays["spread"])
     diagnoser.classes_ = np.array(configuration["classes"])
     diagnoser.temperature_ = float(configuration["temperature"])
+    movements = configuration["movements"]
+    diagnoser.movements_ = None if movements is None else (int(movements[0]), int(movements[1]))
     channels = len(diagnoser.standard_.mean)
     shape = network_shape(encoder, channels, len(diagnoser.classes_))
     network = build_network(configuration["network"], shape)

@@ -7,11 +7,13 @@ import os
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 
+from failuretwin.core.errors import FailureTwinError
 from failuretwin.core.types import IntArray
 from failuretwin.decision.learned.encoder import Encoder, Floats
 from failuretwin.decision.learned.recipe import Recipe
@@ -22,6 +24,11 @@ AHEAD = 2
 """Chunks made ahead for each process, so that none waits."""
 
 Chunk = tuple[Floats, IntArray]
+
+
+def cores() -> int:
+    """Return how many processes this machine can run at a time."""
+    return os.cpu_count() or 1
 
 
 @dataclass(frozen=True)
@@ -40,7 +47,7 @@ class Stream:
     recipe: Recipe
     encoder: Encoder
     batch_runs: int = 64
-    uses: int = 4
+    uses: int = 6
 
     @contextmanager
     def chunks(self) -> Iterator[Iterator[Chunk]]:
@@ -48,10 +55,15 @@ class Stream:
 
         Scripts must be guarded by ``if __name__ == "__main__":``.
         """
-        workers = max(1, len(os.sched_getaffinity(0)) - 1)
+        workers = max(1, cores() - 1)
         pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
         try:
             yield self._in_order(pool, AHEAD * workers)
+        except BrokenProcessPool as error:
+            raise FailureTwinError(
+                "a process that makes runs has died. Look for what ended it, such as too little "
+                "memory, and start again."
+            ) from error
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
