@@ -134,6 +134,11 @@ def test_calibration_changes_no_verdict(runs, trained):
     assert nats[1] <= nats[0] + 1e-9
 
 
+def test_calibration_on_unknown_classes_is_refused(runs, trained):
+    with pytest.raises(InputError, match="does not know motor_9:stuck"):
+        trained.calibrate(runs, ["motor_9:stuck"] * runs.sizes["run"])
+
+
 @pytest.fixture(scope="module")
 def stream(armpi, measured_armpi, encoder):
     return Stream(Recipe(armpi, measured_armpi, 3), encoder, batch_runs=32, uses=2)

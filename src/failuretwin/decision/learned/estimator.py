@@ -165,11 +165,21 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         Args:
             X: Runs that the network has not learned from.
             y: Class of each; None: as the run set says.
+
+        Raises:
+            InputError: If a class is not among those that the network knows.
         """
-        truth = np.asarray(truth_of(X) if y is None else y)
-        index = np.searchsorted(self.classes_, truth, sorter=np.argsort(self.classes_))
-        index = np.argsort(self.classes_)[index]
-        self.temperature_ = best_temperature(self.scores(X), index)
+        scores = self.scores(X)
+        number = {name: i for i, name in enumerate(self.classes_.tolist())}
+        truth = np.asarray(truth_of(X) if y is None else y).tolist()
+        strange = sorted({str(name) for name in truth if name not in number})
+        if strange:
+            raise InputError(
+                f"the network does not know {', '.join(strange)}. Expected runs of "
+                f"{', '.join(map(str, number))}."
+            )
+        index = np.array([number[name] for name in truth], dtype=np.int64)
+        self.temperature_ = best_temperature(scores, index)
         return self
 
     def scores(self, X: Runs) -> FloatArray:
