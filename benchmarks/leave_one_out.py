@@ -17,7 +17,7 @@ from failuretwin.app.calibrating import learn_robot
 from failuretwin.app.results import Record, score_line, write_json_lines
 from failuretwin.connection.calibration.calibration import Calibration
 from failuretwin.data_knowledge.raw_session import find_sessions
-from failuretwin.decision.bayes import priors_of
+from failuretwin.decision.priors import priors_of
 from failuretwin.digital_model.imperfections import Imperfections, generic_imperfections
 from failuretwin.digital_model.robot import Robot
 

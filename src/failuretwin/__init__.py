@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from failuretwin.data_knowledge.generation import iterate, simulate
     from failuretwin.data_knowledge.plan import Plan
     from failuretwin.data_knowledge.reading import ReadOptions, read_runs
-    from failuretwin.decision.bayes import BayesDiagnoser, Priors
+    from failuretwin.decision.bayes import BayesDiagnoser
+    from failuretwin.decision.priors import Priors
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.twin import DigitalTwin
 
@@ -23,7 +24,7 @@ _HOME = {
     "BayesDiagnoser": "decision.bayes",
     "DigitalTwin": "digital_model.twin",
     "Plan": "data_knowledge.plan",
-    "Priors": "decision.bayes",
+    "Priors": "decision.priors",
     "ReadOptions": "data_knowledge.reading",
     "iterate": "data_knowledge.generation",
     "load_robot": "digital_model.robot",

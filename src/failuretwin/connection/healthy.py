@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import gammaln
 
+from failuretwin.core.ellipsoid import Ellipsoid, log_fall
 from failuretwin.core.movements import Movements
-from failuretwin.core.quadrature import log_of, log_sum
+from failuretwin.core.quadrature import log_of
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
 from failuretwin.digital_model.engine import SAG_ROUNDS
-from failuretwin.digital_model.imperfections import Imperfections
+from failuretwin.digital_model.imperfections import Imperfections, Timing
 from failuretwin.digital_model.settling import Settling, loads_in_range
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -57,10 +57,12 @@ class HealthyModel:
     Attributes:
         twin: Kinematics.
         imperfections: Offsets, scatter and rates of lost commands.
+        blur: Factor on all scatter and noise; 1 for a robot as it is.
     """
 
     twin: DigitalTwin
     imperfections: Imperfections
+    blur: float = 1.0
 
     @cached_property
     def settling(self) -> Settling:
@@ -70,6 +72,10 @@ class HealthyModel:
     @cached_property
     def scatter(self) -> FloatArray:
         """Scale of the settled scatter and of what is not known of the robot, (motor,) [rad]."""
+        return self.blur * self._sharp_scatter
+
+    @property
+    def _sharp_scatter(self) -> FloatArray:
         scatter, doubt = np.asarray(self.settling.scatter), self.imperfections.variation
         if doubt is None:
             return np.hypot(scatter, self._rounding)
@@ -93,8 +99,29 @@ class HealthyModel:
         """Noise of a settled tool position that belongs to no motor [m]."""
         readings = self.imperfections.readings
         if readings is None or self.imperfections.settling is None:
-            return PATH_NOISE_M
-        return float(np.hypot(readings.noise_m, LEAST_NOISE_M))
+            return self.blur * PATH_NOISE_M
+        return self.blur * float(np.hypot(readings.noise_m, LEAST_NOISE_M))
+
+    @property
+    def knows_timing(self) -> bool:
+        """Whether it is known how late and how evenly this robot starts to move."""
+        exact = self.imperfections.settling is None
+        return exact or self.imperfections.timing != Timing()
+
+    @cached_property
+    def lag_s(self) -> float:
+        """Mean lag of the motion behind the command [s]: servo loops, dead time, first-order lag.
+
+        A loop follows a ramp one over its integral gain late.
+        """
+        timing = self.imperfections.timing
+        loops = [1.0 / motor.loop.I for motor in self.twin.robot.motors]
+        return float(np.mean(loops) + np.mean(timing.delay_s) + np.mean(timing.lag_s))
+
+    @cached_property
+    def shortening(self) -> float:
+        """Mean share by which ramps end early [-]."""
+        return float(np.mean(self.imperfections.timing.ramp_shortening))
 
     @cached_property
     def none_held(self) -> BoolArray:
@@ -104,10 +131,14 @@ class HealthyModel:
     @cached_property
     def outlier_log_density(self) -> float:
         """Log of the outlier rate times the density of "anywhere within reach" [1/m3]."""
+        return float(np.log(OUTLIER_RATE) - np.log(4.0 / 3.0 * np.pi * self.reach**3))
+
+    @cached_property
+    def reach(self) -> float:
+        """How far the tool can be from the base at most [m]: the links laid end to end."""
         chain = self.twin.robot.chain
-        reach = sum(np.linalg.norm(joint.T_pj[:3, 3]) for joint in chain.joints)
-        reach += np.linalg.norm(chain.T_jt[:3, 3])
-        return float(np.log(OUTLIER_RATE) - np.log(4.0 / 3.0 * np.pi * reach**3))
+        links = sum(float(np.linalg.norm(joint.T_pj[:3, 3])) for joint in chain.joints)
+        return links + float(np.linalg.norm(chain.T_jt[:3, 3]))
 
     def alternatives(self, movements: Movements) -> Alternatives:
         """Return what may become of each movement; the first is that every command arrives.
@@ -118,21 +149,29 @@ class HealthyModel:
         """
         origin, target = np.nan_to_num(movements.origin()), np.nan_to_num(movements.target)
         travel = np.sign(target - origin)
-        lost, rates, again = self._losses(self._late(movements))
-        twice = self._in_a_row
-        weights = [rates * (1.0 - again * twice), (rates * again)[..., twice]]
-        older, earlier = _before(origin), _before(travel)
+        lost, rates = self._losses(self.late(movements))
+        again = self._in_a_row
+        before = _before(rates)
+        # Chance that of the motors that miss a command now, these had missed the one before too.
+        chances = [before @ _meets(lost, lost[now], had) for now, had in again]
+        twice = [rates[..., now] * chance for (now, _), chance in zip(again, chances, strict=True)]
+        single = rates.copy()
+        for (now, _), weight in zip(again, twice, strict=True):
+            single[..., now] -= weight
+        missing = np.array([*lost, *(lost[now] for now, _ in again)])
+        had = np.array([*np.zeros_like(lost), *(had for _, had in again)])
+        weights = np.stack([*np.moveaxis(single, -1, 0), *twice], axis=-1)
         return Alternatives(
-            lost=np.concatenate([lost, lost[twice]]),
-            base=_choose(target, (lost, origin), (lost[twice], older)),
-            direction=_choose(travel, (lost, earlier), (lost[twice], _before(earlier))),
-            log_weight=log_of(np.concatenate(weights, axis=2) * (1.0 - OUTLIER_RATE)),
+            lost=missing,
+            base=_choose(target, (missing, origin), (had, _before(origin))),
+            direction=_choose(travel, (missing, _before(travel)), (had, _before(_before(travel)))),
+            log_weight=log_of(weights * (1.0 - OUTLIER_RATE)),
         )
 
-    def _losses(self, late: FloatArray) -> tuple[BoolArray, FloatArray, FloatArray]:
-        """Return which motors each alternative loses, how probable it is, and that they had before.
+    def _losses(self, late: FloatArray) -> tuple[BoolArray, FloatArray]:
+        """Return which motors each alternative loses, and how probable it is.
 
-        (alternative, motor), and twice (run, movement, alternative). The first loses none.
+        (alternative, motor), and (run, movement, alternative). The first loses none.
         """
         robot, entries = self.twin.robot, self.imperfections.lost_commands
         lost = np.zeros((1 + len(entries), len(robot.motors)), dtype=bool)
@@ -141,17 +180,21 @@ class HealthyModel:
             lost[i, [robot.motor_names.index(motor) for motor in entry.motors]] = True
             rates[..., i] = entry.rate + (entry.rate_when_late - entry.rate) * late
         rates[..., 0] = 1.0 - rates.sum(axis=-1)
-        return lost, rates, _before(rates @ _covers(lost).T)
+        return lost, rates
 
     @cached_property
-    def _in_a_row(self) -> BoolArray:
-        """Alternatives whose motors may well miss two commands in a row, (alternative,)."""
-        lost, rates, _ = self._losses(np.ones((1, 1)))
-        _, punctual, _ = self._losses(np.zeros((1, 1)))
-        most = np.maximum(rates, punctual)[0, 0]
-        return np.asarray(most * (most @ _covers(lost).T) > RARE)
+    def _in_a_row(self) -> list[tuple[int, BoolArray]]:
+        """Losses that may well follow on another: which one, and who had missed two, (motor,)."""
+        lost, rates = self._losses(np.array([[0.0, 1.0]]))
+        most = rates[0].max(axis=0)
+        found = []
+        for now in range(1, len(lost)):
+            for had in np.unique(lost[1:] & lost[now], axis=0):
+                if had.any() and most[now] * (most @ _meets(lost, lost[now], had)) > RARE:
+                    found.append((now, had))
+        return found
 
-    def _late(self, movements: Movements) -> FloatArray:
+    def late(self, movements: Movements) -> FloatArray:
         """Return the probability that each movement started late, (run, movement).
 
         A late start holds up the next command, so the time between commands betrays it; for the
@@ -179,76 +222,53 @@ class HealthyModel:
             near = base + np.where(held, 0.0, offset)
         return near
 
-    def log_density(
-        self,
-        evidence: SettledEvidence,
-        alternatives: Alternatives,
-        pose: FloatArray,
-        held: BoolArray,
-    ) -> FloatArray:
-        """Return the log density of each settled position, whatever became of the commands.
+    def explain(
+        self, evidence: SettledEvidence, alternatives: Alternatives
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return how well each alternative explains the settled positions, and with which pose.
 
         Args:
             evidence: Settled positions.
-            alternatives: What may become of each movement.
-            pose: Predicted settled angles, (run, movement, node, alternative, motor) [rad], for
-                as many nodes of some unknown as are wanted.
-            held: Motors that do not scatter, (motor,).
+            alternatives: What may have become of each movement.
 
         Returns:
-            (run, movement, node) [log 1/m3]; 0 for movements that are not usable.
+            Log weight times density of each alternative if no motor is faulty,
+            (run, movement, alternative) [log 1/m3], and the pose, scattered so as to meet the
+            position, (run, movement, alternative, motor) [rad].
         """
-        _, mixed = self._weighed(evidence, alternatives, pose, held)
-        return np.where(evidence.usable[..., None], mixed, 0.0)
-
-    def became(
-        self,
-        evidence: SettledEvidence,
-        alternatives: Alternatives,
-        pose: FloatArray,
-        held: BoolArray,
-    ) -> FloatArray:
-        """Return the probability of each alternative, (run, movement, alternative).
-
-        Args:
-            evidence: Settled positions.
-            alternatives: What may become of each movement.
-            pose: Predicted settled angles, (run, movement, alternative, motor) [rad].
-            held: Motors that do not scatter, (motor,).
-        """
-        weighed, mixed = self._weighed(evidence, alternatives, pose[:, :, None], held)
-        share = np.exp(weighed - mixed[..., None])[:, :, 0]
-        return np.where(evidence.usable[..., None], share, 0.0)
-
-    def _weighed(
-        self,
-        evidence: SettledEvidence,
-        alternatives: Alternatives,
-        pose: FloatArray,
-        held: BoolArray,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return log weight times density of each alternative, and of all with outliers.
-
-        (run, movement, node, alternative) and (run, movement, node).
-        """
-        predicted, jacobian = self.twin.path_and_jacobian(pose)
-        scaled = jacobian * np.where(held, 0.0, self.scatter)
-        error = evidence.point[:, :, None, None] - predicted
-        density = log_student(error, scaled, self.path_noise**2, self.settling.tail_dof)
-        weighed = density + alternatives.log_weight[:, :, None]
-        return weighed, np.logaddexp(log_sum(weighed, axis=-1), self.outlier_log_density)
-
-    def log_healthy(self, evidence: SettledEvidence, alternatives: Alternatives) -> FloatArray:
-        """Return the log density of each position if no motor is faulty, (run, movement)."""
         pose = self.settle(alternatives.base, alternatives.direction, self.none_held)
-        return self.log_density(evidence, alternatives, pose[:, :, None], self.none_held)[..., 0]
+        predicted, jacobian = self.twin.path_and_jacobian(pose)
+        error = evidence.point[:, :, None] - predicted
+        spread = Ellipsoid.of(jacobian * self.scatter, self.path_noise**2)
+        dof = self.settling.tail_dof
+        density = spread.log_norm(dof) + log_fall(spread.product(error, error), dof)
+        return (
+            alternatives.log_weight + density,
+            pose + scattered(spread, jacobian, self.scatter, error),
+        )
 
 
-def _covers(lost: BoolArray) -> FloatArray:
-    """Return 1 where the motors of one alternative are among those of another, (one, other)."""
-    covers = np.array([[np.all(other >= one) for other in lost] for one in lost], dtype=float)
-    covers[0] = 0.0  # the first loses none
-    return covers
+def scattered(
+    spread: Ellipsoid, jacobian: FloatArray, scale: FloatArray, error: FloatArray
+) -> FloatArray:
+    """Return by how much motors scatter, at the most probable, to meet a settled position.
+
+    Args:
+        spread: Covariance of the position, (...).
+        jacobian: Its derivative by the angles, (..., 3, motor) [m/rad].
+        scale: Scatter of each motor, (motor,) [rad].
+        error: Position minus expected position, (..., 3) [m].
+
+    Returns:
+        (..., motor) [rad].
+    """
+    pull = spread.solve(error)
+    return np.asarray(scale**2 * np.einsum("...ak,...a->...k", jacobian, pull))
+
+
+def _meets(lost: BoolArray, now: BoolArray, had: BoolArray) -> FloatArray:
+    """Return 1 for the losses that hit exactly `had` of the motors `now`, (alternative,)."""
+    return np.asarray((lost & now == had).all(axis=1), dtype=np.float64)
 
 
 def _choose(arrived: FloatArray, *missed: tuple[BoolArray, FloatArray]) -> FloatArray:
@@ -256,10 +276,13 @@ def _choose(arrived: FloatArray, *missed: tuple[BoolArray, FloatArray]) -> Float
 
     Args:
         arrived: Value of a motor that got its command, (run, movement, motor).
-        missed: Motors that did not, (alternative, motor), and their value, (run, movement, motor).
+        missed: Motors that did not, (alternative, motor), and their value, (run, movement, motor);
+            the last that names a motor counts.
     """
-    chosen = [np.where(mask, value[:, :, None], arrived[:, :, None]) for mask, value in missed]
-    return np.concatenate(chosen, axis=2)
+    chosen = arrived[:, :, None]
+    for mask, value in missed:
+        chosen = np.where(mask, value[:, :, None], chosen)
+    return np.asarray(chosen)
 
 
 def _before(values: FloatArray) -> FloatArray:
@@ -270,33 +293,3 @@ def _before(values: FloatArray) -> FloatArray:
 def _spread(deviation: tuple[float, ...]) -> FloatArray:
     """Return standard deviations as an array that fits any number of motors; none are zero."""
     return np.asarray(deviation or 0.0)
-
-
-def log_student(
-    error: FloatArray, scaled_jacobian: FloatArray, noise: float, dof: float
-) -> FloatArray:
-    """Return log densities of a 3-variate Student t distribution with S = A A^T + noise I.
-
-    Args:
-        error: Deviations, (..., 3).
-        scaled_jacobian: A, the Jacobian times the scale of each motor, (..., 3, motor).
-        noise: Variance added on each axis.
-        dof: Degrees of freedom; infinite: normal.
-
-    Returns:
-        (...).
-    """
-    ax, ay, az = (scaled_jacobian[..., axis, :] for axis in range(3))
-    dot = "...i,...i->..."
-    xx, yy, zz = (np.einsum(dot, a, a) + noise for a in (ax, ay, az))
-    xy, xz, yz = np.einsum(dot, ax, ay), np.einsum(dot, ax, az), np.einsum(dot, ay, az)
-    cxx, cyy, czz = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
-    cxy, cxz, cyz = xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz
-    det = xx * cxx + xy * cxy + xz * cxz
-    x, y, z = error[..., 0], error[..., 1], error[..., 2]
-    square = cxx * x * x + cyy * y * y + czz * z * z
-    square = (square + 2.0 * (cxy * x * y + cxz * x * z + cyz * y * z)) / det
-    if np.isinf(dof):
-        return -0.5 * (3.0 * np.log(2.0 * np.pi) + np.log(det) + square)
-    constant = gammaln((dof + 3.0) / 2.0) - gammaln(dof / 2.0) - 1.5 * np.log(dof * np.pi)
-    return constant - 0.5 * np.log(det) - 0.5 * (dof + 3.0) * np.log1p(square / dof)

@@ -2,10 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from failuretwin.core.types import FloatArray, as_floats
+
+
+@dataclass(frozen=True)
+class Weighted:
+    """A distribution as values with weights, (value,) each; weights need not add up to 1."""
+
+    values: FloatArray
+    weights: FloatArray
+
+    def quantiles(self, levels: tuple[float, ...]) -> FloatArray:
+        """Return quantiles, (level,)."""
+        return weighted_quantiles(self.values, self.weights, levels)
+
+    def draw(self, count: int, rng: np.random.Generator) -> FloatArray:
+        """Return draws, (count,)."""
+        return rng.choice(self.values, count, p=self.weights / self.weights.sum())
 
 
 def log_sum(values: FloatArray, axis: int | tuple[int, ...]) -> FloatArray:

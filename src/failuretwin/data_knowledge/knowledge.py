@@ -21,8 +21,11 @@ class FailureMode:
         effect: What the motor then does.
         shows: How it looks at the tool.
         prior_odds: Odds against healthy for each motor before a run is seen.
+        before_run: Probability that the fault was there before the run, if it is there.
         advice: What to do now.
         source: Where the row comes from.
+        sizes: Magnitudes that diagnosis considers, in the unit of the mode; none for modes with
+            beliefs of their own.
     """
 
     name: str
@@ -30,8 +33,10 @@ class FailureMode:
     effect: str
     shows: str
     prior_odds: float
+    before_run: float
     advice: str
     source: str
+    sizes: tuple[float, ...] = ()
 
 
 @cache
@@ -40,6 +45,12 @@ def failure_modes() -> dict[str, FailureMode]:
     path = Path(str(files("failuretwin.data_knowledge") / "failure_modes.toml"))
     table = read_toml(path)
     return {mode: from_table(FailureMode, row, f"{path}: {mode}") for mode, row in table.items()}
+
+
+def magnitude_range(mode: str) -> tuple[float, float]:
+    """Return lowest and highest magnitude that diagnosis considers, in the unit of the mode."""
+    low, high = failure_modes()[mode].sizes
+    return low, high
 
 
 def prior_odds(hypothesis: Hypothesis) -> float:

@@ -69,7 +69,7 @@ def why_undecided(
 
 
 def lost_commands(
-    became: FloatArray, lost: BoolArray, motors: Sequence[str], faulty: str | None
+    became: FloatArray, lost: BoolArray, motors: Sequence[str], faulty: Sequence[str]
 ) -> list[str]:
     """Return the commands of a run that seem not to have arrived, a line each.
 
@@ -77,13 +77,13 @@ def lost_commands(
         became: Probability of each alternative, (movement, alternative).
         lost: Motors that lose their command in it, (alternative, motor).
         motors: Names of the motors.
-        faulty: Motor whose fault is told anyway.
+        faulty: Motors whose fault is told anyway.
     """
     lines = []
     for movement, share in enumerate(became):
         missing = share @ lost > LIKELY
-        names = [m.replace("_", " ") for m, gone in zip(motors, missing, strict=True) if gone]
-        told = [name for name in names if name != (faulty or "").replace("_", " ")]
+        told = [m for m, gone in zip(motors, missing, strict=True) if gone and m not in faulty]
         if told:
-            lines.append(f"movement {movement + 1}: {' and '.join(told)} did not get the command")
+            names = " and ".join(motor.replace("_", " ") for motor in told)
+            lines.append(f"movement {movement + 1}: {names} did not get the command")
     return lines

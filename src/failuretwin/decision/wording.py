@@ -44,12 +44,29 @@ def verdict(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> str:
     return text
 
 
+_SIZES = {
+    "steady_state_error": " by about {size:.1f} deg",
+    "encoder_bias": " by {size:+.1f} deg",
+    "backlash": " of {size:.1f} deg",
+    "drift": " by {size:+.2f} deg/s",
+    "lag": " by {size:.2f} s",
+    "encoder_scale": " by {size:+.0%}",
+}
+"""How the magnitude of a mode is told; angles in degrees. Those left out are shares."""
+
+
 def _size_and_onset(diagnosis: Diagnosis, hypothesis: Hypothesis) -> str:
-    degrees = float(np.rad2deg(diagnosis.magnitude or 0.0))
-    if hypothesis.faults[0].mode == "stuck":
-        since = f"{diagnosis.onset_s:.1f} s" if diagnosis.onset_s else "before the run"
-        return f" at {round(degrees)} deg since {since}"
-    return f" by about {degrees:.1f} deg"
+    onset = diagnosis.onset_s or 0.0
+    since = f" since {onset:.1f} s" if onset else " since before the run"
+    if len(hypothesis.faults) != 1 or diagnosis.magnitude is None:
+        return since if onset else ""
+    fault, size = hypothesis.faults[0], diagnosis.magnitude
+    if fault.magnitude_unit in ("rad", "rad/s"):
+        size = float(np.rad2deg(size))
+    if fault.mode == "stuck":
+        return f" at {round(size)} deg{since}"
+    text = _SIZES.get(fault.mode, " ({size:.0%})").format(size=size)
+    return text + (since if onset else "")
 
 
 def possible_hypotheses(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> Sequence[Hypothesis]:

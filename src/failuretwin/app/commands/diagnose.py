@@ -88,7 +88,8 @@ def diagnose(
         tracking_line,
     )
     from failuretwin.core.hypothesis import parse_hypotheses
-    from failuretwin.decision.bayes import BayesDiagnoser, priors_of
+    from failuretwin.decision.bayes import BayesDiagnoser
+    from failuretwin.decision.priors import priors_of
     from failuretwin.digital_model.imperfections import load_imperfections
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.twin import DigitalTwin

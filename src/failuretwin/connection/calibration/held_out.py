@@ -7,7 +7,8 @@ import numpy as np
 from failuretwin.connection.calibration.calibration import HeldOut
 from failuretwin.connection.calibration.observations import Observations
 from failuretwin.connection.calibration.settled_part import SettledPart, fit_settled_part
-from failuretwin.connection.healthy import PATH_NOISE_M, log_student
+from failuretwin.connection.healthy import PATH_NOISE_M
+from failuretwin.core.ellipsoid import log_student
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.imperfections import generic_imperfections

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import gammaln
 
 from failuretwin.connection.calibration.observations import Observations
-from failuretwin.connection.healthy import log_student
+from failuretwin.core.ellipsoid import log_student
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, loads_in_range

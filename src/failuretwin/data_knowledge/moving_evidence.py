@@ -1,0 +1,78 @@
+"""What a run says while the arm moves: readings of the tool from each start until it rests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from failuretwin.core.runs import measured_rate
+from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.data_knowledge.settled_evidence import SettledEvidence
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+MOST_READINGS = 12
+"""Readings of one movement that are looked at; more say nothing new, as all share one lag."""
+
+
+@dataclass(frozen=True)
+class MovingEvidence:
+    """Readings on the way, for each movement of many runs.
+
+    Attributes:
+        since: Time since the movement was commanded, (run, movement, reading) [s].
+        point: Tool position, (run, movement, reading, axis) [m]; 0 where there is none.
+        seen: Readings that are there, (run, movement, reading).
+    """
+
+    since: FloatArray
+    point: FloatArray
+    seen: BoolArray
+
+    def __getitem__(self, runs: slice) -> MovingEvidence:
+        """Return the evidence of some of the runs."""
+        return MovingEvidence(self.since[runs], self.point[runs], self.seen[runs])
+
+
+def moving_evidence(runs: xr.Dataset, settled: SettledEvidence) -> MovingEvidence:
+    """Return the readings of each movement before those that `settled` has used.
+
+    Of densely sampled paths readings are left out evenly, so that no two lie closer than the true
+    rate of the sensor says.
+
+    Args:
+        runs: A run set; `measured` (run, time, axis) is read.
+        settled: Where the tool settled in the same runs.
+    """
+    time = as_floats(runs["time"].values)
+    measured = as_floats(runs["measured"].values)
+    least_step = 0.9 / measured_rate(runs)
+    finite = np.asarray(np.isfinite(measured).all(axis=-1))
+    start = settled.movements.start
+    until = np.where(settled.usable, settled.begin, settled.end)
+    shape = (*start.shape, MOST_READINGS)
+    since, point = np.zeros(shape), np.zeros((*shape, 3))
+    seen = np.zeros(shape, dtype=bool)
+    for run, movement in np.argwhere(settled.movements.exists & (until > start)):
+        first, stop = np.searchsorted(time, [start[run, movement], until[run, movement] - 1e-9])
+        rows = first + np.flatnonzero(finite[run, first:stop])
+        rows = rows[_apart(time[rows], least_step)]
+        if len(rows) > MOST_READINGS:
+            rows = rows[np.rint(np.linspace(0, len(rows) - 1, MOST_READINGS)).astype(int)]
+        since[run, movement, : len(rows)] = time[rows] - start[run, movement]
+        point[run, movement, : len(rows)] = measured[run, rows]
+        seen[run, movement, : len(rows)] = True
+    return MovingEvidence(since, point, seen)
+
+
+def _apart(time: FloatArray, least_step: float) -> BoolArray:
+    """Return which of some sorted instants to keep so that none are closer than `least_step`."""
+    kept = np.zeros(len(time), dtype=bool)
+    last = -np.inf
+    for i, at in enumerate(time):
+        if at - last >= least_step:
+            kept[i], last = True, at
+    return kept

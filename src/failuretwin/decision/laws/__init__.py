@@ -1,0 +1,1 @@
+"""Laws of the fault modes: how a motor settles with a fault."""

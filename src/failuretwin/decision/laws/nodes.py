@@ -1,0 +1,53 @@
+"""Nodes of an unknown that holds for the whole run: dense where a movement may point."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from failuretwin.core.quadrature import log_of, log_sum, log_trapezoid_weights
+from failuretwin.core.types import BoolArray, FloatArray
+
+LOCAL_STEPS = np.array([-8, -5, -3.5, -2.5, -1.75, -1, -0.5, 0, 0.5, 1, 1.75, 2.5, 3.5, 5, 8.0])
+"""Nodes around the value that a movement points to, in its own standard deviations."""
+COARSE_NODES = 41
+"""Nodes spread evenly over the range of sizes, on each side of zero."""
+
+
+def nodes_around(
+    best: FloatArray, width: FloatArray, usable: BoolArray, otherwise: float
+) -> FloatArray:
+    """Return nodes around the value that each movement points to, (run, node).
+
+    Args:
+        best: That value, (run, movement).
+        width: Its standard deviation, (run, movement).
+        usable: Movements that point anywhere, (run, movement).
+        otherwise: What the others give.
+    """
+    nodes = best[..., None] + width[..., None] * LOCAL_STEPS
+    return np.where(usable[..., None], nodes, otherwise).reshape(len(best), -1)
+
+
+def size_nodes(
+    best: FloatArray, width: FloatArray, usable: BoolArray, sizes: tuple[float, ...], signed: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Return magnitudes of a fault, sorted, and the log of their prior, (run, node) each.
+
+    Args:
+        best: Magnitude that each movement points to, (run, movement).
+        width: Its standard deviation, (run, movement).
+        usable: Movements that point anywhere, (run, movement).
+        sizes: Lowest and highest magnitude, all between as likely.
+        signed: Whether they come with a minus too.
+    """
+    low, high = sizes
+    grid = np.linspace(low, high, COARSE_NODES)
+    if signed:
+        grid = np.concatenate([-grid, grid])
+    local = nodes_around(best, width, usable, low)
+    coarse = np.broadcast_to(grid, (len(best), len(grid)))
+    nodes = np.sort(np.concatenate([local, coarse], axis=1), axis=1)
+    nodes = np.clip(nodes, -high if signed else low, high)
+    inside = np.abs(nodes) >= low - 1e-12
+    mass = np.where(inside, log_trapezoid_weights(nodes), log_of(0.0))
+    return nodes, mass - log_sum(mass, axis=1)[:, None]

@@ -1,0 +1,210 @@
+"""What every movement says of the angle of one motor, whatever becomes of the others.
+
+As one motor moves and the others settle as healthy ones, the tool runs on a circle. Near the
+angle that brings it nearest to where it was seen, the squared distance is a parabola: four
+numbers say all that a movement can say of this motor, and any fault of it is weighed by them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from failuretwin.connection.healthy import Alternatives, HealthyModel, scattered
+from failuretwin.core.ellipsoid import Ellipsoid, log_norm
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.data_knowledge.settled_evidence import SettledEvidence
+
+REFINEMENTS = 2
+"""Newton steps from the point of the circle nearest to the tool; more change nothing."""
+LONGEST_STEP_RAD = 0.3
+"""Bound on such a step: near a singular pose the parabola promises too much."""
+LEAST_PRECISION = 1e-3
+"""Precision [1/rad2] below which a movement says nothing of the motor: the tool is on its axis."""
+
+
+@dataclass(frozen=True)
+class MotorProfile:
+    """Evidence on the settled angle of one motor, (..., alternative) each.
+
+    Leading axes are run and movement, and one more where another motor takes several angles.
+
+    Attributes:
+        best: Angle that brings the tool nearest to where it was seen [rad].
+        precision: Curvature of the squared distance there [1/rad2].
+        square: Squared distance at `best`, in scales of the others' scatter.
+        log_weight: Log of the alternative's weight times the density's norm.
+        expected: Angle at which the motor settles if it is healthy [rad].
+        scatter: Scale of its own settled scatter [rad].
+        dof: Degrees of freedom of the scatter.
+        outlier: Log density of the tool being anywhere, times its rate.
+        usable: Movements with evidence, (run, movement).
+        pose: Angles of all motors that explain the position best, with this motor at `best` and
+            the others scattered, (..., alternative, motor) [rad].
+    """
+
+    best: FloatArray
+    precision: FloatArray
+    square: FloatArray
+    log_weight: FloatArray
+    expected: FloatArray
+    scatter: float
+    dof: float
+    outlier: float
+    usable: BoolArray
+    pose: FloatArray
+
+    def __getitem__(self, run: int) -> MotorProfile:
+        """Return what one of the runs says, without the axis of runs."""
+        return replace(
+            self,
+            best=self.best[run],
+            precision=self.precision[run],
+            square=self.square[run],
+            log_weight=self.log_weight[run],
+            expected=self.expected[run],
+            usable=self.usable[run],
+            pose=self.pose[run],
+        )
+
+    def log_terms(self, angle: FloatArray, held: bool) -> FloatArray:
+        """Return log weight times density of each alternative.
+
+        Args:
+            angle: Where the motor settles, scatter aside, (..., alternative) [rad].
+            held: Whether the gear holds it exactly there.
+        """
+        precision, log_weight = self._with_scatter(held)
+        return log_weight + self._fall(self.square + precision * (angle - self.best) ** 2)
+
+    def log_density(self, angle: FloatArray, held: bool) -> FloatArray:
+        """Return the log density of each settled position, whatever became of the commands.
+
+        Args:
+            angle: Where the motor settles, scatter aside, (..., node, alternative) [rad], or with
+                a last axis of 1 if it is the same whatever became of the commands.
+            held: Whether the gear holds it exactly there.
+
+        Returns:
+            (..., node) [log 1/m3]; 0 for movements that are not usable.
+        """
+        precision, log_weight = self._with_scatter(held)
+        count = log_weight.shape[-1]
+        total: FloatArray | float = 1.0
+        # Alternative by alternative: large temporary arrays would cost more than the arithmetic.
+        for k in range(count):
+            off = angle[..., k if angle.shape[-1] > 1 else 0] - self.best[..., None, k]
+            off *= off
+            off *= precision[..., None, k]
+            off += self.square[..., None, k]
+            fall = self._fall(off)
+            fall += log_weight[..., None, k] - self.outlier
+            total = total + np.exp(fall, out=fall)
+        found = self.outlier + np.log(total)
+        usable = self.usable.reshape(self.usable.shape + (1,) * (found.ndim - 2))
+        return np.where(usable, found, 0.0)
+
+    def _with_scatter(self, held: bool) -> tuple[FloatArray, FloatArray]:
+        """Return precision and log weight once the motor's own scatter counts."""
+        if held:
+            return self.precision, self.log_weight
+        inflation = 1.0 + self.scatter**2 * self.precision
+        return self.precision / inflation, self.log_weight - 0.5 * np.log(inflation)
+
+    def _fall(self, square: FloatArray) -> FloatArray:
+        if np.isinf(self.dof):
+            return -0.5 * square
+        fall = square / self.dof
+        np.log1p(fall, out=fall)
+        fall *= -0.5 * (self.dof + 3.0)
+        return fall
+
+
+def motor_profile(
+    evidence: SettledEvidence,
+    model: HealthyModel,
+    alternatives: Alternatives,
+    motor: int,
+    *,
+    other: int | None = None,
+    other_angle: FloatArray | None = None,
+    other_held: bool = False,
+) -> MotorProfile:
+    """Return what each movement says of one motor.
+
+    Args:
+        evidence: Settled positions.
+        model: The healthy robot.
+        alternatives: What may have become of each movement.
+        motor: Index of the motor.
+        other: Index of another motor that has a fault of its own, if any.
+        other_angle: Where it settles, (run, movement, node, alternative) [rad].
+        other_held: Whether the gear holds it exactly there.
+    """
+    base, direction = alternatives.base, alternatives.direction
+    log_weight, point = alternatives.log_weight, evidence.point[:, :, None]
+    fixed = model.none_held.copy()
+    if other is not None and other_angle is not None:
+        base, direction = base[:, :, None], direction[:, :, None]
+        log_weight, point = log_weight[:, :, None], point[:, :, None]
+        base = np.repeat(base, other_angle.shape[2], axis=2)
+        base[..., other] = other_angle
+        fixed[other] = True
+    expected = model.settle(base, direction, fixed)
+    fixed[motor] = True
+    scale = model.scatter.copy()
+    scale[motor] = 0.0
+    if other_held and other is not None:
+        scale[other] = 0.0
+    angle = _nearest_on_circle(model, expected, motor, point)
+    pose = base.copy()
+    for _ in range(REFINEMENTS):
+        pose[..., motor] = angle
+        settled = model.settle(pose, direction, fixed)
+        predicted, jacobian = model.twin.path_and_jacobian(settled)
+        spread = Ellipsoid.of(jacobian * scale, model.path_noise**2)
+        lever, error = jacobian[..., motor], point - predicted
+        precision = spread.product(lever, lever)
+        slope = spread.product(lever, error)
+        step = slope / np.maximum(precision, LEAST_PRECISION)
+        angle = angle + np.clip(step, -LONGEST_STEP_RAD, LONGEST_STEP_RAD)
+    taken = np.clip(step, -LONGEST_STEP_RAD, LONGEST_STEP_RAD)
+    square = spread.product(error, error) - taken * (2.0 * slope - precision * taken)
+    settled = settled + scattered(spread, jacobian, scale, error - lever * taken[..., None])
+    settled[..., motor] = angle
+    dof = model.settling.tail_dof
+    return MotorProfile(
+        best=angle,
+        precision=precision,
+        square=np.maximum(square, 0.0),
+        log_weight=log_weight + log_norm(dof) - 0.5 * np.log(spread.determinant),
+        expected=expected[..., motor],
+        scatter=float(model.scatter[motor]),
+        dof=dof,
+        outlier=model.outlier_log_density,
+        usable=evidence.usable,
+        pose=settled,
+    )
+
+
+def _nearest_on_circle(
+    model: HealthyModel, pose: FloatArray, motor: int, point: FloatArray
+) -> FloatArray:
+    """Return the angle of `motor` that brings the tool nearest to `point`, (...) [rad].
+
+    Three poses say where the circle lies (the line, if the joint slides).
+    """
+    poses = np.repeat(pose[..., None, :], 3, axis=-2)
+    poses[..., motor] = np.array([0.0, 0.5 * np.pi, np.pi])
+    path = model.twin.path(poses)
+    first, quarter, half = path[..., 0, :], path[..., 1, :], path[..., 2, :]
+    if model.twin.robot.chain.joints[motor].prismatic:
+        along = (half - first) / np.pi
+        toward = np.sum((point - first) * along, axis=-1)
+        return np.asarray(toward / np.maximum(np.sum(along**2, axis=-1), 1e-12))
+    centre = 0.5 * (first + half)
+    cosine, sine, toward = first - centre, quarter - centre, point - centre
+    found = np.arctan2(np.sum(toward * sine, axis=-1), np.sum(toward * cosine, axis=-1))
+    turns = np.rint((pose[..., motor] - found) / (2.0 * np.pi))
+    return np.asarray(found + 2.0 * np.pi * turns)

@@ -1,0 +1,53 @@
+"""What is believed of faults before a run is seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from failuretwin.core.errors import InputError
+from failuretwin.decision.laws.steady_state_error import ERROR_RANGES, Range
+from failuretwin.decision.onsets import OnsetPrior
+from failuretwin.digital_model.robot import Robot
+
+
+@dataclass(frozen=True)
+class Priors:
+    """What is believed before the run is seen.
+
+    Attributes:
+        onset: When a motor may have got stuck.
+        error_ranges: Run-level ranges of steady-state errors [rad], equally likely.
+    """
+
+    onset: OnsetPrior = field(default_factory=OnsetPrior)
+    error_ranges: Sequence[Range] = ERROR_RANGES
+
+
+def priors_of(
+    robot: Robot, error_range_counts: tuple[float, float] | None, onset_s: float | None
+) -> Priors:
+    """Return priors with what is known of the faults, the default for what is not.
+
+    Args:
+        robot: The robot, for its servo units.
+        error_range_counts: Range of steady-state errors [servo units].
+        onset_s: Onset of stuck faults [s].
+
+    Raises:
+        InputError: If the range is not 0 <= low < high or the onset is negative.
+    """
+    priors = Priors()
+    if error_range_counts is not None:
+        low, high = error_range_counts
+        if not 0.0 <= low < high < np.inf:
+            raise InputError(f"--sse-range is {low:g} {high:g}, expected 0 <= LOW < HIGH.")
+        count = robot.servo_units.rad_per_count
+        priors = replace(priors, error_ranges=((low * count, high * count),))
+    if onset_s is not None:
+        if not 0.0 <= onset_s < np.inf:
+            raise InputError(f"--onset is {onset_s:g} s, expected 0 or more.")
+        priors = replace(priors, onset=replace(priors.onset, known_s=onset_s))
+    return priors

@@ -1,0 +1,119 @@
+"""From a hypothesis to what runs say of it: the one place that knows the law of each mode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import UNKNOWN, Fault, Hypothesis
+from failuretwin.core.types import FloatArray
+from failuretwin.data_knowledge.knowledge import prior_odds
+from failuretwin.decision.law import Estimate, Law, Scene, Weight, weigh
+from failuretwin.decision.laws.lasting import AMOUNTS, drift_law, lasting_law
+from failuretwin.decision.laws.stays import MISSES, weigh_misses
+from failuretwin.decision.laws.steady_state_error import error_law
+from failuretwin.decision.laws.stuck import stuck_law
+from failuretwin.decision.laws.timed import lag_law, slow_law
+from failuretwin.decision.laws.unknown import weigh_unknown
+from failuretwin.decision.pairs import weigh_pair
+from failuretwin.decision.priors import Priors
+
+UNKNOWN_ODDS = 0.3
+"""Odds of `unknown` against healthy: assumed, like those of the rarer fault modes."""
+MOST_FAULTS = 2
+"""Faults that can be weighed at once."""
+
+
+def _lasting(mode: str) -> Callable[[Scene, int, Priors], Law]:
+    return lambda scene, motor, priors: lasting_law(
+        scene, motor, mode, priors.onset.before_run(mode)
+    )
+
+
+LAWS: Mapping[str, Callable[[Scene, int, Priors], Law]] = {
+    "stuck": lambda scene, motor, priors: stuck_law(scene, motor, priors.onset),
+    "steady_state_error": lambda scene, motor, priors: error_law(
+        scene, motor, priors.error_ranges, priors.onset.before_run("steady_state_error")
+    ),
+    "drift": lambda scene, motor, priors: drift_law(scene, motor, priors.onset.before_run("drift")),
+    **{mode: _lasting(mode) for mode in AMOUNTS},
+}
+"""Law of each mode that makes a motor settle beside its target."""
+TIMED: Mapping[str, Callable[[Scene, int, float], Law]] = {"lag": lag_law, "slow": slow_law}
+"""Law of each mode that shows on the way."""
+WEIGHABLE = (*LAWS, *TIMED, *MISSES)
+"""Modes that can be weighed."""
+
+
+def check_weighable(hypothesis: Hypothesis) -> None:
+    """Refuse a hypothesis that cannot be weighed.
+
+    Raises:
+        InputError: If a mode cannot be weighed, or not together with another.
+    """
+    if len(hypothesis.faults) > MOST_FAULTS:
+        raise InputError(
+            f"hypothesis '{hypothesis}' has {len(hypothesis.faults)} faults. Expected "
+            f"{MOST_FAULTS} at most."
+        )
+    known = WEIGHABLE if len(hypothesis.faults) == 1 else tuple(LAWS)
+    for fault in hypothesis.faults:
+        if fault.mode not in known:
+            raise InputError(
+                f"fault mode {fault.mode!r} cannot be weighed in '{hypothesis}'. Expected one of "
+                f"{', '.join(known)}."
+            )
+
+
+def log_prior(hypotheses: Sequence[Hypothesis]) -> FloatArray:
+    """Return the log prior probability of each hypothesis, (hypothesis,)."""
+    odds = np.array([prior_odds(h) if h.known else UNKNOWN_ODDS for h in hypotheses])
+    return np.asarray(np.log(odds / odds.sum()))
+
+
+def weigh_all(scene: Scene, hypotheses: Sequence[Hypothesis], priors: Priors) -> list[Weight]:
+    """Return what runs say of each hypothesis, in their order."""
+    known = [h for h in hypotheses if h.known]
+    weights = {h: weigh_hypothesis(scene, h, priors) for h in known}
+    if len(known) < len(hypotheses):
+        ways = [lambda blurred, h=h: weigh_hypothesis(blurred, h, priors) for h in known]
+        weights[UNKNOWN] = weigh_unknown(scene, ways, log_prior(known))
+    return [weights[h] for h in hypotheses]
+
+
+def weigh_hypothesis(scene: Scene, hypothesis: Hypothesis, priors: Priors) -> Weight:
+    """Return what runs say of one known hypothesis."""
+    if hypothesis.is_healthy:
+        return _weigh_healthy(scene)
+    if len(hypothesis.faults) == 2:
+        scenes = [scene[run] for run in range(len(scene.log_healthy))]
+        one, two = hypothesis.faults
+        laws = [(_law(alone, one, priors), _law(alone, two, priors)) for alone in scenes]
+        return weigh_pair(scenes, laws)
+    fault = hypothesis.faults[0]
+    motor, early = _motor(scene, fault), priors.onset.before_run(fault.mode)
+    if fault.mode in MISSES:
+        return weigh_misses(scene, motor, fault.mode, early)
+    if fault.mode in TIMED:
+        return weigh(scene, TIMED[fault.mode](scene, motor, early))
+    return weigh(scene, _law(scene, fault, priors))
+
+
+def _motor(scene: Scene, fault: Fault) -> int:
+    return scene.model.twin.robot.motor_names.index(fault.motor)
+
+
+def _law(scene: Scene, fault: Fault, priors: Priors) -> Law:
+    return LAWS[fault.mode](scene, _motor(scene, fault), priors)
+
+
+def _weigh_healthy(scene: Scene) -> Weight:
+    """Return what runs say of no motor being faulty."""
+    by_movement = scene.log_healthy + scene.on_way
+
+    def estimate(run: int) -> Estimate:
+        return Estimate(None, None, scene.became[run])
+
+    return Weight(by_movement.sum(axis=1), by_movement, scene.log_healthy, estimate)
