@@ -19,7 +19,8 @@ from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.data_knowledge.generation import simulate
-from failuretwin.decision.hybrid import HybridDiagnoser, fit_weights
+from failuretwin.decision.blend import fit_weights
+from failuretwin.decision.hybrid import HybridDiagnoser
 from failuretwin.decision.learned.networks import NETWORKS
 from failuretwin.decision.learned.storage import load_network, save_network
 from failuretwin.decision.metrics import (
@@ -49,7 +50,7 @@ def train_missing(folder: Path, robot: Robot, seeds: int, iterations: int) -> No
         for name in NETWORKS:
             path = folder / f"{name}_{seed}.npz"
             if not path.exists():
-                diagnoser, found = train_network(
+                diagnoser, found, _ = train_network(
                     TrainingPlan(name, iterations, seed), robot, imperfections
                 )
                 save_network(diagnoser, path)

@@ -13,6 +13,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.plan import Plan
+from failuretwin.decision.blend import Weights
 from failuretwin.decision.learned.encoder import Encoder
 from failuretwin.decision.learned.estimator import LearnedDiagnoser
 from failuretwin.decision.learned.networks import NETWORKS
@@ -37,7 +38,7 @@ def trained(armpi, measured_armpi, runs):
 
     def make(name):
         diagnoser = LearnedDiagnoser(name, encoder, iterations=8, random_state=1).fit(runs)
-        diagnoser.temperature_ = 0.7
+        diagnoser.temperature_, diagnoser.weights_ = 0.7, Weights(0.4, 0.6)
         return diagnoser
 
     return {name: make(name) for name in NETWORKS}
@@ -65,6 +66,7 @@ def test_a_stored_network_answers_the_same(armpi, trained, runs, network, tmp_pa
     again = load_network(path, armpi)
     np.testing.assert_array_equal(again.predict_proba(runs), trained[network].predict_proba(runs))
     assert again.get_params()["random_state"] == 1
+    assert (again.weights_, again.movements_) == (Weights(0.4, 0.6), (5, 5))
     first, second = (d.diagnose(runs)[0].to_record() for d in (again, trained[network]))
     assert first == second
 

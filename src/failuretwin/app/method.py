@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from failuretwin.app.learning import check_learning
 from failuretwin.core.errors import InputError
 from failuretwin.decision.bayes import BayesDiagnoser
+from failuretwin.decision.hybrid import Diagnoser, HybridDiagnoser
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:
@@ -16,26 +17,41 @@ if TYPE_CHECKING:
 
 BAYES = "bayes"
 """Name of the method that needs no file."""
+BLEND = f"{BAYES}+"
+"""What stands before the file of a network that is blended with it."""
 
 
-def learned_diagnoser(
-    method: str, robot: Robot, settings: Mapping[str, object]
-) -> LearnedDiagnoser:
-    """Load the network that the user names.
+def chosen_diagnoser(
+    method: str, bayes: BayesDiagnoser, settings: Mapping[str, object]
+) -> Diagnoser:
+    """Return the diagnoser that the user names.
 
     Args:
-        method: Its file.
-        robot: The robot that is diagnosed.
-        settings: Options by name that belong to the Bayesian method; None where not given.
+        method: ``bayes``, the file of a network, or ``bayes+`` and that file.
+        bayes: The Bayesian diagnoser.
+        settings: Options by name that belong to it alone; None where not given.
 
     Raises:
-        InputError: If one of those is given, the file is no network for this robot, or the extra
-            `learn` is missing.
+        InputError: If one of those is given with a network, the file is no network for this robot
+            or was never fitted to be blended, or the extra `learn` is missing.
     """
-    path = Path(method)
+    if method == BAYES:
+        return bayes
+    network = _network(Path(method.removeprefix(BLEND)), bayes.twin.robot, settings)
+    if not method.startswith(BLEND):
+        return network
+    if network.weights_ is None:
+        raise InputError(
+            f"{method.removeprefix(BLEND)}: how it weighs beside Bayes was never fitted. Train it "
+            "with `failuretwin train`, or use it alone."
+        )
+    return HybridDiagnoser(bayes, network, network.weights_)
+
+
+def _network(path: Path, robot: Robot, settings: Mapping[str, object]) -> LearnedDiagnoser:
     if not path.exists():
         raise InputError(
-            f"--method {method}: is neither 'bayes' nor a file that exists. Train a network with "
+            f"--method {path}: is neither 'bayes' nor a file that exists. Train a network with "
             f"`failuretwin train --out {path.with_suffix('.npz')}`."
         )
     given = [name for name, value in settings.items() if value is not None]
@@ -50,9 +66,14 @@ def learned_diagnoser(
     return load_network(path, robot)
 
 
-def expected_name(diagnoser: BayesDiagnoser | LearnedDiagnoser) -> str:
-    """Return the name of the healthy behaviour that a diagnoser expects."""
-    if isinstance(diagnoser, BayesDiagnoser):
-        return diagnoser.healthy_model.imperfections.name
-    expected = diagnoser.encoder and diagnoser.encoder.expected
-    return expected.name if expected else "none"
+def expected_name(diagnoser: Diagnoser, bayes: BayesDiagnoser) -> str:
+    """Return the name of the healthy behaviour that a diagnoser expects.
+
+    Args:
+        diagnoser: As `chosen_diagnoser` gave it.
+        bayes: The Bayesian diagnoser, which is it or a part of it unless it is a network.
+    """
+    encoder = getattr(diagnoser, "encoder", None)
+    if encoder is None:
+        return bayes.healthy_model.imperfections.name
+    return encoder.expected.name if encoder.expected else "none"

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.decision.bayes import BayesDiagnoser
+from failuretwin.decision.blend import fit_weights
+from failuretwin.decision.hybrid import Diagnoser, HybridDiagnoser
 from failuretwin.decision.learned.encoder import Encoder
 from failuretwin.decision.learned.estimator import LearnedDiagnoser
 from failuretwin.decision.learned.recipe import Recipe, widened
@@ -16,6 +19,10 @@ from failuretwin.decision.learned.stream import Stream
 from failuretwin.decision.learned.training import Standard
 from failuretwin.digital_model.imperfections import Imperfections
 from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.twin import DigitalTwin
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 WIDER = 2.0
 """Robots in training differ this many times as much as the calibration leaves open."""
@@ -25,19 +32,17 @@ VALIDATION_SEED = 1_000_003
 
 @dataclass(frozen=True)
 class Validation:
-    """How a network does on simulated runs of the physics engine, which it has not learned from.
+    """How diagnoses do on simulated runs of the physics engine that nothing was learned from.
 
     Attributes:
         runs: How many there were.
-        right: Share that it gets right.
+        right: Share that is right.
         surprise: Mean log score [nats a run].
-        temperature: What its scores were divided by, found on other such runs.
     """
 
     runs: int
     right: float
     surprise: float
-    temperature: float
 
 
 @dataclass(frozen=True)
@@ -48,7 +53,8 @@ class TrainingPlan:
         network: Name of the network.
         iterations: Batches to learn from.
         seed: Seed of all chance.
-        validation_runs: Runs of the physics engine; half set the temperature, half judge.
+        validation_runs: Runs of the physics engine; half set temperature and
+            weights, half judge.
     """
 
     network: str
@@ -62,7 +68,7 @@ def train_network(
     robot: Robot,
     imperfections: Imperfections,
     on_iteration: Callable[[int], None] = lambda done: None,
-) -> tuple[LearnedDiagnoser, Validation]:
+) -> tuple[LearnedDiagnoser, Validation, Validation]:
     """Train a network on the twin with imperfections and calibrate its probabilities.
 
     Nothing is chosen on the way: the network of the last iteration is the result.
@@ -72,10 +78,13 @@ def train_network(
         robot: The robot.
         imperfections: Its healthy behaviour, such as a calibration.
         on_iteration: Called after each batch with the number of those done.
+
+    Returns:
+        The network, how it does, and how it does blended with the Bayesian diagnosis.
     """
     encoder = Encoder("robust", robot, expectation_of(robot, imperfections))
     recipe = Recipe(robot, widened(imperfections, WIDER), plan.seed)
-    diagnoser = LearnedDiagnoser(
+    network = LearnedDiagnoser(
         plan.network,
         encoder,
         iterations=plan.iterations,
@@ -83,33 +92,36 @@ def train_network(
         batch_runs=64,
         random_state=plan.seed % 2**32,
     )
-    stream = Stream(recipe, encoder, diagnoser.batch_runs)
+    stream = Stream(recipe, encoder, network.batch_runs)
     classes = [str(hypothesis) for hypothesis in recipe.hypotheses]
     with stream.chunks() as chunks:
         standard = Standard.of(next(chunks)[0])
         batches = stream.batches(chunks)
-        diagnoser.fit_batches(batches, standard, classes, recipe.movements, on_iteration)
-    return diagnoser, _calibrate(diagnoser, recipe, plan, imperfections)
-
-
-def _calibrate(
-    diagnoser: LearnedDiagnoser, recipe: Recipe, plan: TrainingPlan, imperfections: Imperfections
-) -> Validation:
-    """Set the temperature on runs of the physics engine and judge on others of them."""
+        network.fit_batches(batches, standard, classes, recipe.movements, on_iteration)
     other = Recipe(
-        recipe.robot, imperfections, plan.seed + VALIDATION_SEED, recipe.variants, "physics"
+        robot, imperfections, plan.seed + VALIDATION_SEED, recipe.variants, engine="physics"
     )
-    encoder = diagnoser.encoder
-    assert encoder is not None
-    features, index = other.chunk(0, plan.validation_runs, encoder)
-    truth = diagnoser.classes_[index]
     half = plan.validation_runs // 2
-    diagnoser.calibrate(features[:half], truth[:half])
-    chances = diagnoser.predict_proba(features[half:])
-    return _judge(chances, index[half:], float(diagnoser.temperature_))
+    bayes = BayesDiagnoser(DigitalTwin(robot), imperfections)
+    _calibrate(network, bayes, other.run_set(0, half))
+    judges = other.run_set(1, half)
+    both = HybridDiagnoser(bayes, network, network.weights_)
+    return network, _judge(network, judges), _judge(both, judges)
 
 
-def _judge(chances: FloatArray, truth: IntArray, temperature: float) -> Validation:
-    given = chances[np.arange(len(truth)), truth]
-    right = float(np.mean(chances.argmax(axis=1) == truth))
-    return Validation(len(truth), right, float(-np.log(given).mean()), temperature)
+def _calibrate(network: LearnedDiagnoser, bayes: BayesDiagnoser, runs: xr.Dataset) -> None:
+    """Set the temperature of a network, and its weights beside the Bayesian diagnosis."""
+    network.calibrate(runs)
+    classes = network.classes_.tolist()
+    by_bayes = [[d.posterior[name] for name in classes] for d in bayes.diagnose(runs)]
+    truth = [classes.index(str(fault)) for fault in runs["fault"].values]
+    network.weights_ = fit_weights(
+        np.array(by_bayes), network.predict_proba(runs), np.array(truth, dtype=np.int64)
+    )
+
+
+def _judge(diagnoser: Diagnoser, runs: xr.Dataset) -> Validation:
+    diagnoses = diagnoser.diagnose(runs)
+    given = np.array([d.posterior[str(d.truth)] for d in diagnoses])
+    right = float(np.mean([d.diagnosis == d.truth for d in diagnoses]))
+    return Validation(len(diagnoses), right, float(-np.log(given).mean()))

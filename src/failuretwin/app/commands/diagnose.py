@@ -21,8 +21,8 @@ from failuretwin.app.commands.options import PATH, common_options, reading_optio
     "--method",
     default="bayes",
     show_default=True,
-    metavar="bayes|MODEL",
-    help="How to diagnose: by Bayes' rule, or by a network that `train` wrote.",
+    metavar="bayes|MODEL|bayes+MODEL",
+    help="How to diagnose: by Bayes' rule, by a network that `train` wrote, or by both.",
 )
 @click.option(
     "--track",
@@ -78,7 +78,7 @@ def diagnose(
     """
     del seed  # nothing here is drawn by chance
     from failuretwin.app.inputs import read_inputs, tell_mismatch
-    from failuretwin.app.method import BAYES, expected_name, learned_diagnoser
+    from failuretwin.app.method import chosen_diagnoser, expected_name
     from failuretwin.app.results import write_csv, write_json_lines
     from failuretwin.app.tables import print_diagnoses, print_scores
     from failuretwin.app.tracking import (
@@ -113,10 +113,10 @@ def diagnose(
         "--sse-range": sse_range,
         "--onset": onset,
     }
-    diagnoser = bayes if method == BAYES else learned_diagnoser(method, model, settings)
+    diagnoser = chosen_diagnoser(method, bayes, settings)
     history = open_history(bayes, calibration) if track else None
     runs = read_inputs(inputs, model, how, published_labels, columns, approximate)
-    tell_mismatch(runs, expected_name(diagnoser))
+    tell_mismatch(runs, expected_name(diagnoser, bayes))
     tracked = None if history is None else diagnose_tracked(runs, bayes, history)
     diagnoses = diagnoser.diagnose(runs) if tracked is None else tracked.diagnoses
     records = [diagnosis.to_record() for diagnosis in diagnoses]

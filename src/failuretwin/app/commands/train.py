@@ -61,10 +61,12 @@ def train(
         imperfections = load_imperfections(str(calibration), model)
     plan = TrainingPlan(network, iterations, seed)
     with progress_bar("training", iterations) as advance:
-        diagnoser, found = train_network(plan, model, imperfections, lambda done: advance(1))
+        diagnoser, alone, both = train_network(plan, model, imperfections, lambda done: advance(1))
     save_network(diagnoser, out)
     click.echo(
-        f"{100.0 * found.right:.1f} % of {found.runs} simulated runs of the physics engine right, "
-        f"log score {found.surprise:.3f} nats a run, temperature {found.temperature:.2f}"
+        f"of {alone.runs} simulated runs of the physics engine {100.0 * alone.right:.1f} % right, "
+        f"log score {alone.surprise:.3f} nats a run, temperature {diagnoser.temperature_:.2f}; "
+        f"blended with Bayes {100.0 * both.right:.1f} %, {both.surprise:.3f} nats"
     )
     click.echo(f"written to {out}; use it with `failuretwin diagnose --method {out}`")
+    click.echo(f"or together with Bayes: --method bayes+{out}")

@@ -19,6 +19,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.movements import find_movements
 from failuretwin.core.runs import check_motors, check_runs, truth_of
 from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.decision.blend import Weights
 from failuretwin.decision.learned.encoder import Encoder, Floats
 from failuretwin.decision.learned.networks import Shape, build_network
 from failuretwin.decision.learned.paper_features import POINTS
@@ -62,6 +63,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         standard_: Mean and spread of each channel.
         temperature_: What scores are divided by before they become probabilities.
         movements_: Fewest and most movements of a run that it learned from; None: not known.
+        weights_: How it is blended with the Bayesian diagnosis; None: was never fitted.
     """
 
     def __init__(
@@ -158,6 +160,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
                 on_iteration(done)
         self.network_ = network.cpu()
         self.classes_, self.standard_, self.temperature_ = classes, standard, 1.0
+        self.weights_: Weights | None = None
 
     def calibrate(self, X: Runs, y: ArrayLike | None = None) -> LearnedDiagnoser:
         """Set the temperature at which these runs surprise least; never use a test set.

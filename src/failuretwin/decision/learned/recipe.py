@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
+from failuretwin.core.runs import RunTable, concatenate
 from failuretwin.core.types import IntArray
 from failuretwin.data_knowledge.generation import simulate_runs
 from failuretwin.data_knowledge.plan import Plan
@@ -17,6 +19,9 @@ from failuretwin.digital_model.imperfections import Imperfections, Variation
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.modes import MODES, FaultMode, SteadyStateError, Stuck
 from failuretwin.failure_behavior.random_movements import RandomMovements
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 Range = tuple[float, float]
 
@@ -89,19 +94,33 @@ class Recipe:
             runs: How many; a variant has as many as another.
             encoder: Makes the features.
         """
+        made = [
+            (places, encoder.encode(signals_of_table(table)))
+            for places, table in self._made(number, runs)
+        ]
+        order = np.concatenate([places for places, _ in made])
+        shuffled = np.random.default_rng([self.seed, number, 1]).permutation(runs)
+        features = np.concatenate([part for _, part in made])
+        return features[shuffled], self._classes(number, runs)[order[shuffled]]
+
+    def run_set(self, number: int, runs: int) -> xr.Dataset:
+        """Return the runs of a chunk as a run set that knows their truth."""
+        return concatenate([table.to_dataset() for _, table in self._made(number, runs)])
+
+    def _classes(self, number: int, runs: int) -> IntArray:
         rng = np.random.default_rng([self.seed, number])
-        classes = rng.integers(0, len(self.hypotheses), runs)
-        parts = []
+        return rng.integers(0, len(self.hypotheses), runs)
+
+    def _made(self, number: int, runs: int) -> Iterator[tuple[IntArray, RunTable]]:
+        """Give the runs of each variant, and their places among the classes of the chunk."""
+        classes = self._classes(number, runs)
         for kind, variant in enumerate(self.variants):
-            plan = self._plan(variant)
-            mine = range(kind, runs, len(self.variants))
-            numbers = [int(classes[i]) * RUNS_PER_CLASS + number * runs + i for i in mine]
-            if numbers:
-                parts.append(encoder.encode(signals_of_table(simulate_runs(plan, numbers))))
-        made = np.concatenate(parts)
-        order = np.concatenate([range(k, runs, len(self.variants)) for k in range(len(parts))])
-        shuffled = rng.permutation(runs)
-        return made[shuffled], classes[order.astype(np.int64)[shuffled]]
+            places = np.arange(kind, runs, len(self.variants))
+            if len(places):
+                numbers = [
+                    int(classes[i]) * RUNS_PER_CLASS + number * runs + int(i) for i in places
+                ]
+                yield places, simulate_runs(self._plan(variant), numbers)
 
     def _plan(self, variant: Variant) -> Plan:
         return Plan(

@@ -21,6 +21,7 @@ from failuretwin.core.config import from_table
 from failuretwin.core.errors import InputError
 from failuretwin.core.fingerprint import fingerprint
 from failuretwin.data_knowledge.store import reason, replacing
+from failuretwin.decision.blend import Weights
 from failuretwin.decision.learned.encoder import Encoder
 from failuretwin.decision.learned.estimator import LearnedDiagnoser, network_shape
 from failuretwin.decision.learned.networks import build_network
@@ -70,6 +71,7 @@ def _configuration(diagnoser: LearnedDiagnoser) -> dict[str, Any]:
         "arguments": {key: v for key, v in arguments.items() if key not in _NOT_STORED},
         "features_in": int(diagnoser.n_features_in_),
         "movements": diagnoser.movements_,
+        "weights": None if diagnoser.weights_ is None else asdict(diagnoser.weights_),
         "classes": diagnoser.classes_.tolist(),
         "temperature": float(diagnoser.temperature_),
         "versions": {
@@ -151,6 +153,10 @@ def _restored(
     diagnoser.temperature_ = float(configuration["temperature"])
     movements = configuration["movements"]
     diagnoser.movements_ = None if movements is None else (int(movements[0]), int(movements[1]))
+    weights = configuration["weights"]
+    diagnoser.weights_ = (
+        None if weights is None else from_table(Weights, weights, f"{path}: weights")
+    )
     channels = len(diagnoser.standard_.mean)
     shape = network_shape(encoder, channels, len(diagnoser.classes_))
     network = build_network(configuration["network"], shape)
