@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,11 +15,15 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.errors import InputError
-from failuretwin.core.movements import find_movements
 from failuretwin.core.runs import check_motors, check_runs, truth_of
-from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.core.types import FloatArray
 from failuretwin.decision.blend import Weights
 from failuretwin.decision.learned.encoder import Encoder, Floats
+from failuretwin.decision.learned.experience import (
+    movement_counts,
+    movement_range,
+    with_doubt,
+)
 from failuretwin.decision.learned.networks import Shape, build_network
 from failuretwin.decision.learned.paper_features import POINTS
 from failuretwin.decision.learned.robust_features import SHARED
@@ -101,7 +104,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         """
         if _is_run_set(X) and y is None:
             y = truth_of(X)
-        self.movements_ = _movement_range(X) if _is_run_set(X) else None
+        self.movements_ = movement_range(X) if _is_run_set(X) else None
         features, classes = validate_data(
             self, self._features(X), y, allow_nd=True, dtype=np.float32
         )
@@ -223,20 +226,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         diagnoses = tell(
             runs, self.predict_proba, [str(name) for name in self.classes_], self.about
         )
-        counts = _movement_counts(runs)
-        return [self._doubted(d, int(n)) for d, n in zip(diagnoses, counts, strict=True)]
-
-    def _doubted(self, diagnosis: Diagnosis, movements: int) -> Diagnosis:
-        """Return the diagnosis with a remark if the network knows no such runs."""
-        low, high = self.movements_ or (movements, movements)
-        if low <= movements <= high:
-            return diagnosis
-        known = f"{low}" if low == high else f"{low} to {high}"
-        remark = (
-            f"{movements} movements, and the network learned from runs of {known}: its "
-            "probabilities mean little here"
-        )
-        return replace(diagnosis, quality=(*diagnosis.quality, remark))
+        return with_doubt(diagnoses, movement_counts(runs), self.movements_)
 
     @property
     def about(self) -> tuple[str, str]:
@@ -267,17 +257,6 @@ def network_shape(encoder: Encoder | None, channels: int, classes: int) -> Shape
     if encoder is None or encoder.features != "robust":
         return Shape(channels, classes)
     return Shape(channels, classes, len(encoder.robot.motors), len(SHARED))
-
-
-def _movement_counts(runs: xr.Dataset) -> IntArray:
-    """Return the number of movements of each run, (run,)."""
-    signals = signals_of(runs)
-    return find_movements(signals.command, signals.time).exists.sum(axis=1)
-
-
-def _movement_range(runs: xr.Dataset) -> tuple[int, int]:
-    counts = _movement_counts(runs)
-    return int(counts.min()), int(counts.max())
 
 
 def _is_run_set(X: Runs) -> bool:
