@@ -17,9 +17,8 @@ from failuretwin import BayesDiagnoser, DigitalTwin, Plan, ReadOptions, load_rob
 from failuretwin.app.training import TrainingPlan, train_network
 from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.generation import simulate
-from failuretwin.decision.blend import fit_weights
 from failuretwin.decision.hybrid import HybridDiagnoser
 from failuretwin.decision.learned.networks import NETWORKS
 from failuretwin.decision.learned.storage import load_network, save_network
@@ -34,12 +33,10 @@ from failuretwin.digital_model.imperfections import load_imperfections
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:
-    import xarray as xr
+    pass
 
 PER_CLASS = 223
 """Runs of each class by the physics engine: 2007 in all."""
-FITTED_PER_CLASS = 60
-"""Runs of each class, of another seed, on which the weights of a blend are fitted."""
 
 
 def train_missing(folder: Path, robot: Robot, seeds: int, iterations: int) -> None:
@@ -72,11 +69,6 @@ def nats_of(diagnoses: Sequence[Diagnosis]) -> FloatArray:
     return log_score(truth, [d.posterior for d in diagnoses]).nats
 
 
-def chances_of(diagnoses: Sequence[Diagnosis], classes: Sequence[str]) -> FloatArray:
-    """Return probabilities (run, class)."""
-    return np.array([[d.posterior[name] for name in classes] for d in diagnoses])
-
-
 def print_networks(said: Mapping[str, Sequence[Diagnosis]], what: str) -> None:
     """Print every network and, over its seeds, the mean of every kind."""
     print(f"\n{what}\n{'':16s}{'right':>10s}{'nats':>8s}{'ECE':>8s}")
@@ -105,11 +97,6 @@ def compare(first: Sequence[Diagnosis], second: Sequence[Diagnosis], words: str)
     )
 
 
-def numbers_of(runs: xr.Dataset, classes: Sequence[str]) -> IntArray:
-    """Return the number of the true class of each run."""
-    return np.array([classes.index(str(fault)) for fault in runs["fault"].values])
-
-
 def main() -> None:
     """Train, score, compare."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -126,33 +113,24 @@ def main() -> None:
     }
     bayes = BayesDiagnoser(DigitalTwin(robot))
     hypotheses = paper_hypotheses(robot.motor_names)
-    classes = [str(hypothesis) for hypothesis in hypotheses]
-
-    def made(count: int, seed: int) -> xr.Dataset:
-        return simulate(Plan(robot, hypotheses, count, seed, imperfections, engine="physics"))
-
-    fitted, judged_on = made(FITTED_PER_CLASS, 500_001), made(PER_CLASS, 500_002)
-    sets = {f"{len(judged_on['run'])} runs of the physics engine": judged_on}
+    plan = Plan(robot, hypotheses, PER_CLASS, 500_002, imperfections, engine="physics")
+    sets = {f"{plan.size} runs of the physics engine": simulate(plan)}
     if arguments.real is not None:
         options = ReadOptions(published_labels=True)
         real = read_runs(arguments.real, robot, options)
         sets[f"{len(real['run'])} real runs of {arguments.real.name}"] = real
-    truth = numbers_of(fitted, classes)
-    by_model = chances_of(bayes.diagnose(fitted), classes)
-    weights = {
-        name: fit_weights(by_model, chances_of(net.diagnose(fitted), classes), truth)
-        for name, net in networks.items()
-    }
     for what, runs in sets.items():
         said = {name: network.diagnose(runs) for name, network in networks.items()}
         model = bayes.diagnose(runs)
         print_networks({"bayes": model, **said}, what)
         for name, network in networks.items():
-            for form, weight in (("blended", weights[name]), ("gated", None)):
+            for form, weight in (("blended", network.weights_), ("gated", None)):
                 both = HybridDiagnoser(bayes, network, weight).diagnose(runs)
                 compare(model, both, f"{form} with {name} against bayes")
                 compare(said[name], both, f"{form} with {name} against {name}")
-    print("\nweights of the blends:", {name: str(weight) for name, weight in weights.items()})
+    print()
+    for name, network in networks.items():
+        print(f"{name}: temperature {network.temperature_:.2f}, {network.weights_}")
 
 
 if __name__ == "__main__":
