@@ -16,7 +16,6 @@ from failuretwin.connection.calibration.calibration import (
 )
 from failuretwin.connection.calibration.held_out import held_out_sessions, judge
 from failuretwin.connection.calibration.motion_part import (
-    Lateness,
     gap_starts,
     glitch_rates,
     lateness,
@@ -40,7 +39,7 @@ from failuretwin.connection.calibration.rates import LossRates, Rate, loss_rates
 from failuretwin.connection.calibration.settled_part import SettledPart, fit_settled_part
 from failuretwin.connection.calibration.timing_fit import fit_timing
 from failuretwin.connection.calibration.what_if import best_payload, sense_remarks
-from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.imperfections import (
     Imperfections,
     Variation,
@@ -98,9 +97,11 @@ def calibrate(
             part = fit_settled_part(part.observations, robot, payload)
     movements = movements_of(kept)
     late = lateness(movements)
-    losses = loss_rates(part.observations, part.lost, _late_of(part, late), robot.motor_names)
+    losses = loss_rates(
+        part.observations, part.lost, late.punctual, late.delayed, robot.motor_names
+    )
     rng = np.random.default_rng(BOOTSTRAP_SEED)
-    timing = fit_timing(transients(kept, movements, late, part, robot), robot, rng)
+    timing = fit_timing(transients(kept, movements, late, part, part.settling, robot), robot, rng)
     gaps = gap_starts(kept, movements, late.late)
     glitches = glitch_rates(kept) if part.observations.position is not None else None
     imperfections = Imperfections(
@@ -118,7 +119,7 @@ def calibrate(
         imperfections=imperfections,
         parameters=(
             *settling_parameters(part.fit, robot, payload),
-            *timing_parameters(timing, np.random.default_rng(BOOTSTRAP_SEED)),
+            *timing_parameters(timing),
             *lateness_parameters(late, gaps),
             *loss_parameters(losses),
             *_glitch_parameters(glitches, robot),
@@ -143,11 +144,6 @@ def _held_out(part: SettledPart, robot: Robot, judged: xr.Dataset | None) -> tup
         for index, name in enumerate(unseen.sessions)
     ]
     return tuple(entry for entry in entries if entry is not None)
-
-
-def _late_of(part: SettledPart, late: Lateness) -> BoolArray:
-    seen = part.observations
-    return np.asarray(np.nan_to_num(late.late)[seen.run, seen.number] > 0.0)
 
 
 def _variation(part: SettledPart, losses: Sequence[LossRates]) -> Variation:
