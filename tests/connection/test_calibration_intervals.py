@@ -7,11 +7,16 @@ import pytest
 from scipy import special, stats
 
 from failuretwin.connection.calibration.learn import calibrate
-from failuretwin.connection.calibration.parameters import rate_parameter, settling_parameters
+from failuretwin.connection.calibration.parameters import (
+    rate_parameter,
+    settling_parameters,
+    spring_remarks,
+)
 from failuretwin.connection.calibration.rates import Rate
 from failuretwin.connection.calibration.settled_errors import log_rounded_student
 from failuretwin.connection.calibration.settled_fit import SettledFit
 from failuretwin.connection.calibration.timing_fit import LAGS_S, joint_doubt
+from failuretwin.connection.calibration.trust import untrusted
 from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.plan import Plan
@@ -73,6 +78,35 @@ def test_tails_may_be_those_of_a_normal_scatter(armpi):
     wide = tails(2.5, 0.5, armpi)
     assert not wide.identified
     assert "hundred movements" in wide.note
+
+
+# What does not fit a healthy robot
+
+
+def test_a_compliance_below_zero_is_remarked_upon(armpi):
+    mode, deviation = np.zeros(17), np.full(17, 1e-3)
+    mode[4:8] = [-1e-12, -0.05, 0.1, -0.2]
+    fit = SettledFit(mode, np.diag(deviation**2), np.ones(17), 0.0)
+    remarks = spring_remarks(settling_parameters(fit, armpi, 0.0))
+    assert [remark.partition(":")[0] for remark in remarks] == [
+        "compliance of motor_2",
+        "compliance of motor_4",
+    ]
+    assert "-0.05 rad/(N m) (-0.052 to -0.048) is negative" in remarks[0]
+
+
+def test_a_session_with_many_suspect_runs_is_left_out_as_a_whole():
+    names = [f"{session}/{run}" for session in "ab" for run in range(10)] + ["alone"]
+    sessions = ["a"] * 10 + ["b"] * 10 + ["alone"]
+    doubt = np.zeros(21)
+    doubt[[0, 1]] = 0.95  # two of ten: by chance
+    doubt[[10, 14, 17]] = 0.9
+    doubt[20] = 1.0
+    found = untrusted(names, sessions, doubt)
+    assert [entry.run for entry in found] == ["a/0", "a/1", *names[10:20], "alone"]
+    assert {entry.movement for entry in found} == {0}
+    assert found[0].reason == found[-1].reason == "looks faulty"
+    assert {e.reason for e in found[2:12]} == {"its session looks faulty, in 3 of 10 runs"}
 
 
 # Whole counts

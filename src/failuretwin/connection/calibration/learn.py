@@ -11,7 +11,6 @@ import numpy as np
 from failuretwin.connection.calibration.calibration import (
     Calibration,
     HeldOut,
-    LeftOut,
     Parameter,
 )
 from failuretwin.connection.calibration.held_out import held_out_sessions, judge
@@ -28,16 +27,18 @@ from failuretwin.connection.calibration.motion_values import (
     schedule_of,
     timing_of,
 )
-from failuretwin.connection.calibration.observations import observe
+from failuretwin.connection.calibration.observations import observe, session_names
 from failuretwin.connection.calibration.parameters import (
     loss_parameters,
     rate_parameter,
     settling_parameters,
+    spring_remarks,
     timing_parameters,
 )
 from failuretwin.connection.calibration.rates import LossRates, Rate, loss_rates
 from failuretwin.connection.calibration.settled_part import SettledPart, fit_settled_part
 from failuretwin.connection.calibration.timing_fit import fit_timing
+from failuretwin.connection.calibration.trust import untrusted
 from failuretwin.connection.calibration.what_if import best_payload, sense_remarks
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.imperfections import (
@@ -49,8 +50,6 @@ from failuretwin.digital_model.robot import Robot
 if TYPE_CHECKING:
     import xarray as xr
 
-SUSPECT = 0.9
-"""A run that is faulty with at least this probability is left out."""
 BOOTSTRAP_SEED = 0
 
 
@@ -72,8 +71,8 @@ def calibrate(
         robot: The robot.
         name: What to call the imperfections in results.
         source: Which logs they come from.
-        suspicion: Probability that each run is faulty, (run,); runs with 0.9 or more are left
-            out. None: all count.
+        suspicion: Probability that each run is faulty, (run,); runs and sessions that look so are
+            left out. None: all count.
         use_readings: Whether to look at the motors' own readings, where the runs have them.
         judged: Healthy runs of sessions that only say how good the fit is; None: each session is
             left out once and judged by a fit to the others.
@@ -83,11 +82,11 @@ def calibrate(
     Raises:
         InputError: If too few movements come to rest near their targets.
     """
-    trusted = np.ones(runs.sizes["run"], dtype=bool)
-    if suspicion is not None:
-        trusted = suspicion < SUSPECT
-    left_out = [LeftOut(str(run), 0, "", "looks faulty") for run in runs["run"].values[~trusted]]
-    kept = runs.isel(run=np.flatnonzero(trusted))
+    names = [str(run) for run in runs["run"].values]
+    doubt = np.zeros(len(names)) if suspicion is None else suspicion
+    left_out = untrusted(names, session_names(runs), doubt)
+    out = {entry.run for entry in left_out}
+    kept = runs.isel(run=[i for i, run in enumerate(names) if run not in out])
     part = fit_settled_part(observe(kept, use_readings=use_readings), robot)
     payload, remarks = 0.0, list[str]()
     if thorough:
@@ -115,22 +114,23 @@ def calibrate(
         readings=readings_of(kept, robot, glitches),
         variation=_variation(part, losses),
     )
+    settling = settling_parameters(part.fit, robot, payload)
     return Calibration(
         imperfections=imperfections,
         parameters=(
-            *settling_parameters(part.fit, robot, payload),
+            *settling,
             *timing_parameters(timing),
             *lateness_parameters(late, gaps),
             *loss_parameters(losses),
             *_glitch_parameters(glitches, robot),
         ),
         sessions=part.observations.sessions,
-        runs=int(trusted.sum()),
+        runs=len(names) - len(out),
         movements=int(np.sum(part.fitted)),
         used_readings=part.observations.position is not None,
         left_out=(*left_out, *part.left_out(robot)),
         held_out=_held_out(part, robot, judged) if thorough else (),
-        remarks=(*remarks, *part.remarks()),
+        remarks=(*remarks, *part.remarks(), *spring_remarks(settling)),
     )
 
 

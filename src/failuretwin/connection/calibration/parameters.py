@@ -54,6 +54,17 @@ def settling_parameters(fit: SettledFit, robot: Robot, payload: float) -> list[P
     return [*found, _tails(fit)]
 
 
+def spring_remarks(settling: Sequence[Parameter]) -> list[str]:
+    """Return a sentence for each motor that seems to rise against gravity."""
+    return [
+        f"compliance of {p.motor}: {p.value:.2g} {p.unit} ({p.low:.2g} to {p.high:.2g}) is "
+        "negative, as if the motor rose against gravity; check its sense, the masses of the URDF "
+        "and the payload. The figure is used as it is"
+        for p in settling
+        if p.name == "compliance" and p.identified and p.value < 0.0
+    ]
+
+
 def _tails(fit: SettledFit) -> Parameter:
     """Return the degrees of freedom, with an interval that is even about their inverse.
 
