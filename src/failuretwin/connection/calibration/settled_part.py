@@ -153,9 +153,10 @@ def probably_arrived(
     scale = np.hypot(settling.scatter, rounding(robot))
     offset = settling.offset(robot, observations.position, observations.direction)
     off = observations.position - observations.target - offset
-    # A motor that stays rests on the side that it came from, within twice its friction.
-    held = np.maximum(np.abs(off + travel) - 2.0 * np.abs(settling.friction), 0.0)
-    odds = (1.0 - rate) / rate * _density(off / scale, settling) / _density(held / scale, settling)
+    # A motor that stays has come from either side before: friction holds it as now or as against.
+    held, turned = off + travel, 2.0 * np.asarray(settling.friction) * observations.direction
+    stays = 0.5 * sum(_density(error / scale, settling) for error in (held, held - turned))
+    odds = (1.0 - rate) / rate * _density(off / scale, settling) / stays
     return np.where(told, arrived, odds / (1.0 + odds))
 
 
