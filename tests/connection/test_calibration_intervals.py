@@ -85,7 +85,7 @@ def test_tails_may_be_those_of_a_normal_scatter(armpi):
 
 def test_a_compliance_below_zero_is_remarked_upon(armpi):
     mode, deviation = np.zeros(17), np.full(17, 1e-3)
-    mode[4:8] = [-1e-12, -0.05, 0.1, -0.2]
+    mode[4:8] = [-1e-12, -0.05, 0.1, -0.2]  # gravity does not load motor 1
     fit = SettledFit(mode, np.diag(deviation**2), np.ones(17), 0.0)
     remarks = spring_remarks(settling_parameters(fit, armpi, 0.0))
     assert [remark.partition(":")[0] for remark in remarks] == [

@@ -24,6 +24,7 @@ INVERSE_DOF_SPREAD = float(
     np.sqrt(np.expm1(DOF_PRIOR_SPREAD**2)) * np.exp(DOF_PRIOR_SPREAD**2 / 2.0) / DOF_PRIOR
 )
 """Standard deviation of the inverse degrees of freedom in the log-normal prior."""
+UNLOADED = "gravity does not load this motor"
 
 ADVICE = {
     "bias": "more movements that come to rest, to targets all over the range",
@@ -46,7 +47,7 @@ def settling_parameters(fit: SettledFit, robot: Robot, payload: float) -> list[P
             learned = bool(fit.deviation[at] < LEARNED * fit.prior_deviation[at])
             note = "" if learned else f"the logs do not say; it takes {ADVICE[name]}"
             if name == "compliance" and load[k] < LOAD_FLOOR_NM:
-                learned, note = False, "gravity does not load this motor"
+                learned, note = False, UNLOADED
             low, high = value - half, value + half
             if name == "scatter":
                 value, low, high = (float(np.exp(x)) for x in (value, low, high))
@@ -61,7 +62,7 @@ def spring_remarks(settling: Sequence[Parameter]) -> list[str]:
         "negative, as if the motor rose against gravity; check its sense, the masses of the URDF "
         "and the payload. The figure is used as it is"
         for p in settling
-        if p.name == "compliance" and p.identified and p.value < 0.0
+        if p.name == "compliance" and p.note != UNLOADED and p.value < 0.0
     ]
 
 
