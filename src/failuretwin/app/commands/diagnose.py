@@ -136,7 +136,8 @@ def diagnose(
     if tracked is not None:
         keep_history(tracked)
     print_diagnoses(diagnoses)
-    print_lines(ambiguity_lines(runs, diagnoser))
+    if method == "bayes":
+        print_lines(ambiguity_lines(runs, bayes))
     print_scores(records)
     if tracked is not None:
         click.echo(f"\n{tracking_line(tracked)}")
