@@ -12,20 +12,32 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 from telling import nats, right, share
 
 import failuretwin as ft
-from failuretwin.core.hypothesis import UNKNOWN, Fault, Hypothesis, paper_hypotheses, single_faults
-from failuretwin.core.types import FloatArray
+from failuretwin.core.diagnosis import Diagnosis
+from failuretwin.core.hypothesis import (
+    HEALTHY,
+    UNKNOWN,
+    Fault,
+    Hypothesis,
+    paper_hypotheses,
+    single_faults,
+)
+from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.decision.metrics.paired import log_score_gain
 from failuretwin.decision.separation import Judge, separation, truth_and_faults
 from failuretwin.digital_model.imperfections import Imperfections, load_imperfections
 from failuretwin.digital_model.robot import Robot
 
 FOREIGN_NATS = 5.0
+DISTANCES = (FOREIGN_NATS, 15.0, 40.0, np.inf)
+OTHERS = "[a motor that is faulty, another motor, healthy, no verdict]"
 LEFT_OUT = (
     "encoder_scale",
     "encoder_bias",
@@ -51,24 +63,40 @@ def main() -> None:
     healthy = load_imperfections("armpi_fpv", robot)
     twin, nine = ft.DigitalTwin(robot), paper_hypotheses(robot.motor_names)
     diagnoser = ft.BayesDiagnoser(twin, healthy, [*nine, UNKNOWN])
-    called = []
-    print(f"{'left out':24s} {'foreign':>9s}  called unknown: of the foreign; of all")
+    print(f"{'left out':24s} {'foreign':>8s}   of the foreign: called unknown; others: {OTHERS}")
+    parts = []
     for name, true in left_out(robot):
         per_class = -(-options.runs // len(true))
         runs = ft.simulate(ft.Plan(robot, true, per_class, options.seed, healthy))
-        found = diagnoser.diagnose(runs)
-        said = np.array([d.diagnosis == str(UNKNOWN) for d in found])
-        foreign = ahead(diagnoser, runs, nine, healthy) >= FOREIGN_NATS
-        called.append(said[foreign])
-        print(
-            f"{name:24s} {np.count_nonzero(foreign):4d}/{len(found):4d}  "
-            f"{share(int(said[foreign].sum()), int(foreign.sum()))}; "
-            f"{share(int(said.sum()), len(said))}",
-            flush=True,
-        )
-    everything = np.concatenate(called)
-    print(f"{'all of the foreign':24s}            {share(int(everything.sum()), len(everything))}")
+        said = np.array([_kind(d) for d in diagnoser.diagnose(runs)])
+        nats_ahead = ahead(diagnoser, runs, nine, healthy)
+        tell(name, said, nats_ahead >= FOREIGN_NATS)
+        parts.append((said, nats_ahead))
+    said, nats_ahead = (np.concatenate(values) for values in zip(*parts, strict=True))
+    tell("everything", said, nats_ahead >= FOREIGN_NATS)
+    for low, high in pairwise(DISTANCES):
+        tell(f"  {low:g} to {high:g} nats", said, (nats_ahead >= low) & (nats_ahead < high))
     tell_loss(ft.simulate(ft.Plan(robot, nine, options.known, options.seed, healthy)), diagnoser)
+
+
+def _kind(diagnosis: Diagnosis) -> str:
+    """Return what was said: unknown, nothing, healthy, a faulty motor, another motor."""
+    if diagnosis.diagnosis in (None, str(UNKNOWN), str(HEALTHY)):
+        return str(diagnosis.diagnosis)
+    faulty = {fault.motor for fault in Hypothesis.parse(str(diagnosis.truth)).faults}
+    said = Hypothesis.parse(str(diagnosis.diagnosis)).faults[0].motor
+    return "faulty" if said in faulty else "other"
+
+
+def tell(name: str, said: NDArray[np.str_], some: BoolArray) -> None:
+    """Print what was said of some of the runs of a kind."""
+    chosen = said[some]
+    unknown, *others = (
+        int(np.count_nonzero(chosen == kind))
+        for kind in (str(UNKNOWN), "faulty", "other", str(HEALTHY), str(None))
+    )
+    foreign = f"{len(chosen):3d}/{len(said):3d}"
+    print(f"{name:24s} {foreign:>8s}   {share(unknown, len(chosen))}; {others}", flush=True)
 
 
 def left_out(robot: Robot) -> Iterator[tuple[str, list[Hypothesis]]]:
