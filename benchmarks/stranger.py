@@ -30,8 +30,8 @@ from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.modes import MODES, FaultMode
 
 SEPARABLE_NATS = 5.0
-ALARM = 0.99
-"""Probability of any fault above which an alarm is raised."""
+ALARMS = (0.99, 0.999)
+"""Probabilities of any fault above which an alarm may be raised."""
 ONSETS_S = (0.0, 8.0)
 EDGE = 1e-9
 
@@ -140,10 +140,11 @@ def _intervals(runs: xr.Dataset, found: Sequence[Diagnosis]) -> list[IntervalCas
 def tell_alarms(found: Sequence[Diagnosis]) -> None:
     """Print what is said of healthy runs."""
     faulty = sum(d.diagnosis not in (str(HEALTHY), None) for d in found)
-    alarms = sum(1.0 - d.posterior[str(HEALTHY)] > ALARM for d in found)
     print(f"healthy: {len(found)} runs, {sum(d.diagnosis is None for d in found)} untold")
     print(f"  called faulty: {share(faulty, len(found))}")
-    print(f"  P(fault) > {ALARM}: {share(alarms, len(found))}")
+    for threshold in ALARMS:
+        alarms = sum(1.0 - d.posterior[str(HEALTHY)] > threshold for d in found)
+        print(f"  P(fault) > {threshold}: {share(alarms, len(found))}")
 
 
 if __name__ == "__main__":
