@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import xarray as xr
 from rich.progress import track
+from telling import share
 
 import failuretwin as ft
 from failuretwin.core.diagnosis import Diagnosis
@@ -28,7 +29,6 @@ from failuretwin.data_knowledge.settled_evidence import settled_evidence
 from failuretwin.decision.law import Scene
 from failuretwin.decision.metrics.ranks import check_ranks, rank_of_truth
 from failuretwin.decision.metrics.reliability import calibrated_error, equal_edges, reliability
-from failuretwin.decision.metrics.shares import Share
 from failuretwin.decision.onsets import OnsetPrior
 from failuretwin.decision.priors import Priors
 from failuretwin.decision.weighing import weigh_hypothesis
@@ -166,7 +166,7 @@ def report(found: list[Outcome], rng: np.random.Generator) -> None:
     sure = np.array([o.diagnosis.probability for o in told])
     nats = [-np.log(max(o.diagnosis.posterior[o.truth], 1e-300)) for o in found]
     print(f"{len(found)} runs, {len(found) - len(told)} without a verdict")
-    correct = _share(int(right.sum()), len(right))
+    correct = share(int(right.sum()), len(right))
     print(f"right {correct}, log score {np.mean(nats):.4f} nats a run")
     bins = reliability(sure, right, equal_edges())
     error = bins.error
@@ -174,7 +174,7 @@ def report(found: list[Outcome], rng: np.random.Generator) -> None:
     print(f"calibration error {error:.4f} (a perfect one shows {np.mean(chance):.4f} by chance)")
     for count, hits, mean in zip(bins.count, bins.right, bins.confidence, strict=True):
         if count:
-            print(f"  said {mean:.3f}: right {_share(int(hits), int(count))}")
+            print(f"  said {mean:.3f}: right {share(int(hits), int(count))}")
     for mode in ("stuck", "steady_state_error"):
         cases = [o for o, r in zip(told, right, strict=True) if r and mode in o.truth]
         everyone = [o for o in found if mode in o.truth]
@@ -184,15 +184,10 @@ def report(found: list[Outcome], rng: np.random.Generator) -> None:
             truth = np.array([o.onset_s if what == "onset" else o.size for o in everyone])
             known = np.isfinite(truth)
             check = check_ranks(rank_of_truth(draws[known], truth[known], rng), DRAWS, rng)
-            held = _share(inside, len(cases))
+            held = share(inside, len(cases))
             print(f"{mode}, {what}: 90 % intervals hold the truth in {held}")
             print(f"  ranks: chi2 p = {check.chi2_p:.3f}, band p = {check.band_p:.3f}")
             print(f"  share of each bin over its due: {np.round(check.count / check.expected, 2)}")
-
-
-def _share(count: int, total: int) -> str:
-    low, high = Share(count, total).interval
-    return f"{count} of {total} ({count / max(total, 1):.1%}, {low:.1%} to {high:.1%})"
 
 
 def _inside(outcome: Outcome, what: str) -> bool:

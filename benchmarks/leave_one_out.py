@@ -1,27 +1,56 @@
 """Diagnosis of labelled real sessions, each with a calibration that has not seen it.
 
-    python benchmarks/leave_one_out.py FOLDER [--json FILE]
+    python benchmarks/leave_one_out.py FOLDER [--onset SECONDS] [--json FILE] [--plot DIR]
 
 FOLDER holds session folders named ..._label_K. Those of labels 0 to 4 are logs of a healthy robot
-and calibrate the twin, all but the session that is judged. The generic offsets of an uncalibrated
-robot are judged beside it.
+and calibrate the twin, all but the session that is judged. Two others are judged beside it, and
+compared run by run: the generic offsets of an uncalibrated robot, and the same calibrations with
+settled poses alone.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 import failuretwin as ft
 from failuretwin.app.calibrating import learn_robot
+from failuretwin.app.plots import plot_runs
 from failuretwin.app.results import Record, score_line, write_json_lines
 from failuretwin.connection.calibration.calibration import Calibration
+from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.data_knowledge.raw_session import find_sessions
+from failuretwin.decision.metrics import log_score, log_score_gain, mcnemar
 from failuretwin.decision.priors import priors_of
-from failuretwin.digital_model.imperfections import Imperfections, generic_imperfections
+from failuretwin.digital_model.imperfections import generic_imperfections
 from failuretwin.digital_model.robot import Robot
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 HEALTHY_LABELS = tuple(f"label_{k}" for k in range(5))
+
+
+@dataclass
+class Method:
+    """A way to diagnose, and what came of it.
+
+    Attributes:
+        name: What to call it.
+        calibrated: Whether it knows the robot; else generic offsets.
+        whole_run: Whether readings on the way count.
+        records: Its results so far.
+    """
+
+    name: str
+    calibrated: bool = True
+    whole_run: bool = True
+    records: list[Record] = field(default_factory=list)
 
 
 def main() -> None:
@@ -32,32 +61,37 @@ def main() -> None:
     parser.add_argument("--onset", type=float, help="onset of stuck faults, where known [s]")
     parser.add_argument("--sse-range", type=float, nargs=2, help="range of errors, where known")
     parser.add_argument("--json", type=Path, help="write the results, calibrated")
+    parser.add_argument("--plot", type=Path, help="folder for a picture of each run that is wrong")
     options = parser.parse_args()
     robot = ft.load_robot(options.robot)
     priors = priors_of(robot, options.sse_range, options.onset)
+    judged = Method("calibrated without the session")
+    beside = (
+        Method("generic offsets", calibrated=False),
+        Method("calibrated, settled poses alone", whole_run=False),
+    )
     sessions = find_sessions(options.folder)
     healthy = [s for s in sessions if s.name.endswith(HEALTHY_LABELS)]
     known: dict[tuple[Path, ...], Calibration] = {}
-    calibrated: list[Record] = []
-    generic: list[Record] = []
     for session in sessions:
         others = tuple(s for s in healthy if s != session)
         if others not in known:
             known[others] = _learn(others, robot)
         runs = ft.read_runs(session, robot, ft.ReadOptions(published_labels=True))
-        for records, imperfections in (
-            (calibrated, known[others].imperfections),
-            (generic, generic_imperfections(robot)),
-        ):
-            records += _diagnose(runs, robot, imperfections, priors)
-    print(f"calibrated without the session: {score_line(calibrated)}")
-    print(f"generic offsets:                {score_line(generic)}")
-    for record in calibrated:
+        for method in (judged, *beside):
+            found = _diagnose(runs, robot, known[others], priors, method)
+            method.records += [diagnosis.to_record() for diagnosis in found]
+            if method is judged and options.plot is not None:
+                _plot_wrong(found, runs, robot, options.plot)
+    print(f"{judged.name}: {score_line(judged.records)}")
+    for method in beside:
+        print(f"{method.name}: {score_line(method.records)}")
+        print(f"  {_compare(method.records, judged.records)}")
+    for record in judged.records:
         if record["diagnosis"] != record["truth"]:
             print(f"  {record['run']}: {record['truth']}, said: {record['verdict']}")
     if options.json is not None:
-        write_json_lines(calibrated, options.json)
-        write_json_lines(generic, options.json.with_name(f"generic_{options.json.name}"))
+        write_json_lines(judged.records, options.json)
 
 
 def _learn(sessions: tuple[Path, ...], robot: Robot) -> Calibration:
@@ -67,13 +101,35 @@ def _learn(sessions: tuple[Path, ...], robot: Robot) -> Calibration:
 
 
 def _diagnose(
-    runs: object, robot: Robot, imperfections: Imperfections, priors: ft.Priors
-) -> list[Record]:
-    import xarray as xr
+    runs: xr.Dataset, robot: Robot, known: Calibration, priors: ft.Priors, method: Method
+) -> list[Diagnosis]:
+    diagnoser = ft.BayesDiagnoser(
+        ft.DigitalTwin(robot),
+        known.imperfections if method.calibrated else generic_imperfections(robot),
+        priors=priors,
+        whole_run=method.whole_run,
+    )
+    return diagnoser.diagnose(runs)
 
-    assert isinstance(runs, xr.Dataset)
-    diagnoser = ft.BayesDiagnoser(ft.DigitalTwin(robot), imperfections, priors=priors)
-    return [diagnosis.to_record() for diagnosis in diagnoser.diagnose(runs)]
+
+def _compare(first: Sequence[Record], second: Sequence[Record]) -> str:
+    """Return what the second saves over the first, on the same runs."""
+    truth = [str(record["truth"]) for record in first]
+    nats = [log_score(truth, [r["posterior"] for r in records]).nats for records in (first, second)]
+    gain = log_score_gain(nats[0], nats[1], np.random.default_rng(0))
+    right = [np.array([r["diagnosis"] == r["truth"] for r in rs]) for rs in (first, second)]
+    low, high = gain.interval
+    return (
+        f"calibrated, whole run saves {gain.mean:.4f} nats a run over it (95 % interval {low:.4f} "
+        f"to {high:.4f}); exact McNemar p = {mcnemar(right[0], right[1]).p:.3g}"
+    )
+
+
+def _plot_wrong(found: Sequence[Diagnosis], runs: xr.Dataset, robot: Robot, folder: Path) -> None:
+    wrong = [i for i, diagnosis in enumerate(found) if diagnosis.diagnosis != diagnosis.truth]
+    if wrong:
+        folder.mkdir(parents=True, exist_ok=True)
+        plot_runs(runs.isel(run=wrong), [found[i] for i in wrong], ft.DigitalTwin(robot), folder)
 
 
 if __name__ == "__main__":

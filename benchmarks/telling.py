@@ -1,0 +1,42 @@
+"""How benchmarks tell what they found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from failuretwin.core.diagnosis import Diagnosis
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.decision.metrics.proper import log_score
+from failuretwin.decision.metrics.reliability import calibrated_error, equal_edges, reliability
+from failuretwin.decision.metrics.shares import Share
+
+
+def share(count: int, total: int) -> str:
+    """Return so many of so many, with the Wilson 95 % interval."""
+    told = Share(count, total)
+    low, high = told.interval
+    return f"{count} of {total} ({told.value:.1%}, {low:.1%} to {high:.1%})"
+
+
+def right(found: Sequence[Diagnosis]) -> BoolArray:
+    """Return which diagnoses are right, (run,); one without a verdict is not."""
+    return np.array([d.diagnosis == d.truth for d in found])
+
+
+def nats(found: Sequence[Diagnosis]) -> FloatArray:
+    """Return the log score of each run, (run,) [nats]."""
+    return log_score([str(d.truth) for d in found], [d.posterior for d in found]).nats
+
+
+def calibration(found: Sequence[Diagnosis], rng: np.random.Generator) -> str:
+    """Return the calibration error of those with a verdict, and what chance alone shows."""
+    told = [d for d in found if d.diagnosis is not None]
+    sure = np.array([d.probability for d in told])
+    bins = reliability(sure, right(told), equal_edges())
+    chance = calibrated_error(sure, equal_edges(), rng)
+    return (
+        f"calibration error {bins.error:.4f} (a perfect one shows {np.mean(chance):.4f} by "
+        f"chance, {np.quantile(chance, 0.95):.4f} at most in 95 %)"
+    )

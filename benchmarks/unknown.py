@@ -1,0 +1,146 @@
+"""Is what is not in the set of hypotheses called `unknown`, and what does that cost?
+
+    python benchmarks/unknown.py [--runs 40] [--known 40] [--seed 0]
+
+Offered are the paper's nine hypotheses and `unknown`; true are faults of other modes, and two
+faults at once. A run is foreign if its truth beats every one of the nine by 5 nats or more, as
+docs/ambiguity.md reckons it; of two faults, at sizes and an onset that explain the run exactly.
+The loss is that on runs of the nine, with `unknown` in the set and without.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from telling import nats, right, share
+
+import failuretwin as ft
+from failuretwin.core.diagnosis import Diagnosis
+from failuretwin.core.hypothesis import (
+    HEALTHY,
+    UNKNOWN,
+    Fault,
+    Hypothesis,
+    paper_hypotheses,
+    single_faults,
+)
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.decision.metrics.paired import log_score_gain
+from failuretwin.decision.separation import Judge, separation, truth_and_faults
+from failuretwin.digital_model.imperfections import Imperfections, load_imperfections
+from failuretwin.digital_model.robot import Robot
+
+FOREIGN_NATS = 5.0
+DISTANCES = (FOREIGN_NATS, 15.0, 40.0, np.inf)
+OTHERS = "[a motor that is faulty, another motor, healthy, no verdict]"
+LEFT_OUT = (
+    "encoder_scale",
+    "encoder_bias",
+    "slow",
+    "lag",
+    "backlash",
+    "drift",
+    "intermittent",
+    "torque_loss",
+    "lost_commands",
+)
+PAIRS = (("stuck", "stuck"), ("stuck", "encoder_scale"), ("stuck", "encoder_bias"))
+
+
+def main() -> None:
+    """Make runs, diagnose them and tell."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=40, help="of each mode that is left out")
+    parser.add_argument("--known", type=int, default=40, help="of each of the nine")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    robot = ft.load_robot("armpi_fpv")
+    healthy = load_imperfections("armpi_fpv", robot)
+    twin, nine = ft.DigitalTwin(robot), paper_hypotheses(robot.motor_names)
+    diagnoser = ft.BayesDiagnoser(twin, healthy, [*nine, UNKNOWN])
+    print(f"{'left out':24s} {'foreign':>8s}   of the foreign: called unknown; others: {OTHERS}")
+    parts = []
+    for name, true in left_out(robot):
+        per_class = -(-options.runs // len(true))
+        runs = ft.simulate(ft.Plan(robot, true, per_class, options.seed, healthy))
+        said = np.array([_kind(d) for d in diagnoser.diagnose(runs)])
+        nats_ahead = ahead(diagnoser, runs, nine, healthy)
+        tell(name, said, nats_ahead >= FOREIGN_NATS)
+        parts.append((said, nats_ahead))
+    said, nats_ahead = (np.concatenate(values) for values in zip(*parts, strict=True))
+    tell("everything", said, nats_ahead >= FOREIGN_NATS)
+    for low, high in pairwise(DISTANCES):
+        tell(f"  {low:g} to {high:g} nats", said, (nats_ahead >= low) & (nats_ahead < high))
+    tell_loss(ft.simulate(ft.Plan(robot, nine, options.known, options.seed, healthy)), diagnoser)
+
+
+def _kind(diagnosis: Diagnosis) -> str:
+    """Return what was said: unknown, nothing, healthy, a faulty motor, another motor."""
+    if diagnosis.diagnosis in (None, str(UNKNOWN), str(HEALTHY)):
+        return str(diagnosis.diagnosis)
+    faulty = {fault.motor for fault in Hypothesis.parse(str(diagnosis.truth)).faults}
+    said = Hypothesis.parse(str(diagnosis.diagnosis)).faults[0].motor
+    return "faulty" if said in faulty else "other"
+
+
+def tell(name: str, said: NDArray[np.str_], some: BoolArray) -> None:
+    """Print what was said of some of the runs of a kind."""
+    chosen = said[some]
+    unknown, *others = (
+        int(np.count_nonzero(chosen == kind))
+        for kind in (str(UNKNOWN), "faulty", "other", str(HEALTHY), str(None))
+    )
+    foreign = f"{len(chosen):3d}/{len(said):3d}"
+    print(f"{name:24s} {foreign:>8s}   {share(unknown, len(chosen))}; {others}", flush=True)
+
+
+def left_out(robot: Robot) -> Iterator[tuple[str, list[Hypothesis]]]:
+    """Return what is true, by kind: every motor, or neighbouring pairs of motors."""
+    for mode in LEFT_OUT:
+        motors = robot.motor_names
+        if mode == "torque_loss":  # the first motor turns about the vertical and bears no load
+            motors = motors[1:]
+        yield mode, [h for h in single_faults(motors, [mode]) if h.faults]
+    for one, two in PAIRS:
+        neighbours = zip(robot.motor_names, robot.motor_names[1:], strict=False)
+        pairs = [Hypothesis((Fault(a, one), Fault(b, two))) for a, b in neighbours]
+        yield f"{one}+{two}", pairs
+
+
+def ahead(
+    diagnoser: ft.BayesDiagnoser,
+    runs: xr.Dataset,
+    nine: Sequence[Hypothesis],
+    healthy: Imperfections,
+) -> FloatArray:
+    """Return by how much the truth of each run beats the nearest of the nine, (run,) [nats]."""
+    truth, faults = truth_and_faults(runs)
+    if len(truth[0].faults) == 1:
+        return separation(diagnoser.twin, runs, healthy, nine).nearest
+    # Two faults that hold for the run explain it exactly: densities are relative to that.
+    judge = Judge(diagnoser.healthy_model, tuple(nine), diagnoser.priors)
+    return -judge.fits(runs, faults, runs["onset"].values).max(axis=1)
+
+
+def tell_loss(runs: xr.Dataset, diagnoser: ft.BayesDiagnoser) -> None:
+    """Print what `unknown` costs on runs of the nine."""
+    known = [h for h in diagnoser.hypotheses or () if h.known]
+    without = ft.BayesDiagnoser(diagnoser.twin, diagnoser.imperfections, known).diagnose(runs)
+    found = diagnoser.diagnose(runs)
+    for name, results in (("without unknown", without), ("with it", found)):
+        good = right(results)
+        print(f"runs of the nine, {name}: right {share(int(good.sum()), len(good))}")
+    said = sum(d.diagnosis == str(UNKNOWN) for d in found)
+    gain = log_score_gain(nats(found), nats(without), np.random.default_rng(0))
+    low, high = gain.interval
+    print(f"  called unknown: {share(said, len(found))}")
+    print(f"  costs {gain.mean:.4f} nats a run (95 % interval {low:.4f} to {high:.4f})")
+
+
+if __name__ == "__main__":
+    main()
