@@ -105,11 +105,16 @@ def main() -> None:
 
 
 def _showing(runs: xr.Dataset) -> xr.Dataset:
-    """Return the runs whose fault begins in time to show."""
+    """Return the runs whose fault begins in time to show, and no more healthy ones than of each."""
     last = runs["movement_start"].values[:, -1]
     stuck = np.char.find(runs["fault"].values.astype(str), "stuck") >= 0
     last = last + np.where(stuck, runs["ramp_duration"].values[:, -1].max(axis=-1), 0.0)
-    return runs.isel(run=np.flatnonzero(~(runs["onset"].values > last)))
+    shows = ~(runs["onset"].values > last)
+    healthy = np.flatnonzero(runs["fault"].values == "healthy")
+    faulty = len(shows) - len(healthy)
+    kept = round(len(healthy) * (np.count_nonzero(shows) - len(healthy)) / faulty)
+    shows[healthy[kept:]] = False
+    return runs.isel(run=np.flatnonzero(shows))
 
 
 @dataclass(frozen=True)
@@ -163,9 +168,13 @@ def report(found: list[Outcome], rng: np.random.Generator) -> None:
     print(f"{len(found)} runs, {len(found) - len(told)} without a verdict")
     correct = _share(int(right.sum()), len(right))
     print(f"right {correct}, log score {np.mean(nats):.4f} nats a run")
-    error = reliability(sure, right, equal_edges()).error
+    bins = reliability(sure, right, equal_edges())
+    error = bins.error
     chance = calibrated_error(sure, equal_edges(), rng)
     print(f"calibration error {error:.4f} (a perfect one shows {np.mean(chance):.4f} by chance)")
+    for count, hits, mean in zip(bins.count, bins.right, bins.confidence, strict=True):
+        if count:
+            print(f"  said {mean:.3f}: right {_share(int(hits), int(count))}")
     for mode in ("stuck", "steady_state_error"):
         cases = [o for o, r in zip(told, right, strict=True) if r and mode in o.truth]
         everyone = [o for o in found if mode in o.truth]

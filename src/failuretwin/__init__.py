@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from failuretwin.data_knowledge.generation import iterate, simulate
     from failuretwin.data_knowledge.plan import Plan
     from failuretwin.data_knowledge.reading import ReadOptions, read_runs
+    from failuretwin.decision.ambiguity import ambiguity
     from failuretwin.decision.bayes import BayesDiagnoser
     from failuretwin.decision.priors import Priors
     from failuretwin.digital_model.robot import load_robot
@@ -26,6 +27,7 @@ _HOME = {
     "Plan": "data_knowledge.plan",
     "Priors": "decision.priors",
     "ReadOptions": "data_knowledge.reading",
+    "ambiguity": "decision.ambiguity",
     "iterate": "data_knowledge.generation",
     "load_robot": "digital_model.robot",
     "read_runs": "data_knowledge.reading",
@@ -39,6 +41,7 @@ __all__ = [
     "Priors",
     "ReadOptions",
     "__version__",
+    "ambiguity",
     "iterate",
     "load_robot",
     "read_runs",

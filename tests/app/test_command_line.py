@@ -121,6 +121,23 @@ def test_table_says_right_and_wrong_and_how_often(results):
         assert word in answer.stdout
 
 
+def test_what_such_motions_show_is_told(results, failuretwin, simulated):
+    answer, _, _ = results
+    (line,) = [row for row in answer.stdout.splitlines() if row.startswith("smallest faults")]
+    sizes = re.findall(r"motor (\d) misses its targets by about (\d+\.\d) deg", line)
+    assert [motor for motor, _ in sizes] == ["1", "2", "3", "4"]
+    assert all(0.3 < float(size) < 10.0 for _, size in sizes)
+    assert "cannot be told apart by such motions" not in answer.stdout
+
+    alike = "healthy,motor_2:encoder_scale,motor_2:torque_loss,motor_1:torque_loss"
+    said = failuretwin("diagnose", simulated, "--hypotheses", alike).stdout
+    (line,) = [row for row in said.splitlines() if row.startswith("cannot be told apart")]
+    groups = line.partition(": ")[2].split("; ")
+    assert any(row.startswith("healthy or ") and "motor 1 weak" in row for row in groups)
+    assert "motor 2 has a wrong scale or motor 2 weak" in groups
+    assert "not for certain, however large: motor 1 weak" in said
+
+
 def test_wrong_diagnoses_are_marked(failuretwin, simulated, tmp_path):
     runs = load_run_set(simulated).isel(run=[1, 2])
     save_run_set(runs.assign(fault=("run", runs["fault"].values[::-1])), tmp_path / "lies.nc")

@@ -46,6 +46,13 @@ def print_diagnoses(diagnoses: Sequence[Diagnosis]) -> None:
     console.print(f"\n{diagnoses[0].method}", soft_wrap=True)
 
 
+def print_lines(lines: Sequence[str]) -> None:
+    """Print lines of text."""
+    console = table_console()
+    for line in lines:
+        console.print(line, soft_wrap=True)
+
+
 def print_scores(records: Sequence[Record]) -> None:
     """Print how good the diagnoses are, if the truth of any run is known."""
     scores = score_records(records)

@@ -179,7 +179,7 @@ class HealthyModel:
         for i, entry in enumerate(entries, start=1):
             lost[i, [robot.motor_names.index(motor) for motor in entry.motors]] = True
             rates[..., i] = entry.rate + (entry.rate_when_late - entry.rate) * late
-        rates[..., 0] = 1.0 - rates.sum(axis=-1)
+        rates[..., 0] = np.maximum(1.0 - rates.sum(axis=-1), 0.0)  # rounding may exceed one
         return lost, rates
 
     @cached_property

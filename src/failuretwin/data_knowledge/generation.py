@@ -20,11 +20,12 @@ from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable, Truth
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.assembly import assemble
+from failuretwin.data_knowledge.driving import drive_of
 from failuretwin.data_knowledge.plan import STEP_S, Plan
 from failuretwin.data_knowledge.workforce import Workforce
 from failuretwin.digital_model.disturbances import Disturbances, draw_disturbances, stack
-from failuretwin.digital_model.engine import Drive, Engine, ServoEngine
-from failuretwin.digital_model.imperfect import actual_movements, delay_commands, lagged
+from failuretwin.digital_model.engine import Engine, ServoEngine
+from failuretwin.digital_model.imperfect import delay_commands
 from failuretwin.digital_model.physics.engine import PhysicsEngine
 from failuretwin.digital_model.tool_sensor import sense
 from failuretwin.digital_model.twin import DigitalTwin
@@ -72,7 +73,10 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
     commanded = delay_commands(stack_movements([draw.movements for draw in draws]), chance.late)
     injection = Injection([draw.faults for draw in draws], plan.robot.motor_names, plan.modes)
     command, time = commanded.reference(plan.time), plan.time
-    drive = _drive(plan, commanded, command, injection, chance)
+    felt = chance
+    if plan.engine == "physics":  # its gears have friction of their own
+        felt = replace(chance, friction=np.zeros_like(chance.friction))
+    drive = drive_of(commanded, command, time, injection, felt)
     position = _engine(plan).angles(drive, time)
     measured, read = sense(
         DigitalTwin(plan.robot),
@@ -101,38 +105,6 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
     )
 
 
-def _drive(
-    plan: Plan,
-    commanded: Movements,
-    command: FloatArray,
-    injection: Injection,
-    chance: Disturbances,
-) -> Drive:
-    """Return what the motors are told once faults and bad luck have had their say.
-
-    Args:
-        plan: What to simulate.
-        commanded: Movements as commanded.
-        command: Their references, (run, time, motor) [rad].
-        injection: Faults of the runs.
-        chance: Bad luck of the runs.
-    """
-    faulty, lost = injection.on_movements(commanded, chance.lost)
-    chance = replace(chance, lost=lost)
-    if plan.engine == "physics":  # its gears have friction of their own
-        chance = replace(chance, friction=np.zeros_like(chance.friction))
-    actual = actual_movements(faulty, chance)
-    followed = command if _same(actual, commanded) else actual.reference(plan.time)
-    followed = lagged(followed, plan.time, chance.lag)
-    return Drive(
-        reference=injection.on_reference(followed, plan.time),
-        held=injection.held(plan.time),
-        weakness=injection.weakness(plan.time),
-        compliance=chance.compliance if chance.compliance.any() else None,
-        payload=chance.payload if chance.payload.any() else None,
-    )
-
-
 def _durations(plan: Plan, commanded: Movements, chance: Disturbances) -> FloatArray:
     """Return how long each run lasts, (run,) [s]: until the command after it would come."""
     last = float(plan.time[-1])
@@ -140,11 +112,6 @@ def _durations(plan: Plan, commanded: Movements, chance: Disturbances) -> FloatA
         return np.full(len(commanded.start), last)
     end = commanded.start[:, -1] + chance.late[:, -1] + plan.movements.period_s
     return np.minimum(end, last)
-
-
-def _same(one: Movements, other: Movements) -> bool:
-    names = ("initial", "target", "ramp_duration", "start")
-    return all(np.array_equal(getattr(one, n), getattr(other, n), equal_nan=True) for n in names)
 
 
 def _engine(plan: Plan) -> Engine:

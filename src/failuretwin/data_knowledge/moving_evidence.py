@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.core.runs import measured_rate
+from failuretwin.core.runs import measured_rate, time_step
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
 
@@ -36,12 +36,17 @@ class MovingEvidence:
         """Return the evidence of some of the runs."""
         return MovingEvidence(self.since[runs], self.point[runs], self.seen[runs])
 
+    def where(self, wanted: BoolArray) -> MovingEvidence:
+        """Return the evidence of some of the movements alone, (run, movement)."""
+        return MovingEvidence(self.since, self.point, self.seen & wanted[..., None])
+
 
 def moving_evidence(runs: xr.Dataset, settled: SettledEvidence) -> MovingEvidence:
     """Return the readings of each movement before those that `settled` has used.
 
     Of densely sampled paths readings are left out evenly, so that no two lie closer than the true
-    rate of the sensor says.
+    rate of the sensor says; of paths drawn out by straight lines, those that are kept lie where the
+    lines meet.
 
     Args:
         runs: A run set; `measured` (run, time, axis) is read.
@@ -49,8 +54,9 @@ def moving_evidence(runs: xr.Dataset, settled: SettledEvidence) -> MovingEvidenc
     """
     time = as_floats(runs["time"].values)
     measured = as_floats(runs["measured"].values)
-    least_step = 0.9 / measured_rate(runs)
-    finite = np.asarray(np.isfinite(measured).all(axis=-1))
+    rate = measured_rate(runs)
+    least_step, every = 0.9 / rate, round(1.0 / (rate * time_step(runs)))
+    read = np.array([_corners(path, every) for path in measured])
     start = settled.movements.start
     until = np.where(settled.usable, settled.begin, settled.end)
     shape = (*start.shape, MOST_READINGS)
@@ -58,7 +64,7 @@ def moving_evidence(runs: xr.Dataset, settled: SettledEvidence) -> MovingEvidenc
     seen = np.zeros(shape, dtype=bool)
     for run, movement in np.argwhere(settled.movements.exists & (until > start)):
         first, stop = np.searchsorted(time, [start[run, movement], until[run, movement] - 1e-9])
-        rows = first + np.flatnonzero(finite[run, first:stop])
+        rows = first + np.flatnonzero(read[run, first:stop])
         rows = rows[_apart(time[rows], least_step)]
         if len(rows) > MOST_READINGS:
             rows = rows[np.rint(np.linspace(0, len(rows) - 1, MOST_READINGS)).astype(int)]
@@ -66,6 +72,21 @@ def moving_evidence(runs: xr.Dataset, settled: SettledEvidence) -> MovingEvidenc
         point[run, movement, : len(rows)] = measured[run, rows]
         seen[run, movement, : len(rows)] = True
     return MovingEvidence(since, point, seen)
+
+
+def _corners(path: FloatArray, every: int) -> BoolArray:
+    """Return which samples of a path (time, axis) may be readings, (time,).
+
+    Of one drawn out by straight lines these are every so many, where it bends most; of any other,
+    all that are there.
+    """
+    seen = np.asarray(np.isfinite(path).all(axis=-1))
+    if every < 2 or 2 * np.count_nonzero(seen) < len(seen):
+        return seen
+    bend = np.zeros(len(path))
+    bend[1:-1] = np.linalg.norm(np.nan_to_num(np.diff(path, 2, axis=0)), axis=-1)
+    phase = np.arange(len(path)) % every
+    return seen & (phase == np.argmax(np.bincount(phase, bend)))
 
 
 def _apart(time: FloatArray, least_step: float) -> BoolArray:

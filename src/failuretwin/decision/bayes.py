@@ -22,7 +22,7 @@ from failuretwin.data_knowledge.settled_evidence import SettledEvidence, settled
 from failuretwin.decision.assessment import lost_commands, unused_movements, why_undecided
 from failuretwin.decision.law import Estimate, Scene, Weight
 from failuretwin.decision.priors import Priors
-from failuretwin.decision.weighing import check_weighable, log_prior, weigh_all
+from failuretwin.decision.weighing import check_weighable, log_prior, shows_on_way, weigh_all
 from failuretwin.decision.wording import explanation, verdict
 from failuretwin.digital_model.imperfections import Imperfections, default_imperfections
 from failuretwin.digital_model.twin import DigitalTwin
@@ -103,8 +103,7 @@ class BayesDiagnoser:
                 "no run holds a movement: `command` never leaves its first value. Expected runs "
                 "of one movement at least."
             )
-        use_way = self.whole_run and self.healthy_model.knows_timing
-        moving = moving_evidence(sound, evidence) if use_way else None
+        moving = self._on_way(sound, evidence)
         names = [str(name) for name in runs["run"].values]
         faults = truth_of(runs)
         truth: list[str | None] = [None] * len(names) if faults is None else list(faults)
@@ -116,6 +115,21 @@ class BayesDiagnoser:
                 at = first + run
                 results.append(self._conclude(weighed, run, names[at], truth[at], quality[at]))
         return results
+
+    def _on_way(self, runs: xr.Dataset, evidence: SettledEvidence) -> MovingEvidence | None:
+        """Return the readings on the way that count; None where there are none.
+
+        Where a motor settled says all about most faults, and more reliably, so readings on the
+        way count beside it only where some hypothesis shows nowhere else.
+        """
+        if not (self.whole_run and self.healthy_model.knows_timing):
+            return None
+        moving = moving_evidence(runs, evidence)
+        if any(shows_on_way(hypothesis) for hypothesis in self._hypotheses):
+            return moving
+        unseen = ~evidence.usable
+        unseen[:, 1:] |= unseen[:, :-1]  # what follows tells where it ended
+        return moving.where(unseen)
 
     def _check(self, runs: xr.Dataset) -> None:
         check_runs(runs, "the run set")

@@ -22,6 +22,9 @@ from failuretwin.decision.motor_profile import MotorProfile, motor_profile
 from failuretwin.decision.ramps import RampModel
 from failuretwin.decision.transients import Transients
 
+HELD_ANGLES = 25
+"""Held angles at which the way is judged, over the range of a motor."""
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -41,7 +44,10 @@ class Scene:
     _profiles: dict[int, MotorProfile] = field(
         default_factory=dict, init=False, compare=False, repr=False
     )
-    _ways: dict[tuple[int, bool], FloatArray] = field(
+    _off: dict[tuple[int, bool], FloatArray] = field(
+        default_factory=dict, init=False, compare=False, repr=False
+    )
+    _held: dict[int, FloatArray] = field(
         default_factory=dict, init=False, compare=False, repr=False
     )
 
@@ -74,15 +80,51 @@ class Scene:
         """Log density of the readings on the way if no motor is faulty, (run, movement)."""
         return np.zeros(self.usable.shape) if self.transients is None else self.transients.healthy
 
-    def on_way_with(self, motor: int, held: bool) -> FloatArray:
-        """Return the same with one motor that is held or settles off its target."""
+    def on_way_off(self, motor: int, lasting: bool = False) -> FloatArray:
+        """Return the same with one motor that settles off its target, (run, movement).
+
+        Args:
+            motor: Index of the motor.
+            lasting: Whether it is off by about the same in all movements.
+        """
         if self.transients is None:
             return self.on_way
-        key = (motor, held)
-        if key not in self._ways:
-            judge = self.transients.held if held else self.transients.off
-            self._ways[key] = judge(motor, self.profile(motor))
-        return self._ways[key]
+        key = (motor, lasting)
+        if key not in self._off:
+            self._off[key] = self.transients.off(motor, self.profile(motor), lasting)
+        return self._off[key]
+
+    def on_way_held(self, motor: int, angle: FloatArray) -> FloatArray:
+        """Return the same with one motor that is held at some angle or gets stuck there.
+
+        Args:
+            motor: Index of the motor.
+            angle: Angles, (run, node) [rad].
+
+        Returns:
+            (run, movement, node); between the angles that were computed, a straight line.
+        """
+        if self.transients is None:
+            return np.repeat(self.on_way[..., None], angle.shape[1], axis=2)
+        low, high = self.held_range(motor)
+        if motor not in self._held:
+            grid = np.linspace(low, high, HELD_ANGLES)
+            self._held[motor] = self.transients.held(motor, self.profile(motor), grid)
+        place = np.clip((angle - low) / (high - low) * (HELD_ANGLES - 1), 0, HELD_ANGLES - 1)
+        left = np.minimum(place.astype(np.int64), HELD_ANGLES - 2)
+        share = (place - left)[:, None]
+        shape = (*self.usable.shape, angle.shape[1])
+        at, after = (
+            np.take_along_axis(self._held[motor], np.broadcast_to(k[:, None], shape), axis=2)
+            for k in (left, left + 1)
+        )
+        return at + share * (after - at)
+
+    def held_range(self, motor: int) -> tuple[float, float]:
+        """Return the range of angles at which a motor may be held [rad]."""
+        low, high = self.model.twin.robot.motors[motor].movement_range
+        margin = 0.1 * (high - low)
+        return low - margin, high + margin
 
     @cached_property
     def log_healthy(self) -> FloatArray:
@@ -122,8 +164,9 @@ class Law:
             share of each sample, same axes; axes of nodes and movements may be 1.
         redrawn: Log weights of the nodes in each group, (group, node), where every movement draws
             its own node; None: one node holds for the whole run.
-        on_way: Log density of the readings on the way at each node, (run, movement, node), where
-            the fault shows there; None: as for any motor that is held or settles off its target.
+        on_way: Log density of the readings on the way at each node, (run, movement, node); None:
+            as for any motor that settles off its target.
+        lasting: Whether the motor is off by about the same in all movements.
     """
 
     motor: int
@@ -134,6 +177,7 @@ class Law:
     onsets: Callable[[int], tuple[FloatArray, FloatArray]]
     redrawn: FloatArray | None = None
     on_way: FloatArray | None = None
+    lasting: bool = False
 
 
 @dataclass(frozen=True)
@@ -214,15 +258,38 @@ def posterior_of(
     )
 
 
-def weigh(scene: Scene, law: Law) -> Weight:
-    """Return what the runs say of a fault of one motor."""
-    profile = scene.profile(law.motor)
-    density = by_node = profile.log_density(law.angle, law.held)
+@dataclass(frozen=True)
+class Densities:
+    """Log densities of each movement with a fault.
+
+    Attributes:
+        by_node: Of its settled position at each node, (run, movement, node).
+        by_cell: The same with nodes that are redrawn summed in their groups,
+            (run, movement, cell).
+        way: Of its readings on the way, (run, movement, cell) or the same for all cells,
+            (run, movement, 1).
+    """
+
+    by_node: FloatArray
+    by_cell: FloatArray
+    way: FloatArray
+
+
+def densities(scene: Scene, law: Law) -> Densities:
+    """Return what each movement says of a fault of one motor."""
+    by_node = by_cell = scene.profile(law.motor).log_density(law.angle, law.held)
     if law.redrawn is not None:  # (run, movement, group, node) summed over nodes
-        density = log_sum(by_node[:, :, None] + law.redrawn, axis=-1)
+        by_cell = log_sum(by_node[:, :, None] + law.redrawn, axis=-1)
     way = law.on_way
     if way is None:
-        way = scene.on_way_with(law.motor, law.held)[..., None]
+        way = scene.on_way_off(law.motor, law.lasting)[..., None]
+    return Densities(by_node, by_cell, way)
+
+
+def weigh(scene: Scene, law: Law) -> Weight:
+    """Return what the runs say of a fault of one motor."""
+    profile, says = scene.profile(law.motor), densities(scene, law)
+    by_node, density, way = says.by_node, says.by_cell, says.way
     found = posterior_of(scene.log_healthy, density, law.log_prior, (scene.on_way, way))
 
     def estimate(run: int) -> Estimate:

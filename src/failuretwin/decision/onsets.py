@@ -95,8 +95,11 @@ def at_movement_starts(movements: Movements) -> Stretches:
 
 
 def at_once(evidence: SettledEvidence) -> Stretches:
-    """Return the stretches of a fault that acts at once: up to where the tool is seen at rest."""
-    middle = 0.5 * (evidence.begin + evidence.end)
+    """Return the stretches of a fault that acts at once: up to where the tool is seen at rest.
+
+    Of a movement that is never seen at rest: up to the last reading or the next movement.
+    """
+    middle = 0.5 * (np.minimum(evidence.begin, evidence.end) + evidence.end)
     exists = evidence.movements.exists
     return _between(np.where(exists, middle, np.nan), exists)
 

@@ -39,10 +39,10 @@ def _weigh_one(scene: Scene, one: Law, two: Law) -> Weight:
     alone = [_cells(_alone(scene, law), law) for law in (one, two)]  # (movement, cell)
     both = _both(scene, one, two)  # (movement, cell of one, cell of two)
     settled = scene.log_healthy[0], alone, both
-    ways = [scene.on_way_with(law.motor, law.held)[0] for law in (one, two)]
-    alone = [values + way[:, None] for values, way in zip(alone, ways, strict=True)]
+    ways = [_way(scene, law) for law in (one, two)]
+    alone = [values + way for values, way in zip(alone, ways, strict=True)]
     # The way with both faults is not computed: it is no less probable than with one of them.
-    both = both + np.maximum(*ways)[:, None, None]
+    both = both + np.maximum(ways[0][:, :, None], ways[1][:, None])
     healthy, count = settled[0] + scene.on_way[0], len(both)
     prior = [law.log_prior[0] for law in (one, two)]  # (movement, cell)
 
@@ -77,6 +77,13 @@ def _weigh_one(scene: Scene, one: Law, two: Law) -> Weight:
         settled=_by_movement(*settled, *first_two)[None],
         estimate=estimate,
     )
+
+
+def _way(scene: Scene, law: Law) -> FloatArray:
+    """Return log densities of the way with one of the faults alone, (movement, node or 1)."""
+    if law.on_way is not None:
+        return law.on_way[0]
+    return scene.on_way_off(law.motor, law.lasting)[0][:, None]
 
 
 def _alone(scene: Scene, law: Law) -> FloatArray:
@@ -133,8 +140,8 @@ def _thinned(scene: Scene, law: Law) -> Law:
         prior[..., cell] = np.logaddexp(prior[..., cell], law.log_prior[..., node])
 
     def of_run(run: int) -> tuple[FloatArray, FloatArray]:
-        parts = law.onsets(run)
-        return parts if parts[0].shape[1] == 1 else (parts[0][:, kept], parts[1][:, kept])
+        onset, part = law.onsets(run)
+        return _of_nodes(onset, kept), _of_nodes(part, kept)
 
     return replace(
         law,
@@ -142,7 +149,13 @@ def _thinned(scene: Scene, law: Law) -> Law:
         log_prior=prior,
         size=law.size[:, kept],
         onsets=of_run,
+        on_way=None if law.on_way is None else law.on_way[:, :, kept],
     )
+
+
+def _of_nodes(values: FloatArray, nodes: IntArray) -> FloatArray:
+    """Return the values (movement, node, sample) of some nodes; a node axis of 1 is for all."""
+    return values if values.shape[1] == 1 else values[:, nodes]
 
 
 def _nearest(values: FloatArray, kept: FloatArray) -> IntArray:

@@ -13,13 +13,18 @@ from functools import cached_property
 import numpy as np
 
 from failuretwin.connection.healthy import Alternatives
-from failuretwin.core.quadrature import log_sum
+from failuretwin.core.quadrature import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.decision.motor_profile import MotorProfile
 from failuretwin.decision.ramps import RampModel, Ramps
 
-LARGEST_OFFSET_RAD = 0.3
-"""Furthest from its target that a motor is taken to have settled without being stuck [rad]."""
+LARGEST_OFFSET_RAD = 0.9
+"""Furthest from its target that a motor is taken to have settled without being stuck [rad]; the
+largest encoder faults that are considered."""
+STARTS_RAD = np.linspace(-LARGEST_OFFSET_RAD, LARGEST_OFFSET_RAD, 13)
+"""Where a motor may stand before the run if not where it should, from there."""
+RARELY_ELSEWHERE = 0.01
+"""Motors that do so less often are taken to stand where they should [-]."""
 TRUST = 0.1
 """Power to which what the way says is taken: its readings share errors of timing and of both ends
 that the model of the way does not know, so that all of a movement count for about one. Chosen on
@@ -84,37 +89,49 @@ class Transients:
     def healthy(self) -> FloatArray:
         """Log density if no motor is faulty, (run, movement)."""
         course, luck = self._healthy
-        return self._trusted(self._judge(course.origin(), course.destination()) + luck)
+        return self._trusted(self._from_anywhere(course, self._judge(course)) + luck)
 
-    def held(self, motor: int, profile: MotorProfile) -> FloatArray:
+    def held(self, motor: int, profile: MotorProfile, angle: FloatArray) -> FloatArray:
         """Return the log density if a motor is held all the way or gets stuck on it.
+
+        Where the end of a movement was seen, the motor is taken to be held where that puts it.
 
         Args:
             motor: Index of the motor.
             profile: What each movement says of it.
+            angle: Where it may be held otherwise, (node,) [rad].
 
         Returns:
-            (run, movement).
+            (run, movement, node).
         """
         seen = np.argmax(profile.log_terms(profile.best, True), axis=-1)
-        angle, usable = _at(profile.best, seen), self._usable
-        angle = np.where(usable, angle, self._typical(angle, motor)[:, None])
-        ends = np.where(usable[..., None, None], profile.pose, self._expected)
-        ends[..., motor] = angle[..., None]
+        nearest = self._nearest_seen(_at(profile.best, seen), motor)
+        ends = np.where(self._usable[..., None, None], profile.pose, self._expected)
+        ends[..., motor] = nearest[..., None]
         lost = self.alternatives.lost.copy()
         lost[:, motor] = True  # whatever becomes of its command
         course, luck = self._settle(_Course(ends, seen, lost, self._first))
-        stays = self._judge(course.origin(), course.destination())
+        item, cases = self._items, len(angle)
+        at = np.where(self._usable[item][:, None], nearest[item][:, None], angle)
+        end = np.repeat(course.destination()[item][:, None], cases, axis=1)
+        end[..., motor] = at
+        begin = np.repeat(course.origin()[item][:, None], cases, axis=1)
+        begin[..., motor] = at
+        stays = self._weigh(*item, begin, end)
         moving = replace(course, lost=self.alternatives.lost).origin()
-        stops = self._judge(moving, course.destination(), stops=motor)
-        return self._trusted(np.logaddexp(stays, stops) - np.log(2.0) + luck)
+        begin[..., motor] = moving[item][:, None, motor]
+        stops = self._weigh(*item, begin, end, stops=motor)
+        found = np.zeros((*self._usable.shape, cases))
+        found[item] = np.logaddexp(stays, stops) - np.log(2.0)
+        return self._trusted(self._from_anywhere(course, found) + luck[..., None])
 
-    def off(self, motor: int, profile: MotorProfile) -> FloatArray:
+    def off(self, motor: int, profile: MotorProfile, lasting: bool) -> FloatArray:
         """Return the log density if a motor goes to where it was seen to settle.
 
         Args:
             motor: Index of the motor.
             profile: What each movement says of it.
+            lasting: Whether it is off by about the same in all movements.
 
         Returns:
             (run, movement).
@@ -126,16 +143,65 @@ class Transients:
         )
         seen = np.argmax(profile.log_terms(near, False), axis=-1)
         ends = np.where(self._usable[..., None, None], profile.pose, self._expected)
-        ends[..., motor] = np.where(self._usable[..., None], near, self._expected[..., motor])
+        unseen = self._expected[..., motor]
+        if lasting:
+            unseen = unseen + self._usually_off(_at(near - profile.expected, seen))
+        ends[..., motor] = np.where(self._usable[..., None], near, unseen)
         course, luck = self._settle(_Course(ends, seen, self.alternatives.lost, self._first))
-        return self._trusted(self._judge(course.origin(), course.destination()) + luck)
+        return self._trusted(self._from_anywhere(course, self._judge(course), motor) + luck)
+
+    def _usually_off(self, offset: FloatArray) -> FloatArray:
+        """Return the median of offsets (run, movement) over the movements seen, (run, 1, 1)."""
+        some = self._usable.any(axis=1, keepdims=True)
+        seen = np.where(self._usable, offset, np.where(some, np.nan, 0.0))
+        return np.asarray(np.nanmedian(seen, axis=1))[:, None, None]
+
+    def _from_anywhere(
+        self, course: _Course, says: FloatArray, off: int | None = None
+    ) -> FloatArray:
+        """Return log densities if a motor may have stood elsewhere before the run.
+
+        A healthy one does if it missed the command before.
+
+        Args:
+            course: Where the movements led.
+            says: Log density of each movement if all stood where they should, (run, movement) or
+                (run, movement, node).
+            off: Motor that is as likely to have been off as not.
+        """
+        chance = np.exp(self.alternatives.log_weight[:, 0]) @ self.alternatives.lost  # (run, motor)
+        if off is not None:
+            chance = 0.5 * chance
+            chance[:, off] = 0.5
+        shape = (-1,) + (1,) * (says.ndim - 2)
+        usual = np.log1p(-np.minimum(chance.sum(axis=1), 0.9))
+        terms = [says[:, 0] + usual.reshape(shape)]
+        for motor in np.flatnonzero(chance.max(axis=0) > RARELY_ELSEWHERE):
+            other = self._elsewhere(course, int(motor)) + log_of(chance[:, motor])
+            terms.append(np.broadcast_to(other.reshape(shape), terms[0].shape))
+        says = says.copy()
+        says[:, 0] = np.logaddexp.reduce(terms, axis=0)
+        return says
+
+    def _elsewhere(self, course: _Course, motor: int) -> FloatArray:
+        """Return the log density of the first movement if a motor was off before it, (run,)."""
+        run = np.flatnonzero(self.ramps.moving.seen[:, 0].any(axis=-1))
+        begin, end = (
+            np.repeat(pose[run, 0][:, None], len(STARTS_RAD), axis=1)
+            for pose in (course.origin(), course.destination())
+        )
+        begin[..., motor] += STARTS_RAD
+        found = np.zeros(len(self._usable))
+        says = self._weigh(run, np.zeros_like(run), begin, end)
+        found[run] = log_sum(says, axis=-1) - np.log(len(STARTS_RAD))
+        return found
 
     @cached_property
     def astray(self) -> FloatArray:
         """Log density if the tool strays from its way as no fault explains, (run, movement)."""
         course, _ = self._healthy
         spread_m = ASTRAY * self.ramps.model.reach
-        return TRUST * self._judge(course.origin(), course.destination(), spread_m=spread_m)
+        return TRUST * self._judge(course, spread_m)
 
     def _trusted(self, says: FloatArray) -> FloatArray:
         """Return what the way says as far as it is trusted, (run, movement, ...)."""
@@ -203,12 +269,19 @@ class Transients:
         ends = np.where(self._usable[..., None, None], self.poses, self._expected)
         return self._settle(_Course(ends, seen, self.alternatives.lost, self._first))
 
-    def _typical(self, angle: FloatArray, motor: int) -> FloatArray:
-        """Return the median over the movements seen, else the angle before the run, (run,)."""
-        masked = np.where(self._usable, angle, np.nan)
-        start = self._first[:, motor]
-        some = np.asarray(self._usable.any(axis=1))
-        return np.where(some, np.nanmedian(np.where(some[:, None], masked, 0.0), axis=1), start)
+    def _nearest_seen(self, angle: FloatArray, motor: int) -> FloatArray:
+        """Return angles (run, movement) with those of unseen ends from the next movement seen.
+
+        Where none follows, from the last one before; where there is none, from before the run.
+        """
+        filled = np.where(self._usable, angle, np.nan)
+        count = filled.shape[1]
+        for m in range(count - 2, -1, -1):
+            filled[:, m] = np.where(np.isnan(filled[:, m]), filled[:, m + 1], filled[:, m])
+        before = self._first[:, motor]
+        for m in range(count):
+            filled[:, m] = before = np.where(np.isnan(filled[:, m]), before, filled[:, m])
+        return filled
 
     def _settle(self, course: _Course) -> tuple[_Course, FloatArray]:
         """Find out what became of movements whose end was not seen.
@@ -240,42 +313,41 @@ class Transients:
         return replace(course, chosen=chosen), luck
 
     def _weigh(
-        self, run: IntArray, movement: IntArray, origin: FloatArray, destination: FloatArray
-    ) -> FloatArray:
-        """Return log densities of some movements, (item, case); 0 without readings."""
-        duration = np.repeat(self._duration[run, movement][:, None], origin.shape[1], axis=1)
-        still = np.zeros(origin.shape[1:])
-        return self.ramps.log_density(Ramps(run, movement, origin, destination, duration, still))
-
-    def _judge(
         self,
+        run: IntArray,
+        movement: IntArray,
         origin: FloatArray,
         destination: FloatArray,
         stops: int | None = None,
         spread_m: float = 0.0,
     ) -> FloatArray:
-        """Return log densities of motors that go from one pose to another, (run, movement).
+        """Return log densities of some movements, (item, case); 0 without readings.
 
         Args:
-            origin: Where each movement begins, (run, movement, motor) [rad].
-            destination: Where it ends, (run, movement, motor) [rad].
+            run: Which run each movement belongs to, (item,).
+            movement: Its number in the run, (item,).
+            origin: Where it begins, (item, case, motor) [rad].
+            destination: Where it ends, (item, case, motor) [rad].
             stops: Motor that is on its way to its target but stops where it ends.
             spread_m: How far the tool may stray from its way [m].
         """
-        duration = self._duration
+        duration = np.repeat(self._duration[run, movement][:, None], origin.shape[1], axis=1)
         if stops is not None:
-            duration = duration.copy()
-            target = np.nan_to_num(self.ramps.settled.movements.target[..., stops])
-            travel = target - origin[..., stops]
+            target = np.nan_to_num(self.ramps.settled.movements.target[run, movement, stops])
+            travel = target[:, None] - origin[..., stops]
             travel = np.where(np.abs(travel) > 1e-6, travel, np.inf)
             done = (destination - origin)[..., stops] / travel
             duration[..., stops] *= np.clip(done, 0.0, 1.0)
+        still = np.zeros(origin.shape[1:])
+        ramps = Ramps(run, movement, origin, destination, duration, still, spread_m)
+        return self.ramps.log_density(ramps)
+
+    def _judge(self, course: _Course, spread_m: float = 0.0) -> FloatArray:
+        """Return log densities of all movements of a course, (run, movement)."""
         item = self._items
-        still = np.zeros((1, origin.shape[-1]))
+        begin, end = (values[item][:, None] for values in (course.origin(), course.destination()))
         found = np.zeros(self._usable.shape)
-        begin, end, time = (values[item][:, None] for values in (origin, destination, duration))
-        ramps = Ramps(*item, begin, end, time, still, spread_m)
-        found[item] = self.ramps.log_density(ramps)[:, 0]
+        found[item] = self._weigh(*item, begin, end, spread_m=spread_m)[:, 0]
         return found
 
 

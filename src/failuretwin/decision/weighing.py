@@ -67,6 +67,11 @@ def check_weighable(hypothesis: Hypothesis) -> None:
             )
 
 
+def shows_on_way(hypothesis: Hypothesis) -> bool:
+    """Return whether a hypothesis shows in how the motors move more than in where they settle."""
+    return not hypothesis.known or any(fault.mode in TIMED for fault in hypothesis.faults)
+
+
 def log_prior(hypotheses: Sequence[Hypothesis]) -> FloatArray:
     """Return the log prior probability of each hypothesis, (hypothesis,)."""
     odds = np.array([prior_odds(h) if h.known else UNKNOWN_ODDS for h in hypotheses])
@@ -90,23 +95,26 @@ def weigh_hypothesis(scene: Scene, hypothesis: Hypothesis, priors: Priors) -> We
     if len(hypothesis.faults) == 2:
         scenes = [scene[run] for run in range(len(scene.log_healthy))]
         one, two = hypothesis.faults
-        laws = [(_law(alone, one, priors), _law(alone, two, priors)) for alone in scenes]
+        laws = [(law_of(alone, one, priors), law_of(alone, two, priors)) for alone in scenes]
         return weigh_pair(scenes, laws)
     fault = hypothesis.faults[0]
-    motor, early = _motor(scene, fault), priors.onset.before_run(fault.mode)
     if fault.mode in MISSES:
-        return weigh_misses(scene, motor, fault.mode, early)
-    if fault.mode in TIMED:
-        return weigh(scene, TIMED[fault.mode](scene, motor, early))
-    return weigh(scene, _law(scene, fault, priors))
+        early = priors.onset.before_run(fault.mode)
+        return weigh_misses(scene, motor_of(scene, fault), fault.mode, early)
+    return weigh(scene, law_of(scene, fault, priors))
 
 
-def _motor(scene: Scene, fault: Fault) -> int:
+def motor_of(scene: Scene, fault: Fault) -> int:
+    """Return the index of the motor that has the fault."""
     return scene.model.twin.robot.motor_names.index(fault.motor)
 
 
-def _law(scene: Scene, fault: Fault, priors: Priors) -> Law:
-    return LAWS[fault.mode](scene, _motor(scene, fault), priors)
+def law_of(scene: Scene, fault: Fault, priors: Priors) -> Law:
+    """Return the law of a fault, of any mode but those of `MISSES`."""
+    motor = motor_of(scene, fault)
+    if fault.mode in TIMED:
+        return TIMED[fault.mode](scene, motor, priors.onset.before_run(fault.mode))
+    return LAWS[fault.mode](scene, motor, priors)
 
 
 def _weigh_healthy(scene: Scene) -> Weight:

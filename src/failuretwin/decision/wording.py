@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from failuretwin.core.diagnosis import Diagnosis, MovementEvidence
-from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.hypothesis import Fault, Hypothesis
 from failuretwin.data_knowledge.knowledge import failure_modes, plain_name
 
 SURE = 0.95
@@ -61,12 +61,21 @@ def _size_and_onset(diagnosis: Diagnosis, hypothesis: Hypothesis) -> str:
     if len(hypothesis.faults) != 1 or diagnosis.magnitude is None:
         return since if onset else ""
     fault, size = hypothesis.faults[0], diagnosis.magnitude
+    if fault.mode == "stuck":
+        return f" at {round(float(np.rad2deg(size)))} deg{since}"
+    return size_words(fault, size) + (since if onset else "")
+
+
+def size_words(fault: Fault, size: float) -> str:
+    """Return the size of a fault as it is told behind its name, such as `` by about 2.4 deg``.
+
+    Args:
+        fault: Any but a stuck motor.
+        size: Its magnitude, in the unit of its mode.
+    """
     if fault.magnitude_unit in ("rad", "rad/s"):
         size = float(np.rad2deg(size))
-    if fault.mode == "stuck":
-        return f" at {round(size)} deg{since}"
-    text = _SIZES.get(fault.mode, " ({size:.0%})").format(size=size)
-    return text + (since if onset else "")
+    return _SIZES.get(fault.mode, " ({size:.0%})").format(size=size)
 
 
 def possible_hypotheses(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> Sequence[Hypothesis]:

@@ -77,10 +77,11 @@ def diagnose(
     downwards), such a file (.mat), a bag (.bag, .mcap), or a CSV file with --columns.
     """
     del seed  # nothing here is drawn by chance
+    from failuretwin.app.ambiguity_lines import ambiguity_lines
     from failuretwin.app.inputs import read_inputs, tell_mismatch
     from failuretwin.app.method import chosen_diagnoser, expected_name
     from failuretwin.app.results import write_csv, write_json_lines
-    from failuretwin.app.tables import print_diagnoses, print_scores
+    from failuretwin.app.tables import print_diagnoses, print_lines, print_scores
     from failuretwin.app.tracking import (
         diagnose_tracked,
         keep_history,
@@ -135,6 +136,8 @@ def diagnose(
     if tracked is not None:
         keep_history(tracked)
     print_diagnoses(diagnoses)
+    if method == "bayes":
+        print_lines(ambiguity_lines(runs, bayes))
     print_scores(records)
     if tracked is not None:
         click.echo(f"\n{tracking_line(tracked)}")

@@ -89,7 +89,9 @@ def lasting_law(scene: Scene, motor: int, mode: str, early: float) -> Law:
     """
     amount, profile = AMOUNTS[mode], scene.profile(motor)
     gain = amount.gain(scene, motor)
-    best, width = _pointed(profile, gain[..., 0])
+    largest = amount.of_size(np.array(magnitude_range(mode)[1]))
+    settled = _settled(scene, motor, np.abs(gain) * largest)
+    best, width = _pointed(profile, settled[..., 0], gain[..., 0])
     best = np.clip(best, -1e3, 1e3)
     slope = _slope(amount, best)
     size, log_size = size_nodes(
@@ -104,18 +106,40 @@ def lasting_law(scene: Scene, motor: int, mode: str, early: float) -> Law:
     return Law(
         motor=motor,
         held=False,
-        angle=profile.expected[:, :, None] + offset,
+        angle=settled[:, :, None] + offset,
         log_prior=log_of(stretches.weights(early))[..., None] + log_size[:, None],
         size=size,
         onsets=stretches.onsets(early),
+        lasting=True,
     )
 
 
-def _pointed(profile: MotorProfile, gain: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _settled(scene: Scene, motor: int, farthest: FloatArray) -> FloatArray:
+    """Return where a motor settles apart from what the fault itself adds, (..., alternative) [rad].
+
+    It sags in the pose that it is really in, which a large fault takes far from the target: the
+    load there is that of the angle that the movement points to.
+
+    Args:
+        scene: The runs.
+        motor: Index of the motor.
+        farthest: How far the fault may put it off, (run, movement, alternative) [rad].
+    """
+    model, alternatives, profile = scene.model, scene.alternatives, scene.profile(motor)
+    pose = model.settle(alternatives.base, alternatives.direction, model.none_held)
+    low, high = profile.expected - farthest, profile.expected + farthest
+    pose[..., motor] = np.clip(profile.best, low, high)
+    offset = model.settling.offset(model.twin.robot, pose, alternatives.direction)
+    return np.asarray(alternatives.base[..., motor] + offset[..., motor])
+
+
+def _pointed(
+    profile: MotorProfile, settled: FloatArray, gain: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return the amount that each movement points to and its deviation, (run, movement)."""
     safe = np.where(np.abs(gain) > 1e-9, gain, 1.0)
     spread = np.sqrt(1.0 / np.maximum(profile.precision[..., 0], 1e-6) + profile.scatter**2)
-    return (profile.best[..., 0] - profile.expected[..., 0]) / safe, spread / np.abs(safe)
+    return (profile.best[..., 0] - settled) / safe, spread / np.abs(safe)
 
 
 def _slope(amount: Amount, at: FloatArray) -> FloatArray:

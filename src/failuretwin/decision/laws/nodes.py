@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from failuretwin.core.quadrature import log_of, log_sum, log_trapezoid_weights
+from failuretwin.core.quadrature import log_sum, log_trapezoid_weights
 from failuretwin.core.types import BoolArray, FloatArray
 
 LOCAL_STEPS = np.array([-8, -5, -3.5, -2.5, -1.75, -1, -0.5, 0, 0.5, 1, 1.75, 2.5, 3.5, 5, 8.0])
@@ -46,8 +46,9 @@ def size_nodes(
         grid = np.concatenate([-grid, grid])
     local = nodes_around(best, width, usable, low)
     coarse = np.broadcast_to(grid, (len(best), len(grid)))
-    nodes = np.sort(np.concatenate([local, coarse], axis=1), axis=1)
-    nodes = np.clip(nodes, -high if signed else low, high)
-    inside = np.abs(nodes) >= low - 1e-12
-    mass = np.where(inside, log_trapezoid_weights(nodes), log_of(0.0))
+    nodes = np.concatenate([local, coarse], axis=1)
+    side = np.where(signed & (nodes < 0.0), -1.0, 1.0)
+    nodes = np.sort(side * np.clip(side * nodes, low, high), axis=1)
+    # Both sides moved together: what lies between the lowest sizes has no mass.
+    mass = log_trapezoid_weights(nodes - np.sign(nodes) * low)
     return nodes, mass - log_sum(mass, axis=1)[:, None]

@@ -54,12 +54,10 @@ def weigh_misses(scene: Scene, motor: int, mode: str, early: float) -> Weight:
         mode: Id of the mode, one of `MISSES`.
         early: Probability that the fault was there before the run.
     """
-    sizes = np.linspace(*magnitude_range(mode), SHARES)
-    place = _densities(scene, motor)
+    sizes = _sizes(mode)
     stretches = at_movement_starts(scene.evidence.movements)
     log_first = log_of(stretches.weights(early)) - np.log(SHARES)
-    healthy = scene.log_healthy + scene.on_way
-    after = _chain(place, healthy, MISSES[mode], sizes)  # (run, movement, first, size)
+    after = log_densities(scene, motor, mode)
     joint = after[:, -1] + log_first[..., None]
     log_evidence = log_sum(joint, axis=(1, 2))
     share = np.exp(joint - log_evidence[:, None, None])
@@ -75,8 +73,24 @@ def weigh_misses(scene: Scene, motor: int, mode: str, early: float) -> Weight:
             became=scene.became[run],
         )
 
-    settled = by_movement - np.maximum(scene.on_way, scene.on_way_with(motor, held=True))
+    settled = by_movement - np.maximum(scene.on_way, scene.on_way_off(motor))
     return Weight(log_evidence, by_movement, settled, estimate)
+
+
+def log_densities(scene: Scene, motor: int, mode: str) -> FloatArray:
+    """Return the log density of all movements up to each one, (run, movement, first, size).
+
+    Args:
+        scene: The runs.
+        motor: Index of the motor.
+        mode: Id of the mode, one of `MISSES`.
+    """
+    healthy = scene.log_healthy + scene.on_way
+    return _chain(_densities(scene, motor), healthy, MISSES[mode], _sizes(mode))
+
+
+def _sizes(mode: str) -> FloatArray:
+    return np.linspace(*magnitude_range(mode), SHARES)
 
 
 @dataclass(frozen=True)
@@ -104,8 +118,8 @@ def _densities(scene: Scene, motor: int) -> _Places:
     on_way = profile.log_density(way.reshape(runs, count, -1, 1), False)
     on_way = log_sum(on_way.reshape(runs, count, -1, steps), axis=3) - np.log(steps)
     arrives = np.eye(count, count + 1, 1, dtype=bool)
-    held = scene.on_way_with(motor, held=True)[..., None]
-    off = scene.on_way_with(motor, held=False)[..., None]
+    held = scene.on_way_held(motor, places)
+    off = scene.on_way_off(motor)[..., None]
     return _Places(at + np.where(arrives, off, held), on_way + held)
 
 
@@ -130,9 +144,10 @@ def _chain(
         moved = np.full_like(state, -np.inf)
         moved[..., :-1] = state[..., :-1] + log_stay[:, None] + place.at[:, m, None, None]
         from_way = log_sum(state[..., :-1] + place.way[:, m, None, None], axis=-1)
-        lying = place.way[:, m].max(axis=-1)[:, None, None]  # where it stuck before is not known
+        # Where it stuck before is not known: on the way from any place that it may have left.
+        lying = log_sum(place.way[:, m, : m + 1], axis=-1)[:, None, None] - np.log(m + 1)
         moved[..., -1] = np.logaddexp(
-            log_midway + from_way, log_stay + state[..., -1] + lying - np.log(len(WAY))
+            log_midway + from_way, np.logaddexp(log_midway, log_stay) + state[..., -1] + lying
         )
         arrives = np.where(
             spoilt[..., 0], log_arrive + total + place.at[:, m, m + 1][:, None, None], -np.inf

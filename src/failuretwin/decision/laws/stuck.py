@@ -60,6 +60,7 @@ def stuck_law(scene: Scene, motor: int, prior: OnsetPrior) -> Law:
         log_prior=log_prior,
         size=angle,
         onsets=of_run,
+        on_way=scene.on_way_held(motor, angle),
     )
 
 
@@ -68,7 +69,7 @@ def _angle_nodes(scene: Scene, motor: int, prior: OnsetPrior) -> FloatArray:
 
     They crowd where the likelihood or the prior may have a peak.
     """
-    low, high = _range(scene, motor)
+    low, high = scene.held_range(motor)
     profile = scene.profile(motor)
     runs = len(profile.best)
     width = np.sqrt(1.0 / np.maximum(profile.precision[..., 0], 1.0) + 1e-10)
@@ -85,13 +86,6 @@ def _angle_nodes(scene: Scene, motor: int, prior: OnsetPrior) -> FloatArray:
     return np.sort(np.clip(np.concatenate(nodes, axis=1), low, high), axis=1)
 
 
-def _range(scene: Scene, motor: int) -> tuple[float, float]:
-    """Return the range of angles at which a motor may be held [rad]."""
-    low, high = scene.model.twin.robot.motors[motor].movement_range
-    margin = 0.1 * (high - low)
-    return low - margin, high + margin
-
-
 def _log_prior(scene: Scene, motor: int, angle: FloatArray, prior: OnsetPrior) -> FloatArray:
     """Return log prior masses, (run, movement first affected, plateau | ramp, node).
 
@@ -101,7 +95,7 @@ def _log_prior(scene: Scene, motor: int, angle: FloatArray, prior: OnsetPrior) -
     evidence = scene.evidence
     origin, target = _ends(evidence, motor)
     scale = max(float(scene.model.scatter[motor]), 1e-4)
-    low, high = _range(scene, motor)
+    low, high = scene.held_range(motor)
     plateau = _student(angle[:, None] - origin[..., None], SETTLED_SCALE * scale, 4.0)
     if prior.known_s is not None:
         way = _position_at(scene, motor, prior.known_s)

@@ -13,7 +13,7 @@ from failuretwin.failure_behavior.fault_value import FaultGroup, PerMovement
 from failuretwin.failure_behavior.modes.base import MotorMotion, MotorOrders, Range
 from failuretwin.failure_behavior.modes.sized import SizedMode
 
-_CHANCE, _LOST = "chance", "lost"
+CHANCE, LOST = "chance", "lost"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,11 +98,11 @@ class LostCommands(SizedMode):
     def _draw_per_movement(
         self, movements: int, rng: np.random.Generator
     ) -> dict[str, PerMovement]:
-        return {_CHANCE: rng.random(movements)}
+        return {CHANCE: rng.random(movements)}
 
     def _lost(self, faults: FaultGroup, start: FloatArray) -> BoolArray:
         """Return which movements are lost, (run, movement)."""
-        return np.asarray(faults.per_movement[_CHANCE] < faults.effect(start))
+        return np.asarray(faults.per_movement[CHANCE] < faults.effect(start))
 
     def on_movements(self, faults: FaultGroup, orders: MotorOrders) -> MotorOrders:
         """Lose commands beside those that get lost anyway."""
@@ -110,4 +110,4 @@ class LostCommands(SizedMode):
 
     def as_struck(self, faults: FaultGroup, motion: MotorMotion) -> FaultGroup:
         """Return the faults with the movements that this fault has lost."""
-        return replace(faults, per_movement={_LOST: self._lost(faults, motion.start)})
+        return replace(faults, per_movement={LOST: self._lost(faults, motion.start)})

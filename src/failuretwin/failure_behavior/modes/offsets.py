@@ -15,7 +15,7 @@ from failuretwin.failure_behavior.modes.sized import SignedMode, SizedMode
 PUBLISHED_ERROR_RAD = (float(np.deg2rad(10 * 0.24)), float(np.deg2rad(50 * 0.24)))
 """Bounds of the paper's steady-state errors: 10 and 50 counts of 0.24 deg [rad]."""
 
-_OFFSET = "offset_rad"
+OFFSET = "offset_rad"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,20 +40,20 @@ class SteadyStateError(SizedMode):
         self, movements: int, rng: np.random.Generator
     ) -> dict[str, PerMovement]:
         sign = np.where(rng.random(movements) < 0.5, -1.0, 1.0)
-        return {_OFFSET: sign * rng.uniform(*self.magnitude, movements)}
+        return {OFFSET: sign * rng.uniform(*self.magnitude, movements)}
 
     def on_movements(self, faults: FaultGroup, orders: MotorOrders) -> MotorOrders:
         """Add its error to every target."""
-        offset = faults.per_movement[_OFFSET] * faults.severity(orders.start)
+        offset = faults.per_movement[OFFSET] * faults.severity(orders.start)
         return replace(orders, target=orders.target + offset)
 
     def as_struck(self, faults: FaultGroup, motion: MotorMotion) -> FaultGroup:
         """Return the faults with the errors as severe as they were, and their rms."""
         severity = faults.severity(motion.start)
-        offset = faults.per_movement[_OFFSET] * severity
+        offset = faults.per_movement[OFFSET] * severity
         hit = np.maximum(np.count_nonzero(severity, axis=1), 1)
         rms = np.sqrt(np.sum(offset**2, axis=1) / hit)
-        return replace(faults, magnitude=rms, per_movement={_OFFSET: offset})
+        return replace(faults, magnitude=rms, per_movement={OFFSET: offset})
 
 
 @dataclass(frozen=True, kw_only=True)

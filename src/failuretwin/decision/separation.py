@@ -1,0 +1,195 @@
+"""By how many nats what is true beats every other hypothesis, if nothing is left to chance.
+
+The truth of each run is made again without scatter, losses and glitches, seen where the run was
+seen, and laid beside the best member of every hypothesis, in units of the declared scatter.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from failuretwin.connection.healthy import HealthyModel
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
+from failuretwin.core.movements import Movements, find_movements
+from failuretwin.core.runs import check_motors, check_runs
+from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.data_knowledge.moving_evidence import moving_evidence
+from failuretwin.data_knowledge.noise_free import noise_free_path
+from failuretwin.data_knowledge.settled_evidence import settled_evidence
+from failuretwin.decision.best_fit import best_fit, first_spoilt
+from failuretwin.decision.noise_free_scene import NoiseFreeScene
+from failuretwin.decision.priors import Priors
+from failuretwin.decision.weighing import TIMED, check_weighable
+from failuretwin.digital_model.imperfections import Imperfections, default_imperfections
+from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.failure_behavior.fault_value import FaultValue
+from failuretwin.failure_behavior.injection import Injection
+from failuretwin.failure_behavior.modes.registry import MODES
+from failuretwin.failure_behavior.replay import replayed
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+CHUNK_RUNS = 64
+"""Runs at a time: keeps the work on nodes in about 100 MB."""
+
+
+@dataclass(frozen=True)
+class Separation:
+    """How far the truth of some runs is ahead of each hypothesis.
+
+    Attributes:
+        hypotheses: The hypotheses.
+        truth: What is true of each run, among them or not.
+        nats: By how much the truth is expected to beat each, (run, hypothesis) [nats]; 0 for
+            itself.
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    truth: tuple[Hypothesis, ...]
+    nats: FloatArray
+
+    @property
+    def nearest(self) -> FloatArray:
+        """By how much the truth beats the nearest other hypothesis, (run,) [nats]."""
+        own = np.array([[h == truth for h in self.hypotheses] for truth in self.truth])
+        return np.asarray(np.where(own, np.inf, self.nats).min(axis=1))
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Lays noise-free runs beside every hypothesis.
+
+    Attributes:
+        model: The healthy robot and its scatter.
+        hypotheses: What may be the case: healthy or single faults.
+        priors: Ranges of sizes that are considered.
+    """
+
+    model: HealthyModel
+    hypotheses: tuple[Hypothesis, ...]
+    priors: Priors
+
+    def __post_init__(self) -> None:
+        for hypothesis in self.hypotheses:
+            if not hypothesis.known or len(hypothesis.faults) > 1:
+                raise InputError(
+                    f"'{hypothesis}' cannot be laid beside others. Expected healthy or one fault."
+                )
+            check_weighable(hypothesis)
+
+    def fits(
+        self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]], onset: FloatArray
+    ) -> FloatArray:
+        """Return how well the best member of each hypothesis fits, (run, hypothesis) [nats].
+
+        Args:
+            runs: Runs as commanded, with readings where the tool is seen.
+            faults: The true faults of each run.
+            onset: When faults begin in each run, (run,) [s]; NaN: before it.
+        """
+        parts = [
+            self._fits(
+                runs.isel(run=slice(at, at + CHUNK_RUNS)),
+                faults[at : at + CHUNK_RUNS],
+                onset[at : at + CHUNK_RUNS],
+            )
+            for at in range(0, len(faults), CHUNK_RUNS)
+        ]
+        return np.concatenate(parts)
+
+    def _fits(
+        self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]], onset: FloatArray
+    ) -> FloatArray:
+        silent = self.silent(runs, faults)
+        settled = settled_evidence(silent)
+        moving = moving_evidence(silent, settled) if self._needs_way else None
+        scene = NoiseFreeScene(settled, self.model, moving)
+        first = first_spoilt(settled.movements, onset)
+        return np.stack([best_fit(scene, h, self.priors, first) for h in self.hypotheses], axis=1)
+
+    def silent(self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]]) -> xr.Dataset:
+        """Return the runs as they would be seen if nothing were left to chance."""
+        twin, time = self.model.twin, as_floats(runs["time"].values)
+        path = noise_free_path(
+            twin,
+            self.model.imperfections,
+            commanded(runs),
+            time,
+            Injection(faults, twin.robot.motor_names, MODES),
+        )
+        seen = np.isfinite(as_floats(runs["measured"].values))
+        return runs.assign(measured=(("run", "time", "axis"), np.where(seen, path, np.nan)))
+
+    @property
+    def _needs_way(self) -> bool:
+        """Whether the way counts: only of faults that show there, if the timing is known."""
+        modes = {fault.mode for h in self.hypotheses for fault in h.faults}
+        return not modes.isdisjoint(TIMED) and self.model.knows_timing
+
+
+def commanded(runs: xr.Dataset) -> Movements:
+    """Return the movements of a run set: as it tells them, else as `command` shows them."""
+    names = ("target", "ramp_duration", "movement_start")
+    command = as_floats(runs["command"].values)
+    if all(name in runs for name in names):
+        return Movements(command[:, 0], *(as_floats(runs[name].values) for name in names))
+    return find_movements(command, as_floats(runs["time"].values))
+
+
+def separation(
+    twin: DigitalTwin,
+    runs: xr.Dataset,
+    imperfections: Imperfections | None = None,
+    hypotheses: Sequence[Hypothesis] | None = None,
+    priors: Priors | None = None,
+) -> Separation:
+    """Return by how much the truth of simulated runs is expected to beat each hypothesis.
+
+    Args:
+        twin: Digital twin of the robot.
+        runs: A run set with its truth (`fault`, `fault_detail`, `onset`), of the modes as they
+            come.
+        imperfections: The declared scatter and chance of the robot that the runs are of; without
+            lost commands, scatter alone counts. None: as its profile says.
+        hypotheses: What the truth is laid beside: healthy and single faults; None: the paper's.
+        priors: Ranges of sizes that are considered; None: the default.
+
+    Raises:
+        InputError: If the truth is not told, or a run has several faults at once.
+    """
+    check_runs(runs, "the run set")
+    check_motors(runs, twin.robot.name, twin.robot.motor_names)
+    truth, faults = truth_and_faults(runs)
+    asked = tuple(hypotheses or paper_hypotheses(twin.robot.motor_names))
+    model = HealthyModel(twin, imperfections or default_imperfections(twin.robot))
+    everything = tuple(dict.fromkeys((*asked, *truth)))
+    judge = Judge(model, everything, priors or Priors())
+    fit = judge.fits(runs, faults, as_floats(runs["onset"].values))
+    own = fit[np.arange(len(truth)), [everything.index(h) for h in truth]]
+    return Separation(asked, truth, own[:, None] - fit[:, : len(asked)])
+
+
+def truth_and_faults(
+    runs: xr.Dataset,
+) -> tuple[tuple[Hypothesis, ...], list[list[FaultValue]]]:
+    """Return what is true of each run, and its faults as they strike it.
+
+    Raises:
+        InputError: If the run set does not tell.
+    """
+    for name in ("fault", "fault_detail", "onset"):
+        if name not in runs:
+            raise InputError(
+                f"the run set does not tell its truth: no variable `{name}`. Expected simulated "
+                "runs, such as `failuretwin simulate` writes."
+            )
+    truth = tuple(Hypothesis.parse(str(name)) for name in runs["fault"].values)
+    details = [json.loads(str(text)) for text in runs["fault_detail"].values]
+    return truth, [[replayed(fault) for fault in detail["faults"]] for detail in details]

@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+from itertools import combinations, product
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from failuretwin.connection.healthy import OUTLIER_RATE, RARE, HealthyModel
+from failuretwin.core.movements import Movements
+from failuretwin.digital_model.imperfections import Imperfections, LostCommand, Timing
+
+MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
+SETS = [s for size in (1, 2, 3) for s in combinations(MOTORS, size)]
+PERIOD_S, LATE_PERIOD_S = 2.0, 3.0
+
+
+def movements(late):
+    """Return one run whose movement m starts late if `late[m]`; targets are unlike each other."""
+    rng = np.random.default_rng(0)
+    count = len(late)
+    gaps = np.where(late, LATE_PERIOD_S, PERIOD_S)[:-1]
+    return Movements(
+        initial=rng.uniform(-1, 1, (1, 4)),
+        target=rng.uniform(-1, 1, (1, count, 4)),
+        ramp_duration=np.full((1, count, 4), 0.8),
+        start=np.concatenate([[0.0], np.cumsum(gaps)])[None],
+    )
+
+
+def model(twin, entries, late_rate):
+    losses = tuple(LostCommand(*entry) for entry in entries)
+    timing = Timing(late_rate=late_rate)
+    return HealthyModel(twin, Imperfections("lossy", "test", timing=timing, lost_commands=losses))
+
+
+def by_base(masks, bases, weights):
+    """Return total weights by what the motors do, rounded so that they can be compared."""
+    total = {}
+    for mask, base, weight in zip(masks, bases, weights, strict=True):
+        key = (tuple(map(bool, mask)), tuple(np.round(base, 9)))
+        total[key] = total.get(key, 0.0) + weight
+    return total
+
+
+def enumerated(entries, late, late_rate, commanded, m):
+    """Return the weights of all that losses now and in the movement before can do."""
+    none = np.zeros(4, dtype=bool)
+    masks = [none, *(np.isin(MOTORS, motors) for motors, _, _ in entries)]
+
+    def rates(at):
+        chance = float(late[at]) if at + 1 < len(late) else late_rate
+        lost = [rate + chance * (when_late - rate) for _, rate, when_late in entries]
+        return [1.0 - sum(lost), *lost]
+
+    origin, target = commanded.origin()[0], commanded.target[0]
+    cases = []
+    for now, before in product(range(len(masks)), repeat=2):
+        if m == 0 and before > 0:
+            continue
+        chance = rates(m)[now] * (rates(m - 1)[before] if m > 0 else 1.0)
+        both = masks[now] & masks[before]
+        base = np.where(masks[now], np.where(both, origin[m - 1], origin[m]), target[m])
+        cases.append((masks[now], base, chance * (1.0 - OUTLIER_RATE)))
+    return by_base(*zip(*cases, strict=True))
+
+
+entries = st.lists(st.sampled_from(SETS), min_size=1, max_size=4, unique=True).flatmap(
+    lambda sets: st.tuples(
+        *(st.tuples(st.just(s), st.floats(0.05, 0.2), st.floats(0.05, 0.2)) for s in sets)
+    )
+)
+
+
+@given(
+    entries=entries,
+    late=st.lists(st.booleans(), min_size=1, max_size=4),
+    late_rate=st.floats(0.0, 1.0),
+)
+def test_alternatives_are_all_that_two_losses_in_a_row_can_do(twin, entries, late, late_rate):
+    """Every loss now times every loss before, motor by motor: any sets may follow on any others."""
+    commanded = movements(late)
+    found = model(twin, entries, late_rate).alternatives(commanded)
+    for m in range(len(late)):
+        got = by_base(found.lost, found.base[0, m], np.exp(found.log_weight[0, m]))
+        expected = enumerated(entries, late, late_rate, commanded, m)
+        got = {key: weight for key, weight in got.items() if weight > 0.0}
+        expected = {key: weight for key, weight in expected.items() if weight > 0.0}
+        # What is rare counts as a single loss.
+        for key in expected.keys() | got.keys():
+            assert got.get(key, 0.0) == pytest.approx(expected.get(key, 0.0), abs=RARE)
+        assert sum(got.values()) == pytest.approx(1.0 - OUTLIER_RATE, rel=1e-12)
+
+
+def test_a_motor_that_missed_two_travelled_last_in_the_movement_before_both(twin):
+    commanded = movements([False, False, False])
+    found = model(twin, [(("motor_2",), 0.3, 0.3)], 0.0).alternatives(commanded)
+    travel = np.sign(commanded.target - commanded.origin())[0, :, 1]
+    assert len(found.lost) == 3
+    np.testing.assert_array_equal(found.direction[0, 2, :, 1], travel[[2, 1, 0]])
+
+
+@pytest.mark.parametrize(("share", "count"), [(0.1, 10), (0.3333333335, 3), (1.0, 1)])
+def test_motors_may_lose_every_command(twin, share, count):
+    """Rates that add up to one, give or take rounding, leave no chance that all arrives."""
+    entries = [(motors, share, share) for motors in SETS[:count]]
+    found = model(twin, entries, 0.5).alternatives(movements([False, True, False]))
+    assert np.exp(found.log_weight[..., 0]).max() < 1e-9
+    total = np.exp(found.log_weight).sum(axis=-1)
+    np.testing.assert_allclose(total, 1.0 - OUTLIER_RATE, rtol=1e-9)
+
+
+def test_rare_losses_in_a_row_are_left_out(twin):
+    rate = 0.9 * np.sqrt(RARE)
+    found = model(twin, [(("motor_1",), rate, rate)], 0.0).alternatives(movements([False] * 3))
+    assert found.lost.tolist() == [[False] * 4, [True, False, False, False]]
+
+
+def test_a_run_has_the_alternatives_that_it_has_among_others(twin):
+    healthy = model(twin, [(("motor_1", "motor_2"), 0.1, 0.2), (("motor_1",), 0.1, 0.1)], 0.3)
+    short, long = movements([False, True]), movements([True, False, False, True])
+    padded = Movements(
+        np.concatenate([short.initial, long.initial]),
+        *(
+            np.concatenate(
+                [
+                    np.pad(
+                        getattr(short, name),
+                        [(0, 0), (0, 2), *[(0, 0)] * (getattr(short, name).ndim - 2)],
+                        constant_values=np.nan,
+                    ),
+                    getattr(long, name),
+                ]
+            )
+            for name in ("target", "ramp_duration", "start")
+        ),
+    )
+    alone, both = healthy.alternatives(short), healthy.alternatives(padded)
+    for name in ("base", "direction", "log_weight"):
+        np.testing.assert_array_equal(getattr(both, name)[:1, :2], getattr(alone, name))

@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from failuretwin.core.ellipsoid import Ellipsoid, log_fall, log_norm
+
+DOFS = [1.0, 2.5, 4.0, 30.0, np.inf]
+
+
+def student(shape, dof):
+    """Return scipy's distribution with this scale matrix."""
+    if np.isinf(dof):
+        return stats.multivariate_normal(cov=shape)
+    return stats.multivariate_t(shape=shape, df=dof)
+
+
+def drawn(seed, columns, size, noise):
+    """Return roots (2, 5, 3, column), their covariances, and two sets of vectors (2, 5, 3)."""
+    rng = np.random.default_rng(seed)
+    root = size * rng.normal(size=(2, 5, 3, columns))
+    shape = root @ np.swapaxes(root, -1, -2) + noise * np.eye(3)
+    return root, shape, rng.normal(size=(2, 5, 3)), rng.normal(size=(2, 5, 3))
+
+
+@given(
+    seed=st.integers(0, 1000),
+    columns=st.integers(1, 7),
+    size=st.sampled_from([0.0, 1e-3, 0.05]),
+    noise=st.sampled_from([1e-6, 1.0]),
+)
+def test_solutions_are_those_of_linear_algebra(seed, columns, size, noise):
+    """Scales of a robot and worse: one direction may be a hundred times wider than another."""
+    root, shape, a, b = drawn(seed, columns, size, noise)
+    spread = Ellipsoid.of(root, noise)
+    solved = np.linalg.solve(shape, b[..., None])[..., 0]
+    np.testing.assert_allclose(spread.determinant, np.linalg.det(shape), rtol=1e-6)
+    top = np.abs(solved).max()
+    np.testing.assert_allclose(spread.solve(b), solved, rtol=1e-6, atol=1e-6 * top)
+    np.testing.assert_allclose(spread.product(a, b), np.sum(a * solved, -1), atol=1e-5 * top)
+
+
+@pytest.mark.parametrize("dof", DOFS)
+def test_norm_is_the_density_at_the_centre(dof):
+    root, shape, *_ = drawn(3, 4, 0.01, 1e-6)
+    found = Ellipsoid.of(root, 1e-6).log_norm(dof)
+    for at in np.ndindex(2, 5):
+        assert found[at] == pytest.approx(student(shape[at], dof).logpdf(np.zeros(3)), abs=1e-9)
+
+
+@pytest.mark.parametrize("dof", DOFS)
+def test_fall_is_that_of_the_standard_density(dof):
+    standard = student(np.eye(3), dof)
+    along = np.array([0.0, 0.3, 1.0, 4.0, 50.0])
+    points = np.outer(along, [0.6, -0.8, 0.0])
+    np.testing.assert_allclose(
+        log_norm(dof) + log_fall(along**2, dof), standard.logpdf(points), rtol=1e-12
+    )
+
+
+def test_many_degrees_of_freedom_are_normal():
+    square = np.linspace(0.0, 30.0, 7)
+    np.testing.assert_allclose(log_fall(square, 1e9), log_fall(square, np.inf), rtol=1e-6)
+    assert log_norm(1e9) == pytest.approx(log_norm(np.inf), abs=1e-6)

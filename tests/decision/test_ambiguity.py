@@ -1,0 +1,257 @@
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from coaxial_arm import ARM_M, coaxial_twin
+
+from failuretwin import BayesDiagnoser, ambiguity
+from failuretwin.connection.healthy import HealthyModel
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses, single_faults
+from failuretwin.core.movements import Movements
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.plan import Plan
+from failuretwin.decision.ambiguity import _groups, _motions
+from failuretwin.decision.noise_free_scene import shrink
+from failuretwin.decision.priors import Priors
+from failuretwin.decision.separation import Judge
+from failuretwin.decision.trials import Trials
+from failuretwin.digital_model.imperfections import Imperfections, Readings
+from failuretwin.digital_model.settling import Settling
+from failuretwin.failure_behavior.modes import MODES, SteadyStateError
+
+TIME = 0.01 * np.arange(1000)
+TARGETS = np.array(
+    [
+        [0.9, 0.5, -0.4, 0.6],
+        [-0.7, -0.3, 0.7, -0.5],
+        [0.4, 0.8, 0.3, 0.8],
+        [-1.1, -0.6, -0.8, -0.7],
+        [0.2, 0.3, 0.5, 0.4],
+    ]
+)
+NOISE_M = np.hypot(0.0, 0.0003)
+"""Noise of a settled position where readings have none: what bending links leave unsaid."""
+
+
+def motion(targets, initial=None):
+    """Return commands of a movement every 2 s, (time, motor)."""
+    targets = np.asarray(targets, dtype=float)
+    initial = np.zeros(targets.shape[1]) if initial is None else np.asarray(initial, dtype=float)
+    return Movements(
+        initial=initial[None],
+        target=targets[None],
+        ramp_duration=np.full((1, *targets.shape), 0.8),
+        start=2.0 * np.arange(len(targets), dtype=float)[None] + 0.05,
+    ).reference(TIME)[0]
+
+
+def scattered(scatter, dof=np.inf):
+    """Return imperfections of nothing but scatter [rad]."""
+    zero = (0.0,) * len(scatter)
+    settling = Settling(zero, zero, zero, tuple(scatter), dof, "test")
+    return Imperfections("scattered", "test", settling=settling, readings=Readings(rate_hz=10.0))
+
+
+def faults(*names):
+    return [HEALTHY, *(Hypothesis.parse(name) for name in names)]
+
+
+def told(found, true, other):
+    """Return by how much `true` beats `other` [nats]."""
+    return found.nats[found.hypotheses.index(true), found.hypotheses.index(other)]
+
+
+@pytest.fixture(scope="module")
+def coaxial(tmp_path_factory):
+    return coaxial_twin(tmp_path_factory.mktemp("coaxial"))
+
+
+def test_a_motor_that_is_never_told_to_move_may_be_stuck(twin):
+    idle = TARGETS.copy()
+    idle[:, 0] = 0.0
+    found = ambiguity(twin, motion(idle), TIME, scattered([0.005] * 4))
+    assert told(found, "motor_1:stuck", "healthy") == pytest.approx(0.0, abs=0.05)
+    assert found.groups == (("healthy", "motor_1:stuck"),)
+    assert min(told(found, f"motor_{k}:stuck", "healthy") for k in (2, 3, 4)) > 40.0
+
+
+def test_a_motor_that_moves_is_not_taken_for_stuck(twin):
+    found = ambiguity(twin, motion(TARGETS), TIME, scattered([0.005] * 4))
+    assert found.groups == ()
+
+
+def test_play_of_motors_about_one_axis_shows_whose_it_is_only_if_they_turn_apart(coaxial):
+    names = ("motor_1:backlash", "motor_2:backlash")
+    there = np.array([0.5, -0.3, 0.4, -0.6, 0.1])
+    crossing = np.array([0.5, 0.8, -0.4, 0.3, 0.6])
+    scatter = scattered([0.003, 0.003])
+    together = ambiguity(
+        coaxial, motion(np.stack([there, there], 1)), TIME, scatter, faults(*names)
+    )
+    apart = ambiguity(
+        coaxial, motion(np.stack([there, crossing], 1)), TIME, scatter, faults(*names)
+    )
+
+    assert together.groups == (names,)
+    assert told(together, *names) == pytest.approx(0.0, abs=0.05)
+    assert None not in together.detected.values()
+    assert set(together.isolated.values()) == {None}
+    assert apart.groups == ()
+    assert None not in apart.isolated.values()
+
+
+def test_a_shifted_zero_about_one_axis_never_shows_whose_it_is(coaxial):
+    names = ("motor_1:encoder_bias", "motor_2:encoder_bias")
+    targets = np.random.default_rng(0).uniform(-1, 1, (5, 2))
+    found = ambiguity(coaxial, motion(targets), TIME, scattered([0.003, 0.003]), faults(*names))
+    assert found.groups == (names,)
+
+
+def expected_smallest(scatter, movements):
+    """Return the shifted zero that is 5 nats ahead: half of its squared distance, summed."""
+    spread = 2.0 * (ARM_M * scatter) ** 2 + NOISE_M**2
+    return np.sqrt(2.0 * 5.0 / movements * spread) / ARM_M
+
+
+@pytest.mark.parametrize(
+    ("scatter", "onset", "spoilt"), [(0.02, 0.0, 5), (0.04, 0.0, 5), (0.02, 5.0, 3)]
+)
+def test_the_smallest_size_is_where_half_the_squared_distance_says(coaxial, scatter, onset, spoilt):
+    targets = np.random.default_rng(0).uniform(-1, 1, (5, 2))
+    found = ambiguity(
+        coaxial,
+        motion(targets),
+        TIME,
+        scattered([scatter, scatter]),
+        faults("motor_1:encoder_bias"),
+        onset_s=onset,
+    )
+    expected = expected_smallest(scatter, spoilt)
+    assert found.detected["motor_1:encoder_bias"] == pytest.approx(expected, rel=0.01)
+
+
+def test_separation_grows_with_the_square_of_the_size(twin):
+    """Compare with half of the squared distance, linearised at the healthy poses."""
+    bias, scatter = Hypothesis.parse("motor_3:encoder_bias"), 0.03
+    judge = Judge(HealthyModel(twin, scattered([scatter] * 4)), (HEALTHY, bias), Priors())
+    trials = Trials(judge, _motions(twin, motion(TARGETS), TIME), 0.0)
+    sizes = np.array([0.02, 0.03, 0.04])
+    _, jacobian = twin.path_and_jacobian(TARGETS)
+    lever = jacobian[..., 2]
+    spread = scatter**2 * jacobian @ jacobian.swapaxes(-1, -2) + NOISE_M**2 * np.eye(3)
+    square = np.einsum("ma,ma->", lever, np.linalg.solve(spread, lever[..., None])[..., 0])
+    ahead = trials.ahead([(bias, float(size)) for size in sizes])[:, 0]
+    np.testing.assert_allclose(ahead, 0.5 * square * sizes**2, rtol=0.08)
+    assert ahead[2] / ahead[0] == pytest.approx(4.0, rel=0.05)
+
+
+@pytest.mark.parametrize("square", [0.01, 1.0, 9.0, 100.0])
+def test_expected_falls_are_those_of_simulated_scatter(square):
+    rng, dof = np.random.default_rng(0), 4.0
+    chi = rng.chisquare(dof, 400_000) / dof
+    noise = rng.standard_normal((400_000, 3)) / np.sqrt(chi)[:, None]
+
+    def cost(points):
+        return 0.5 * (dof + 3.0) * np.log1p(np.sum(points**2, axis=1) / dof)
+
+    shift = np.array([np.sqrt(square), 0.0, 0.0])
+    # Both signs: what is odd in the shift cancels.
+    drawn = 0.5 * np.mean(cost(noise + shift) + cost(noise - shift)) - np.mean(cost(noise))
+    formula = 0.5 * (dof + 3.0) * np.log1p(square * shrink(dof) / dof)
+    assert formula == pytest.approx(drawn, rel=0.04, abs=min(0.5, 0.05 * square))
+    assert shrink(np.inf) == 1.0
+
+
+@pytest.fixture(scope="module")
+def real_motions(armpi, measured_armpi):
+    """Random motions of the imperfect arm, and what they can tell of steady-state errors."""
+    plan = Plan(armpi, [HEALTHY], 12, 3, measured_armpi)
+    runs = simulate(plan)
+    return runs["command"].values, runs["time"].values
+
+
+def test_faults_above_the_smallest_size_are_found_and_those_well_below_are_not(
+    twin, armpi, measured_armpi, real_motions
+):
+    smallest = ambiguity(twin, *real_motions, measured_armpi).isolated
+    diagnoser = BayesDiagnoser(twin, measured_armpi)
+    right = {}
+    for factor in (0.4, 2.0):
+        for name, size in smallest.items():
+            low = 0.9 * factor * size
+            modes = {**MODES, "steady_state_error": SteadyStateError(magnitude=(low, low / 0.81))}
+            plan = Plan(armpi, faults(name)[1:], 12, 4, measured_armpi, modes=modes)
+            found = diagnoser.diagnose(simulate(plan))
+            right[factor, name] = sum(d.diagnosis == d.truth for d in found)
+    above = [count for (factor, _), count in right.items() if factor > 1]
+    below = [count for (factor, _), count in right.items() if factor < 1]
+    assert sum(above) >= 0.9 * 48
+    assert sum(below) <= 0.2 * 48
+
+
+def test_stuck_motors_of_real_motions_are_told_apart(twin, armpi, measured_armpi, real_motions):
+    found = ambiguity(twin, *real_motions, measured_armpi)
+    assert found.hypotheses == tuple(map(str, paper_hypotheses(armpi.motor_names)))
+    assert found.groups == ()
+    assert list(found.detected) == list(found.isolated) == list(found.hypotheses[5:])
+    assert all(
+        found.detected[name] <= found.isolated[name] < np.deg2rad(5.0) for name in found.isolated
+    )
+
+
+def test_a_late_motor_is_told_by_its_way_where_the_timing_is_known(twin, measured_armpi):
+    hypotheses = single_faults(["motor_2"], ["lag", "slow"])
+    known = ambiguity(twin, motion(TARGETS), TIME, measured_armpi, hypotheses)
+    unknown = ambiguity(twin, motion(TARGETS), TIME, scattered([0.006] * 4), hypotheses)
+    assert known.groups == ()
+    assert ("healthy", "motor_2:lag") in [group[:2] for group in unknown.groups]
+
+
+def test_losses_that_chance_may_bring_hide_a_fault_of_one_movement(twin, measured_armpi):
+    names = ("motor_1:stuck", "motor_2:stuck")
+    late = {"hypotheses": faults(*names), "onset_s": 7.9}
+    sound = dataclasses.replace(measured_armpi, lost_commands=())
+    assert (
+        told(ambiguity(twin, motion(TARGETS), TIME, measured_armpi, **late), names[0], "healthy")
+        < 4.0
+    )
+    assert told(ambiguity(twin, motion(TARGETS), TIME, sound, **late), names[0], "healthy") > 10.0
+
+
+def test_groups_hold_all_that_are_alike_and_none_that_are_not():
+    """Of a chain healthy - a - b, c apart, the ends are no group."""
+    alike = np.zeros((3, 4), dtype=bool)
+    alike[0, [0, 2]] = True
+    names = ("healthy", "a", "b", "c")
+    assert _groups(names, alike) == (("healthy", "a"), ("a", "b"))
+    alike[1, 0] = True
+    assert _groups(names, alike) == (("healthy", "a", "b"),)
+    assert _groups(names, np.eye(3, 4, 1, dtype=bool)) == ()
+
+
+def test_wrong_requests_are_refused(twin):
+    with pytest.raises(InputError, match=r"shape \(1000, 3\), expected \(..., 1000 times, 4 motor"):
+        ambiguity(twin, motion(TARGETS)[:, :3], TIME)
+    with pytest.raises(InputError, match="never leaves its first value"):
+        ambiguity(twin, np.zeros((1000, 4)), TIME)
+    two = [Hypothesis.parse("motor_1:stuck+motor_2:stuck")]
+    with pytest.raises(InputError, match="Expected healthy or one fault"):
+        ambiguity(twin, motion(TARGETS), TIME, hypotheses=two)
+
+
+def test_the_page_prints_what_it_says(capsys):
+    page = (Path(__file__).parents[2] / "docs" / "ambiguity.md").read_text()
+    code, said = re.findall(r"```(?:python)?\n(.*?)```", page, re.DOTALL)
+    exec(code, {})
+    printed, expected = capsys.readouterr().out.split(), said.split()
+    assert len(printed) == len(expected)
+    for word, other in zip(printed, expected, strict=True):
+        if re.fullmatch(r"[\d.]+", other):
+            assert float(word) == pytest.approx(float(other), rel=0.02)
+        else:
+            assert word == other

@@ -1,0 +1,170 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from failuretwin import BayesDiagnoser
+from failuretwin.core.hypothesis import UNKNOWN, Hypothesis, single_faults
+from failuretwin.data_knowledge.knowledge import magnitude_range
+from failuretwin.data_knowledge.settled_evidence import settled_evidence
+from failuretwin.decision import pairs
+from failuretwin.decision.law import Scene
+from failuretwin.decision.laws.lasting import AMOUNTS, drift_law, lasting_law
+from failuretwin.decision.laws.nodes import size_nodes
+from failuretwin.decision.laws.steady_state_error import error_law, offset_nodes
+from failuretwin.decision.laws.stuck import stuck_law
+from failuretwin.decision.laws.timed import lag_law, slow_law
+from failuretwin.decision.onsets import OnsetPrior
+from failuretwin.decision.priors import Priors
+from failuretwin.decision.weighing import WEIGHABLE, weigh_hypothesis
+
+MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
+RANGES = ((0.02, 0.08), (0.04, 0.2))
+
+LAWS = {
+    "stuck": lambda scene, early: stuck_law(scene, 1, OnsetPrior(early)),
+    "stuck at a known time": lambda scene, early: stuck_law(scene, 1, OnsetPrior(known_s=2.3)),
+    "steady_state_error": lambda scene, early: error_law(scene, 1, RANGES, early),
+    "drift": lambda scene, early: drift_law(scene, 1, early),
+    "lag": lambda scene, early: lag_law(scene, 1, early),
+    "slow": lambda scene, early: slow_law(scene, 1, early),
+    **{
+        mode: lambda scene, early, mode=mode: lasting_law(scene, 1, mode, early) for mode in AMOUNTS
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def runs(imperfect):
+    """A run of each class, of 3 to 5 movements: some end early."""
+    some = imperfect.isel(run=slice(0, 180, 20)).copy(deep=True)
+    for run, last in enumerate([800, 450] * 4):
+        some["command"][run, last:] = some["command"].values[run, last]
+        some["measured"][run, last:] = np.nan
+    return some
+
+
+@pytest.fixture(scope="module")
+def scene(twin, runs):
+    return Scene(settled_evidence(runs), BayesDiagnoser(twin).healthy_model)
+
+
+@pytest.fixture(scope="module")
+def blind(twin, runs):
+    return Scene(settled_evidence(runs.assign(measured=np.nan * runs["measured"])),
+                 BayesDiagnoser(twin).healthy_model)  # fmt: skip
+
+
+@pytest.mark.parametrize("early", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("law", LAWS)
+def test_prior_mass_of_a_law_is_one(scene, law, early):
+    """Over all onsets and nodes, or groups of nodes, and within each group."""
+    found = LAWS[law](scene, early)
+    mass = np.exp(found.log_prior).sum(axis=(1, 2))
+    np.testing.assert_allclose(mass, 1.0, atol=1e-9)
+    if found.redrawn is not None:
+        np.testing.assert_allclose(np.exp(found.redrawn).sum(axis=1), 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_no_fault_begins_with_a_movement_that_is_not_there(scene, law):
+    found = LAWS[law](scene, 0.3)
+    mass = np.exp(found.log_prior).sum(axis=2)
+    assert (scene.evidence.movements.exists.sum(axis=1) < 5).any()
+    np.testing.assert_array_equal(mass[~scene.evidence.movements.exists], 0.0)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_onsets_lie_in_the_run(scene, law):
+    """No later than the end of the last movement; of a stuck motor, of its ramp if that is late."""
+    found, evidence = LAWS[law](scene, 0.3), scene.evidence
+    for run in range(9):
+        onset, share = np.broadcast_arrays(*found.onsets(run))
+        assert (share >= 0.0).all()
+        assert np.isfinite(onset).all()
+        late = 3.0 if "stuck" in law else 0.0
+        last = max(np.nanmax(evidence.end[run]), np.nanmax(evidence.movements.start[run]) + late)
+        prior = np.exp(found.log_prior[run]).sum(axis=1) > 0.0
+        possible = np.broadcast_to(prior[:, None, None] if len(onset) > 1 else True, onset.shape)
+        assert onset.min() >= 0.0
+        assert onset[possible & (share > 0.0)].max() <= last
+
+
+@pytest.mark.parametrize(
+    "hypothesis",
+    [*single_faults(MOTORS[1:2], WEIGHABLE), UNKNOWN,
+     Hypothesis.parse("motor_2:encoder_bias+motor_3:stuck"),
+     Hypothesis.parse("motor_1:drift+motor_4:steady_state_error")],
+    ids=str,
+)  # fmt: skip
+def test_without_evidence_every_hypothesis_is_as_good(twin, blind, hypothesis):
+    """The density of no reading at all is one, whatever may be wrong."""
+    if hypothesis == UNKNOWN:
+        known = Hypothesis.parse("motor_2:stuck")
+        both = BayesDiagnoser(twin, hypotheses=(known, UNKNOWN))
+        weighed = both._weigh(blind.evidence, None)
+        evidence = weighed.weights[1].log_evidence
+    else:
+        evidence = weigh_hypothesis(blind, hypothesis, Priors()).log_evidence
+    np.testing.assert_allclose(evidence, 0.0, atol=1e-6)
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    sizes=st.sampled_from([(0.02, 0.85), (0.25, 0.8), (0.005, 0.06)]),
+    signed=st.booleans(),
+)
+def test_sizes_are_as_likely_wherever_the_nodes_lie(seed, sizes, signed):
+    """The nodes crowd where movements point, the prior stays uniform: its distribution function
+    is a straight line on each side of zero."""
+    rng = np.random.default_rng(seed)
+    best, width = rng.normal(0.0, 0.6, (2, 5)), rng.uniform(1e-4, 0.2, (2, 5))
+    nodes, log_mass = size_nodes(best, width, rng.random((2, 5)) < 0.7, sizes, signed)
+    low, high = sizes
+    for node, mass in zip(nodes, np.exp(log_mass), strict=True):
+        assert mass.sum() == pytest.approx(1.0)
+        assert (np.diff(node) >= 0.0).all()
+        assert node[mass > 0.0].min() >= (-high if signed else low) - 1e-12
+        assert np.abs(node[mass > 0.0]).min() >= low - 1e-12
+        for at in rng.uniform(low, high, 5):
+            below = mass[(node >= low) & (node < at)].sum() / (0.5 if signed else 1.0)
+            step = (high - low) / 40.0
+            assert below == pytest.approx((at - low) / (high - low), abs=step / (high - low))
+        if signed:
+            assert mass[node > 0.0].sum() == pytest.approx(0.5, abs=1e-9)
+
+
+@pytest.mark.parametrize("ranges", [RANGES, ((0.1, 0.3),), ((0.01, 0.02), (0.3, 0.35))])
+def test_errors_are_as_likely_within_each_range(ranges):
+    size, log_weight = offset_nodes(ranges)
+    weights = np.exp(log_weight)
+    np.testing.assert_allclose(weights @ size, 0.0, atol=1e-12)
+    for (low, high), weight in zip(ranges, weights, strict=True):
+        step = np.ptp(np.abs(size)) / 35
+        mean = weight @ np.abs(size)
+        assert mean == pytest.approx(0.5 * (low + high), abs=step)
+        inside = (np.abs(size) > low - step) & (np.abs(size) < high + step)
+        assert weight[inside].sum() == pytest.approx(1.0)
+
+
+def test_drifts_of_all_rates_and_both_signs_are_as_likely(scene):
+    law = drift_law(scene, 0, 0.6)
+    mass = np.exp(law.log_prior[0]).sum(axis=0)
+    low, high = magnitude_range("drift")
+    size = law.size[0]
+    assert np.abs(size).min() == pytest.approx(low)
+    assert np.abs(size).max() == pytest.approx(high)
+    assert mass @ size == pytest.approx(0.0, abs=1e-12)
+    assert mass @ np.abs(size) == pytest.approx(0.5 * (low + high), rel=1e-6)
+
+
+@pytest.mark.parametrize("mode", ["stuck", "encoder_bias", "drift"])
+def test_thinning_a_law_for_pairs_loses_no_mass(scene, mode):
+    alone = scene[3]
+    law = LAWS[mode](alone, 0.3)
+    few = pairs._thinned(alone, law)
+    assert few.log_prior.shape[2] == pairs.MOST_NODES < law.log_prior.shape[2]
+    whole, kept = (np.exp(x.log_prior[0]).sum(axis=1) for x in (law, few))
+    np.testing.assert_allclose(kept, whole, atol=1e-12)

@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+from failuretwin.connection.healthy import OUTLIER_RATE, PATH_NOISE_M, HealthyModel
+from failuretwin.data_knowledge.settled_evidence import settled_evidence
+from failuretwin.decision.law import Scene
+from failuretwin.digital_model.imperfections import Imperfections, LostCommand
+from failuretwin.digital_model.settling import Settling
+
+MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
+SCATTER = np.array([0.005, 0.006, 0.005, 0.004])
+DOF = 5.0
+SETTLING = Settling(
+    bias=(0.002, 0.005, 0.0, 0.003),
+    compliance=(0.0, 0.14, 0.17, 0.19),
+    friction=(0.007, 0.005, 0.011, 0.011),
+    scatter=tuple(SCATTER),
+    tail_dof=DOF,
+    source="made up",
+)
+LOSSES = (LostCommand(("motor_1",), 0.1, 0.1), LostCommand(("motor_2", "motor_3"), 0.05, 0.05))
+IMPERFECT = Imperfections("made up", "test", settling=SETTLING, lost_commands=LOSSES)
+REACH_M = 0.028505 + 0.0361 + 0.10048 + 0.094714 + 0.05071
+ANYWHERE = OUTLIER_RATE / (4 / 3 * np.pi * REACH_M**3)
+
+
+@pytest.fixture(scope="module")
+def scene_of(twin, run_of):
+    """Make a scene of random movements at whose ends the arm is off by `off` [rad]."""
+
+    def make(seed, off):
+        rng = np.random.default_rng(seed)
+        targets = rng.uniform(-0.8, 0.8, (2, 4))
+        points = twin.path(targets + off + 0.003 * rng.normal(size=(2, 4)))
+        runs = run_of(targets, points, MOTORS)
+        return Scene(settled_evidence(runs), HealthyModel(twin, IMPERFECT))
+
+    return make
+
+
+class BruteForce:
+    """The density of a settled position over the angle of one motor, by scipy."""
+
+    def __init__(self, scene, movement, motor):
+        self.twin, self.model, self.motor = scene.model.twin, scene.model, motor
+        self.point = scene.evidence.point[0, movement]
+        alternatives = scene.alternatives
+        self.base = alternatives.base[0, movement]
+        self.direction = alternatives.direction[0, movement]
+        self.weight = np.exp(alternatives.log_weight[0, movement])
+
+    def pose(self, angle, alternative):
+        """Where the arm settles if the motor ends at `angle`: gravity and friction on the rest."""
+        base = self.base[alternative].copy()
+        base[self.motor] = angle
+        free = np.arange(4) != self.motor
+        near = base
+        for _ in range(5):
+            offset = SETTLING.offset(self.twin.robot, near, self.direction[alternative])
+            near = base + free * offset
+        return near
+
+    def shape(self, pose, held):
+        """Covariance scale of the position, derivatives by finite differences."""
+        step = 1e-6 * np.eye(4)
+        slopes = ((self.twin.path(pose + step) - self.twin.path(pose - step)) / 2e-6).T
+        scale = np.where((np.arange(4) == self.motor) & held, 0.0, SCATTER)
+        return (slopes * scale) @ (slopes * scale).T + PATH_NOISE_M**2 * np.eye(3)
+
+    def density(self, angle, held):
+        total = ANYWHERE
+        for alternative, weight in enumerate(self.weight):
+            pose = self.pose(angle, alternative)
+            shape = self.shape(pose, held)
+            kind = stats.multivariate_t(self.twin.path(pose), shape, DOF)
+            total += weight * kind.pdf(self.point)
+        return total
+
+    def square(self, angle, alternative=0):
+        """Squared distance in scales of the others' scatter."""
+        pose = self.pose(angle, alternative)
+        error = self.point - self.twin.path(pose)
+        return error @ np.linalg.solve(self.shape(pose, True), error)
+
+
+@pytest.mark.parametrize("off", [0.0, 0.05, 0.3])
+@pytest.mark.parametrize("motor", range(4))
+def test_best_angle_is_where_the_squared_distance_is_least(scene_of, motor, off):
+    """Found by bounded minimisation around it, within a fifth of its own deviation."""
+    scene = scene_of(motor, off * np.eye(4)[motor])
+    profile = scene.profile(motor)
+    for movement in range(2):
+        force = BruteForce(scene, movement, motor)
+        best, precision = (x[0, movement, 0] for x in (profile.best, profile.precision))
+        width = 1.0 / np.sqrt(precision)
+        found = optimize.minimize_scalar(
+            force.square,
+            bounds=(best - 5 * width, best + 5 * width),
+            method="bounded",
+            options={"xatol": 0.02 * width},
+        )
+        assert found.x == pytest.approx(best, abs=0.2 * width)
+        assert found.fun == pytest.approx(profile.square[0, movement, 0], abs=0.02, rel=0.02)
+
+
+@pytest.mark.parametrize("held", [True, False])
+@pytest.mark.parametrize("off", [0.0, 0.1])
+@pytest.mark.parametrize("motor", range(4))
+def test_densities_are_those_of_brute_force(scene_of, motor, off, held):
+    """Of all alternatives together, at angles around the best one.
+
+    A parabola stands for a circle: the further away, the larger the error [nats for each rad].
+    """
+    scene = scene_of(10 + motor, off * np.eye(4)[motor])
+    profile = scene.profile(motor)
+    for movement in range(2):
+        force = BruteForce(scene, movement, motor)
+        best, precision = (x[0, movement, 0] for x in (profile.best, profile.precision))
+        width = np.sqrt(1.0 / precision + (0.0 if held else SCATTER[motor] ** 2))
+        steps = width * np.array([-3.0, -1.0, 0.0, 0.5, 2.0])
+        angles = np.broadcast_to(best + steps[:, None], (1, 2, 5, 1))
+        got = profile.log_density(angles, held)[0, movement]
+        expected = np.log([force.density(angle, held) for angle in best + steps])
+        assert (np.abs(got - expected) < 0.02 + 5.0 * np.abs(steps)).all()
+
+
+@pytest.mark.parametrize("motor", range(4))
+def test_a_healthy_motor_is_the_healthy_robot(scene_of, motor):
+    """A motor that settles where healthy ones do, scatter and all, is no fault."""
+    scene = scene_of(5, np.zeros(4))
+    profile = scene.profile(motor)
+    found = profile.log_density(profile.expected[:, :, None], False)[..., 0]
+    np.testing.assert_allclose(found, scene.log_healthy, rtol=0, atol=0.05)
+
+
+def test_far_angles_are_left_to_the_outliers(scene_of):
+    scene = scene_of(1, np.zeros(4))
+    profile = scene.profile(0)
+    far = np.broadcast_to(profile.best[:, :, None] + 2.0, (1, 2, 1, profile.best.shape[-1]))
+    np.testing.assert_allclose(profile.log_density(far, True), np.log(ANYWHERE), atol=0.2)
+    assert np.exp(profile.outlier) == pytest.approx(ANYWHERE, rel=1e-6)

@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from failuretwin.connection.healthy import HealthyModel
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.noise_free import without_chance
+from failuretwin.data_knowledge.plan import Plan
+from failuretwin.decision.priors import Priors
+from failuretwin.decision.separation import Judge, separation, truth_and_faults
+from failuretwin.digital_model.imperfections import default_imperfections
+from failuretwin.failure_behavior.modes import MODES
+
+SETTLED = ("stuck", "encoder_bias", "encoder_scale", "backlash", "torque_loss", "drift")
+"""Modes whose members settle exactly somewhere, that is, with nothing drawn for each movement."""
+
+
+def quiet(imperfections):
+    """Return imperfections without chance, but with their declared scatter."""
+    return dataclasses.replace(without_chance(imperfections), settling=imperfections.settling)
+
+
+def test_the_truth_is_nearest_to_itself(twin, imperfect):
+    found = separation(twin, imperfect)
+    own = [found.hypotheses.index(truth) for truth in found.truth]
+    np.testing.assert_array_equal(found.nats[np.arange(180), own], 0.0)
+    others = found.nats.copy()
+    others[np.arange(180), own] = np.inf
+    np.testing.assert_array_equal(found.nearest, others.min(axis=1))
+
+
+def test_runs_that_are_far_ahead_are_diagnosed_right(twin, imperfect, diagnoses):
+    ahead = separation(twin, imperfect).nearest >= 5.0
+    right = np.array([d.truth == d.diagnosis for d in diagnoses])
+    assert ahead.sum() >= 130
+    assert right[ahead].mean() >= 0.97
+    assert right[~ahead].mean() <= right[ahead].mean() - 0.05
+
+
+def test_a_run_is_separated_alone(twin, imperfect):
+    some = imperfect.isel(run=[3, 50, 130])
+    whole = separation(twin, imperfect).nats[[3, 50, 130]]
+    np.testing.assert_allclose(separation(twin, some).nats, whole, rtol=1e-9, atol=1e-9)
+
+
+def test_readings_count_only_by_being_there(twin, imperfect):
+    some = imperfect.isel(run=[25, 105])
+    moved = some.assign(measured=some["measured"] + 0.1)
+    blind = some.assign(measured=some["measured"] * np.nan)
+    np.testing.assert_array_equal(separation(twin, moved).nats, separation(twin, some).nats)
+    np.testing.assert_array_equal(separation(twin, blind).nats, 0.0)
+
+
+@pytest.fixture(scope="module")
+def of_all_modes(armpi, measured_armpi):
+    """Runs of every mode at motor 2, with all of their profiles, on an arm that never errs."""
+    sure = without_chance(measured_armpi)
+    return simulate(Plan(armpi, single_faults(["motor_2"], MODES), 4, 2, sure))
+
+
+def test_runs_are_made_again_as_they_were(twin, armpi, measured_armpi, of_all_modes):
+    judge = Judge(HealthyModel(twin, without_chance(measured_armpi)), (HEALTHY,), Priors())
+    faults = truth_and_faults(of_all_modes)[1]
+    again = judge.silent(of_all_modes, faults)
+    np.testing.assert_allclose(again["measured"], of_all_modes["measured"], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("motor", "mode"),
+    [
+        (f"motor_{k}", mode)
+        for k in (1, 2, 3, 4)
+        for mode in SETTLED
+        if (k, mode) != (1, "torque_loss")  # motor 1 carries no load
+    ],
+)
+def test_a_law_puts_the_tool_where_the_simulator_does(twin, armpi, measured_armpi, mode, motor):
+    hypothesis = Hypothesis.parse(f"{motor}:{mode}")
+    known = quiet(measured_armpi)
+    law = dataclasses.replace(MODES[mode], onset_s=(0.0, 0.0), profiles=("step",))
+    runs = simulate(Plan(armpi, [hypothesis], 4, 1, without_chance(known), modes={mode: law}))
+    judge = Judge(HealthyModel(twin, known), (hypothesis, HEALTHY), Priors())
+    faults = truth_and_faults(runs)[1]
+    own, healthy = judge.fits(runs, faults, runs["onset"].values).T
+    travel = np.diff(
+        runs["target"].values[:, :, runs["motor"].values == motor][..., 0], prepend=0.0
+    )
+    # A movement that is shorter than the play does not turn the joint; laws leave that out.
+    simple = (mode != "backlash") | (np.abs(travel).min(axis=1) > runs["magnitude"].values)
+    assert simple.any()
+    assert own[simple].min() > -1.0
+    assert (own - healthy)[simple].min() > 0.0
+
+
+def test_without_losses_scatter_alone_counts(twin, armpi, imperfect):
+    known = default_imperfections(armpi)
+    stuck = imperfect.isel(run=range(20, 100))
+    lossy = separation(twin, stuck).nats[:, 0]
+    sound = separation(twin, stuck, dataclasses.replace(known, lost_commands=())).nats[:, 0]
+    assert (sound >= lossy - 1e-9).all()
+    assert sound.mean() > 1.1 * lossy.mean()
+
+
+def test_a_truth_that_is_not_among_the_hypotheses_has_a_nearest_too(twin, imperfect):
+    two = [HEALTHY, Hypothesis.parse("motor_2:stuck")]
+    found = separation(twin, imperfect, hypotheses=two)
+    assert found.nats.shape == (180, 2)
+    whole = separation(twin, imperfect)
+    np.testing.assert_allclose(found.nats, whole.nats[:, [0, 2]], rtol=0, atol=1e-9)
+    strange = [truth not in two for truth in found.truth]
+    np.testing.assert_array_equal(found.nearest[strange], found.nats[strange].min(axis=1))
+
+
+def test_wrong_runs_are_refused(twin, armpi, imperfect):
+    with pytest.raises(InputError, match="does not tell its truth: no variable `fault_detail`"):
+        separation(twin, imperfect.drop_vars("fault_detail"))
+    both = Hypothesis.parse("motor_1:stuck+motor_2:stuck")
+    runs = simulate(Plan(armpi, [both], 1))
+    with pytest.raises(InputError, match="Expected healthy or one fault"):
+        separation(twin, runs)
