@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import itertools
 
 import numpy as np
@@ -12,6 +13,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.plan import Plan
+from failuretwin.decision.learned import stream as stream_module
 from failuretwin.decision.learned.encoder import Encoder
 from failuretwin.decision.learned.estimator import LearnedDiagnoser
 from failuretwin.decision.learned.recipe import Recipe
@@ -39,7 +41,7 @@ def runs(armpi, measured_armpi):
 
 @pytest.fixture(scope="module")
 def trained(encoder, runs):
-    return LearnedDiagnoser("cnn", encoder, iterations=150, random_state=0).fit(runs)
+    return LearnedDiagnoser("cnn", encoder, iterations=100, random_state=0).fit(runs)
 
 
 def test_stuck_motors_are_soon_learned(armpi, measured_armpi, trained):
@@ -92,9 +94,9 @@ def test_run_sets_need_an_encoder(runs):
 
 
 def test_it_can_be_cloned_and_cross_validated(encoder, runs, trained):
-    copy = clone(trained)
-    assert copy.get_params()["network"] == "cnn"
-    assert not hasattr(copy, "network_")
+    fresh = clone(trained)
+    assert fresh.get_params()["network"] == "cnn"
+    assert not hasattr(fresh, "network_")
     features = encoder.encode(signals_of(runs))
     quick = LearnedDiagnoser("cnn", iterations=20, random_state=0)
     scores = cross_val_score(quick, features, runs["fault"].values, cv=2)
@@ -122,8 +124,8 @@ def test_probabilities_sum_to_one_even_for_huge_scores():
 
 def test_calibration_changes_no_verdict(runs, trained):
     before = trained.predict(runs)
-    other = LearnedDiagnoser("cnn", trained.encoder, iterations=150, random_state=0).fit(runs)
-    other.calibrate(runs)
+    other = copy.deepcopy(trained).calibrate(runs)
+    assert other.temperature_ != trained.temperature_
     np.testing.assert_array_equal(other.predict(runs), before)
     truth = runs["fault"].values
     place = [list(other.classes_).index(t) for t in truth]
@@ -158,11 +160,12 @@ def test_every_run_is_used_as_often_as_asked(stream):
     np.testing.assert_array_equal(times / CHUNK_RUNS, [2.0, 2.0, 2.0, 2.0, 1.0])
 
 
-def test_fresh_runs_come_from_other_processes_in_order(stream, encoder):
+def test_fresh_runs_come_from_other_processes_in_order(stream, encoder, monkeypatch):
+    monkeypatch.setattr(stream_module, "CHUNK_RUNS", 48)
     with stream.chunks() as chunks:
         streamed = list(itertools.islice(chunks, 2))
     for number, (features, classes) in enumerate(streamed):
-        expected = stream.recipe.chunk(number, CHUNK_RUNS, encoder)
+        expected = stream.recipe.chunk(number, 48, encoder)
         np.testing.assert_array_equal(features, expected[0])
         np.testing.assert_array_equal(classes, expected[1])
 

@@ -63,6 +63,16 @@ def test_the_papers_network_has_its_size():
     assert sum(p.numel() for p in network.parameters()) == layers + 100 * 9 + 9
 
 
+def test_the_papers_network_begins_as_in_matlab():
+    """Orthogonal recurrent weights; a forget gate that starts open, about sigmoid(1)."""
+    network = build_network("lstm", Shape(6, 9))
+    for layer in (network.first, network.second):
+        back = layer.weight_hh_l0.detach()
+        torch.testing.assert_close(back.T @ back, torch.eye(100), atol=1e-5, rtol=0.0)
+        bias = (layer.bias_ih_l0 + layer.bias_hh_l0).detach().reshape(4, 100)
+        torch.testing.assert_close(bias, torch.tensor([0.0, 1.0, 0.0, 0.0])[:, None].expand(4, 100))
+
+
 def test_nothing_is_dropped_when_nothing_is_learned():
     network = build_network("lstm", SHAPE)
     features, _ = toy(8)
