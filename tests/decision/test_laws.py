@@ -10,7 +10,6 @@ from failuretwin.core.hypothesis import UNKNOWN, Hypothesis, single_faults
 from failuretwin.data_knowledge.knowledge import magnitude_range
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
 from failuretwin.decision import pairs
-from failuretwin.decision.law import Scene
 from failuretwin.decision.laws.drift import drift_law
 from failuretwin.decision.laws.lasting import AMOUNTS, lasting_law
 from failuretwin.decision.laws.nodes import size_nodes
@@ -19,6 +18,7 @@ from failuretwin.decision.laws.stuck import stuck_law
 from failuretwin.decision.laws.timed import lag_law, slow_law
 from failuretwin.decision.onsets import OnsetPrior
 from failuretwin.decision.priors import Priors
+from failuretwin.decision.scene import Scene
 from failuretwin.decision.weighing import WEIGHABLE, weigh_hypothesis
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")

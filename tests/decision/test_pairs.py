@@ -8,9 +8,9 @@ from failuretwin.core.hypothesis import HEALTHY, Hypothesis
 from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision.law import Scene
 from failuretwin.decision.onsets import OnsetPrior
 from failuretwin.decision.priors import Priors
+from failuretwin.decision.scene import Scene
 from failuretwin.decision.weighing import weigh_hypothesis
 from failuretwin.digital_model.imperfections import load_imperfections
 

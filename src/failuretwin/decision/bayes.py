@@ -20,9 +20,10 @@ from failuretwin.data_knowledge.log_quality import LogQuality, log_quality, with
 from failuretwin.data_knowledge.moving_evidence import MovingEvidence, moving_evidence
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence, settled_evidence
 from failuretwin.decision.assessment import lost_commands, unused_movements, why_undecided
-from failuretwin.decision.law import Estimate, Scene, Weight
 from failuretwin.decision.priors import Priors
+from failuretwin.decision.scene import Scene
 from failuretwin.decision.weighing import check_weighable, log_prior, shows_on_way, weigh_all
+from failuretwin.decision.weight import Estimate, Weight
 from failuretwin.decision.wording import explanation, verdict
 from failuretwin.digital_model.imperfections import Imperfections, default_imperfections
 from failuretwin.digital_model.twin import DigitalTwin

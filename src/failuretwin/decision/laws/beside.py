@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.law import Scene
 from failuretwin.decision.motor_profile import MotorProfile
+from failuretwin.decision.scene import Scene
 
 
 def settled_beside(scene: Scene, motor: int, farthest: FloatArray) -> FloatArray:

@@ -7,10 +7,11 @@ import numpy as np
 from failuretwin.core.quadrature import log_of, log_sum, weighted_quantiles
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.knowledge import magnitude_range
-from failuretwin.decision.law import Law, Scene
+from failuretwin.decision.law import Law
 from failuretwin.decision.laws.beside import pointed, settled_beside
 from failuretwin.decision.laws.nodes import size_nodes
 from failuretwin.decision.onsets import SHARES, Stretches, at_once
+from failuretwin.decision.scene import Scene
 
 ONSETS = SHARES[[1, 4, 8]]
 """Onsets to sum over in each stretch, as shares of its length."""

@@ -13,10 +13,11 @@ import numpy as np
 from failuretwin.core.quadrature import log_of
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.knowledge import magnitude_range
-from failuretwin.decision.law import Law, Scene
+from failuretwin.decision.law import Law
 from failuretwin.decision.laws.beside import pointed, settled_beside
 from failuretwin.decision.laws.nodes import size_nodes
 from failuretwin.decision.onsets import at_once
+from failuretwin.decision.scene import Scene
 from failuretwin.digital_model.settling import sag
 
 

@@ -12,9 +12,10 @@ import numpy as np
 
 from failuretwin.core.quadrature import log_of
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.law import Law, Scene
+from failuretwin.decision.law import Law
 from failuretwin.decision.laws.beside import settled_beside
 from failuretwin.decision.onsets import at_movement_starts
+from failuretwin.decision.scene import Scene
 
 Range = tuple[float, float]
 

@@ -14,9 +14,10 @@ from failuretwin.connection.healthy import HealthyModel
 from failuretwin.core.quadrature import log_of, log_sum, log_trapezoid_weights
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
-from failuretwin.decision.law import Law, Scene
+from failuretwin.decision.law import Law
 from failuretwin.decision.laws.nodes import nodes_around
 from failuretwin.decision.onsets import SHARES, OnsetPrior
+from failuretwin.decision.scene import Scene
 
 COARSE_NODES = 49
 """Nodes spread evenly over the range of the held angle."""
