@@ -11,6 +11,7 @@ from failuretwin import DigitalTwin, load_robot
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
 from failuretwin.digital_model.imperfections import load_imperfections
+from roscores import Roscore, need_ros
 
 settings.register_profile("steady", deadline=None, derandomize=True)
 settings.register_profile("search", deadline=None, max_examples=2000)
@@ -80,3 +81,16 @@ def run_of():
         ).to_dataset()
 
     return make
+
+
+@pytest.fixture(scope="session")
+def roscore(tmp_path_factory):
+    """A real roscore; this process finds it by its environment."""
+    need_ros()
+    core = Roscore(tmp_path_factory.mktemp("ros"))
+    core.start()
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("ROS_HOME", "ROS_IP", "ROS_MASTER_URI"):
+            patch.setitem(os.environ, name, core.environment[name])
+        yield core
+    core.stop()

@@ -23,7 +23,10 @@ ROOMS = (
 )
 """From left to right; a room may import itself and those to its left."""
 
-EXTRAS = {"dask", "distributed", "matplotlib", "mujoco", "rosbags", "sklearn", "torch"}
+EXTRAS = {
+    *("dask", "distributed", "matplotlib", "mcap", "mujoco", "rosbags", "roslibpy", "rospy"),
+    *("sklearn", "torch"),
+}
 
 HELP_CPU_S = 0.5
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import special, stats
+from scipy import stats
 
 from failuretwin import DigitalTwin
 from failuretwin.connection.calibration.held_out import held_out_sessions, judge
@@ -16,7 +16,8 @@ from failuretwin.connection.calibration.rates import (
     median_interval,
     spread_of,
 )
-from failuretwin.connection.calibration.settled_fit import fit_settling, rounding
+from failuretwin.connection.calibration.settled_errors import rounding
+from failuretwin.connection.calibration.settled_fit import fit_settling
 from failuretwin.connection.calibration.settled_part import fit_settled_part
 from failuretwin.connection.calibration.timing_fit import Transients, fit_timing
 from failuretwin.connection.calibration.what_if import best_payload, sense_remarks
@@ -116,24 +117,10 @@ def test_spread_of_uniform_draws_is_their_range_whatever_stands_out():
     np.testing.assert_allclose(spread_of(spoilt), (0.2, 0.8), atol=0.05)
 
 
-@pytest.mark.parametrize(("hits", "trials"), [(3, 40), (1, 2), (17, 400)])
-def test_interval_of_a_rate_is_that_of_the_jeffreys_posterior(hits, trials):
-    low, high = Rate(hits, trials).interval
-    below = special.betainc(hits + 0.5, trials - hits + 0.5, [low, high])
-    np.testing.assert_allclose(below, [0.025, 0.975], rtol=1e-9)
-    assert Rate(hits, trials).mean == pytest.approx((hits + 0.5) / (trials + 1.0), rel=1e-15)
-
-
-def test_interval_of_a_rate_holds_the_truth():
-    hits = np.arange(401)
-    for rate in (0.02, 0.08, 0.3):
-        inside = [low <= rate <= high for low, high in (Rate(int(h), 400).interval for h in hits)]
-        assert 0.92 < stats.binom.pmf(hits, 400, rate) @ inside < 0.985
-
-
 def test_what_never_or_always_happened_may_never_or_always_happen():
     assert Rate(0, 50).interval[0] == 0.0
     assert Rate(0, 50).interval[1] > 0.03
+    assert not Rate(0, 50).identified
     assert Rate(50, 50).interval[1] == 1.0
     assert Rate(0, 0).interval == (0.0, 1.0)
 
@@ -143,16 +130,20 @@ def test_lost_commands_are_counted_by_set_of_motors_and_lateness(settle):
     near = np.abs(seen.target - seen.origin) < 0.1
     lost = np.zeros((10, 4), dtype=bool)
     lost[0, :2] = lost[1, 0] = lost[2, 0] = True
-    late = np.arange(10) < 2
-    found = {loss.motors: loss for loss in loss_rates(seen, lost, late, NAMES)}
-    assert set(found) == {("motor_1", "motor_2"), *((name,) for name in NAMES)}
+    delayed = np.arange(10).reshape(2, 5) < 2
+    punctual = ~delayed
+    punctual[1, 4] = False  # of the last movement nobody knows
+    lost[9] = True
+    found = {loss.motors: loss for loss in loss_rates(seen, lost, punctual, delayed, NAMES)}
+    assert set(found) == {("motor_1", "motor_2"), tuple(NAMES), *((name,) for name in NAMES)}
     first = found["motor_1",]
     assert (first.late.hits, first.punctual.hits) == (1, 1)
     assert first.late.trials == 2 - near[:2, 0].sum()
-    assert first.punctual.trials == 8 - near[2:, 0].sum()
+    assert first.punctual.trials == 7 - near[2:9, 0].sum()
     both = found["motor_1", "motor_2"]
     assert (both.late.hits, both.punctual.hits) == (1, 0)
     assert found["motor_3",].late.hits == found["motor_3",].punctual.hits == 0
+    assert found[tuple(NAMES)].punctual.hits == 0
 
 
 # Late starts, gaps, glitches
@@ -176,6 +167,9 @@ def test_a_late_start_holds_up_the_next_command():
     assert found.period == pytest.approx(2.01, abs=0.011)
     expected = [[0.0, 0.0, 2.80 - found.period, 0.0, np.nan], [0.0, 0.0, 0.0, np.nan, np.nan]]
     np.testing.assert_allclose(found.late, expected, atol=1e-12)
+    np.testing.assert_array_equal(np.argwhere(found.delayed), [[0, 2]])
+    assert not found.punctual[0, 4]  # nothing follows it
+    assert found.punctual.sum() == 3 + 3
 
 
 @pytest.mark.parametrize("start", [[[0.0, 1.1, 3.9, 5.0, 8.7]], [[0.0, 2.0, 4.0]]])
@@ -317,6 +311,25 @@ def test_lost_commands_and_odd_movements_do_not_bend_the_fit(settle, armpi, twin
     assert np.all(np.abs(part.fit.mode - clean.fit.mode) < 2.0 * clean.fit.deviation + 1e-12)
 
 
+def test_commands_lost_on_short_ways_do_not_make_the_tails(settle, armpi):
+    rigid = replace(TYPICAL, compliance=(0.0,) * 4)  # no motor's sag depends on where others are
+    seen = settle(rigid, seed=7, movements=200)
+    none_follows = {"run": np.arange(200), "number": np.zeros(200, dtype=int)}
+    seen = replace(seen, **none_follows)
+    clean = fit_settled_part(seen, armpi)
+    way = np.abs(seen.target - seen.origin)
+    rate = np.where(way < 25 * COUNT, 0.3, 0.15)
+    stay = (way > 8 * COUNT) & (np.random.default_rng(7).random((200, 4)) < rate)
+    short = stay & (way < 25 * COUNT)
+    assert short.sum() > 8
+    pose = seen.position + np.where(stay, seen.origin - seen.target, 0.0)
+    part = fit_settled_part(replace(seen, position=pose), armpi)
+    assert np.mean(part.arrived[short]) < 0.2
+    assert np.mean(part.arrived[~stay]) > 0.98
+    moved = np.abs(part.fit.mode - clean.fit.mode)[12:] / clean.fit.deviation[12:]
+    assert moved.max() < 1.0
+
+
 def test_too_few_movements_are_refused(settle, armpi):
     with pytest.raises(InputError, match=r"only 5 of 5 movements .* expected 6 at least"):
         fit_settled_part(settle(TYPICAL, seed=6, movements=5), armpi)
@@ -347,7 +360,8 @@ def ramps(armpi, lag, rate, read):
     reading = read(DigitalTwin(armpi).respond(reference, TIME))
     used = np.broadcast_to(np.arange(1000) % round(100 / rate) == 0, (6, 1000))
     of_motors = reading.shape[2] == 4
-    return Transients(movements, np.where(used[..., None], reading, np.nan), of_motors, used, TIME)
+    reading = np.where(used[..., None], reading, np.nan)
+    return Transients(movements, np.zeros((6, 1000, 4)), reading, of_motors, used, TIME)
 
 
 @pytest.mark.parametrize("lag", [0.015, 0.03, 0.05])

@@ -15,7 +15,7 @@ from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses, s
 from failuretwin.core.movements import Movements
 from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.plan import Plan
-from failuretwin.decision.ambiguity import _motions
+from failuretwin.decision.ambiguity import _groups, _motions
 from failuretwin.decision.noise_free_scene import shrink
 from failuretwin.decision.priors import Priors
 from failuretwin.decision.separation import Judge
@@ -221,6 +221,17 @@ def test_losses_that_chance_may_bring_hide_a_fault_of_one_movement(twin, measure
         < 4.0
     )
     assert told(ambiguity(twin, motion(TARGETS), TIME, sound, **late), names[0], "healthy") > 10.0
+
+
+def test_groups_hold_all_that_are_alike_and_none_that_are_not():
+    """Of a chain healthy - a - b, c apart, the ends are no group."""
+    alike = np.zeros((3, 4), dtype=bool)
+    alike[0, [0, 2]] = True
+    names = ("healthy", "a", "b", "c")
+    assert _groups(names, alike) == (("healthy", "a"), ("a", "b"))
+    alike[1, 0] = True
+    assert _groups(names, alike) == (("healthy", "a", "b"),)
+    assert _groups(names, np.eye(3, 4, 1, dtype=bool)) == ()
 
 
 def test_wrong_requests_are_refused(twin):

@@ -10,14 +10,15 @@ from failuretwin.core.hypothesis import UNKNOWN, Hypothesis, single_faults
 from failuretwin.data_knowledge.knowledge import magnitude_range
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
 from failuretwin.decision import pairs
-from failuretwin.decision.law import Scene
-from failuretwin.decision.laws.lasting import AMOUNTS, drift_law, lasting_law
+from failuretwin.decision.laws.drift import drift_law
+from failuretwin.decision.laws.lasting import AMOUNTS, lasting_law
 from failuretwin.decision.laws.nodes import size_nodes
 from failuretwin.decision.laws.steady_state_error import error_law, offset_nodes
 from failuretwin.decision.laws.stuck import stuck_law
 from failuretwin.decision.laws.timed import lag_law, slow_law
 from failuretwin.decision.onsets import OnsetPrior
 from failuretwin.decision.priors import Priors
+from failuretwin.decision.scene import Scene
 from failuretwin.decision.weighing import WEIGHABLE, weigh_hypothesis
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
@@ -161,7 +162,8 @@ def test_drifts_of_all_rates_and_both_signs_are_as_likely(scene):
 
 
 @pytest.mark.parametrize("mode", ["stuck", "encoder_bias", "drift"])
-def test_thinning_a_law_for_pairs_loses_no_mass(scene, mode):
+def test_thinning_a_law_for_pairs_loses_no_mass(scene, monkeypatch, mode):
+    monkeypatch.setattr(pairs, "MOST_NODES", 48)
     alone = scene[3]
     law = LAWS[mode](alone, 0.3)
     few = pairs._thinned(alone, law)

@@ -6,7 +6,7 @@ from scipy import optimize, stats
 
 from failuretwin.connection.healthy import OUTLIER_RATE, PATH_NOISE_M, HealthyModel
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision.law import Scene
+from failuretwin.decision.scene import Scene
 from failuretwin.digital_model.imperfections import Imperfections, LostCommand
 from failuretwin.digital_model.settling import Settling
 

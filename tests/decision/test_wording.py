@@ -1,38 +1,122 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from failuretwin.core.diagnosis import Diagnosis
-from failuretwin.core.hypothesis import HEALTHY, Hypothesis
-from failuretwin.decision.wording import verdict
+from failuretwin.core.diagnosis import Diagnosis, MovementEvidence
+from failuretwin.core.hypothesis import HEALTHY, MAGNITUDE_UNITS, UNKNOWN, Hypothesis
+from failuretwin.decision.weighing import WEIGHABLE
+from failuretwin.decision.wording import SURE, explanation, percent, possible_hypotheses, verdict
+
+SIZED = {
+    "stuck": (np.deg2rad(-12.3), "motor 3 stuck at -12 deg since 2.5 s, 98 % sure"),
+    "steady_state_error": (
+        np.deg2rad(4.2),
+        "motor 3 misses its targets by about 4.2 deg since 2.5 s, 98 % sure",
+    ),
+    "slow": (0.4, "motor 3 slow by 40 % since 2.5 s, 98 % sure"),
+    "lag": (0.123, "motor 3 late by 0.12 s since 2.5 s, 98 % sure"),
+    "backlash": (np.deg2rad(2.0), "motor 3 has play of 2.0 deg since 2.5 s, 98 % sure"),
+    "drift": (np.deg2rad(-1.5), "motor 3 drifts by -1.50 deg/s since 2.5 s, 98 % sure"),
+    "intermittent": (
+        0.3,
+        "motor 3 sticks now and then (30 % of the time) since 2.5 s, 98 % sure",
+    ),
+    "torque_loss": (0.55, "motor 3 weak by 55 % since 2.5 s, 98 % sure"),
+    "encoder_bias": (
+        np.deg2rad(7.04),
+        "motor 3 has a shifted zero by +7.0 deg since 2.5 s, 98 % sure",
+    ),
+    "encoder_scale": (-0.25, "motor 3 has a wrong scale by -25 % since 2.5 s, 98 % sure"),
+    "lost_commands": (0.6, "motor 3 loses commands (60 % of them) since 2.5 s, 98 % sure"),
+}
+PAIR = Hypothesis.parse("motor_1:stuck+motor_3:drift")
 
 
-def said(text, magnitude):
-    best = Hypothesis.parse(text)
-    posterior = {text: 0.97, "healthy": 0.03}
-    return verdict(Diagnosis(run="run", posterior=posterior, magnitude=magnitude), [best, HEALTHY])
+def told(hypothesis, chance=0.98, others=(), **facts):
+    """Return the verdict on a hypothesis and others with the rest of the probability."""
+    ranked = (hypothesis, *(h for h, _ in others))
+    posterior = {str(hypothesis): chance, **{str(h): p for h, p in others}}
+    return verdict(Diagnosis("run", posterior, **facts), ranked)
+
+
+def single(mode):
+    return Hypothesis.parse(f"motor_3:{mode}")
+
+
+@pytest.mark.parametrize("mode", SIZED)
+def test_verdicts_say_motor_size_onset_and_how_sure(mode):
+    size, expected = SIZED[mode]
+    unit = MAGNITUDE_UNITS[mode]
+    assert told(single(mode), onset_s=2.5, magnitude=size, magnitude_unit=unit) == expected
+
+
+def test_every_mode_has_its_words():
+    assert set(SIZED) == set(WEIGHABLE)
+
+
+@pytest.mark.parametrize("onset_s", [0.0, 0.04])
+@pytest.mark.parametrize("mode", SIZED)
+def test_what_was_there_before_the_run_has_no_time(mode, onset_s):
+    size, expected = SIZED[mode]
+    got = told(single(mode), onset_s=onset_s, magnitude=size, magnitude_unit=MAGNITUDE_UNITS[mode])
+    before = " since before the run" if mode == "stuck" else ""
+    assert got == expected.replace(" since 2.5 s", before)
+
+
+def test_two_faults_are_both_named():
+    assert told(PAIR, onset_s=1.26) == "motor 1 stuck and motor 3 drifts since 1.3 s, 98 % sure"
+    assert told(PAIR, onset_s=0.0) == "motor 1 stuck and motor 3 drifts, 98 % sure"
+
+
+def test_no_fault_and_no_known_fault():
+    assert told(HEALTHY) == "healthy, 98 % sure"
+    assert told(UNKNOWN, onset_s=3.0) == (
+        "something that none of the known faults explains since 3.0 s, 98 % sure"
+    )
+    assert told(HEALTHY, undecided="the log is empty") == "cannot tell, because the log is empty"
 
 
 @pytest.mark.parametrize(
-    ("text", "magnitude", "words"),
+    ("chance", "text"),
     [
-        ("motor_1:encoder_scale", -0.25, "motor 1 has a wrong scale by -25%, 97 % sure"),
-        ("motor_2:encoder_bias", 0.5, "motor 2 has a shifted zero by +28.6 deg, 97 % sure"),
-        ("motor_3:stuck", -0.5, "motor 3 stuck at -29 deg since before the run, 97 % sure"),
-        ("motor_4:drift", 0.02, "motor 4 drifts by +1.15 deg/s, 97 % sure"),
-        ("motor_4:lag", 0.2, "motor 4 late by 0.20 s, 97 % sure"),
+        (0.5, "50 %"),
+        (0.98, "98 %"),
+        (0.994, "99.4 %"),
+        (0.9999, "over 99.9 %"),
+        (1.0, "over 99.9 %"),
     ],
 )
-def test_sizes_are_told_in_their_own_unit(text, magnitude, words):
-    assert said(text, magnitude) == words
+def test_nothing_is_certain(chance, text):
+    assert percent(chance) == text
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("unknown", "something that none of the known faults explains, 97 % sure"),
-        ("motor_1:stuck+motor_2:drift", "motor 1 stuck and motor 2 drifts, 97 % sure"),
-    ],
-)
-def test_no_size_is_told_where_there_is_none(text, words):
-    assert said(text, None) == words
+def test_what_else_it_may_be_is_told():
+    others = [(single("stuck"), 0.3), (PAIR, 0.08), (UNKNOWN, 0.02)]
+    assert told(HEALTHY, 0.6, others) == (
+        "healthy, 60 % sure (or motor 3 stuck 30 %, motor 1 stuck and motor 3 drifts 8 %)"
+    )
+
+
+@pytest.mark.parametrize("chances", [(0.96, 0.04), (0.5, 0.44, 0.03, 0.03), (0.2,) * 5, (1.0,)])
+def test_possible_hypotheses_are_the_fewest_that_are_sure(chances):
+    names = [HEALTHY, *(single(mode) for mode in SIZED)][: len(chances)]
+    diagnosis = Diagnosis("run", {str(h): p for h, p in zip(names, chances, strict=True)})
+    count = len(possible_hypotheses(diagnosis, names))
+    assert sum(chances[:count]) >= SURE - 1e-9
+    assert count == 1 or sum(chances[: count - 1]) < SURE
+
+
+def test_explanation_says_which_movements_speak_for_it_and_what_to_do():
+    evidence = (MovementEvidence(1, 3.21), MovementEvidence(2, 0.4), MovementEvidence(4, -1.5))
+    stuck = single("stuck")
+    diagnosis = Diagnosis("run", {str(PAIR): 0.9, str(stuck): 0.1}, evidence=evidence)
+    lines = explanation(diagnosis, (PAIR, stuck), ["movement 2: motor 4 did not get the command"])
+    pair = "motor 1 stuck and motor 3 drifts"
+    assert lines[:4] == (
+        f"movement 1: 3.2 nats for {pair} over motor 3 stuck",
+        f"movement 4: 1.5 nats for motor 3 stuck over {pair}",
+        "movement 2: motor 4 did not get the command",
+        f"cannot be told apart in this run: {pair} or motor 3 stuck",
+    )
+    assert [line.split(":")[0] for line in lines[4:]] == ["possible causes", "what to do"] * 2

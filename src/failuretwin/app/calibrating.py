@@ -10,8 +10,9 @@ import numpy as np
 
 from failuretwin.app.calibration_tables import shown_unit
 from failuretwin.connection.calibration.calibration import Calibration, LeftOut
-from failuretwin.connection.calibration.learn import SUSPECT, calibrate
+from failuretwin.connection.calibration.learn import calibrate
 from failuretwin.connection.calibration.observations import session_names
+from failuretwin.connection.calibration.trust import MOST_SUSPECT, SUSPECT
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import FloatArray
@@ -21,8 +22,6 @@ from failuretwin.digital_model.robot import Robot
 if TYPE_CHECKING:
     import xarray as xr
 
-MOST_SUSPECT = 0.25
-"""Share of runs that may look faulty before the logs are refused."""
 MOST_LEFT_OUT = 0.3
 """Share of movements that may be left out before the logs are refused."""
 

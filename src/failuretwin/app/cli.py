@@ -14,10 +14,14 @@ import click
 from failuretwin import __version__
 from failuretwin.app.commands.calibrate import calibrate
 from failuretwin.app.commands.diagnose import diagnose
+from failuretwin.app.commands.emulate import emulate
 from failuretwin.app.commands.evaluate import evaluate
 from failuretwin.app.commands.import_ import import_
 from failuretwin.app.commands.robot import robot
 from failuretwin.app.commands.simulate import simulate
+from failuretwin.app.commands.study import study
+from failuretwin.app.commands.train import train
+from failuretwin.app.commands.watch import watch
 from failuretwin.core.errors import FailureTwinError
 
 
@@ -27,7 +31,10 @@ def cli() -> None:
     """Tell from commands and the tool path alone which motor of a robot arm failed, and how."""
 
 
-for command in (import_, simulate, diagnose, evaluate, calibrate, robot):
+for command in (
+    *(import_, simulate, diagnose, evaluate, calibrate),
+    *(train, study, emulate, watch, robot),
+):
     cli.add_command(command)
 
 

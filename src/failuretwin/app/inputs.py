@@ -19,7 +19,6 @@ from failuretwin.data_knowledge.matlab_files import RECOVERY_ERROR, RECOVERY_WOR
 from failuretwin.data_knowledge.reading import ReadOptions, read_runs
 from failuretwin.data_knowledge.session_runs import As
 from failuretwin.data_knowledge.store import replacing
-from failuretwin.decision.bayes import BayesDiagnoser
 from failuretwin.digital_model.imperfections import GENERIC_NAME
 from failuretwin.digital_model.robot import Robot
 
@@ -53,10 +52,14 @@ def read_inputs(
     return runs
 
 
-def tell_mismatch(runs: xr.Dataset, diagnoser: BayesDiagnoser) -> None:
-    """Tell the user where simulated runs lack the imperfections that the diagnoser expects."""
+def tell_mismatch(runs: xr.Dataset, expected: str) -> None:
+    """Tell the user where simulated runs lack the imperfections that a diagnoser expects.
+
+    Args:
+        runs: The run set.
+        expected: Name of those imperfections.
+    """
     made_with = _made_with(runs)
-    expected = diagnoser.healthy_model.imperfections.name
     if made_with is not None and made_with != expected and expected != GENERIC_NAME:
         click.echo(
             f"note: the runs were simulated with imperfections '{made_with}', the diagnosis "

@@ -135,10 +135,15 @@ class HealthyModel:
 
     @cached_property
     def reach(self) -> float:
-        """How far the tool can be from the base at most [m]: the links laid end to end."""
-        chain = self.twin.robot.chain
+        """How far the tool can be from the base at most [m]: links and slides laid end to end."""
+        robot, chain = self.twin.robot, self.twin.robot.chain
         links = sum(float(np.linalg.norm(joint.T_pj[:3, 3])) for joint in chain.joints)
-        return links + float(np.linalg.norm(chain.T_jt[:3, 3]))
+        slides = sum(
+            max(abs(end) for end in motor.movement_range)
+            for motor, joint in zip(robot.motors, chain.joints, strict=True)
+            if joint.prismatic
+        )
+        return links + slides + float(np.linalg.norm(chain.T_jt[:3, 3]))
 
     def alternatives(self, movements: Movements) -> Alternatives:
         """Return what may become of each movement; the first is that every command arrives.

@@ -9,12 +9,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.connection.calibration.settled_fit import largest_load
 from failuretwin.connection.run_evidence import LEAST_SCATTER_RAD, RunEvidence
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.imperfections import Variation
 from failuretwin.digital_model.robot import Robot
-from failuretwin.digital_model.settling import Settling
+from failuretwin.digital_model.settling import Settling, largest_load
 
 START = 1.0
 """Standard deviation of bias and largest sag of a robot whose calibration states no doubt, in
@@ -42,7 +41,7 @@ class WearLimits:
         horizon: The doubt about wear grows for this many runs without learning, and no longer.
     """
 
-    rate: float = 0.015
+    rate: float = 0.025
     reach: float = 0.5
     limit: float = 4.0
     horizon: int = 200

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -40,7 +40,8 @@ class Ambiguity:
         hypotheses: Healthy and faults, in the order of `nats`.
         nats: By how much each (row), at typical size, is expected to beat each other (column),
             (hypothesis, hypothesis) [nats]; the median over motions and signs.
-        groups: Hypotheses that cannot be told apart at typical size, two or more each.
+        groups: Hypotheses of which no two can be told apart at typical size, as many as can be;
+            one may be in several groups.
         detected: Smallest size at which each fault is told from a healthy robot, by hypothesis, in
             the unit of the mode; None: no size considered is. Held angles are no size.
         isolated: Smallest size at which it is told from everything else too.
@@ -138,16 +139,38 @@ def _sizes(hypothesis: Hypothesis, priors: Priors) -> tuple[float, float]:
 
 
 def _groups(names: Sequence[str], alike: BoolArray) -> tuple[tuple[str, ...], ...]:
-    """Return groups of hypotheses of which each is like another of them.
+    """Return the largest groups of hypotheses of which no two are told apart.
 
     Args:
         names: Healthy, then faults.
         alike: Which faults are not told from which hypotheses, (fault, hypothesis).
     """
-    joined = np.eye(len(names), dtype=bool)
-    joined[1:] |= alike
+    joined = np.zeros((len(names), len(names)), dtype=bool)
+    joined[1:] = alike
     joined |= joined.T
-    for middle in range(len(names)):
-        joined |= joined[:, [middle]] & joined[[middle]]
-    rows = dict.fromkeys(tuple(np.flatnonzero(row).tolist()) for row in joined)
-    return tuple(tuple(names[i] for i in row) for row in rows if len(row) > 1)
+    np.fill_diagonal(joined, False)
+    neighbours = [set(np.flatnonzero(row).tolist()) for row in joined]
+    groups = _cliques(neighbours, set(), set(range(len(names))), set())
+    return tuple(
+        tuple(names[i] for i in group) for group in sorted(map(sorted, groups)) if len(group) > 1
+    )
+
+
+def _cliques(
+    neighbours: Sequence[set[int]], group: set[int], more: set[int], done: set[int]
+) -> Iterator[set[int]]:
+    """Yield every largest set of mutual neighbours that holds `group` (Bron and Kerbosch, 1973).
+
+    Args:
+        neighbours: Neighbours of each member.
+        group: Mutual neighbours so far.
+        more: Neighbours of them all that may join.
+        done: Those that may not: all groups with them were found.
+    """
+    if not more and not done:
+        yield group
+        return
+    pivot = max(more | done, key=lambda i: len(neighbours[i] & more))
+    for i in sorted(more - neighbours[pivot]):
+        yield from _cliques(neighbours, group | {i}, more & neighbours[i], done & neighbours[i])
+        more, done = more - {i}, done | {i}

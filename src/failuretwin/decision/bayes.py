@@ -20,9 +20,10 @@ from failuretwin.data_knowledge.log_quality import LogQuality, log_quality, with
 from failuretwin.data_knowledge.moving_evidence import MovingEvidence, moving_evidence
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence, settled_evidence
 from failuretwin.decision.assessment import lost_commands, unused_movements, why_undecided
-from failuretwin.decision.law import Estimate, Scene, Weight
 from failuretwin.decision.priors import Priors
+from failuretwin.decision.scene import Scene
 from failuretwin.decision.weighing import check_weighable, log_prior, shows_on_way, weigh_all
+from failuretwin.decision.weight import Estimate, Weight
 from failuretwin.decision.wording import explanation, verdict
 from failuretwin.digital_model.imperfections import Imperfections, default_imperfections
 from failuretwin.digital_model.twin import DigitalTwin
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 CHUNK_RUNS = 64
-"""Runs at a time: keeps the work on nodes in about 100 MB."""
+"""Runs of five movements at a time: keeps the work on nodes in about 100 MB."""
 
 LEVELS = (0.05, 0.5, 0.95)
 """Quantiles that are told: the ends of a 90 % interval and the median."""
@@ -108,8 +109,9 @@ class BayesDiagnoser:
         faults = truth_of(runs)
         truth: list[str | None] = [None] * len(names) if faults is None else list(faults)
         results = []
-        for first in range(0, len(names), CHUNK_RUNS):
-            rows = slice(first, first + CHUNK_RUNS)
+        chunk = _runs_at_a_time(evidence.movements.start.shape[1])
+        for first in range(0, len(names), chunk):
+            rows = slice(first, first + chunk)
             weighed = self._weigh(evidence[rows], None if moving is None else moving[rows])
             for run in range(len(weighed.log_posterior)):
                 at = first + run
@@ -190,6 +192,11 @@ class BayesDiagnoser:
         lost = weighed.scene.alternatives.lost
         faulty = [fault.motor for fault in hypothesis.faults]
         return lost_commands(estimate.became, lost, self.twin.robot.motor_names, faulty)
+
+
+def _runs_at_a_time(movements: int) -> int:
+    """Return how many runs of so many movements to weigh at a time: nodes grow with the square."""
+    return max(1, min(CHUNK_RUNS, 25 * CHUNK_RUNS // max(movements, 1) ** 2))
 
 
 def _evidence(weighed: _Weighed, run: int, order: IntArray) -> tuple[MovementEvidence, ...]:

@@ -12,9 +12,10 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.core.quadrature import log_of
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.decision.law import Law, Scene, densities
+from failuretwin.decision.law import Law, densities
 from failuretwin.decision.laws.stays import MISSES, log_densities
 from failuretwin.decision.priors import Priors
+from failuretwin.decision.scene import Scene
 from failuretwin.decision.weighing import law_of, motor_of
 
 

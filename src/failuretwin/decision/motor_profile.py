@@ -20,6 +20,8 @@ REFINEMENTS = 2
 """Newton steps from the point of the circle nearest to the tool; more change nothing."""
 LONGEST_STEP_RAD = 0.3
 """Bound on such a step: near a singular pose the parabola promises too much."""
+HELD_BEYOND = 1.1
+"""Share of the range of movements within which a motor may stand, on one side of its target."""
 LEAST_PRECISION = 1e-3
 """Precision [1/rad2] below which a movement says nothing of the motor: the tool is on its axis."""
 
@@ -40,6 +42,7 @@ class MotorProfile:
         dof: Degrees of freedom of the scatter.
         outlier: Log density of the tool being anywhere, times its rate.
         usable: Movements with evidence, (run, movement).
+        around: Whether angles a full turn apart, which are the same, may both come up.
         pose: Angles of all motors that explain the position best, with this motor at `best` and
             the others scattered, (..., alternative, motor) [rad].
     """
@@ -53,6 +56,7 @@ class MotorProfile:
     dof: float
     outlier: float
     usable: BoolArray
+    around: bool
     pose: FloatArray
 
     def __getitem__(self, run: int) -> MotorProfile:
@@ -76,7 +80,8 @@ class MotorProfile:
             held: Whether the gear holds it exactly there.
         """
         precision, log_weight = self._with_scatter(held)
-        return log_weight + self._fall(self.square + precision * (angle - self.best) ** 2)
+        off = self._turned(angle - self.best)
+        return log_weight + self._fall(self.square + precision * off**2)
 
     def log_density(self, angle: FloatArray, held: bool) -> FloatArray:
         """Return the log density of each settled position, whatever became of the commands.
@@ -95,6 +100,7 @@ class MotorProfile:
         # Alternative by alternative: large temporary arrays would cost more than the arithmetic.
         for k in range(count):
             off = angle[..., k if angle.shape[-1] > 1 else 0] - self.best[..., None, k]
+            off = self._turned(off)
             off *= off
             off *= precision[..., None, k]
             off += self.square[..., None, k]
@@ -104,6 +110,10 @@ class MotorProfile:
         found = self.outlier + np.log(total)
         usable = self.usable.reshape(self.usable.shape + (1,) * (found.ndim - 2))
         return np.where(usable, found, 0.0)
+
+    def _turned(self, off: FloatArray) -> FloatArray:
+        """Return differences of angles, the shorter way around."""
+        return off - 2.0 * np.pi * np.rint(off / (2.0 * np.pi)) if self.around else off
 
     def _with_scatter(self, held: bool) -> tuple[FloatArray, FloatArray]:
         """Return precision and log weight once the motor's own scatter counts."""
@@ -184,8 +194,15 @@ def motor_profile(
         dof=dof,
         outlier=model.outlier_log_density,
         usable=evidence.usable,
+        around=_may_turn_around(model, motor),
         pose=settled,
     )
+
+
+def _may_turn_around(model: HealthyModel, motor: int) -> bool:
+    """Return whether a motor may be half a turn or more from where it should be."""
+    low, high = model.twin.robot.motors[motor].movement_range
+    return not model.twin.robot.chain.joints[motor].prismatic and HELD_BEYOND * (high - low) > np.pi
 
 
 def _nearest_on_circle(

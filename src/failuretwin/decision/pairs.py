@@ -9,13 +9,17 @@ import numpy as np
 
 from failuretwin.core.quadrature import Weighted, log_sum
 from failuretwin.core.types import FloatArray, IntArray
-from failuretwin.decision.law import Estimate, Law, Scene, Weight
+from failuretwin.decision.law import Law
 from failuretwin.decision.motor_profile import MotorProfile, motor_profile
+from failuretwin.decision.scene import Scene
+from failuretwin.decision.weight import Estimate, Weight
 
 FEWEST_NATS = 14.0
 """Nodes of the first fault this far below its best, given any movement, are left out."""
-MOST_NODES = 48
-"""Nodes of the first fault to sum over; the others of its law are thinned out."""
+MOST_NODES = 400
+"""Nodes of each fault to sum over; of laws with more, such as drift, the others are thinned out.
+What one fault alone makes of a movement says little of its size beside another, so few can be
+spared."""
 
 
 def weigh_pair(scenes: Sequence[Scene], laws: Sequence[tuple[Law, Law]]) -> Weight:
@@ -83,7 +87,7 @@ def _way(scene: Scene, law: Law) -> FloatArray:
     """Return log densities of the way with one of the faults alone, (movement, node or 1)."""
     if law.on_way is not None:
         return law.on_way[0]
-    return scene.on_way_off(law.motor)[0][:, None]
+    return scene.on_way_off(law.motor, law.lasting)[0][:, None]
 
 
 def _alone(scene: Scene, law: Law) -> FloatArray:

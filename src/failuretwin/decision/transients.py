@@ -125,12 +125,13 @@ class Transients:
         found[item] = np.logaddexp(stays, stops) - np.log(2.0)
         return self._trusted(self._from_anywhere(course, found) + luck[..., None])
 
-    def off(self, motor: int, profile: MotorProfile) -> FloatArray:
+    def off(self, motor: int, profile: MotorProfile, lasting: bool) -> FloatArray:
         """Return the log density if a motor goes to where it was seen to settle.
 
         Args:
             motor: Index of the motor.
             profile: What each movement says of it.
+            lasting: Whether it is off by about the same in all movements.
 
         Returns:
             (run, movement).
@@ -142,7 +143,9 @@ class Transients:
         )
         seen = np.argmax(profile.log_terms(near, False), axis=-1)
         ends = np.where(self._usable[..., None, None], profile.pose, self._expected)
-        unseen = self._expected[..., motor] + self._usually_off(_at(near - profile.expected, seen))
+        unseen = self._expected[..., motor]
+        if lasting:
+            unseen = unseen + self._usually_off(_at(near - profile.expected, seen))
         ends[..., motor] = np.where(self._usable[..., None], near, unseen)
         course, luck = self._settle(_Course(ends, seen, self.alternatives.lost, self._first))
         return self._trusted(self._from_anywhere(course, self._judge(course), motor) + luck)

@@ -10,8 +10,9 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import UNKNOWN, Fault, Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.knowledge import prior_odds
-from failuretwin.decision.law import Estimate, Law, Scene, Weight, weigh
-from failuretwin.decision.laws.lasting import AMOUNTS, drift_law, lasting_law
+from failuretwin.decision.law import Law, weigh
+from failuretwin.decision.laws.drift import drift_law
+from failuretwin.decision.laws.lasting import AMOUNTS, lasting_law
 from failuretwin.decision.laws.stays import MISSES, weigh_misses
 from failuretwin.decision.laws.steady_state_error import error_law
 from failuretwin.decision.laws.stuck import stuck_law
@@ -19,6 +20,8 @@ from failuretwin.decision.laws.timed import lag_law, slow_law
 from failuretwin.decision.laws.unknown import weigh_unknown
 from failuretwin.decision.pairs import weigh_pair
 from failuretwin.decision.priors import Priors
+from failuretwin.decision.scene import Scene
+from failuretwin.decision.weight import Estimate, Weight
 
 UNKNOWN_ODDS = 0.3
 """Odds of `unknown` against healthy: assumed, like those of the rarer fault modes."""

@@ -50,13 +50,17 @@ _SIZES = {
     "backlash": " of {size:.1f} deg",
     "drift": " by {size:+.2f} deg/s",
     "lag": " by {size:.2f} s",
-    "encoder_scale": " by {size:+.0%}",
+    "encoder_scale": " by {size:+.0f} %",
+    "slow": " by {size:.0f} %",
+    "torque_loss": " by {size:.0f} %",
+    "lost_commands": " ({size:.0f} % of them)",
+    "intermittent": " ({size:.0f} % of the time)",
 }
-"""How the magnitude of a mode is told; angles in degrees. Those left out are shares."""
+"""How the magnitude of a mode is told: angles in degrees, shares in per cent."""
 
 
 def _size_and_onset(diagnosis: Diagnosis, hypothesis: Hypothesis) -> str:
-    onset = diagnosis.onset_s or 0.0
+    onset = round(diagnosis.onset_s or 0.0, 1)
     since = f" since {onset:.1f} s" if onset else " since before the run"
     if len(hypothesis.faults) != 1 or diagnosis.magnitude is None:
         return since if onset else ""
@@ -75,7 +79,10 @@ def size_words(fault: Fault, size: float) -> str:
     """
     if fault.magnitude_unit in ("rad", "rad/s"):
         size = float(np.rad2deg(size))
-    return _SIZES.get(fault.mode, " ({size:.0%})").format(size=size)
+    if fault.magnitude_unit == "ratio":
+        size *= 100.0
+    text = _SIZES.get(fault.mode, " ({size:.2g} {unit})")
+    return text.format(size=size, unit=fault.magnitude_unit)
 
 
 def possible_hypotheses(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> Sequence[Hypothesis]:

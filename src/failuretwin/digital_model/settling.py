@@ -74,6 +74,11 @@ def loads_in_range(robot: Robot, payload: float) -> FloatArray:
     return robot.loads.torque(poses * robot.sense, payload)
 
 
+def largest_load(robot: Robot, payload: float) -> FloatArray:
+    """Return the largest gravity torque that each motor meets in its range, (motor,) [N m]."""
+    return np.abs(loads_in_range(robot, payload)).max(axis=0)
+
+
 def sag(
     robot: Robot,
     pose: FloatArray,

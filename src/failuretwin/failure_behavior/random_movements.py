@@ -35,10 +35,22 @@ class RandomMovements:
         """Nominal length of a run [s]."""
         return self.count * self.period_s
 
-    def draw(self, robot: Robot, schedule: Schedule, rng: np.random.Generator) -> Movements:
+    def draw(
+        self,
+        robot: Robot,
+        schedule: Schedule,
+        rng: np.random.Generator,
+        initial: FloatArray | None = None,
+    ) -> Movements:
         """Return the movements of one run, with a leading run axis of 1.
 
-        The arm starts at its zero pose; ramps that would exceed the speed cap take longer.
+        Ramps that would exceed the speed cap take longer.
+
+        Args:
+            robot: The robot.
+            schedule: When movements are commanded.
+            rng: The run's own generator.
+            initial: Where the arm starts, (motor,) [rad]; None: at its zero pose.
         """
         low, high = np.array([motor.movement_range for motor in robot.motors]).T
         target = rng.uniform(low, high, (self.count, len(low)))
@@ -46,7 +58,7 @@ class RandomMovements:
             units = robot.servo_units
             target = units.to_rad(np.round(units.to_counts(target)))
         ramp = rng.choice(self.ramp_shares, (self.count, len(low))) * self.period_s
-        initial = np.zeros(len(low))
+        initial = np.zeros(len(low)) if initial is None else initial
         return Movements(
             initial=initial[None],
             target=target[None],

@@ -18,6 +18,13 @@ from failuretwin.app.commands.options import PATH, common_options, reading_optio
     help="What `calibrate` learned of this robot. Default: the calibration its profile names.",
 )
 @click.option(
+    "--method",
+    default="bayes",
+    show_default=True,
+    metavar="bayes|MODEL|bayes+MODEL",
+    help="How to diagnose: by Bayes' rule, by a network that `train` wrote, or by both.",
+)
+@click.option(
     "--track",
     is_flag=True,
     help="Follow the wear of the robot from run to run, and keep its history beside the "
@@ -49,6 +56,7 @@ from failuretwin.app.commands.options import PATH, common_options, reading_optio
 def diagnose(
     inputs: tuple[Path, ...],
     calibration: Path | None,
+    method: str,
     track: bool,
     hypotheses: str | None,
     sse_range: tuple[float, float] | None,
@@ -71,6 +79,7 @@ def diagnose(
     del seed  # nothing here is drawn by chance
     from failuretwin.app.ambiguity_lines import ambiguity_lines
     from failuretwin.app.inputs import read_inputs, tell_mismatch
+    from failuretwin.app.method import chosen_diagnoser, expected_name
     from failuretwin.app.results import write_csv, write_json_lines
     from failuretwin.app.tables import print_diagnoses, print_lines, print_scores
     from failuretwin.app.tracking import (
@@ -88,7 +97,7 @@ def diagnose(
 
     model = load_robot(robot)
     twin = DigitalTwin(model)
-    diagnoser = BayesDiagnoser(
+    bayes = BayesDiagnoser(
         twin,
         imperfections=None if calibration is None else load_imperfections(str(calibration), model),
         hypotheses=(
@@ -98,10 +107,18 @@ def diagnose(
         ),
         priors=priors_of(model, sse_range, onset),
     )
-    history = open_history(diagnoser, calibration) if track else None
+    settings = {
+        "--calibration": calibration,
+        "--track": track or None,
+        "--hypotheses": hypotheses,
+        "--sse-range": sse_range,
+        "--onset": onset,
+    }
+    diagnoser = chosen_diagnoser(method, bayes, settings)
+    history = open_history(bayes, calibration) if track else None
     runs = read_inputs(inputs, model, how, published_labels, columns, approximate)
-    tell_mismatch(runs, diagnoser)
-    tracked = None if history is None else diagnose_tracked(runs, diagnoser, history)
+    tell_mismatch(runs, expected_name(diagnoser, bayes))
+    tracked = None if history is None else diagnose_tracked(runs, bayes, history)
     diagnoses = diagnoser.diagnose(runs) if tracked is None else tracked.diagnoses
     records = [diagnosis.to_record() for diagnosis in diagnoses]
     if json_file is not None:
@@ -119,7 +136,8 @@ def diagnose(
     if tracked is not None:
         keep_history(tracked)
     print_diagnoses(diagnoses)
-    print_lines(ambiguity_lines(runs, diagnoser))
+    if method == "bayes":
+        print_lines(ambiguity_lines(runs, bayes))
     print_scores(records)
     if tracked is not None:
         click.echo(f"\n{tracking_line(tracked)}")

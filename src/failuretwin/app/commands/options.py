@@ -61,3 +61,40 @@ def reading_options(command: F) -> F:
         help="Read raw sessions with readings at their times and gaps missing, or drawn out by "
         "straight lines as the authors published them.",
     )(command)
+
+
+def live_options(command: F) -> F:
+    """Add what `emulate` and `watch` share: topics, the emulated robot, the pace of time."""
+    command = click.option(
+        "--duration",
+        type=click.FloatRange(min=0.0, min_open=True),
+        metavar="SECONDS",
+        help="Stop after this time. Default: with the log, or never.",
+    )(command)
+    command = click.option(
+        "--speed",
+        type=click.FloatRange(min=0.0),
+        default=1.0,
+        show_default=True,
+        help="How fast the time of logs and emulated robots passes; 0: as fast as possible.",
+    )(command)
+    command = click.option(
+        "--imperfections",
+        metavar="none|NAME|FILE",
+        help="What an emulated robot does that its twin does not. Default: what is known of it.",
+    )(command)
+    command = click.option(
+        "--fault",
+        "faults",
+        multiple=True,
+        metavar="MOTOR:MODE@START-END",
+        help="A fault of an emulated robot, such as motor_3:stuck@40-80 (repaired after 80 s) or "
+        "motor_3:stuck@40. Can be given several times.",
+    )(command)
+    return click.option(
+        "--topics",
+        type=PATH,
+        metavar="FILE.toml",
+        help="Names and types of the robot's ROS topics, see docs/live.md. Default: those of the "
+        "data set's authors.",
+    )(command)

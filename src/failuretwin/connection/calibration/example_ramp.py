@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +12,6 @@ from failuretwin.connection.calibration.motion_part import (
     AFTER_RAMP_S,
     lateness,
     movements_of,
-    settled_movements,
     transients,
 )
 from failuretwin.connection.calibration.observations import observe
@@ -72,9 +71,8 @@ def example_ramp(found: Calibration, runs: xr.Dataset, robot: Robot) -> ExampleR
     seen = observe(runs, use_readings=found.used_readings)
     part = fit_settled_part(seen, robot, settling.payload)
     movements = movements_of(runs)
-    ramps = transients(runs, movements, lateness(movements), part, robot)
     # What is shown is the calibration, which may have seen fewer sessions than this fit.
-    ramps = replace(ramps, movements=settled_movements(movements, settling, robot))
+    ramps = transients(runs, movements, lateness(movements), part, settling, robot)
     twin = DigitalTwin(robot)
     told = _motion(ramps, twin, found.imperfections.timing)
     if not ramps.of_motors:
@@ -105,7 +103,7 @@ def example_ramp(found: Calibration, runs: xr.Dataset, robot: Robot) -> ExampleR
 def _motion(ramps: Transients, twin: DigitalTwin, timing: Timing) -> FloatArray:
     """Return how the typical calibrated robot makes the movements, (run, time, motor) [rad]."""
     ones = np.ones(len(ramps.movements.start))
-    return motion(
+    free = motion(
         ramps.movements,
         ramps.time,
         twin,
@@ -113,6 +111,7 @@ def _motion(ramps: Transients, twin: DigitalTwin, timing: Timing) -> FloatArray:
         _middle(timing.ramp_shortening) * ones,
         _middle(timing.lag_s),
     )
+    return free + ramps.yielding
 
 
 def _middle(values: Range) -> float:

@@ -11,12 +11,10 @@ import numpy as np
 from failuretwin.connection.calibration.calibration import (
     Calibration,
     HeldOut,
-    LeftOut,
     Parameter,
 )
 from failuretwin.connection.calibration.held_out import held_out_sessions, judge
 from failuretwin.connection.calibration.motion_part import (
-    Lateness,
     gap_starts,
     glitch_rates,
     lateness,
@@ -29,18 +27,20 @@ from failuretwin.connection.calibration.motion_values import (
     schedule_of,
     timing_of,
 )
-from failuretwin.connection.calibration.observations import observe
+from failuretwin.connection.calibration.observations import observe, session_names
 from failuretwin.connection.calibration.parameters import (
     loss_parameters,
     rate_parameter,
     settling_parameters,
+    spring_remarks,
     timing_parameters,
 )
 from failuretwin.connection.calibration.rates import LossRates, Rate, loss_rates
 from failuretwin.connection.calibration.settled_part import SettledPart, fit_settled_part
 from failuretwin.connection.calibration.timing_fit import fit_timing
+from failuretwin.connection.calibration.trust import untrusted
 from failuretwin.connection.calibration.what_if import best_payload, sense_remarks
-from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.imperfections import (
     Imperfections,
     Variation,
@@ -50,8 +50,6 @@ from failuretwin.digital_model.robot import Robot
 if TYPE_CHECKING:
     import xarray as xr
 
-SUSPECT = 0.9
-"""A run that is faulty with at least this probability is left out."""
 BOOTSTRAP_SEED = 0
 
 
@@ -73,8 +71,8 @@ def calibrate(
         robot: The robot.
         name: What to call the imperfections in results.
         source: Which logs they come from.
-        suspicion: Probability that each run is faulty, (run,); runs with 0.9 or more are left
-            out. None: all count.
+        suspicion: Probability that each run is faulty, (run,); runs and sessions that look so are
+            left out. None: all count.
         use_readings: Whether to look at the motors' own readings, where the runs have them.
         judged: Healthy runs of sessions that only say how good the fit is; None: each session is
             left out once and judged by a fit to the others.
@@ -84,11 +82,11 @@ def calibrate(
     Raises:
         InputError: If too few movements come to rest near their targets.
     """
-    trusted = np.ones(runs.sizes["run"], dtype=bool)
-    if suspicion is not None:
-        trusted = suspicion < SUSPECT
-    left_out = [LeftOut(str(run), 0, "", "looks faulty") for run in runs["run"].values[~trusted]]
-    kept = runs.isel(run=np.flatnonzero(trusted))
+    names = [str(run) for run in runs["run"].values]
+    doubt = np.zeros(len(names)) if suspicion is None else suspicion
+    left_out = untrusted(names, session_names(runs), doubt)
+    out = {entry.run for entry in left_out}
+    kept = runs.isel(run=[i for i, run in enumerate(names) if run not in out])
     part = fit_settled_part(observe(kept, use_readings=use_readings), robot)
     payload, remarks = 0.0, list[str]()
     if thorough:
@@ -98,9 +96,11 @@ def calibrate(
             part = fit_settled_part(part.observations, robot, payload)
     movements = movements_of(kept)
     late = lateness(movements)
-    losses = loss_rates(part.observations, part.lost, _late_of(part, late), robot.motor_names)
+    losses = loss_rates(
+        part.observations, part.lost, late.punctual, late.delayed, robot.motor_names
+    )
     rng = np.random.default_rng(BOOTSTRAP_SEED)
-    timing = fit_timing(transients(kept, movements, late, part, robot), robot, rng)
+    timing = fit_timing(transients(kept, movements, late, part, part.settling, robot), robot, rng)
     gaps = gap_starts(kept, movements, late.late)
     glitches = glitch_rates(kept) if part.observations.position is not None else None
     imperfections = Imperfections(
@@ -114,22 +114,23 @@ def calibrate(
         readings=readings_of(kept, robot, glitches),
         variation=_variation(part, losses),
     )
+    settling = settling_parameters(part.fit, robot, payload)
     return Calibration(
         imperfections=imperfections,
         parameters=(
-            *settling_parameters(part.fit, robot, payload),
-            *timing_parameters(timing, np.random.default_rng(BOOTSTRAP_SEED)),
+            *settling,
+            *timing_parameters(timing),
             *lateness_parameters(late, gaps),
             *loss_parameters(losses),
             *_glitch_parameters(glitches, robot),
         ),
         sessions=part.observations.sessions,
-        runs=int(trusted.sum()),
+        runs=len(names) - len(out),
         movements=int(np.sum(part.fitted)),
         used_readings=part.observations.position is not None,
         left_out=(*left_out, *part.left_out(robot)),
         held_out=_held_out(part, robot, judged) if thorough else (),
-        remarks=(*remarks, *part.remarks()),
+        remarks=(*remarks, *part.remarks(), *spring_remarks(settling)),
     )
 
 
@@ -143,11 +144,6 @@ def _held_out(part: SettledPart, robot: Robot, judged: xr.Dataset | None) -> tup
         for index, name in enumerate(unseen.sessions)
     ]
     return tuple(entry for entry in entries if entry is not None)
-
-
-def _late_of(part: SettledPart, late: Lateness) -> BoolArray:
-    seen = part.observations
-    return np.asarray(np.nan_to_num(late.late)[seen.run, seen.number] > 0.0)
 
 
 def _variation(part: SettledPart, losses: Sequence[LossRates]) -> Variation:

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.connection.calibration.observations import Observations
 from failuretwin.connection.calibration.rates import Rate
 from failuretwin.connection.calibration.settled_part import SettledPart
-from failuretwin.connection.calibration.timing_fit import Transients
+from failuretwin.connection.calibration.timing_fit import Transients, motion
 from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.runs import measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model.robot import Robot
-from failuretwin.digital_model.settling import Settling
+from failuretwin.digital_model.settling import Settling, sag
+from failuretwin.digital_model.twin import DigitalTwin
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -26,6 +26,8 @@ STEADY_S = 0.05
 """Commands whose spacing scatters less than this come at a steady pace [s]."""
 AFTER_RAMP_S = 0.25
 """Readings up to this long after a ramp still tell of its timing [s]."""
+USUAL_LAG_S = 0.03
+"""Lag with which the tool path's poses are guessed, for the sag on the way [s]."""
 GAP_PERIODS = 4.0
 """A silence of this many periods of the readings is a gap."""
 
@@ -43,6 +45,19 @@ class Lateness:
     known: bool
     late: FloatArray
     period: float
+
+    @property
+    def delayed(self) -> BoolArray:
+        """Which movements surely started late, (run, movement)."""
+        return np.asarray(self.late > 0.0)
+
+    @property
+    def punctual(self) -> BoolArray:
+        """Which movements surely started on time, (run, movement).
+
+        The last one of a run holds up no other: it is taken for punctual only if all others were.
+        """
+        return np.asarray(self.late == 0.0) if self.delayed.any() else ~self.delayed
 
 
 def lateness(movements: Movements) -> Lateness:
@@ -89,7 +104,12 @@ def glitch_rates(runs: xr.Dataset) -> list[Rate] | None:
 
 
 def transients(
-    runs: xr.Dataset, movements: Movements, late: Lateness, part: SettledPart, robot: Robot
+    runs: xr.Dataset,
+    movements: Movements,
+    late: Lateness,
+    part: SettledPart,
+    settling: Settling,
+    robot: Robot,
 ) -> Transients:
     """Return the readings on ramps that began on time and at a known place.
 
@@ -97,22 +117,23 @@ def transients(
         runs: The runs of the observations.
         movements: Their movements.
         late: How late they started.
-        part: Sorted settled movements and the fit.
+        part: Sorted settled movements.
+        settling: Where motors settle.
         robot: The robot.
     """
     time = as_floats(runs["time"].values)
-    sound = _sound(movements, part.observations, part)
-    on_time = sound & ~(np.nan_to_num(late.late) > 0.0)
-    on_time[:, -1] &= not late.known or not np.any(np.nan_to_num(late.late) > 0.0)
-    used = np.zeros((len(movements.start), len(time)), dtype=bool)
-    for run, movement in np.argwhere(on_time):
-        begin = movements.start[run, movement]
-        end = begin + np.nanmax(movements.ramp_duration[run, movement]) + AFTER_RAMP_S
-        used[run] |= (time >= begin) & (time < end)
+    used = _on_time(movements, late, part, time)
     of_motors = part.observations.position is not None
     reading = as_floats(runs["position" if of_motors else "measured"].values)
+    free = unloaded_movements(movements, settling)
+    if of_motors:
+        pose = np.nan_to_num(reading)
+    else:
+        none = np.zeros(len(movements.start))
+        pose = motion(free, time, DigitalTwin(robot), none, none, USUAL_LAG_S)
     return Transients(
-        movements=settled_movements(movements, part.settling, robot),
+        movements=free,
+        yielding=sag(robot, pose, np.asarray(settling.compliance), settling.payload),
         reading=reading,
         of_motors=of_motors,
         used=used & np.isfinite(reading).all(axis=2),
@@ -120,26 +141,37 @@ def transients(
     )
 
 
-def _sound(movements: Movements, seen: Observations, part: SettledPart) -> BoolArray:
+def _on_time(
+    movements: Movements, late: Lateness, part: SettledPart, time: FloatArray
+) -> BoolArray:
+    """Return which times belong to a ramp that began on time at a known place, (run, time)."""
+    on_time = _sound(movements, part) & late.punctual
+    used = np.zeros((len(movements.start), len(time)), dtype=bool)
+    for run, movement in np.argwhere(on_time):
+        begin = movements.start[run, movement]
+        end = begin + np.nanmax(movements.ramp_duration[run, movement]) + AFTER_RAMP_S
+        used[run] |= (time >= begin) & (time < end)
+    return used
+
+
+def _sound(movements: Movements, part: SettledPart) -> BoolArray:
     """Return which movements began and ended where the fit says, (run, movement)."""
-    good = np.zeros(movements.start.shape, dtype=bool)
-    fine = ~part.odd & ~part.lost.any(axis=1)
+    good, seen = np.zeros(movements.start.shape, dtype=bool), part.observations
+    fine = ~part.odd & (part.arrived > 0.5).all(axis=1)
     good[seen.run[fine], seen.number[fine]] = True
     before = np.ones_like(good)
     before[:, 1:] = good[:, :-1]
     return good & before
 
 
-def settled_movements(movements: Movements, settling: Settling, robot: Robot) -> Movements:
-    """Return the movements with the targets at which motors really settle."""
-    origin, target = np.nan_to_num(movements.origin()), np.nan_to_num(movements.target)
-    settled = target + settling.offset(robot, target, np.sign(target - origin))
-    still = np.zeros_like(movements.initial)
-    return Movements(
-        initial=movements.initial + settling.offset(robot, movements.initial, still),
-        target=np.where(movements.exists[..., None], settled, np.nan),
-        ramp_duration=movements.ramp_duration,
-        start=movements.start,
+def unloaded_movements(movements: Movements, settling: Settling) -> Movements:
+    """Return the movements with the targets at which motors would settle without load."""
+    bias, friction = np.asarray(settling.bias), np.asarray(settling.friction)
+    travel = np.nan_to_num(movements.target) - np.nan_to_num(movements.origin())
+    return replace(
+        movements,
+        initial=movements.initial + bias,
+        target=movements.target + bias - friction * np.sign(travel),
     )
 
 

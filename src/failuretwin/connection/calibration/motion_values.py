@@ -55,7 +55,7 @@ def timing_of(fit: TimingFit | None, late: Lateness, gaps: FloatArray) -> Timing
 
 def late_starts(late: Lateness) -> FloatArray:
     """Return how late the late movements started, (late movement,) [s]."""
-    return late.late[np.nan_to_num(late.late) > 0.0]
+    return late.late[late.delayed]
 
 
 def late_rate(late: Lateness) -> Rate:

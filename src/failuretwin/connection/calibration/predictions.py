@@ -10,7 +10,7 @@ import numpy as np
 from failuretwin.connection.calibration.calibration import Calibration
 from failuretwin.connection.calibration.held_out import expected_pose, settled_errors
 from failuretwin.connection.calibration.observations import Observations, observe
-from failuretwin.connection.calibration.settled_fit import rounding
+from failuretwin.connection.calibration.settled_errors import rounding
 from failuretwin.connection.calibration.settled_part import fit_settled_part, sort_movements
 from failuretwin.connection.healthy import PATH_NOISE_M
 from failuretwin.core.errors import InputError

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.stats import beta, binom
 
-from failuretwin.connection.calibration.observations import Observations
+from failuretwin.connection.calibration.observations import TRAVEL_RAD, Observations
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.imperfections import LostCommand, Range
 
@@ -18,7 +19,7 @@ PRIOR_MOVEMENTS = 2.0
 
 @dataclass(frozen=True)
 class Rate:
-    """A share estimated from a count, with the Jeffreys prior.
+    """A share estimated from a count.
 
     Attributes:
         hits: How often it happened.
@@ -30,25 +31,39 @@ class Rate:
 
     @property
     def mean(self) -> float:
-        """Posterior mean [-]."""
+        """Posterior mean with the Jeffreys prior [-]."""
         return (self.hits + 0.5) / (self.trials + 1.0)
 
     @property
-    def interval(self) -> Range:
-        """95 % interval [-]; it reaches 0 or 1 where nothing or everything was hit."""
-        low, high = (
-            float(beta.ppf(level, self.hits + 0.5, self.trials - self.hits + 0.5))
-            for level in LEVEL
-        )
-        return (
-            0.0 if self.hits == 0 else low,
-            1.0 if self.hits == self.trials else high,
-        )
+    def identified(self) -> bool:
+        """Whether it was seen to happen; otherwise there is only a bound from above."""
+        return self.hits > 0
 
     @property
-    def log_deviation(self) -> float:
-        """Standard deviation of its logarithm, roughly."""
-        return float(1.0 / np.sqrt(self.hits + 0.5))
+    def interval(self) -> Range:
+        """95 % interval [-]; it reaches 0 or 1 where nothing or everything was hit.
+
+        What is called identified has been seen at least once, and of rare things that alone makes
+        the count too high: the interval is that of a binomial count which is not 0. Half the
+        probability of the count itself lies on either side (mid-P), as with the Jeffreys prior.
+        """
+        if self.hits == 0:
+            return 0.0, 1.0 if self.trials == 0 else float(
+                beta.ppf(LEVEL[1], 0.5, self.trials + 0.5)
+            )
+        low = 0.0 if self._below(0.0) <= LEVEL[1] else self._rate_at(LEVEL[1])
+        return low, 1.0 if self.hits == self.trials else self._rate_at(LEVEL[0])
+
+    def _below(self, rate: float) -> float:
+        """Return the probability of fewer hits, and half that of as many, if there are any."""
+        if rate == 0.0:
+            return 0.5 if self.hits == 1 else 1.0
+        none = binom.pmf(0, self.trials, rate)
+        fewer = binom.cdf(self.hits - 1, self.trials, rate) - none
+        return float((fewer + 0.5 * binom.pmf(self.hits, self.trials, rate)) / (1.0 - none))
+
+    def _rate_at(self, level: float) -> float:
+        return float(brentq(lambda rate: self._below(rate) - level, 1e-9, 1.0 - 1e-9))
 
 
 @dataclass(frozen=True)
@@ -70,16 +85,22 @@ class LossRates:
 
 
 def loss_rates(
-    observations: Observations, lost: BoolArray, late: BoolArray, names: list[str]
+    observations: Observations,
+    lost: BoolArray,
+    punctual: BoolArray,
+    delayed: BoolArray,
+    names: list[str],
 ) -> list[LossRates]:
     """Return the rate of each single motor, and of each set that was seen to go together.
 
     Args:
         observations: Settled movements.
         lost: Motors that stayed, (movement, motor).
-        late: Movements that started late, (movement,).
+        punctual: Movements that started on time, (run, movement).
+        delayed: Movements that started late, (run, movement); what is neither does not count.
         names: Names of the motors.
     """
+    at = observations.run, observations.number
     seen = {tuple(np.flatnonzero(row).tolist()) for row in lost if row.any()}
     single = {(motor,) for motor in range(len(names))}
     rates = []
@@ -88,10 +109,11 @@ def loss_rates(
         pattern = np.isin(np.arange(len(names)), chosen)
         exactly = (lost == pattern).all(axis=1)
         # A motor that is told to stay cannot be seen to lose a command.
-        told = np.abs(observations.target - observations.origin)[:, chosen].min(axis=1) > 0.1
+        travel = np.abs(observations.target - observations.origin)[:, chosen].min(axis=1)
+        told = travel > TRAVEL_RAD
         counts = [
             Rate(int(np.sum(exactly & told & kind)), int(np.sum(told & kind)))
-            for kind in (~late, late)
+            for kind in (punctual[at], delayed[at])
         ]
         rates.append(LossRates(tuple(names[m] for m in members), counts[0], counts[1]))
     return rates

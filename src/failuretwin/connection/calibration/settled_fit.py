@@ -11,23 +11,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import gammaln
 
 from failuretwin.connection.calibration.observations import Observations
-from failuretwin.core.ellipsoid import log_student
+from failuretwin.connection.calibration.settled_errors import SettledErrors, count_of
+from failuretwin.connection.calibration.settled_prior import SettlingPrior
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.robot import Robot
-from failuretwin.digital_model.settling import Settling, loads_in_range
+from failuretwin.digital_model.settling import Settling
 from failuretwin.digital_model.twin import DigitalTwin
 
-OFFSET_PRIOR_RAD = 0.03
-"""Prior standard deviation of bias, friction and the largest sag [rad]: about 2 degrees."""
-SCATTER_PRIOR_RAD, SCATTER_PRIOR_SPREAD = 0.007, 1.0
-"""Prior median of the scatter [rad] and standard deviation of its logarithm."""
-DOF_PRIOR, DOF_PRIOR_SPREAD = 5.0, 0.7
-"""Prior median of the degrees of freedom and standard deviation of their logarithm."""
-TOOL_NOISE_PRIOR_M, TOOL_NOISE_PRIOR_SPREAD = 0.0005, 1.0
-"""Prior median of a tool sensor's own noise [m] and standard deviation of its logarithm."""
 POSE_ROUNDS = 3
 """Rounds in which the pose that gravity acts in and the fit settle together (tool path alone)."""
 
@@ -72,45 +64,6 @@ class SettledFit:
         )
 
 
-@dataclass(frozen=True)
-class _Problem:
-    """The settled errors as a linear model.
-
-    Attributes:
-        error: Settled minus commanded: angles (movement, motor) [rad] or tool (movement, axis) [m].
-        design: Factor of bias, compliance and friction, (3, movement, motor).
-        jacobian: Tool position by angle, (movement, axis, motor); None where angles were read.
-        rounding: Standard deviation of what the motors' readings round off [rad].
-        arrived: Motors whose command arrived, (movement, motor); readings of others do not count.
-    """
-
-    error: FloatArray
-    design: FloatArray
-    jacobian: FloatArray | None
-    rounding: float
-    arrived: FloatArray
-
-    def log_likelihood(self, parameters: FloatArray) -> float:
-        """Return the log likelihood of parameters as in `SettledFit.mode`.
-
-        With the tool path alone, the logarithm of the tool sensor's noise [m] comes after them.
-        """
-        motors = self.design.shape[2]
-        grouped = parameters[: 4 * motors].reshape(4, -1)
-        linear, log_scatter = grouped[:3], grouped[3]
-        dof = float(np.exp(parameters[4 * motors]))
-        expected = np.einsum("pik,pk->ik", self.design, linear)
-        scale = np.hypot(np.exp(log_scatter), self.rounding)
-        if self.jacobian is None:
-            unit = (self.error - expected) / scale
-            constant = gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * np.log(dof * np.pi)
-            density = constant - np.log(scale) - 0.5 * (dof + 1) * np.log1p(unit**2 / dof)
-            return float(np.sum(density * self.arrived))
-        moved = np.einsum("iak,ik->ia", self.jacobian, expected)
-        noise = float(np.exp(2.0 * parameters[-1]))
-        return float(np.sum(log_student(self.error - moved, self.jacobian * scale, noise, dof)))
-
-
 def fit_settling(
     observations: Observations, robot: Robot, arrived: FloatArray, payload: float = 0.0
 ) -> SettledFit:
@@ -119,11 +72,11 @@ def fit_settling(
     Args:
         observations: Settled movements.
         robot: The robot.
-        arrived: 1 where a motor got its command, 0 where it did not, (movement, motor).
+        arrived: How probable it is that each motor got its command, (movement, motor).
         payload: Mass at the tool point [kg].
     """
     of_motors = observations.position is not None
-    prior = _Prior.of(robot, payload, of_motors)
+    prior = SettlingPrior.of(robot, payload, of_motors)
     fit, start = None, prior.mean
     for _ in range(1 if of_motors else POSE_ROUNDS):
         problem = _problem(observations, robot, arrived, payload, fit)
@@ -132,54 +85,13 @@ def fit_settling(
     return fit
 
 
-@dataclass(frozen=True)
-class _Prior:
-    """Independent normal priors: mean and standard deviation of each parameter."""
-
-    mean: FloatArray
-    deviation: FloatArray
-
-    @classmethod
-    def of(cls, robot: Robot, payload: float, of_motors: bool) -> _Prior:
-        """Return priors that know how large a load the motors of the robot carry."""
-        motors = len(robot.motors)
-        load = np.maximum(largest_load(robot, payload), 1e-6)
-        offset = np.full(motors, OFFSET_PRIOR_RAD)
-        mean = np.zeros(4 * motors + 1)
-        mean[3 * motors : -1], mean[-1] = np.log(SCATTER_PRIOR_RAD), np.log(DOF_PRIOR)
-        compliance = np.where(load > 1e-6, OFFSET_PRIOR_RAD / load, 1e-9)
-        spread = np.full(motors, SCATTER_PRIOR_SPREAD)
-        deviation = np.concatenate([offset, compliance, offset, spread, [DOF_PRIOR_SPREAD]])
-        if of_motors:
-            return cls(mean, deviation)
-        return cls(
-            np.append(mean, np.log(TOOL_NOISE_PRIOR_M)),
-            np.append(deviation, TOOL_NOISE_PRIOR_SPREAD),
-        )
-
-    def log_density(self, parameters: FloatArray) -> float:
-        return -0.5 * float(np.sum(((parameters - self.mean) / self.deviation) ** 2))
-
-
-def largest_load(robot: Robot, payload: float) -> FloatArray:
-    """Return the largest gravity torque that each motor meets in its range, (motor,) [N m]."""
-    return np.abs(loads_in_range(robot, payload)).max(axis=0)
-
-
-def rounding(robot: Robot) -> float:
-    """Return the standard deviation of what whole servo counts round off [rad]."""
-    if robot.profile.servo_units is None:
-        return 0.0
-    return float(abs(robot.servo_units.rad_per_count) / np.sqrt(12.0))
-
-
 def _problem(
     observations: Observations,
     robot: Robot,
     arrived: FloatArray,
     payload: float,
     fit: SettledFit | None,
-) -> _Problem:
+) -> SettledErrors:
     twin = DigitalTwin(robot)
     base = np.where(arrived > 0, observations.target, observations.origin)
     jacobian = None
@@ -193,16 +105,18 @@ def _problem(
         point, jacobian = twin.path_and_jacobian(pose)
         error = observations.point - point + np.einsum("iak,ik->ia", jacobian, pose - base)
     torque = robot.sense * robot.loads.torque(pose * robot.sense, payload)
-    return _Problem(
+    return SettledErrors(
         error=error,
         design=np.stack([np.ones_like(torque), torque, -observations.direction]),
         jacobian=jacobian,
-        rounding=rounding(robot),
+        count=count_of(robot),
         arrived=arrived,
     )
 
 
-def _mode(problem: _Problem, prior: _Prior, start: FloatArray) -> tuple[SettledFit, FloatArray]:
+def _mode(
+    problem: SettledErrors, prior: SettlingPrior, start: FloatArray
+) -> tuple[SettledFit, FloatArray]:
     """Return the posterior mode and its curvature, found in units of the prior deviations.
 
     The noise of a tool sensor belongs to no motor: it is averaged out of the fit, and only the

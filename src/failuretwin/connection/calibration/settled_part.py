@@ -8,11 +8,13 @@ import numpy as np
 
 from failuretwin.connection.calibration.calibration import LeftOut
 from failuretwin.connection.calibration.observations import (
+    TRAVEL_RAD,
     Observations,
     follows_seen,
     obeyed,
     stayed,
 )
+from failuretwin.connection.calibration.settled_errors import rounding
 from failuretwin.connection.calibration.settled_fit import SettledFit, fit_settling
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray
@@ -37,6 +39,7 @@ class SettledPart:
         lost: Motors that did not get their command, (movement, motor).
         odd: Movements that look like no healthy ones, (movement,).
         fitted: Movements that the fit is to: not odd, and after one that was seen, (movement,).
+        arrived: How probable it is that each motor got its command, (movement, motor).
         fit: Where motors settle.
         payload: Mass at the tool point that the fit knows of [kg].
     """
@@ -45,6 +48,7 @@ class SettledPart:
     lost: BoolArray
     odd: BoolArray
     fitted: BoolArray
+    arrived: FloatArray
     fit: SettledFit
     payload: float = 0.0
 
@@ -102,9 +106,9 @@ def fit_settled_part(observations: Observations, robot: Robot, payload: float = 
                 f"expected {FEWEST_MOVEMENTS} at least. Give longer logs of a healthy robot."
             )
         observations = obeyed(commanded, lost)
-        arrived = (~lost[kept]).astype(np.float64)
-        fit = fit_settling(observations[kept], robot, arrived, payload)
-        part = SettledPart(observations, lost, odd, kept, fit, payload)
+        arrived = probably_arrived(observations, robot, lost, settling)
+        fit = fit_settling(observations[kept], robot, arrived[kept], payload)
+        part = SettledPart(observations, lost, odd, kept, arrived, fit, payload)
         settling = part.settling
     return part
 
@@ -123,6 +127,43 @@ def sort_movements(
     expected = target + settling.offset(robot, target, direction)
     lost = stayed(observations, robot, expected)
     return lost, _odd(observations, robot, np.where(lost, observations.origin, expected))
+
+
+def probably_arrived(
+    observations: Observations, robot: Robot, lost: BoolArray, settling: Settling
+) -> FloatArray:
+    """Return how probable it is that each motor got its command, (movement, motor).
+
+    A motor that had far to go is sorted already. One that had not, and is read, lost its command
+    as often as the others do; where it rests says which of the two it is. Otherwise those few
+    would make the tails of the scatter.
+
+    Args:
+        observations: Settled movements.
+        robot: The robot.
+        lost: Motors that surely did not get their command, (movement, motor).
+        settling: Where its motors settle, as far as is known.
+    """
+    arrived = (~lost).astype(np.float64)
+    travel = observations.target - observations.origin
+    if observations.position is None or not any(settling.scatter):
+        return arrived
+    told = np.abs(travel) > TRAVEL_RAD
+    rate = ((lost & told).sum(axis=0) + 0.5) / (told.sum(axis=0) + 1.0)
+    scale = np.hypot(settling.scatter, rounding(robot))
+    offset = settling.offset(robot, observations.position, observations.direction)
+    off = observations.position - observations.target - offset
+    # A motor that stays has come from either side before: friction holds it as now or as against.
+    held, turned = off + travel, 2.0 * np.asarray(settling.friction) * observations.direction
+    stays = 0.5 * sum(_density(error / scale, settling) for error in (held, held - turned))
+    odds = (1.0 - rate) / rate * _density(off / scale, settling) / stays
+    return np.where(told, arrived, odds / (1.0 + odds))
+
+
+def _density(unit: FloatArray, settling: Settling) -> FloatArray:
+    """Return the density of a Student t, but for a factor."""
+    dof = settling.tail_dof
+    return np.asarray((1.0 + unit**2 / dof) ** (-0.5 * (dof + 1.0)))
 
 
 def _odd(observations: Observations, robot: Robot, expected: FloatArray) -> BoolArray:

@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from failuretwin.connection.calibration.settled_fit import fit_settling, largest_load
+from failuretwin.connection.calibration.settled_fit import fit_settling
 from failuretwin.connection.calibration.settled_part import SettledPart
 from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.settling import largest_load
 
 SURE_NATS = 5.0
 """Log odds from which one description of the robot is told to be better than another."""
@@ -92,5 +93,5 @@ def best_payload(part: SettledPart, robot: Robot) -> tuple[float, str]:
 
 def _refit(part: SettledPart, robot: Robot, payload: float) -> float:
     """Return the log posterior of another description on the very same movements."""
-    arrived = (~part.lost[part.fitted]).astype(np.float64)
-    return fit_settling(part.observations[part.fitted], robot, arrived, payload).log_posterior
+    seen, arrived = part.observations[part.fitted], part.arrived[part.fitted]
+    return fit_settling(seen, robot, arrived, payload).log_posterior

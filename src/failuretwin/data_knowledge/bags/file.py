@@ -157,10 +157,14 @@ def _fields(connection: Connection) -> dict[str, str]:
     from rosbags.typesys import TypesysError
 
     try:
-        definitions = _typestore(connection).fielddefs
+        return message_fields(_typestore(connection), connection.msgtype)
     except TypesysError:
         return {}
-    _, fields = definitions.get(connection.msgtype, ((), ()))
+
+
+def message_fields(store: Typestore, type_: str) -> dict[str, str]:
+    """Return the types of a message's fields by name, as in `BagTopic`; empty if it is unknown."""
+    _, fields = store.fielddefs.get(type_, ((), ()))
     return {name: _type_text(description) for name, description in fields}
 
 

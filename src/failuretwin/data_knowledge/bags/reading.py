@@ -41,7 +41,7 @@ from failuretwin.data_knowledge.bags.topics import (
 from failuretwin.data_knowledge.timed_log import Samples, Targets, TimedLog
 from failuretwin.digital_model.robot import Robot
 
-__all__ = ["BagTopics", "is_bag", "read_bag"]
+__all__ = ["BagTopics", "Track", "is_bag", "motor_track", "read_bag"]
 
 CLOCK_GAP_NS = 3600 * NS_PER_S
 """A silence of this length [ns] means that the stamps come from more than one clock."""
@@ -90,7 +90,7 @@ def read_bag(path: Path, robot: Robot, topics: BagTopics | None = None) -> list[
 
 
 @dataclass(frozen=True)
-class _Track:
+class Track:
     """What one topic says of the robot, sorted by time.
 
     Attributes:
@@ -114,14 +114,14 @@ class _Recording:
     robot: Robot
     messages: dict[str, list[BagMessage]]
 
-    def tool(self, fitting: Sequence[BagTopic]) -> _Track | None:
+    def tool(self, fitting: Sequence[BagTopic]) -> Track | None:
         topic = only_topic("tool", fitting, self.path)
         if topic is None:
             return None
         rows: ToolRows = tool_rows(self.messages[topic.name], require_kind(topic.fields))
-        return _Track(self._where(topic), rows.stamp_ns, rows.value)
+        return Track(self._where(topic), rows.stamp_ns, rows.value)
 
-    def motors(self, role: Role, fitting: Sequence[BagTopic], *, needed: bool) -> _Track | None:
+    def motors(self, role: Role, fitting: Sequence[BagTopic], *, needed: bool) -> Track | None:
         """Return what the topic for a role says; topics of other joints only do not count."""
         read = {topic.name: self._joints(role, topic) for topic in fitting}
         ours = [topic for topic in fitting if names_a_motor(read[topic.name].names, self.robot)]
@@ -129,7 +129,7 @@ class _Recording:
         topic = only_topic(role, ours or (fitting[:1] if needed else []), self.path)
         if topic is None:
             return None
-        return _motor_track(read[topic.name], self.robot, self._where(topic))
+        return motor_track(read[topic.name], self.robot, self._where(topic))
 
     def _joints(self, role: Role, topic: BagTopic) -> JointRows:
         messages, kind = self.messages[topic.name], require_kind(topic.fields)
@@ -139,7 +139,7 @@ class _Recording:
         return f"{self.path}: topic {topic.name}"
 
 
-def _motor_track(rows: JointRows, robot: Robot, where: str) -> _Track:
+def motor_track(rows: JointRows, robot: Robot, where: str) -> Track:
     """Return the angles of the robot's motors, leaving out rows that say nothing of them."""
     columns = motor_columns(rows.names, robot, where, in_counts=rows.in_counts)
     angle = rows.value[:, columns]
@@ -150,10 +150,10 @@ def _motor_track(rows: JointRows, robot: Robot, where: str) -> _Track:
         angle = np.where(sound, units.to_rad(angle), np.nan)
     said = np.asarray(np.isfinite(angle).any(axis=1))
     duration = None if rows.duration is None else rows.duration[said][:, columns]
-    return _Track(where, rows.stamp_ns[said], angle[said], duration)
+    return Track(where, rows.stamp_ns[said], angle[said], duration)
 
 
-def _check_commanded(command: _Track, robot: Robot) -> None:
+def _check_commanded(command: Track, robot: Robot) -> None:
     """Raise an InputError if a motor is named in commands but never given a value."""
     never = np.flatnonzero(~np.isfinite(command.value).any(axis=0))
     if len(never):
@@ -161,7 +161,7 @@ def _check_commanded(command: _Track, robot: Robot) -> None:
         raise InputError(f"{command.where}: no command holds a value for {names}. Record them.")
 
 
-def _check_whole(position: _Track) -> None:
+def _check_whole(position: Track) -> None:
     """Raise an InputError if no row of readings suffices to compute the tool path from."""
     if not np.isfinite(position.value).all(axis=1).any():
         raise InputError(
@@ -170,7 +170,7 @@ def _check_whole(position: _Track) -> None:
         )
 
 
-def _first_stamp(tracks: Sequence[_Track], path: Path) -> int:
+def _first_stamp(tracks: Sequence[Track], path: Path) -> int:
     """Return the earliest stamp [ns], once it is sure that all stamps are of one clock.
 
     Raises:
@@ -197,11 +197,11 @@ def _seconds(stamp_ns: IntArray, zero_ns: int) -> FloatArray:
     return as_floats((stamp_ns - zero_ns) / NS_PER_S)
 
 
-def _samples(track: _Track, zero_ns: int) -> Samples:
+def _samples(track: Track, zero_ns: int) -> Samples:
     return Samples(_seconds(track.stamp_ns, zero_ns), track.value)
 
 
-def _command(command: _Track, position: _Track | None, zero_ns: int) -> Samples | Targets:
+def _command(command: Track, position: Track | None, zero_ns: int) -> Samples | Targets:
     if command.duration is None:
         return _samples(command, zero_ns)
     rows = slice(int(_starts_with_known_pose(command, position)), None)
@@ -216,7 +216,7 @@ def _command(command: _Track, position: _Track | None, zero_ns: int) -> Samples 
     )
 
 
-def _starts_with_known_pose(command: _Track, position: _Track | None) -> bool:
+def _starts_with_known_pose(command: Track, position: Track | None) -> bool:
     """Return whether the first target only repeats where the readings say that the arm stands.
 
     Planners begin a trajectory with the pose it starts from. It is no movement, and readings tell

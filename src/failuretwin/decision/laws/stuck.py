@@ -14,9 +14,10 @@ from failuretwin.connection.healthy import HealthyModel
 from failuretwin.core.quadrature import log_of, log_sum, log_trapezoid_weights
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
-from failuretwin.decision.law import Law, Scene
+from failuretwin.decision.law import Law
 from failuretwin.decision.laws.nodes import nodes_around
 from failuretwin.decision.onsets import SHARES, OnsetPrior
+from failuretwin.decision.scene import Scene
 
 COARSE_NODES = 49
 """Nodes spread evenly over the range of the held angle."""
@@ -75,14 +76,16 @@ def _angle_nodes(scene: Scene, motor: int, prior: OnsetPrior) -> FloatArray:
     width = np.sqrt(1.0 / np.maximum(profile.precision[..., 0], 1.0) + 1e-10)
     local = nodes_around(profile.best[..., 0], width, profile.usable, low)
     coarse = np.broadcast_to(np.linspace(low, high, COARSE_NODES), (runs, COARSE_NODES))
-    origin, target = _ends(scene.evidence, motor)
-    settled = np.concatenate([origin, target[:, -1:]], axis=1)
+    origin, _ = _ends(scene.evidence, motor)
     scale = max(profile.scatter, 1e-4)
-    tied = [settled[..., None] + SETTLED_SCALE * scale * PRIOR_STEPS]
+    tied = [origin[..., None] + SETTLED_SCALE * scale * PRIOR_STEPS]
     if prior.known_s is not None:
         way = _position_at(scene, motor, prior.known_s)
         tied.append(way[..., None] + ON_THE_WAY_SCALE * scale * PRIOR_STEPS)
-    nodes = [coarse, local, *(peaks.reshape(runs, -1) for peaks in tied)]
+    # Padded movements favour no angle, so that a run is judged as it is on its own.
+    there = scene.evidence.movements.exists[..., None]
+    peaks = [np.where(there, angles, low).reshape(runs, -1) for angles in tied]
+    nodes = [coarse, local, *peaks]
     return np.sort(np.clip(np.concatenate(nodes, axis=1), low, high), axis=1)
 
 

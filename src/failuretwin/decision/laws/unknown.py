@@ -14,7 +14,8 @@ import numpy as np
 
 from failuretwin.core.quadrature import log_sum
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.law import Estimate, Scene, Weight
+from failuretwin.decision.scene import Scene
+from failuretwin.decision.weight import Estimate, Weight
 
 BLURS = (3.0, 8.0, 25.0)
 """Factors on the scatter: just more than tails allow, to anywhere near."""

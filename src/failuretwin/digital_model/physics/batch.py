@@ -22,6 +22,25 @@ SAMPLES_AT_ONCE = 250
 """Bounds what is in memory: states and controls of 64 runs at two steps each take about 10 MB."""
 
 
+@dataclass
+class Arms:
+    """Arms between two stretches of a simulation.
+
+    Attributes:
+        models: The model of each.
+        data: Scratch of MuJoCo, one for each thread.
+        pool: A `mujoco.rollout.Rollout`.
+        state: Their full physics state, (run, state).
+        setpoint: Output of their servos' filters, (run, motor) [rad].
+    """
+
+    models: list[PhysicsModel]
+    data: list[Any]
+    pool: Any
+    state: FloatArray
+    setpoint: FloatArray
+
+
 @dataclass(frozen=True)
 class Batch:
     """How runs are simulated.
@@ -55,31 +74,74 @@ class Batch:
         Raises:
             InputError: If the simulation becomes unstable.
         """
-        mujoco = load_mujoco()
-        models = self._models(drive.payload, len(out))
-        data = [mujoco.MjData(models[0].compiled) for _ in range(threads)]
-        speed = np.array([motor.speed_limit for motor in self.robot.motors])
-        reference = limit_speed(drive.reference * self.robot.sense, self.grid_step, speed)
-        strength = _strength(drive)
-        state = np.array(
-            [
-                rest_state(model, data[0], self.parameters, reference[i, 0], strength[i, 0])
-                for i, model in enumerate(models)
-            ]
-        )
-        out[:, 0] = self._angle(models[0], state[:, None])[:, 0]
-        setpoint = reference[:, 0]
-        compiled = [model.compiled for model in models]
+        reference = self.limited(drive.reference * self.robot.sense)
+        strength = strength_of(drive)
+        arms = self.at_rest(reference[:, 0], strength[:, 0], drive.payload, pool, threads)
+        out[:, 0] = self.angle(arms)
         for part in chunks(out.shape[1] - 1, SAMPLES_AT_ONCE):
             span = slice(part.start, part.stop + 1)
             held = None if drive.held is None else drive.held[:, part]
-            control, setpoint = self._control(reference[:, span], strength[:, span], held, setpoint)
-            states, _ = pool.rollout(compiled, data, state, control)
-            _check_warnings(data, self.step)
-            state = states[:, -1].copy()
-            out[:, part.start + 1 : part.stop + 1] = self._angle(
-                models[0], states[:, self.substeps - 1 :: self.substeps]
+            out[:, part.start + 1 : part.stop + 1] = self.advance(
+                arms, reference[:, span], strength[:, span], held
             )
+
+    def limited(self, reference: FloatArray) -> FloatArray:
+        """Return references (run, time, motor) [rad] that are no faster than the motors."""
+        speed = np.array([motor.speed_limit for motor in self.robot.motors])
+        return limit_speed(reference, self.grid_step, speed)
+
+    def at_rest(
+        self,
+        reference: FloatArray,
+        strength: FloatArray,
+        payload: FloatArray | None,
+        pool: Any,
+        threads: int,
+    ) -> Arms:
+        """Return arms at rest where servos and flex carry their weight.
+
+        Args:
+            reference: Where they are told to stand, physical sense, (run, motor) [rad].
+            strength: Shares of their stiffness that the servos have, (run, motor).
+            payload: Mass at the tool points, (run,) [kg]; None: none.
+            pool: A `mujoco.rollout.Rollout`.
+            threads: How many threads it has, 1 for none.
+        """
+        mujoco = load_mujoco()
+        models = self._models(payload, len(reference))
+        data = [mujoco.MjData(models[0].compiled) for _ in range(threads)]
+        state = np.array(
+            [
+                rest_state(model, data[0], self.parameters, reference[i], strength[i])
+                for i, model in enumerate(models)
+            ]
+        )
+        return Arms(models, data, pool, state, reference)
+
+    def advance(
+        self, arms: Arms, reference: FloatArray, strength: FloatArray, held: BoolArray | None
+    ) -> FloatArray:
+        """Move arms on and return their output sides' angles, (run, time, motor) [rad].
+
+        Args:
+            arms: The arms; their state is moved on.
+            reference: References at both ends of every sample, (run, time + 1, motor) [rad].
+            strength: Shares of their stiffness that the servos have, like `reference`.
+            held: Whether gears are held, (run, time, motor).
+
+        Raises:
+            InputError: If the simulation becomes unstable.
+        """
+        control, arms.setpoint = self._control(reference, strength, held, arms.setpoint)
+        compiled = [model.compiled for model in arms.models]
+        states, _ = arms.pool.rollout(compiled, arms.data, arms.state, control)
+        _check_warnings(arms.data, self.step)
+        arms.state = states[:, -1].copy()
+        return self._angle(arms.models[0], states[:, self.substeps - 1 :: self.substeps])
+
+    def angle(self, arms: Arms) -> FloatArray:
+        """Return the angles at which arms stand, physical sense, (run, motor) [rad]."""
+        return self._angle(arms.models[0], arms.state[:, None])[:, 0]
 
     def _models(self, payload: FloatArray | None, runs: int) -> list[PhysicsModel]:
         masses = np.zeros(runs) if payload is None else payload
@@ -132,7 +194,8 @@ def chunks(count: int, size: int) -> Iterator[slice]:
     return (slice(start, min(start + size, count)) for start in range(0, count, size))
 
 
-def _strength(drive: Drive) -> FloatArray:
+def strength_of(drive: Drive) -> FloatArray:
+    """Return the share of its stiffness that each servo has, (run, time, motor)."""
     if drive.weakness is None:
         return np.ones_like(drive.reference)
     return 1.0 - drive.weakness

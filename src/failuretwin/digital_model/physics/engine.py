@@ -70,16 +70,19 @@ class PhysicsEngine:
                 step is too long for the stiffness of the robot.
         """
         mujoco = load_mujoco()
-        grid_step = _check(drive, time, len(self.robot.motors))
-        substeps = max(1, int(np.ceil(grid_step / self.step_s - 1e-9)))
-        parameters = self.parameters or load_parameters(self.robot)
-        batch = Batch(self.robot, parameters or default_parameters(self.robot), grid_step, substeps)
+        batch = self.batch(_check(drive, time, len(self.robot.motors)))
         out = np.empty(drive.reference.shape)
         pool_size = 0 if self.threads == 1 else self.threads
         with mujoco.rollout.Rollout(nthread=pool_size) as pool:
             for rows in chunks(len(out), RUNS_AT_ONCE):
                 batch.run(_rows(drive, rows), pool, self.threads, out[rows])
         return out * self.robot.sense
+
+    def batch(self, grid_step: float) -> Batch:
+        """Return how runs on a time grid with steps of `grid_step` [s] are simulated."""
+        substeps = max(1, int(np.ceil(grid_step / self.step_s - 1e-9)))
+        parameters = self.parameters or load_parameters(self.robot)
+        return Batch(self.robot, parameters or default_parameters(self.robot), grid_step, substeps)
 
 
 def _rows(drive: Drive, rows: slice) -> Drive:

@@ -1,0 +1,140 @@
+"""Speed of learning and of learned diagnosers, against what they must reach on two cores."""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from runpy import run_path
+
+import numpy as np
+import onnxruntime
+import torch
+
+from failuretwin import load_robot
+from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.plan import Plan
+from failuretwin.decision.learned.encoder import Encoder
+from failuretwin.decision.learned.estimator import LearnedDiagnoser
+from failuretwin.decision.learned.networks import NETWORKS, Shape, build_network
+from failuretwin.decision.learned.numpy_export import export_numpy
+from failuretwin.decision.learned.onnx_export import export_onnx
+from failuretwin.decision.learned.recipe import Recipe
+from failuretwin.decision.learned.robust_features import expectation_of
+from failuretwin.decision.learned.signals import signals_of
+from failuretwin.decision.learned.stream import CHUNK_RUNS, Chunk, Stream
+from failuretwin.decision.learned.training import Pace, Standard, shuffled_batches, training
+from failuretwin.digital_model.imperfections import load_imperfections
+
+PAPER_ITERATIONS, PAPER_JOBS = 5050, 20
+STREAMED = 120
+"""Batches of the timed stream, after the first chunk has come."""
+
+
+def paper_training(cores: int) -> float:
+    """Return the time of one training of the paper's LSTM [s], from a few iterations.
+
+    Args:
+        cores: Threads that share the work.
+    """
+    rng = np.random.default_rng(0)
+    features = rng.standard_normal((3240, 100, 6)).astype(np.float32)
+    classes = rng.integers(0, 9, 3240)
+    torch.set_num_threads(cores)
+    network = build_network("lstm", Shape(6, 9))
+    steps = training(network, shuffled_batches(features, classes, 32, rng), Pace(1000))
+    for _ in itertools.islice(steps, 10):
+        pass
+    begun, timed = time.perf_counter(), 60
+    for _ in itertools.islice(steps, timed):
+        pass
+    torch.set_num_threads(1)
+    return (time.perf_counter() - begun) / timed * PAPER_ITERATIONS
+
+
+def share_waited(name: str, encoder: Encoder, recipe: Recipe) -> tuple[float, float]:
+    """Return the time of an iteration [s] and the share of it that training waits for runs."""
+    stream = Stream(recipe, encoder)
+    waited = [0.0]
+
+    def timed(chunks: Iterator[Chunk]) -> Iterator[Chunk]:
+        while True:
+            begun = time.perf_counter()
+            chunk = next(chunks)
+            waited[0] += time.perf_counter() - begun
+            yield chunk
+
+    with stream.chunks() as chunks:
+        standard = Standard.of(next(chunks)[0])
+        for _ in range(stream.uses):  # until as many chunks are in use as there ever are
+            next(chunks)
+        diagnoser = LearnedDiagnoser(name, encoder, iterations=STREAMED, random_state=0)
+        classes = [str(h) for h in recipe.hypotheses]
+        begun = time.perf_counter()
+        diagnoser.fit_batches(stream.batches(timed(chunks)), standard, classes, recipe.movements)
+        whole = time.perf_counter() - begun
+    return whole / STREAMED, waited[0] / whole
+
+
+def milliseconds(work: Callable[[], object], times: int = 50) -> float:
+    """Return the median time of some work [ms]."""
+    work()
+    taken = []
+    for _ in range(times):
+        begun = time.perf_counter()
+        work()
+        taken.append(time.perf_counter() - begun)
+    return 1000.0 * float(np.median(taken))
+
+
+def exported(name: str, encoder: Encoder, folder: Path) -> tuple[float, float]:
+    """Return the time to classify one run by ONNX and by the NumPy file, features included [ms]."""
+    robot = encoder.robot
+    runs = simulate(Plan(robot, paper_hypotheses(robot.motor_names), 2))
+    diagnoser = LearnedDiagnoser(name, encoder, iterations=2, random_state=0).fit(runs)
+    export_onnx(diagnoser, folder / "network.onnx")
+    export_numpy(diagnoser, folder / "network.py")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(folder / "network.onnx", options)
+    features = encoder.encode(signals_of(runs.isel(run=[0])))
+    diagnose = run_path(str(folder / "network.py"))["diagnose"]
+    time_s, command, measured = (
+        values.values for values in (runs["time"], runs["command"][0], runs["measured"][0])
+    )
+    return (
+        milliseconds(lambda: session.run(None, {"features": features})),
+        milliseconds(lambda: diagnose(time_s, command, measured)),
+    )
+
+
+def main() -> None:
+    """Time everything and print a table."""
+    torch.set_num_threads(1)
+    robot = load_robot("armpi_fpv")
+    imperfect = load_imperfections("armpi_fpv", robot)
+    encoder = Encoder("robust", robot, expectation_of(robot, imperfect))
+    recipe = Recipe(robot, imperfect)
+    one, two = paper_training(1), paper_training(2)
+    print(f"the paper's LSTM, 5050 iterations: {one:.0f} s on one core, {two:.0f} s on two")
+    print(f"so the whole study takes {PAPER_JOBS * one / 2 / 60:.0f} minutes on two cores")
+    begun = time.perf_counter()
+    recipe.chunk(0, CHUNK_RUNS, encoder)
+    each = 1000.0 * (time.perf_counter() - begun) / CHUNK_RUNS
+    print(f"a training run with its features: {each:.2f} ms on one core\n")
+    print(f"{'network':12s}{'iteration':>12s}{'waits':>8s}{'ONNX':>10s}{'NumPy file':>13s}")
+    with tempfile.TemporaryDirectory() as folder:
+        for name in NETWORKS:
+            iteration, waits = share_waited(name, encoder, recipe)
+            by_onnx, by_numpy = exported(name, encoder, Path(folder))
+            print(
+                f"{name:12s}{1000 * iteration:9.1f} ms{100 * waits:6.0f} %{by_onnx:7.2f} ms"
+                f"{by_numpy:10.2f} ms"
+            )
+
+
+if __name__ == "__main__":
+    main()

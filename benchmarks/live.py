@@ -1,0 +1,141 @@
+"""The live loop through a real roscore: nine states, delay, latency.
+
+Start `roscore` first. Arguments: how fast the emulated robots work (default 1), seconds that each
+of them works by its own clock (default 30), seed (default 0).
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
+from failuretwin.app.live.shadow import Shadow
+from failuretwin.connection.emulation.emulated_arm import FIRST_COMMAND_S
+from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.values import CommandSent, Item, Reading
+from failuretwin.connection.ros1.sinks import Ros1Robot
+from failuretwin.connection.ros1.source import Ros1Source
+from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.decision.recent_movements import RecentMovements
+from failuretwin.digital_model.robot import Robot
+
+ONSET_S = 6.0
+"""When the faults begin, by the robot's clock [s]."""
+SURE = 0.9
+LAST_WORDS_S = 1.0
+"""Time for the last messages to come once the robot is gone [s]."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What was said of one state.
+
+    Attributes:
+        last: The last diagnosis.
+        delay_s: From the end of the first ramp after the onset to the first sure and right answer
+            that was kept to the end [s]; NaN where there was none.
+    """
+
+    last: str | None
+    delay_s: float
+
+
+class Commands:
+    """A sink that keeps commands."""
+
+    name, trouble = "commands", ""
+
+    def __init__(self) -> None:
+        self.sent: list[CommandSent] = []
+
+    def put(self, item: Item) -> None:
+        """Keep a command."""
+        if isinstance(item, CommandSent):
+            self.sent.append(item)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing to be closed."""
+
+    def first_reached_after(self, onset_s: float) -> float:
+        """Return when the first movement after an onset [s] of the robot's life ends its ramp."""
+        zero = self.sent[0].time - FIRST_COMMAND_S
+        after = next(one for one in self.sent if one.time >= zero + onset_s)
+        return after.time + float(after.duration.max())
+
+
+def watch_state(robot: Robot, state: str, speed: float, seconds: float, seed: int) -> Outcome:
+    """Let a robot of a state work in a process of its own and watch it over ROS."""
+    command = [sys.executable, "-m", "failuretwin", "emulate", "--seed", str(seed)]
+    command += ["--speed", str(speed), "--duration", str(seconds)]
+    if state != "healthy":
+        command += ["--fault", f"{state}@{ONSET_S}"]
+    twin, commands, sure_since = DigitalTwin(robot), Commands(), np.nan
+    with Ros1Source(robot, RosTopics()) as source:
+        child = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+        shadow = Shadow(source, RecentMovements(BayesDiagnoser(twin)), twin, [commands])
+        deadline = np.inf
+        while time.monotonic() < deadline:
+            shadow.step(0.1)
+            if child.poll() is not None:
+                deadline = min(deadline, time.monotonic() + LAST_WORDS_S)
+            answer = shadow.moment.answer
+            if answer.diagnosis is None or answer.diagnosis.undecided:
+                continue
+            right = answer.diagnosis.posterior[state] >= SURE
+            sure_since = (answer.time if np.isnan(sure_since) else sure_since) if right else np.nan
+    diagnosis = shadow.moment.answer.diagnosis
+    last = None if diagnosis is None else diagnosis.diagnosis
+    return Outcome(last, sure_since - commands.first_reached_after(ONSET_S))
+
+
+def latency(robot: Robot, samples: int = 300) -> list[float]:
+    """Return the times from publishing a reading to the answer to it [s], through roscore."""
+    twin, topics = DigitalTwin(robot), RosTopics()
+    rng = np.random.default_rng(0)
+    taken = []
+    with Ros1Source(robot, topics) as source, Ros1Robot(robot, topics) as sink:
+        shadow = Shadow(source, RecentMovements(BayesDiagnoser(twin)), twin)
+        time.sleep(2.0)
+        pose = np.zeros(len(robot.motors))
+        for k in range(samples):
+            if k % 20 == 0:
+                pose = rng.uniform(-0.8, 0.8, len(pose))
+                sink.put(CommandSent(1000.0 + 0.1 * k, pose, np.full(len(pose), 0.8)))
+                shadow.step(1.0)
+            begin = time.perf_counter()
+            sink.put(Reading(1000.05 + 0.1 * k, np.full(3, np.nan), pose))
+            shadow.step(1.0)
+            taken.append(time.perf_counter() - begin)
+            time.sleep(0.02)
+    return taken
+
+
+def main() -> None:
+    """Print a line for each state, then the latency."""
+    speed, seconds, seed = (float(a) for a in [*sys.argv[1:], "1", "30", "0"][:3])
+    robot = load_robot("armpi_fpv")
+    taken = 1000.0 * np.array(latency(robot))
+    print(
+        f"latency of a sample through roscore: median {np.median(taken):.1f} ms, "
+        f"99 % {np.percentile(taken, 99):.1f} ms, longest {taken.max():.1f} ms"
+    )
+    delays, right = [], 0
+    for state in map(str, paper_hypotheses(robot.motor_names)):
+        outcome = watch_state(robot, state, speed, seconds, int(seed))
+        right += outcome.last == state
+        delays += [outcome.delay_s] if state != "healthy" else []
+        print(f"{state:28s} named {outcome.last!s:28s} sure after {outcome.delay_s:5.1f} s")
+    print(f"{right} of 9 right; median delay {np.nanmedian(delays):.1f} s")
+
+
+if __name__ == "__main__":
+    main()

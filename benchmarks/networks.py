@@ -1,0 +1,137 @@
+"""Networks side by side: same runs, same features, same iterations, several seeds.
+
+Trains what is missing in a folder and scores everything there on simulated runs of the physics
+engine. With --real, also on real runs: that is a look at them, and belongs into looks.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from failuretwin import BayesDiagnoser, DigitalTwin, Plan, ReadOptions, load_robot, read_runs
+from failuretwin.app.training import TrainingPlan, train_network
+from failuretwin.core.diagnosis import Diagnosis
+from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.core.types import FloatArray
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.decision.hybrid import HybridDiagnoser
+from failuretwin.decision.learned.networks import NETWORKS
+from failuretwin.decision.learned.storage import load_network, save_network
+from failuretwin.decision.metrics import (
+    equal_edges,
+    log_score,
+    log_score_gain,
+    mcnemar,
+    reliability,
+)
+from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.digital_model.robot import Robot
+
+if TYPE_CHECKING:
+    pass
+
+PER_CLASS = 223
+"""Runs of each class by the physics engine: 2007 in all."""
+
+
+def train_missing(folder: Path, robot: Robot, seeds: int, iterations: int) -> None:
+    """Train every network for every seed that has no file yet."""
+    folder.mkdir(parents=True, exist_ok=True)
+    imperfections = load_imperfections(robot.name, robot)
+    for seed in range(seeds):
+        for name in NETWORKS:
+            path = folder / f"{name}_{seed}.npz"
+            if not path.exists():
+                diagnoser, found, _ = train_network(
+                    TrainingPlan(name, iterations, seed), robot, imperfections
+                )
+                save_network(diagnoser, path)
+                print(f"{name} seed {seed}: {found}", flush=True)
+
+
+def judged(diagnoses: Sequence[Diagnosis]) -> tuple[float, float, float]:
+    """Return the share right, the log score [nats a run] and the calibration error."""
+    right = np.array([d.diagnosis == d.truth for d in diagnoses])
+    stated = np.array([min(max(d.posterior.values()), 1.0) for d in diagnoses])
+    nats = nats_of(diagnoses)
+    error = reliability(stated, right, equal_edges()).error
+    return float(right.mean()), float(nats.mean()), float(error)
+
+
+def nats_of(diagnoses: Sequence[Diagnosis]) -> FloatArray:
+    """Return the surprise at the truth of each run [nats]."""
+    truth = [str(d.truth) for d in diagnoses]
+    return log_score(truth, [d.posterior for d in diagnoses]).nats
+
+
+def print_networks(said: Mapping[str, Sequence[Diagnosis]], what: str) -> None:
+    """Print every network and, over its seeds, the mean of every kind."""
+    print(f"\n{what}\n{'':16s}{'right':>10s}{'nats':>8s}{'ECE':>8s}")
+    rows = {name: judged(diagnoses) for name, diagnoses in said.items()}
+    for name, (right, nats, error) in rows.items():
+        print(f"{name:16s}{100 * right:8.1f} %{nats:8.3f}{error:8.3f}")
+    for kind in NETWORKS:
+        mine = np.array([row for name, row in rows.items() if name.startswith(f"{kind}_")])
+        if len(mine):
+            (right, nats, error), spread = mine.mean(axis=0), mine[:, 0].std(ddof=len(mine) > 1)
+            print(
+                f"{kind:16s}{100 * right:8.1f} %{nats:8.3f}{error:8.3f}   mean of {len(mine)} "
+                f"seeds, sd {100 * spread:.1f} %"
+            )
+
+
+def compare(first: Sequence[Diagnosis], second: Sequence[Diagnosis], words: str) -> None:
+    """Print by how much the second is better than the first on the same runs."""
+    gain = log_score_gain(nats_of(first), nats_of(second), np.random.default_rng(0))
+    right = [np.array([d.diagnosis == d.truth for d in said]) for said in (first, second)]
+    test = mcnemar(*right)
+    low, high = gain.interval
+    print(
+        f"{words}: {gain.mean:+.4f} nats a run (95 % {low:+.4f} to {high:+.4f}); right by one "
+        f"alone {test.first_only} and {test.second_only}, p = {test.p:.2f}"
+    )
+
+
+def main() -> None:
+    """Train, score, compare."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path, help="where the networks are kept")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--iterations", type=int, default=6000)
+    parser.add_argument("--real", type=Path, help="real runs whose folders end in _label_K")
+    arguments = parser.parse_args()
+    robot = load_robot("armpi_fpv")
+    imperfections = load_imperfections(robot.name, robot)
+    train_missing(arguments.folder, robot, arguments.seeds, arguments.iterations)
+    networks = {
+        path.stem: load_network(path, robot) for path in sorted(arguments.folder.glob("*.npz"))
+    }
+    bayes = BayesDiagnoser(DigitalTwin(robot))
+    hypotheses = paper_hypotheses(robot.motor_names)
+    plan = Plan(robot, hypotheses, PER_CLASS, 500_002, imperfections, engine="physics")
+    sets = {f"{plan.size} runs of the physics engine": simulate(plan)}
+    if arguments.real is not None:
+        options = ReadOptions(published_labels=True)
+        real = read_runs(arguments.real, robot, options)
+        sets[f"{len(real['run'])} real runs of {arguments.real.name}"] = real
+    for what, runs in sets.items():
+        said = {name: network.diagnose(runs) for name, network in networks.items()}
+        model = bayes.diagnose(runs)
+        print_networks({"bayes": model, **said}, what)
+        for name, network in networks.items():
+            for form, weight in (("blended", network.weights_), ("gated", None)):
+                both = HybridDiagnoser(bayes, network, weight).diagnose(runs)
+                compare(model, both, f"{form} with {name} against bayes")
+                compare(said[name], both, f"{form} with {name} against {name}")
+    print()
+    for name, network in networks.items():
+        print(f"{name}: temperature {network.temperature_:.2f}, {network.weights_}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,139 @@
+"""The live view on a terminal: motors, residual, posterior over time, what changed."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from failuretwin.app.live.changes import Change
+from failuretwin.app.live.shadow import Moment
+from failuretwin.connection.links.diagnostic_status import (
+    LEVEL_ERROR,
+    LEVEL_NAMES,
+    LEVEL_OK,
+    LEVEL_STALE,
+    LEVEL_WARN,
+    statuses,
+)
+from failuretwin.connection.links.values import LinkCounts
+
+STYLES = {
+    LEVEL_OK: "green",
+    LEVEL_WARN: "yellow",
+    LEVEL_ERROR: "bold red",
+    LEVEL_STALE: "magenta",
+}
+BLOCKS = " ▁▂▃▄▅▆▇█"
+COLUMNS = 60
+"""Width of the posterior over time."""
+COLUMN_S = 1.0
+"""Time of our own clock that one column stands for [s]."""
+RESIDUAL_MM = 50.0
+"""Residual that fills its bar [mm]."""
+BAR = 20
+SHOWN_HYPOTHESES = 6
+SHOWN_CHANGES = 8
+
+
+class View:
+    """Draws what the shadow knows.
+
+    Args:
+        motors: Names of the robot's motors in chain order.
+        source: What the robot is called.
+    """
+
+    def __init__(self, motors: Sequence[str], source: str) -> None:
+        self._motors = motors
+        self._source = source
+        self._history: deque[dict[str, float]] = deque(maxlen=COLUMNS)
+        self._next_s = 0.0
+
+    def draw(self, moment: Moment, counts: LinkCounts, changes: Sequence[Change]) -> RenderableType:
+        """Return the view of a moment.
+
+        Args:
+            moment: What the shadow knows.
+            counts: What the link has seen.
+            changes: What has changed so far, the newest last.
+        """
+        self._remember(moment)
+        lines = [Text(str(change)) for change in list(changes)[-SHOWN_CHANGES:]]
+        return Group(
+            self._head(moment, counts),
+            self._motor_table(moment),
+            Panel(self._posterior(), title=f"posterior, last {COLUMNS} s", title_align="left"),
+            Panel(Group(*lines), title="what changed", title_align="left"),
+        )
+
+    def _remember(self, moment: Moment) -> None:
+        now_s = time.monotonic()
+        if now_s < self._next_s:
+            return
+        self._next_s = now_s + COLUMN_S
+        diagnosis, stale = moment.answer.diagnosis, moment.answer.state != "OK"
+        known = diagnosis is not None and not stale
+        self._history.append(dict(diagnosis.posterior) if known and diagnosis else {})
+
+    def _head(self, moment: Moment, counts: LinkCounts) -> Text:
+        arm = statuses(moment.answer, self._motors)[0]
+        head = Text(f"{LEVEL_NAMES[arm.level]:6s}", STYLES[arm.level])
+        head.append(f" {arm.message}\n", "default")
+        off = float(np.linalg.norm(moment.residual)) * 1000.0
+        share = 0.0 if np.isnan(off) else min(1.0, off / RESIDUAL_MM)
+        said = "no reading" if np.isnan(off) else f"{off:5.1f} mm off the reference"
+        head.append(
+            f"{self._source}  {moment.stream_time:.1f} s  {counts.received} events, "
+            f"{counts.garbage} garbage, {counts.dropped} dropped, {counts.reconnects} reconnects, "
+            f"{1000 * moment.seconds:.1f} ms a sample\n",
+            "dim",
+        )
+        head.append(f"tool   {_bar(share)} {said}", "default")
+        return head
+
+    def _motor_table(self, moment: Moment) -> Table:
+        table = Table(box=None, pad_edge=False)
+        for name in ("motor", "state", "faulty", "", "how"):
+            table.add_column(name)
+        for status in statuses(moment.answer, self._motors)[1:]:
+            probability = float(status.values.get("probability", 0.0))
+            table.add_row(
+                status.name,
+                Text(LEVEL_NAMES[status.level], STYLES[status.level]),
+                f"{100 * probability:5.1f} %" if status.values else "",
+                _bar(probability),
+                status.message,
+            )
+        return table
+
+    def _posterior(self) -> Table:
+        """Return the posterior over time, a row for each hypothesis that ever mattered."""
+        weight: dict[str, float] = {}
+        for column in self._history:
+            for name, probability in column.items():
+                weight[name] = weight.get(name, 0.0) + probability
+        ranked = sorted(weight, key=lambda name: -weight[name])[:SHOWN_HYPOTHESES]
+        table = Table(box=None, show_header=False, pad_edge=False)
+        for name in ranked:
+            blocks = "".join(_block(column.get(name)) for column in self._history)
+            last = self._history[-1].get(name)
+            table.add_row(name, blocks, "" if last is None else f"{100 * last:5.1f} %")
+        return table
+
+
+def _bar(share: float) -> str:
+    full = round(BAR * share)
+    return "█" * full + "·" * (BAR - full)
+
+
+def _block(probability: float | None) -> str:
+    if probability is None:
+        return "?"
+    return BLOCKS[round(probability * (len(BLOCKS) - 1))]

@@ -1,0 +1,172 @@
+"""A robot behind a rosbridge server, ROS 1 or ROS 2, over a web socket."""
+
+from __future__ import annotations
+
+import threading
+from functools import partial
+from types import SimpleNamespace
+from typing import Any, Self
+
+from failuretwin.connection.links.bulletin import Bulletin
+from failuretwin.connection.links.event_queue import EventQueue
+from failuretwin.connection.links.inbox import Inbox
+from failuretwin.connection.links.ros_topics import RosTopics, kind_of_type
+from failuretwin.connection.links.ros_writer import DIAGNOSTICS_TYPE
+from failuretwin.connection.links.values import Answer, Event, Item, LinkCounts
+from failuretwin.core.errors import InputError
+from failuretwin.data_knowledge.bags.messages import Kind
+from failuretwin.data_knowledge.bags.topics import Role
+from failuretwin.digital_model.robot import Robot
+
+CONNECT_S = 5.0
+"""Longest wait for the server at the start [s]."""
+RECONNECT_S = 2.0
+"""Longest pause between two attempts to reach a server that has gone [s]."""
+GOODBYE_S = 2.0
+"""Longest wait for the server in the end [s]."""
+_ROS1_TIME = {"secs": "sec", "nsecs": "nanosec"}
+"""What ROS 1 calls the parts of a time, and what ROS 2 does."""
+
+
+def connect(host: str, port: int) -> Any:
+    """Return a connection to a rosbridge server, a `roslibpy.Ros`.
+
+    Raises:
+        InputError: If roslibpy is missing or no server answers.
+    """
+    try:
+        import roslibpy
+    except ImportError as error:
+        raise InputError(
+            f"rosbridge needs roslibpy ({error}). Install it: pip install 'failuretwin[live]'."
+        ) from error
+    ros = roslibpy.Ros(host, port, transport="asyncio")
+    ros.factory.set_max_delay(RECONNECT_S)
+    try:
+        ros.run(CONNECT_S)
+    except roslibpy.core.RosTimeoutError as error:
+        ros.terminate()
+        raise InputError(
+            f"no rosbridge server answers at {host}:{port}. Start one there, such as "
+            "`roslaunch rosbridge_server rosbridge_websocket.launch`."
+        ) from error
+    return ros
+
+
+def disconnect(ros: Any) -> None:
+    """Close a connection, and wait for a server that is there to agree."""
+    if ros.is_connected:
+        closed = threading.Event()
+        ros.factory.once("close", lambda _: closed.set())
+        ros.close()
+        closed.wait(GOODBYE_S)
+    ros.terminate()
+
+
+class RosbridgeSource:
+    """Listens to the topics of a robot; a server that goes away and comes back is no trouble.
+
+    Args:
+        robot: The robot.
+        topics: Its topics, with their types.
+        ros: The connection, see `connect`.
+        queue: Where events wait to be fetched.
+    """
+
+    ended = False
+
+    def __init__(
+        self, robot: Robot, topics: RosTopics, ros: Any, queue: EventQueue | None = None
+    ) -> None:
+        import roslibpy
+
+        self.name = f"rosbridge {ros.factory.url}"
+        self._ros = ros
+        self._inbox = Inbox(robot, topics, queue)
+        self._reconnects = -1
+        self._topics = []
+        self._count_connections(None)
+        for role, name, type_ in topics.subscribed:
+            topic = roslibpy.Topic(ros, name, type_)
+            topic.subscribe(partial(self._take, role, kind_of_type(type_)))
+            self._topics.append(topic)
+
+    @property
+    def counts(self) -> LinkCounts:
+        """What it has seen so far."""
+        return self._inbox.counts(self._reconnects)
+
+    def poll(self, timeout_s: float) -> Event | None:
+        """Return the next event; None if none came within `timeout_s` [s]."""
+        return self._inbox.poll(timeout_s)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._ros.is_connected:
+            for topic in self._topics:
+                topic.unsubscribe()
+
+    def _count_connections(self, _: Any) -> None:
+        self._reconnects += 1
+        self._ros.factory.once("close", self._await_next)
+
+    def _await_next(self, _: Any) -> None:
+        self._ros.factory.once("ready", self._count_connections)
+
+    def _take(self, role: Role, kind: Kind, message: Any) -> None:
+        self._inbox.take(role, lambda: (_as_object(message), kind))
+
+
+class RosbridgeDiagnostics:
+    """Publishes answers as diagnostics: every second, and at once when a status gets worse.
+
+    Args:
+        robot: The robot.
+        topics: Names the topic.
+        ros: The connection, see `connect`.
+    """
+
+    def __init__(self, robot: Robot, topics: RosTopics, ros: Any) -> None:
+        import roslibpy
+
+        self.name = f"rosbridge {ros.factory.url} diagnostics"
+        self._ros = ros
+        self._bulletin = Bulletin(robot, topics)
+        self._topic = roslibpy.Topic(ros, topics.diagnostics, DIAGNOSTICS_TYPE)
+        self._topic.advertise()
+
+    @property
+    def trouble(self) -> str:
+        """What keeps items from arriving just now."""
+        return "" if self._ros.is_connected else "the rosbridge server is gone"
+
+    def put(self, item: Item) -> None:
+        """Publish an answer if it is time to and the server is there."""
+        if not isinstance(item, Answer) or self.trouble:
+            return
+        message = self._bulletin.message(item)
+        if message is not None:
+            import roslibpy
+
+            self._topic.publish(roslibpy.Message(message.content))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._ros.is_connected:
+            self._topic.unadvertise()
+
+
+def _as_object(value: Any) -> Any:
+    """Return JSON as objects with fields, times under their ROS 2 names."""
+    if isinstance(value, dict):
+        found = SimpleNamespace()
+        for name, part in value.items():
+            setattr(found, _ROS1_TIME.get(name, str(name)), _as_object(part))
+        return found
+    if isinstance(value, list):
+        return [_as_object(part) for part in value]
+    return value

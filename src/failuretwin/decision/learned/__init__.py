@@ -1,0 +1,1 @@
+"""Diagnosis by networks trained on the digital twin. Needs the extra `learn`."""

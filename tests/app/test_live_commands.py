@@ -1,0 +1,165 @@
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import time
+
+import pytest
+
+from ros_peer import RosPeer
+from roscores import free_port
+
+pytest.importorskip("mcap")
+pytest.importorskip("mujoco")
+
+FAULT = ("--fault", "motor_3:stuck@12-25")
+TOLD = re.compile(r"^ *([\d.]+) s  (.*)$", re.MULTILINE)
+
+
+def told(answer):
+    """Return what a live command said, as (time [s], text)."""
+    return [(float(at), text) for at, text in TOLD.findall(answer.stdout)]
+
+
+@pytest.fixture(scope="module")
+def recording(failuretwin, tmp_path_factory):
+    """An emulated robot of which motor 3 sticks from 12 to 25 s, as a file."""
+    path = tmp_path_factory.mktemp("live") / "robot.mcap"
+    answer = failuretwin("emulate", "--to", path, "--duration", 45, *FAULT)
+    assert answer.returncode == 0, answer.stderr
+    states = [text for _, text in told(answer)]
+    assert states == ["healthy", "motor_3:stuck", "healthy"]
+    return path
+
+
+def check_found(changes):
+    """Check that motor 3 is found stuck after it began, and healthy after it was repaired."""
+    stuck = [at for at, text in changes if text.startswith("motor 3 stuck")]
+    assert stuck
+    assert 12.0 < stuck[0] < 25.0
+    assert [text.startswith("healthy again") for at, text in changes if at > 25.0][-1]
+
+
+def test_a_recorded_fault_and_its_repair_are_found(failuretwin, recording):
+    answer = failuretwin("watch", recording, "--speed", 0)
+    assert answer.returncode == 0, answer.stderr
+    check_found(told(answer))
+    assert "last answer: healthy" in answer.stdout
+
+
+def test_an_emulated_robot_is_watched_and_recorded(failuretwin, tmp_path):
+    path = tmp_path / "live.mcap"
+    answer = failuretwin(
+        *("watch", "emulated", "--speed", 0, "--duration", 45, "--record", path), *FAULT
+    )
+    assert answer.returncode == 0, answer.stderr
+    check_found(told(answer))
+    again = failuretwin("watch", path, "--speed", 0)
+    assert [text for _, text in told(again)][-1:] == [text for _, text in told(answer)][-1:]
+
+
+def test_a_robot_on_a_ros_network_is_watched(roscore):
+    """Three programs on a real roscore: a robot, its shadow, and one that reads /diagnostics."""
+    environment = {
+        **os.environ,
+        **{k: v for k, v in roscore.environment.items() if k.startswith("ROS_")},
+    }
+    peer = RosPeer(roscore.environment)
+    topic = {"topic": "/diagnostics"}
+    peer.ask(op="listen", type="diagnostic_msgs/DiagnosticArray", **topic)
+    command = [sys.executable, "-m", "failuretwin"]
+    robot = subprocess.Popen(
+        [*command, "emulate", "--speed", "5", "--fault", "motor_3:stuck@20"],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        answer = subprocess.run(
+            [*command, "watch", "ros1", "--duration", "14"],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    finally:
+        robot.terminate()
+        said, wrong = robot.communicate(timeout=20)
+        messages = peer.ask(op="heard", **topic)
+        peer.close()
+    assert answer.returncode == 0, answer.stderr
+    assert "motor_3:stuck" in said, wrong
+    assert any(text.startswith("motor 3 stuck") for _, text in told(answer))
+    assert 8 <= len(messages) <= 30
+    motors = {s["name"]: s["level"] for s in messages[-1]["statuses"]}
+    assert motors["failuretwin: motor_3"] == 2
+    assert motors["failuretwin: arm"] == 2
+
+
+def test_without_a_master_the_user_is_told_to_start_one(failuretwin, monkeypatch):
+    pytest.importorskip("roslibpy")
+    monkeypatch.setenv("ROS_MASTER_URI", f"http://127.0.0.1:{free_port()}")
+    for verb in (("watch", "ros1"), ("emulate",)):
+        answer = failuretwin(*verb)
+        assert answer.returncode == 2
+        assert re.search("Start `roscore`|needs rospy", answer.stderr)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("watch", "nowhere"), "source 'nowhere' does not exist. Expected emulated, ros1,"),
+        (("watch", "rosbridge://"), "is no address. Expected rosbridge://HOST[:PORT]"),
+        (("watch", "rosbridge://host:port"), "is no address"),
+        (("watch", "emulated", "--fault", "motor_9:stuck@5"), "unknown motor 'motor_9'"),
+        (("watch", "emulated", "--speed", "nan"), "expected a factor above 0"),
+        (("watch", "emulated", "--topics", "missing.toml"), "missing.toml: cannot be read"),
+        (("emulate", "--robot", "ur5e"), "cm/msg_cm holds servo counts"),
+        (("watch", "ros1", "--robot", "ur5e"), "file for --topics"),
+        (("emulate", "--to", "robot.bag"), "expected ros1 or a file that ends in .mcap"),
+        (("emulate", "--to", "a.mcap", "--fault", "motor_3:stuck"), "is not of the form"),
+        (("emulate", "--to", "no/such/folder.mcap"), "cannot be written"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_line(failuretwin, tmp_path, arguments, said):
+    answer = failuretwin(*arguments, folder=tmp_path)
+    assert answer.returncode == 2
+    assert said in answer.stderr
+    assert answer.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recording_is_not_overwritten(failuretwin, tmp_path):
+    path = tmp_path / "live.mcap"
+    path.write_text("precious")
+    for verb in (("emulate", "--to"), ("watch", "emulated", "--record")):
+        answer = failuretwin(*verb, path)
+        assert answer.returncode == 2
+        assert "exists already" in answer.stderr
+    assert path.read_text() == "precious"
+
+
+def test_an_interrupt_ends_the_watch_and_the_recording(recording, tmp_path):
+    path = tmp_path / "live.mcap"
+    shadow = subprocess.Popen(
+        [sys.executable, "-m", "failuretwin", "watch", str(recording), "--record", str(path)],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 30.0
+    while not path.exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    time.sleep(1.5)
+    shadow.send_signal(2)
+    said, _ = shadow.communicate(timeout=20)
+    assert shadow.returncode == 0
+    assert "stopped" in said
+    from mcap.reader import make_reader
+
+    with path.open("rb") as file:
+        assert make_reader(file).get_summary().statistics.message_count > 5

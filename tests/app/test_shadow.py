@@ -1,0 +1,274 @@
+from __future__ import annotations
+
+from collections import deque
+from io import StringIO
+
+import numpy as np
+import pytest
+
+from failuretwin.app.live import shadow as shadow_module
+from failuretwin.app.live.changes import Changes
+from failuretwin.app.live.shadow import Shadow
+from failuretwin.app.live.view import View
+from failuretwin.app.live.watching import watch_until_end
+from failuretwin.connection.links.values import OK, STALE, Answer, CommandSent, LinkCounts, Reading
+from failuretwin.core.diagnosis import Diagnosis
+
+HEALTHY = Diagnosis("live", {"healthy": 0.99, "motor_3:stuck": 0.01}, verdict="healthy, 99 % sure")
+STUCK = Diagnosis("live", {"healthy": 0.01, "motor_3:stuck": 0.99}, verdict="motor 3 stuck")
+
+
+class Script:
+    """A source that gives what it is told; None is a silence."""
+
+    name = "a script"
+
+    def __init__(self, events):
+        self.events = deque(events)
+        self.counts = LinkCounts()
+
+    @property
+    def ended(self):
+        return not self.events
+
+    def poll(self, timeout_s):
+        return self.events.popleft() if self.events else None
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+
+class Notebook:
+    """A diagnoser that writes down what it is told."""
+
+    def __init__(self, diagnosis=HEALTHY):
+        self.told = []
+        self.diagnosis = diagnosis
+
+    def update(self, time, command, measured):
+        self.told.append((time, command, measured))
+        return Answer(time, OK, self.diagnosis)
+
+
+class Kept:
+    """A sink that keeps everything."""
+
+    name, trouble = "kept", ""
+
+    def __init__(self):
+        self.items = []
+
+    def put(self, item):
+        self.items.append(item)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Our own clock, which stands unless it is moved."""
+    now = [1000.0]
+    monkeypatch.setattr(shadow_module.time, "monotonic", lambda: now[0])
+    return now
+
+
+def reading(t, tool=(0.1, 0.0, 0.2)):
+    return Reading(t, np.array(tool, dtype=float), np.zeros(4))
+
+
+def command(t, target):
+    return CommandSent(t, np.full(4, float(target)), np.ones(4))
+
+
+def run(shadow):
+    while shadow.step(0.0):
+        pass
+
+
+def test_a_diagnoser_is_told_the_reference_with_its_corners(twin):
+    events = [reading(100.0), command(100.3, 0.8), reading(100.8), reading(102.0)]
+    notebook = Notebook()
+    run(Shadow(Script(events), notebook, twin))
+    times = [time for time, _, _ in notebook.told]
+    values = [None if value is None else value[0] for _, value, _ in notebook.told]
+    np.testing.assert_allclose(times, [0.0, 0.3, 0.8, 1.3, 2.0], atol=1e-9)
+    np.testing.assert_allclose(values, [0.0, 0.0, 0.4, 0.8, 0.8], atol=1e-9)
+    seen = [measured is not None for _, _, measured in notebook.told]
+    assert seen == [True, False, True, False, True]
+
+
+def test_a_reading_without_a_tool_position_is_no_measurement(twin):
+    notebook = Notebook()
+    run(Shadow(Script([reading(0.0), reading(0.1, [np.nan] * 3)]), notebook, twin))
+    assert notebook.told[1][2] is None
+
+
+def test_commands_that_come_late_take_their_place(twin):
+    events = [reading(0.0), reading(1.0), reading(2.0), command(0.5, 0.8), reading(3.0)]
+    notebook = Notebook()
+    run(Shadow(Script(events), notebook, twin, commands_late_s=2.0))
+    reference = {round(t, 6): value[0] for t, value, _ in notebook.told}
+    assert reference == pytest.approx({0.0: 0.0, 0.5: 0.0, 1.0: 0.4, 1.5: 0.8, 2.0: 0.8, 3.0: 0.8})
+
+
+def test_silence_is_never_healthy(twin, clock):
+    script, notebook = Script([reading(0.0)]), Notebook()
+    script.events.extend([None] * 20)
+    shadow = Shadow(script, notebook, twin)
+    states = []
+    for _ in range(15):
+        shadow.step(0.0)
+        states.append(shadow.moment.answer.state)
+        clock[0] += 0.6
+    assert states[0] == OK
+    assert states[1:8] == [OK] * 7
+    assert states[9:] == [STALE] * 6  # more than 5 s
+    assert shadow.moment.answer.diagnosis is HEALTHY  # what was known is not forgotten
+    times = [time for time, _, _ in notebook.told]
+    assert times == sorted(times)  # the diagnoser was told that time went on
+    assert times[-1] > 5.0
+    script.events.appendleft(reading(9.0))
+    shadow.step(0.0)
+    assert shadow.moment.answer.state == OK
+
+
+def test_commands_alone_are_silence(twin, clock):
+    script = Script([reading(0.0), *(command(float(t), 0.1) for t in range(1, 20))])
+    shadow = Shadow(script, Notebook(), twin)
+    while shadow.step(0.0):
+        clock[0] += 1.0
+    script.events.extend([None, None])
+    shadow.step(0.0)
+    assert shadow.moment.answer.state == STALE
+
+
+def test_the_user_is_told_how_late_commands_come(twin, armpi):
+    from rich.console import Console
+
+    events = [reading(0.0), reading(2.0), command(0.2, 0.8), reading(2.1), reading(2.2)]
+    script = Script(events)
+    shadow = Shadow(script, Notebook(), twin)
+    console = Console(file=StringIO())
+    told = watch_until_end(shadow, script, [], armpi.motor_names, console, np.inf)
+    late = "commands come late: put commands_late_s = 2.0 into the --topics file"
+    assert late in [change.text for change in told.lines]
+
+
+def test_motor_readings_alone_are_silence(twin, clock):
+    script = Script([reading(0.0), *(reading(float(t), [np.nan] * 3) for t in range(1, 10))])
+    shadow = Shadow(script, Notebook(), twin)
+    for _ in range(9):
+        shadow.step(0.0)
+        clock[0] += 1.0
+    assert shadow.moment.answer.state == STALE
+
+
+def test_before_any_data_nothing_is_known(twin):
+    assert Shadow(Script([]), Notebook(), twin).moment.answer == Answer(0.0, STALE, None)
+
+
+@pytest.mark.parametrize("jump", [3.15e7, -3.15e7])
+def test_a_clock_that_jumps_leaves_the_diagnosers_time_as_it_was(twin, clock, jump):
+    notebook, script = Notebook(), Script([])
+    shadow = Shadow(script, notebook, twin)
+    for k in range(100):
+        script.events.append(reading(5000.0 + 0.1 * k + (jump if k >= 50 else 0.0)))
+        shadow.step(0.0)
+        clock[0] += 0.1
+    np.testing.assert_allclose([t for t, _, _ in notebook.told], 0.1 * np.arange(100), atol=1e-6)
+    assert shadow.clock_jumps == 1
+    assert shadow.moment.answer.time == pytest.approx(5009.9 + jump)
+
+
+def test_sinks_get_events_and_answers_by_the_robots_clock(twin):
+    kept = Kept()
+    run(
+        Shadow(Script([reading(50.0), command(50.5, 0.1), reading(51.0)]), Notebook(), twin, [kept])
+    )
+    assert [(type(item).__name__, item.time) for item in kept.items] == [
+        ("Reading", 50.0),
+        ("Answer", 50.0),
+        ("CommandSent", 50.5),
+        ("Reading", 51.0),
+        ("Answer", 51.0),
+    ]
+
+
+def test_the_residual_is_the_distance_from_the_reference(twin):
+    at_rest = twin.path(np.zeros(4))
+    offset = np.array([0.0, 0.01, 0.0])
+    shadow = Shadow(Script([reading(0.0, at_rest + offset)]), Notebook(), twin)
+    run(shadow)
+    np.testing.assert_allclose(shadow.moment.residual, offset, atol=1e-12)
+
+
+def lines(changes, moments, counts=None, troubles=()):
+    found = []
+    for moment in moments:
+        counts = counts or LinkCounts()
+        found += [c.text for c in changes.notice(moment, counts, 0, troubles)]
+    return found
+
+
+def moment(time, state, diagnosis):
+    answer = Answer(time, state, diagnosis)
+    return shadow_module.Moment(answer, time, np.full(3, np.nan), 0.001)
+
+
+def test_what_changes_is_told_once(armpi):
+    changes = Changes(armpi.motor_names)
+    states = [(OK, HEALTHY)] * 3 + [(OK, STUCK)] * 3 + [(STALE, STUCK)] * 3 + [(OK, HEALTHY)] * 3
+    told = lines(changes, [moment(float(k), *state) for k, state in enumerate(states)])
+    assert told == [
+        "healthy, 99 % sure",
+        "motor 3 stuck",
+        "no data any more",
+        "data are coming",
+        "healthy again: healthy, 99 % sure",
+    ]
+    assert str(changes.lines[1]) == "     3.0 s  motor 3 stuck"
+
+
+def test_an_uncertain_answer_is_no_change(armpi):
+    unsure = Diagnosis("live", {"healthy": 0.6, "motor_3:stuck": 0.4}, verdict="healthy?")
+    changes = Changes(armpi.motor_names)
+    told = lines(changes, [moment(0.0, OK, STUCK), moment(1.0, OK, unsure), moment(2.0, OK, STUCK)])
+    assert told == ["motor 3 stuck"]
+
+
+def test_trouble_with_the_link_is_told(armpi):
+    changes = Changes(armpi.motor_names)
+    still = moment(0.0, OK, None)
+    counts = LinkCounts(10, 2, 3, 1, "ValueError: nonsense")
+    told = [c.text for c in changes.notice(still, counts, 1, ("disk full",))]
+    assert told == [
+        "the link is back",
+        "3 events dropped so far: this computer is too slow",
+        "the robot's clock jumped; going on by our own",
+        "2 messages made no sense so far: ValueError: nonsense",
+        "disk full",
+    ]
+    assert [c.text for c in changes.notice(still, counts, 1, ())] == ["over: disk full"]
+
+
+def test_the_view_shows_motors_posterior_and_changes(armpi):
+    from rich.console import Console
+
+    view, changes = View(armpi.motor_names, "a script"), Changes(armpi.motor_names)
+    told = moment(3.0, OK, STUCK)
+    changes.notice(told, LinkCounts(), 0, ())
+    console = Console(width=120, file=StringIO())
+    with console.capture() as captured:
+        console.print(view.draw(told, LinkCounts(received=7), changes.lines))
+    text = captured.get()
+    assert "ERROR" in text
+    assert "7 events, 0 garbage, 0 dropped" in text
+    assert "motor_3  ERROR   99.0 %" in text
+    assert "motor_3:stuck" in text
+    assert "3.0 s  motor 3 stuck" in text
+    stale = view.draw(moment(9.0, STALE, HEALTHY), LinkCounts(), changes.lines)
+    with console.capture() as captured:
+        console.print(stale)
+    assert "no data for a while" in captured.get()
+    assert "OK" not in captured.get()

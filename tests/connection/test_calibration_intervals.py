@@ -1,0 +1,167 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import special, stats
+
+from failuretwin.connection.calibration.learn import calibrate
+from failuretwin.connection.calibration.parameters import (
+    rate_parameter,
+    settling_parameters,
+    spring_remarks,
+)
+from failuretwin.connection.calibration.rates import Rate
+from failuretwin.connection.calibration.settled_errors import log_rounded_student
+from failuretwin.connection.calibration.settled_fit import SettledFit
+from failuretwin.connection.calibration.timing_fit import LAGS_S, joint_doubt
+from failuretwin.connection.calibration.trust import untrusted
+from failuretwin.core.hypothesis import HEALTHY
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.plan import Plan
+from failuretwin.digital_model.imperfections import Timing
+
+COUNT = np.deg2rad(0.24)
+
+
+# Rates
+
+
+@pytest.mark.parametrize("mean_hits", [0.3, 1.0, 3.0, 10.0])
+@pytest.mark.parametrize("trials", [25, 400])
+def test_interval_of_a_rate_holds_the_truth_wherever_it_was_seen(mean_hits, trials):
+    hits, rate = np.arange(1, trials + 1), mean_hits / trials
+    chance = stats.binom.pmf(hits, trials, rate)
+    likely = hits[chance > 1e-9]
+    intervals = np.array([Rate(int(h), trials).interval for h in likely])
+    inside = (intervals[:, 0] <= rate) & (rate <= intervals[:, 1])
+    assert 0.93 < chance[likely - 1] @ inside / chance.sum() < 0.99
+
+
+def test_interval_of_an_often_seen_rate_is_nearly_that_of_the_jeffreys_posterior():
+    below = special.betainc(60.5, 340.5, Rate(60, 400).interval)
+    np.testing.assert_allclose(below, [0.025, 0.975], atol=5e-4)
+    assert Rate(60, 400).mean == pytest.approx(60.5 / 401.0, rel=1e-15)
+
+
+def test_what_was_never_seen_is_bounded_but_not_called_identified():
+    never = rate_parameter("lost commands", "motor_3", Rate(0, 150))
+    assert not never.identified
+    assert never.low == 0.0
+    assert 0.005 < never.high < 0.03
+    assert never.note == "never seen in 150 cases, so 1.7 % at most; it takes longer logs"
+    once = rate_parameter("lost commands", "motor_3", Rate(1, 150))
+    assert once.identified
+    assert once.low == 0.0
+
+
+# Tails
+
+
+def tails(dof, log_deviation, armpi):
+    mode, deviation = np.zeros(17), np.full(17, 1e-3)
+    mode[-1], deviation[-1] = np.log(dof), log_deviation
+    fit = SettledFit(mode, np.diag(deviation**2), np.ones(17), 0.0)
+    return settling_parameters(fit, armpi, 0.0)[-1]
+
+
+def test_the_interval_of_the_tails_is_even_about_their_inverse(armpi):
+    found = tails(5.0, 0.2, armpi)
+    assert found.identified
+    assert 1.0 / found.low + 1.0 / found.high == pytest.approx(2.0 / found.value, rel=1e-12)
+    assert 1.0 / found.low - 1.0 / found.high == pytest.approx(2 * 1.96 * 0.2 / 5.0, rel=1e-4)
+
+
+def test_tails_may_be_those_of_a_normal_scatter(armpi):
+    assert tails(15.0, 0.6, armpi).high == np.inf
+    wide = tails(2.5, 0.5, armpi)
+    assert not wide.identified
+    assert "hundred movements" in wide.note
+
+
+# What does not fit a healthy robot
+
+
+def test_a_compliance_below_zero_is_remarked_upon(armpi):
+    mode, deviation = np.zeros(17), np.full(17, 1e-3)
+    mode[4:8] = [-1e-12, -0.05, 0.1, -0.2]  # gravity does not load motor 1
+    fit = SettledFit(mode, np.diag(deviation**2), np.ones(17), 0.0)
+    remarks = spring_remarks(settling_parameters(fit, armpi, 0.0))
+    assert [remark.partition(":")[0] for remark in remarks] == [
+        "compliance of motor_2",
+        "compliance of motor_4",
+    ]
+    assert "-0.05 rad/(N m) (-0.052 to -0.048) is negative" in remarks[0]
+
+
+def test_a_session_with_many_suspect_runs_is_left_out_as_a_whole():
+    names = [f"{session}/{run}" for session in "ab" for run in range(10)] + ["alone"]
+    sessions = ["a"] * 10 + ["b"] * 10 + ["alone"]
+    doubt = np.zeros(21)
+    doubt[[0, 1]] = 0.95  # two of ten: by chance
+    doubt[[10, 14, 17]] = 0.9
+    doubt[20] = 1.0
+    found = untrusted(names, sessions, doubt)
+    assert [entry.run for entry in found] == ["a/0", "a/1", *names[10:20], "alone"]
+    assert {entry.movement for entry in found} == {0}
+    assert found[0].reason == found[-1].reason == "looks faulty"
+    assert {e.reason for e in found[2:12]} == {"its session looks faulty, in 3 of 10 runs"}
+
+
+# Whole counts
+
+
+@pytest.mark.parametrize("scale", [0.2, 1.0, 4.0])
+@pytest.mark.parametrize("dof", [2.5, 6.0, 200.0])
+def test_a_reading_is_as_probable_as_all_angles_that_it_stands_for(scale, dof):
+    error = COUNT * (np.arange(-4000, 4001)[:, None] + 0.3)
+    density = np.exp(log_rounded_student(error, np.array([scale * COUNT]), COUNT, dof))[:, 0]
+    assert COUNT * density.sum() == pytest.approx(1.0, abs=1e-6)
+    inside = np.linspace(-0.5, 0.5, 20001) * COUNT
+    for at in (3998, 4000, 4003):
+        points = stats.t.pdf((error[at] + inside) / (scale * COUNT), dof) / (scale * COUNT)
+        assert density[at] == pytest.approx(np.trapezoid(points, inside) / COUNT, rel=1e-6)
+
+
+def test_readings_that_are_not_rounded_have_the_density_itself():
+    error = np.array([[-0.02, 0.0], [0.001, 0.3]])
+    scale = np.array([0.004, 0.02])
+    found = log_rounded_student(error, scale, 0.0, 4.0)
+    np.testing.assert_allclose(found, stats.t.logpdf(error, 4.0, scale=scale), rtol=1e-12)
+
+
+# Timing
+
+
+def test_doubt_about_the_lag_is_doubt_about_the_delay():
+    """Delays that fall as the lag rises are as unsure as the lag is, and as their own spread."""
+    rng, runs = np.random.default_rng(0), 60
+    best, own = rng.normal(0.04, 0.008, runs), rng.normal(0.01, 0.003, runs)
+    costs = (LAGS_S[:, None] - best) ** 2
+    values = np.stack([own - LAGS_S[:, None], np.zeros((len(LAGS_S), runs))], axis=2)
+    delay, shortening, lag = joint_doubt(values, costs, rng)
+    half = stats.t.ppf(0.975, runs - 1) / np.sqrt(runs)
+    assert lag == pytest.approx(half * np.std(best, ddof=1), rel=0.1)
+    assert delay == pytest.approx(half * np.std(own - best, ddof=1), rel=0.1)
+    assert shortening == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("tool", [False, True])
+def test_sag_on_the_way_is_not_taken_for_delay(armpi, measured_armpi, tool):
+    still = replace(measured_armpi.settling, scatter=(5e-4,) * 4)
+    real = replace(
+        measured_armpi,
+        settling=still,
+        timing=Timing(delay_s=(0.015, 0.015), ramp_shortening=(0.02, 0.02), lag_s=(0.03, 0.03)),
+        lost_commands=(),
+        readings=replace(measured_armpi.readings, whole_counts=False, glitch_rate=()),
+    )
+    runs = simulate(Plan(armpi, [HEALTHY], 15, 3, real))
+    found = calibrate(runs, armpi, "trial", "made up", use_readings=not tool, thorough=False)
+    by_name = {p.name: p for p in found.parameters}
+    # As if sag were spread evenly over a ramp, they would be off by up to 2.5, 1.3 ms and 0.3 %.
+    assert by_name["lag"].value == pytest.approx(0.03, abs=1e-3)
+    assert by_name["delay, mean over runs"].value == pytest.approx(0.015, abs=1e-3)
+    shortening = by_name["ramp shortening, mean over runs"].value
+    assert shortening == pytest.approx(0.02, abs=1.2e-3)

@@ -1,0 +1,256 @@
+"""What every link must do, whatever lies behind it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from bag_writers import MONITORING, MONITORING_TEXT, entry, write_bag
+from failuretwin.connection.emulation.emulated_arm import Emulation
+from failuretwin.connection.links.emulated import emulated
+from failuretwin.connection.links.pace import Pace
+from failuretwin.connection.links.replay import replay
+from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.rosbridge import RosbridgeSource, connect, disconnect
+from failuretwin.connection.links.values import CommandSent, Reading
+from failuretwin.connection.ros1.source import Ros1Source
+from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS
+from fake_rosbridge import FakeRosbridge
+from little_logs import LOG_COLUMNS
+from ros_peer import RosPeer
+from roscores import free_port
+
+pytest.importorskip("rosbags")
+pytestmark = [
+    # rospy of Debian 12 leaves sockets to the collector and calls what Python 3.11 deprecates.
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+]
+
+HEADER_TEXT = "uint32 seq\ntime stamp\nstring frame_id\n"
+AUTHORS_TEXT = f"{MONITORING_TEXT.strip()}\n{'=' * 80}\nMSG: std_msgs/Header\n{HEADER_TEXT}"
+
+
+def messages_of(log):
+    """Return (topic, seconds, fields) of the authors' messages, in the order of their stamps."""
+    names = list(LOG_COLUMNS)
+    commands = [
+        ("position_monitoring", t, {"position": p.tolist(), "temperature": d.tolist()})
+        for t, p, d in zip(log.command_time, log.target, log.duration_ms, strict=True)
+    ]
+    readings = [
+        ("condition_monitoring", t, {"position": p.tolist(), "temperature": []})
+        for t, p in zip(log.reading_time, log.counts, strict=True)
+    ]
+    found = sorted([*commands, *readings], key=lambda row: row[1])
+    return [(topic, t, {"name": names, "voltage": [], **fields}) for topic, t, fields in found]
+
+
+def bag(log, folder, form):
+    entries = [
+        entry(topic, MONITORING, round(t * 1e6) * 1000, **fields)
+        for topic, t, fields in messages_of(log)
+    ]
+    return write_bag(folder, form, entries)
+
+
+def session(log, folder):
+    tables = {
+        "trajectory_monitoring_cmd.csv": (log.command_time, log.target),
+        "trajectory_monitoring_cmd_duration.csv": (log.command_time, log.duration_ms),
+        "trajectory_monitoring_position.csv": (log.reading_time, log.counts),
+    }
+    for name, (stamps, values) in tables.items():
+        with (folder / name).open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(["timestamp", *LOG_COLUMNS])
+            writer.writerows([repr(float(t)), *v] for t, v in zip(stamps, values, strict=True))
+    return folder
+
+
+def stamp(t):
+    micro = round(t * 1e6)
+    return {"secs": micro // 10**6, "nsecs": micro % 10**6 * 1000}
+
+
+@contextmanager
+def ros1_link(robot, log, core):
+    peer = RosPeer(core.environment)
+    try:
+        with Ros1Source(robot, RosTopics()) as source:
+            for topic in ("position_monitoring", "condition_monitoring"):
+                # The definition is the authors'; the package name is one we have never heard of.
+                told = peer.ask(
+                    op="advertise",
+                    topic=topic,
+                    type="some_package/Monitoring",
+                    definition=AUTHORS_TEXT,
+                    wait_s=10.0,
+                )
+                assert told["heard"] == 1
+            for topic, t, fields in messages_of(log):
+                header = {"seq": 0, "stamp": stamp(t), "frame_id": ""}
+                peer.ask(op="publish", topic=topic, content={"header": header, **fields})
+            yield source
+    finally:
+        peer.close()
+
+
+@contextmanager
+def rosbridge_link(robot, log):
+    server = FakeRosbridge(free_port())
+    ros = connect("127.0.0.1", server.port)
+    try:
+        with RosbridgeSource(robot, RosTopics(), ros) as source:
+            wait_for(lambda: server.has_subscriber("condition_monitoring"))
+            for topic, t, fields in messages_of(log):
+                header = {"seq": 0, "stamp": stamp(t), "frame_id": ""}
+                server.publish(topic, {"header": header, **fields})
+            yield source
+    finally:
+        disconnect(ros)
+        server.stop()
+
+
+def wait_for(truth, timeout_s=10.0):
+    deadline = time.monotonic() + timeout_s
+    while not truth():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+LINKS = ["session", "ros1 bag", "ros2 bag", "mcap", "ros1", "rosbridge"]
+
+
+@pytest.fixture(params=LINKS)
+def link(request, armpi, little_log, tmp_path):
+    """A source that carries the little log."""
+    if request.param == "session":
+        yield replay(session(little_log, tmp_path), armpi, Pace(0.0))
+    elif request.param == "ros1":
+        with ros1_link(armpi, little_log, request.getfixturevalue("roscore")) as source:
+            yield source
+    elif request.param == "rosbridge":
+        with rosbridge_link(armpi, little_log) as source:
+            yield source
+    else:
+        form = request.param.replace(" bag", "")
+        yield replay(bag(little_log, tmp_path, form), armpi, Pace(0.0))
+
+
+def fetch(source, count):
+    events = []
+    while len(events) < count:
+        event = source.poll(5.0)
+        assert event is not None, f"only {len(events)} of {count} events came"
+        events.append(event)
+    return events
+
+
+def radians(counts):
+    return np.deg2rad(120.0 - 0.24 * counts)
+
+
+def test_a_link_brings_what_the_robot_said(link, little_log, twin):
+    events = fetch(link, 63)
+    commands = [e for e in events if isinstance(e, CommandSent)]
+    readings = [e for e in events if isinstance(e, Reading)]
+    assert (len(commands), len(readings)) == (3, 60)
+    zero = min(commands[0].time, readings[0].time) - little_log.zero
+    stamps = np.array([r.time for r in readings]) - zero
+    assert_allclose(stamps, little_log.reading_time, rtol=0, atol=2e-6)
+    stamps = np.array([c.time for c in commands]) - zero
+    assert_allclose(stamps, little_log.command_time, rtol=0, atol=2e-6)
+    assert_allclose([c.target for c in commands], radians(little_log.target), atol=1e-12)
+    assert_allclose([c.duration for c in commands], little_log.duration_ms / 1000, atol=1e-12)
+    angles = radians(little_log.counts)
+    assert_allclose([r.position for r in readings], angles, atol=1e-12)
+    assert_allclose([r.tool for r in readings], twin.path(angles), atol=1e-12)
+
+
+def test_a_link_counts_what_it_brings_and_says_when_nothing_comes(link):
+    fetch(link, 63)
+    began = time.monotonic()
+    assert link.poll(0.2) is None
+    assert time.monotonic() - began < 1.0
+    assert (link.counts.received, link.counts.garbage, link.counts.dropped) == (63, 0, 0)
+    assert link.name
+
+
+def test_an_emulated_robot_is_a_link(armpi):
+    pytest.importorskip("mujoco")
+    with emulated(Emulation(armpi, NO_IMPERFECTIONS), Pace(0.0), duration_s=4.0) as source:
+        events = []
+        while not source.ended:
+            event = source.poll(1.0)
+            events += [] if event is None else [event]
+    assert [e.time for e in events if isinstance(e, CommandSent)] == [1.0, 3.0]
+    assert sum(isinstance(e, Reading) for e in events) == 400
+    assert source.counts.received == 402
+    assert source.poll(0.1) is None
+
+
+def test_logs_end_and_networks_do_not(armpi, little_log, tmp_path):
+    source = replay(session(little_log, tmp_path), armpi, Pace(0.0))
+    fetch(source, 63)
+    assert source.poll(0.1) is None
+    assert source.ended
+    assert not Ros1Source.ended
+    assert not RosbridgeSource.ended
+
+
+def test_a_replay_keeps_its_pace(armpi, little_log, tmp_path):
+    source = replay(session(little_log, tmp_path), armpi, Pace(10.0))
+    began = time.monotonic()
+    fetch(source, 63)
+    assert 0.59 < time.monotonic() - began < 2.0  # 5.9 s of log
+
+
+def test_the_ros_message_of_the_authors_has_the_right_md5(roscore):
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    from failuretwin.connection.ros1.message_class import message_class
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(MONITORING_TEXT, MONITORING))
+    _, md5 = store.generate_msgdef(MONITORING)
+    ours = message_class("cm/msg_cm")
+    assert ours._type == "cm/msg_cm"
+    assert ours._md5sum == md5
+    peer = RosPeer(roscore.environment)
+    told = peer.ask(
+        op="advertise", topic="md5", type="cm/msg_cm", definition=AUTHORS_TEXT, wait_s=0.0
+    )
+    peer.close()
+    assert told["md5"] == md5
+
+
+def test_what_a_rosbridge_link_asks_for(armpi):
+    server = FakeRosbridge(free_port())
+    ros = connect("127.0.0.1", server.port)
+    topics = RosTopics(
+        command="/arm/command",
+        command_type="trajectory_msgs/JointTrajectory",
+        tool="/tool",
+        tool_type="geometry_msgs/PoseStamped",
+    )
+    with RosbridgeSource(armpi, topics, ros) as source:
+        wait_for(lambda: server.has_subscriber("/tool"))
+        pose = {"position": {"x": 0.1, "y": 0.2, "z": 0.3}, "orientation": {}}
+        header = {"stamp": {"sec": 7, "nanosec": 500_000_000}, "frame_id": ""}
+        server.publish("/tool", {"header": header, "pose": pose})
+        server.send_raw("/tool", json.dumps({"op": "publish", "topic": "/tool", "msg": {}}))
+        event = source.poll(5.0)
+        wait_for(lambda: source.counts.garbage == 1)
+    assert event.time == 7.5
+    assert_allclose(event.tool, [0.1, 0.2, 0.3])
+    assert server.types["/arm/command"] == "trajectory_msgs/JointTrajectory"
+    assert server.types["/tool"] == "geometry_msgs/PoseStamped"
+    disconnect(ros)
+    server.stop()

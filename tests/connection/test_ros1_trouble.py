@@ -1,0 +1,226 @@
+"""ROS 1 with trouble: the master dies, messages make no sense, ten times too many come."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from failuretwin.connection.links.event_queue import EventQueue
+from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.values import OK, STALE, Answer, CommandSent, Reading
+from failuretwin.connection.ros1.sinks import Ros1Diagnostics, Ros1Robot
+from failuretwin.connection.ros1.source import Ros1Source
+from failuretwin.core.diagnosis import Diagnosis
+from little_logs import LOG_COLUMNS
+from ros_peer import RosPeer
+
+pytest.importorskip("rosbags")
+pytestmark = [
+    # rospy of Debian 12 leaves sockets to the collector and calls what Python 3.11 deprecates.
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+]
+RECOVERY_S = 10.0
+STANDARD = RosTopics(
+    command="/arm/command",
+    command_type="trajectory_msgs/JointTrajectory",
+    position="/joint_states",
+    position_type="sensor_msgs/JointState",
+    tool="/tool_point",
+)
+
+
+@pytest.fixture
+def peer(roscore):
+    other = RosPeer(roscore.environment)
+    yield other
+    other.close()
+
+
+def reading(t):
+    return Reading(t, np.array([0.1, 0.0, 0.2]), np.zeros(4))
+
+
+def wait_for(truth, timeout_s=RECOVERY_S):
+    deadline = time.monotonic() + timeout_s
+    while not truth():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.05)
+
+
+def point(topic="/tool_point", x=0.1, t=100):
+    header = {"seq": 0, "stamp": {"secs": t, "nsecs": 0}, "frame_id": ""}
+    return {"topic": topic, "content": {"header": header, "point": {"x": x, "y": 0.0, "z": 0.2}}}
+
+
+def test_a_master_that_is_killed_and_restarted_is_no_trouble(armpi, roscore):
+    posterior = {"healthy": 1.0}
+    with Ros1Source(armpi, STANDARD) as source, Ros1Diagnostics(armpi, STANDARD) as sink:
+        roscore.kill()
+        wait_for(lambda: sink.trouble != "")
+        roscore.start()
+        began = time.monotonic()
+        robot, listener = RosPeer(roscore.environment), RosPeer(roscore.environment)
+        told = robot.ask(
+            op="advertise", topic="/tool_point", type="geometry_msgs/PointStamped", wait_s=15.0
+        )
+        assert told["heard"] == 1
+        robot.ask(op="publish", **point())
+        assert source.poll(5.0).time == 100.0
+        topic = {"topic": "/diagnostics"}
+        listener.ask(op="listen", type="diagnostic_msgs/DiagnosticArray", **topic)
+
+        def heard():
+            sink.put(Answer(time.time(), OK, Diagnosis("live", posterior, verdict="healthy")))
+            return listener.ask(op="heard", **topic)
+
+        wait_for(heard)
+        assert time.monotonic() - began < RECOVERY_S
+        assert sink.trouble == ""
+        assert source.counts.reconnects == 1
+        robot.close()
+        listener.close()
+
+
+def test_a_robot_comes_back_with_its_topics(armpi, roscore):
+    with Ros1Robot(armpi, STANDARD) as sink:
+        roscore.kill()
+        wait_for(lambda: sink.trouble != "")
+        roscore.start()
+        wait_for(lambda: "/joint_states" in roscore.topic_types())
+        assert roscore.topic_types()["/arm/command"] == "trajectory_msgs/JointTrajectory"
+
+
+def test_messages_that_make_no_sense_are_counted_and_left_out(armpi, peer):
+    stamp = {"secs": 5, "nsecs": 0}
+    header = {"seq": 0, "stamp": stamp, "frame_id": ""}
+    names = list(LOG_COLUMNS)
+    good = {"name": ["joint1", "joint2", "joint3", "joint4"], "velocity": [], "effort": []}
+    with Ros1Source(armpi, STANDARD) as source:
+        for topic, type_ in (
+            ("/tool_point", "std_msgs/Header"),
+            ("/joint_states", "sensor_msgs/JointState"),
+            ("/arm/command", "trajectory_msgs/JointTrajectory"),
+        ):
+            # rospy itself checks no types where the listener takes any message.
+            assert peer.ask(op="advertise", topic=topic, type=type_, wait_s=10.0)["heard"] == 1
+        peer.ask(op="publish", topic="/tool_point", content=header)
+        wait_for(lambda: source.counts.garbage == 1)
+        for position in ([1.0], [1e300] * 4, []):
+            content = {"header": header, **good, "position": position}
+            peer.ask(op="publish", topic="/joint_states", content=content)
+        strangers = {**good, "name": names[:2], "position": [0.0, 0.0]}
+        peer.ask(op="publish", topic="/joint_states", content={"header": header, **strangers})
+        backwards = [
+            {"positions": [0.0] * 4, "time_from_start": {"secs": due, "nsecs": 0}} | NO_SPEEDS
+            for due in (2, 1)
+        ]
+        plan = {"header": header, "joint_names": good["name"], "points": backwards}
+        peer.ask(op="publish", topic="/arm/command", content=plan)
+        peer.ask(
+            op="publish",
+            topic="/joint_states",
+            content={"header": header, **good, "position": [0.1, 0.2, 0.3, 0.4]},
+        )
+        event = source.poll(10.0)
+        wait_for(lambda: source.counts.garbage >= 5)
+    assert event.position.tolist() == [0.1, 0.2, 0.3, 0.4]
+    assert np.isnan(event.tool).all()  # another topic tells it
+    assert source.poll(0.2) is None
+    assert source.counts.last_garbage
+
+
+NO_SPEEDS = {"velocities": [], "accelerations": [], "effort": []}
+
+
+def test_ten_times_the_rate_is_taken(armpi, roscore):
+    with Ros1Source(armpi, STANDARD) as source, Ros1Robot(armpi, STANDARD) as sink:
+        wait_until_connected(source, sink)
+        begin = time.monotonic()
+        for k in range(300):
+            sink.put(reading(1000.0 + 0.01 * k))
+            time.sleep(max(0.0, begin + 0.01 * k - time.monotonic()))
+        stamps = []
+        while len(stamps) < 600:
+            event = source.poll(2.0)
+            assert event is not None, f"only {len(stamps)} came"
+            stamps.append(event.time)
+        assert source.counts.dropped == 0
+
+
+def test_a_consumer_that_sleeps_loses_readings_but_no_command(armpi, roscore):
+    queue = EventQueue(capacity=50)
+    topics = RosTopics()
+    with Ros1Source(armpi, topics, queue) as source, Ros1Robot(armpi, topics) as sink:
+        wait_until_connected(source, sink)
+        sink.put(CommandSent(1.0, np.full(4, 0.1), np.ones(4)))
+        for k in range(300):
+            sink.put(reading(1000.0 + k))
+            time.sleep(0.002)
+        wait_for(lambda: queue.dropped > 200)
+        kept = [source.poll(0.1) for _ in range(50)]
+    assert sum(isinstance(event, CommandSent) for event in kept) == 1
+    assert sum(isinstance(event, Reading) for event in kept) == 49
+
+
+def wait_until_connected(source, sink):
+    kinds = set()
+
+    def came():
+        sink.put(CommandSent(time.time(), np.zeros(4), np.ones(4)))
+        sink.put(reading(time.time()))
+        kinds.add(type(source.poll(0.1)))
+        return {CommandSent, Reading} <= kinds
+
+    wait_for(came)
+    while source.poll(0.5) is not None:
+        pass
+
+
+def test_commands_as_trajectories_keep_each_motors_own_duration(armpi, roscore):
+    with Ros1Source(armpi, STANDARD) as source, Ros1Robot(armpi, STANDARD) as sink:
+        wait_until_connected(source, sink)
+        target = np.array([0.4, -0.2, 0.3, 0.1])
+        sink.put(CommandSent(50.0, target, np.array([0.6, 0.8, 1.0, 0.6])))
+        parts = [source.poll(5.0) for _ in range(3)]
+    assert [part.time for part in parts] == pytest.approx([50.0, 50.6, 50.8])
+    np.testing.assert_allclose(parts[0].target, [0.4, -0.15, 0.18, 0.1], atol=1e-12)
+    np.testing.assert_allclose(parts[2].target, target, atol=1e-12)
+
+
+def test_diagnostics_come_every_second_and_at_once_when_it_gets_worse(armpi, peer):
+    topic = {"topic": "/diagnostics"}
+    healthy = Diagnosis("live", {"healthy": 0.99, "motor_2:stuck": 0.01}, verdict="healthy")
+    stuck = Diagnosis(
+        "live",
+        {"healthy": 0.01, "motor_2:stuck": 0.99},
+        verdict="motor 2 stuck",
+        onset_s=3.0,
+        magnitude=0.5,
+        magnitude_unit="rad",
+    )
+    with Ros1Diagnostics(armpi, STANDARD) as sink:
+        peer.ask(op="listen", type="diagnostic_msgs/DiagnosticArray", **topic)
+        began, heard = time.monotonic(), []
+        while time.monotonic() < began + 3.2:
+            late = time.monotonic() > began + 2.5
+            sink.put(Answer(time.time(), OK, stuck if late else healthy))
+            time.sleep(0.05)
+        sink.put(Answer(time.time(), STALE, stuck))
+        time.sleep(0.3)
+        heard = peer.ask(op="heard", **topic)
+    levels = [[s["level"] for s in message["statuses"]] for message in heard]
+    assert levels[-1] == [3] * 5
+    assert levels[-2] == [2, 0, 2, 0, 0]
+    assert 2 <= levels.count([0] * 5) <= 3
+    message = heard[-2]
+    names = [s["name"] for s in message["statuses"]]
+    assert names == [f"failuretwin: {n}" for n in ("arm", *armpi.motor_names)]
+    motor = message["statuses"][2]
+    assert motor["hardware"] == "armpi_fpv"
+    assert motor["values"]["mode"] == "stuck"
+    assert motor["values"]["magnitude"] == "0.5"
+    assert motor["values"]["onset_s"] == "3.00"
+    assert abs(message["at"] - message["stamp"]) < 0.5

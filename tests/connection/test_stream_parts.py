@@ -1,0 +1,213 @@
+"""Small parts of the live loop: queue, clock, order of events, statuses, beat."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from failuretwin.connection.links.diagnostic_status import (
+    LEVEL_ERROR,
+    LEVEL_OK,
+    LEVEL_STALE,
+    LEVEL_WARN,
+    Beat,
+    Status,
+    statuses,
+)
+from failuretwin.connection.links.event_queue import EventQueue
+from failuretwin.connection.links.pace import Pace
+from failuretwin.connection.links.ros_topics import RosTopics, load_topics
+from failuretwin.connection.links.stream_clock import StreamClock
+from failuretwin.connection.links.values import OK, STALE, Answer, CommandSent, Reading
+from failuretwin.connection.sequencer import Sequencer
+from failuretwin.core.diagnosis import Diagnosis
+from failuretwin.core.errors import InputError
+
+YEAR_S = 3.15e7
+
+
+def reading(t):
+    return Reading(t, np.zeros(3))
+
+
+def command(t):
+    return CommandSent(t, np.zeros(4), np.ones(4))
+
+
+def test_a_full_queue_gives_up_the_oldest_readings_and_keeps_commands():
+    queue = EventQueue(capacity=3)
+    for event in (command(0.0), reading(1.0), reading(2.0), reading(3.0), command(4.0)):
+        queue.put(event)
+    assert [queue.get(0.0).time for _ in range(3)] == [0.0, 3.0, 4.0]
+    assert queue.get(0.0) is None
+    assert (queue.received, queue.dropped) == (5, 2)
+
+
+def test_a_slow_consumer_costs_no_memory():
+    queue = EventQueue(capacity=100)
+    for t in range(10_000):
+        queue.put(reading(float(t)))
+    assert len(queue) == 100
+    assert queue.dropped == 9_900
+
+
+def test_a_queue_of_commands_alone_stays_bounded():
+    queue = EventQueue(capacity=2)
+    for t in range(5):
+        queue.put(command(float(t)))
+    assert [queue.get(0.0).time for _ in range(2)] == [3.0, 4.0]
+
+
+def test_a_queue_wakes_who_waits():
+    queue = EventQueue()
+    threading.Timer(0.1, queue.put, [reading(1.0)]).start()
+    began = time.monotonic()
+    assert queue.get(10.0).time == 1.0
+    assert time.monotonic() - began < 5.0
+
+
+@pytest.mark.parametrize("jump", [YEAR_S, -YEAR_S, 3600.0, -30.0])
+def test_a_clock_that_is_set_does_not_move_the_stream(jump):
+    clock = StreamClock()
+    placed = [clock.place(100.0 + 0.1 * k, 0.1 * k) for k in range(50)]
+    placed += [clock.place(100.0 + jump + 0.1 * k, 0.1 * k) for k in range(50, 100)]
+    np.testing.assert_allclose(placed, 0.1 * np.arange(100), atol=1e-6)
+    assert clock.jumps == 1
+
+
+def test_one_senseless_stamp_does_not_move_the_stream():
+    clock = StreamClock()
+    stamps = [0.0, 0.1, 1e12, 0.3, 0.4]
+    placed = [clock.place(stamp, 0.1 * k) for k, stamp in enumerate(stamps)]
+    np.testing.assert_allclose(placed, 0.1 * np.arange(5), atol=1e-3)
+
+
+def test_late_messages_and_silences_are_no_jumps():
+    clock = StreamClock()
+    placed = [clock.place(stamp, 0.0) for stamp in (50.0, 52.0, 50.5, 80.0)]
+    assert placed == [0.0, 2.0, 0.5, 30.0]
+    assert clock.jumps == 0
+    assert clock.stamp(30.0) == 80.0
+
+
+def test_without_events_the_stream_goes_on_by_our_own_clock():
+    clock = StreamClock()
+    clock.place(100.0, 7.0)
+    assert clock.at(10.0) == 3.0
+
+
+def test_commands_that_come_late_take_their_place():
+    sequencer = Sequencer(hold_s=2.0)
+    for event in (reading(0.0), reading(1.0), reading(2.0), command(0.5), reading(3.0)):
+        sequencer.add(event)
+    assert [event.time for event in sequencer.ready(3.0)] == [0.0, 0.5, 1.0]
+    assert [event.time for event in sequencer.ready(np.inf)] == [2.0, 3.0]
+
+
+def test_a_command_goes_before_a_reading_of_its_time():
+    sequencer = Sequencer()
+    sequencer.add(reading(1.0))
+    sequencer.add(command(1.0))
+    assert [type(event) for event in sequencer.ready(1.0)] == [CommandSent, Reading]
+
+
+@pytest.mark.parametrize("speed", [-1.0, np.inf, np.nan])
+def test_a_senseless_speed_is_refused(speed):
+    with pytest.raises(InputError, match="expected a factor above 0"):
+        Pace(speed)
+
+
+def answer(posterior, state=OK, **more):
+    return Answer(5.0, state, Diagnosis("run", posterior, verdict="the verdict", **more))
+
+
+MOTORS = ["motor_1", "motor_2"]
+
+
+def test_the_statuses_of_a_fault():
+    posterior = {"healthy": 0.03, "motor_2:stuck": 0.92, "motor_2:drift": 0.05}
+    told = answer(posterior, magnitude=-0.2, magnitude_unit="rad", onset_s=3.25)
+    arm, first, second = statuses(told, MOTORS)
+    assert [s.name for s in (arm, first, second)] == ["arm", "motor_1", "motor_2"]
+    assert [s.level for s in (arm, first, second)] == [LEVEL_ERROR, LEVEL_OK, LEVEL_ERROR]
+    assert arm.message == "the verdict"
+    assert arm.values == {
+        "diagnosis": "motor_2:stuck",
+        "probability": "0.92",
+        "magnitude": "-0.2",
+        "magnitude_unit": "rad",
+        "onset_s": "3.25",
+        "runner_up": "motor_2:drift",
+        "runner_up_probability": "0.05",
+    }
+    assert second.values == {
+        "probability": "0.97",
+        "mode": "stuck",
+        "magnitude": "-0.2",
+        "magnitude_unit": "rad",
+        "onset_s": "3.25",
+        "runner_up": "drift",
+    }
+
+
+@pytest.mark.parametrize(
+    ("healthy", "level"), [(0.6, LEVEL_OK), (0.4, LEVEL_WARN), (0.05, LEVEL_ERROR)]
+)
+def test_the_level_follows_the_probability_of_a_fault(healthy, level):
+    arm, motor, _ = statuses(answer({"healthy": healthy, "motor_1:stuck": 1 - healthy}), MOTORS)
+    assert (arm.level, motor.level) == (level, level)
+
+
+def test_without_data_nothing_is_healthy_and_nothing_is_forgotten():
+    found = statuses(answer({"healthy": 1.0, "motor_1:stuck": 0.0}, STALE), MOTORS)
+    assert {s.level for s in found} == {LEVEL_STALE}
+    assert found[0].message == "no data for a while; before that: the verdict"
+    for state in (OK, STALE):
+        assert {s.level for s in statuses(Answer(0.0, state, None), MOTORS)} == {LEVEL_STALE}
+
+
+def test_a_run_that_cannot_be_judged_is_a_warning():
+    told = answer({"healthy": 0.5, "motor_1:stuck": 0.5}, undecided="too dark")
+    assert {s.level for s in statuses(told, MOTORS)} == {LEVEL_WARN}
+
+
+def test_reports_come_every_second_and_at_once_when_it_gets_worse():
+    beat = Beat()
+
+    def due(level, now_s):
+        return beat.due([Status("arm", 0, "", {}), Status("motor_1", level, "", {})], now_s)
+
+    assert due(LEVEL_OK, 0.0)
+    assert not due(LEVEL_OK, 0.5)
+    assert due(LEVEL_WARN, 0.6)
+    assert due(LEVEL_ERROR, 0.7)
+    assert not due(LEVEL_OK, 0.8)  # better news can wait
+    assert due(LEVEL_OK, 1.7)
+    assert due(LEVEL_STALE, 1.8)
+
+
+def test_topics_from_a_file(tmp_path):
+    path = tmp_path / "topics.toml"
+    path.write_text('command = "/arm/command"\ncommand_type = "trajectory_msgs/JointTrajectory"\n')
+    assert load_topics(path) == RosTopics("/arm/command", "trajectory_msgs/JointTrajectory")
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ('comand = "x"', "Did you mean 'command'"),
+        ('command = ""', "no topic of commands"),
+        ('position = ""', "neither a topic of motor readings"),
+        ('tool_type = "sensor_msgs/JointState"\ntool = "/t"', "cannot be the tool"),
+        ("commands_late_s = 100.0", r"expected 0 to 60"),
+    ],
+)
+def test_topics_that_make_no_sense_are_refused(tmp_path, text, match):
+    path = tmp_path / "topics.toml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=match) as caught:
+        load_topics(path)
+    assert str(path) in str(caught.value)

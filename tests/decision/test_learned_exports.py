@@ -1,0 +1,200 @@
+from __future__ import annotations
+
+import ast
+import importlib.util
+import sys
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.plan import Plan
+from failuretwin.decision.blend import Weights
+from failuretwin.decision.learned.encoder import Encoder
+from failuretwin.decision.learned.estimator import LearnedDiagnoser
+from failuretwin.decision.learned.networks import NETWORKS
+from failuretwin.decision.learned.numpy_export import export_numpy
+from failuretwin.decision.learned.onnx_export import export_onnx
+from failuretwin.decision.learned.robust_features import expectation_of
+from failuretwin.decision.learned.signals import signals_of
+from failuretwin.decision.learned.storage import load_network, save_network
+
+ALL = pytest.mark.parametrize("network", list(NETWORKS))
+
+
+@pytest.fixture(scope="module")
+def runs(armpi, measured_armpi):
+    return simulate(Plan(armpi, paper_hypotheses(armpi.motor_names), 4, 2, measured_armpi))
+
+
+@pytest.fixture(scope="module")
+def trained(armpi, measured_armpi, runs):
+    """A network of each kind that has learned a little, with a temperature of its own."""
+    encoder = Encoder("robust", armpi, expectation_of(armpi, measured_armpi))
+
+    def make(name):
+        diagnoser = LearnedDiagnoser(name, encoder, iterations=8, random_state=1).fit(runs)
+        diagnoser.temperature_, diagnoser.weights_ = 0.7, Weights(0.4, 0.6)
+        return diagnoser
+
+    return {name: make(name) for name in NETWORKS}
+
+
+@pytest.fixture
+def standalone(tmp_path):
+    """Export a network as a Python file and import it."""
+
+    def make(diagnoser):
+        path = tmp_path / "diagnoser.py"
+        export_numpy(diagnoser, path)
+        spec = importlib.util.spec_from_file_location("diagnoser", path)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module, path
+
+    return make
+
+
+@ALL
+def test_a_stored_network_answers_the_same(armpi, trained, runs, network, tmp_path):
+    path = tmp_path / "network.npz"
+    save_network(trained[network], path)
+    again = load_network(path, armpi)
+    np.testing.assert_array_equal(again.predict_proba(runs), trained[network].predict_proba(runs))
+    assert again.get_params()["random_state"] == 1
+    assert (again.weights_, again.movements_) == (Weights(0.4, 0.6), (5, 5))
+    first, second = (d.diagnose(runs)[0].to_record() for d in (again, trained[network]))
+    assert first == second
+
+
+@ALL
+def test_onnx_runtime_agrees(trained, runs, network, tmp_path):
+    path = tmp_path / "network.onnx"
+    export_onnx(trained[network], path)
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    features = trained[network].encoder.encode(signals_of(runs))
+    for count in (1, 36):
+        (chances,) = session.run(None, {"features": features[:count]})
+        np.testing.assert_allclose(
+            chances, trained[network].predict_proba(features[:count]), atol=2e-6
+        )
+    named = session.get_modelmeta().custom_metadata_map["classes"].split(",")
+    assert named == list(trained[network].classes_)
+
+
+@ALL
+def test_the_numpy_file_agrees(trained, runs, network, standalone):
+    """From commands and readings to probabilities, by code that shares nothing with ours."""
+    module, _ = standalone(trained[network])
+    chances = trained[network].predict_proba(runs)
+    for i in range(0, 36, 5):
+        end = np.searchsorted(runs["time"].values, runs["duration"].values[i] + 1e-9)
+        said = module.diagnose(
+            runs["time"].values[:end],
+            runs["command"].values[i, :end],
+            runs["measured"].values[i, :end],
+        )
+        np.testing.assert_allclose(said, chances[i], atol=1e-5)
+    assert list(trained[network].classes_) == module.CLASSES
+
+
+@pytest.mark.parametrize("features", ["original", "augmented"])
+def test_the_papers_features_are_in_the_numpy_file(armpi, runs, features, standalone):
+    encoder = Encoder(features, armpi)
+    diagnoser = LearnedDiagnoser("lstm", encoder, iterations=2, random_state=1).fit(runs)
+    module, _ = standalone(diagnoser)
+    run = runs.isel(run=[3])
+    said = module.diagnose(run["time"].values, run["command"].values[0], run["measured"].values[0])
+    np.testing.assert_allclose(said, diagnoser.predict_proba(run)[0], atol=1e-5)
+
+
+def test_the_numpy_file_needs_numpy_alone_and_no_new_python(trained, standalone):
+    _, path = standalone(trained["cnn"])
+    tree = ast.parse(path.read_text("ascii"), feature_version=(3, 4))
+    imported = {
+        name
+        for node in ast.walk(tree)
+        for name in (
+            [alias.name for alias in node.names]
+            if isinstance(node, ast.Import)
+            else [node.module]
+            if isinstance(node, ast.ImportFrom)
+            else []
+        )
+    }
+    assert imported == {"__future__", "base64", "io", "json", "numpy"}
+    modern = (ast.MatMult, ast.JoinedStr, ast.AnnAssign, ast.Nonlocal, ast.Starred)
+    assert not [node for node in ast.walk(tree) if isinstance(node, modern)]
+    assert all(
+        not node.args.kwonlyargs and node.returns is None
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef)
+    )
+
+
+def test_loading_runs_no_code(armpi, trained, tmp_path):
+    path = tmp_path / "evil.npz"
+
+    class Evil:
+        def __reduce__(self):
+            return (sys.exit, ("code was run",))
+
+    with path.open("wb") as file:
+        np.savez(file, configuration=np.array([Evil()], dtype=object))
+    with pytest.raises(InputError, match="cannot be read as a network"):
+        load_network(path, armpi)
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "text", "missing", "other archive", "format"])
+def test_a_file_that_is_no_network_is_refused(armpi, trained, tmp_path, damage):
+    path = tmp_path / "network.npz"
+    save_network(trained["cnn"], path)
+    whole = path.read_bytes()
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    if damage == "empty":
+        path.write_bytes(b"")
+    elif damage == "cut":
+        path.write_bytes(whole[: len(whole) // 2])
+    elif damage == "text":
+        path.write_text("no network")
+    elif damage == "missing":
+        path.unlink()
+    elif damage == "other archive":
+        np.savez(path, a=np.zeros(3))
+    else:
+        text = arrays["configuration"].tobytes().replace(b'"format": 1', b'"format": 9')
+        np.savez(path, **{**arrays, "configuration": np.frombuffer(text, dtype=np.uint8)})
+    with pytest.raises(InputError, match="format 9" if damage == "format" else "failuretwin train"):
+        load_network(path, armpi)
+
+
+def test_a_network_for_another_robot_is_refused(trained, tmp_path):
+    from failuretwin import load_robot
+
+    path = tmp_path / "network.npz"
+    save_network(trained["cnn"], path)
+    with pytest.raises(InputError, match="trained for robot 'armpi_fpv'"):
+        load_network(path, load_robot("ur5e"))
+
+
+def test_names_of_exported_files_are_checked(trained, tmp_path):
+    with pytest.raises(InputError, match=r"ends in \.npz"):
+        save_network(trained["cnn"], tmp_path / "network.pt")
+    with pytest.raises(InputError, match="cannot be imported"):
+        export_numpy(trained["cnn"], tmp_path / "my-net.py")
+
+
+def test_the_stored_file_holds_versions(trained, tmp_path):
+    import json
+
+    path = tmp_path / "network.npz"
+    save_network(trained["cnn"], path)
+    with np.load(path, allow_pickle=False) as stored:
+        configuration = json.loads(stored["configuration"].tobytes())
+    assert configuration["versions"]["torch"] == torch.__version__
+    assert configuration["encoder"]["features"] == "robust"

@@ -1,0 +1,152 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from failuretwin.core.errors import InputError
+from failuretwin.decision.learned.encoder import Encoder
+from failuretwin.decision.learned.networks import NETWORKS, Shape, build_network
+from failuretwin.decision.learned.recipe import VARIANTS, Recipe, widened
+from failuretwin.decision.learned.robust_features import expectation_of
+from failuretwin.decision.learned.training import (
+    Pace,
+    Standard,
+    scores_of,
+    shuffled_batches,
+    training,
+)
+
+SHAPE = Shape(channels=10, classes=3, motors=2, shared=2)
+ALL = pytest.mark.parametrize("name", list(NETWORKS))
+
+
+def toy(runs=96, seed=0):
+    """Runs whose class is the channel with a bump somewhere in time."""
+    rng = np.random.default_rng(seed)
+    features = 0.1 * rng.standard_normal((runs, 40, SHAPE.channels)).astype(np.float32)
+    classes = rng.integers(0, SHAPE.classes, runs)
+    for run, kind in enumerate(classes):
+        at = rng.integers(5, 30)
+        features[run, at : at + 8, 4 * (kind % 2) + kind // 2] += 2.0
+    return features, classes
+
+
+def learn(name, seed=0, iterations=120):
+    features, classes = toy()
+    torch.manual_seed(seed)
+    network = build_network(name, SHAPE)
+    batches = shuffled_batches(features, classes, 32, np.random.default_rng(seed))
+    for _ in training(network, batches, Pace(iterations, 3e-3)):
+        pass
+    return network
+
+
+@ALL
+def test_a_bump_is_learned(name):
+    features, classes = toy(seed=1)
+    said = scores_of(learn(name), features).argmax(axis=1)
+    assert np.mean(said == classes) > 0.9
+
+
+def test_the_same_seed_gives_the_same_network():
+    features, _ = toy()
+    first, again, other = (scores_of(learn("cnn", s, 5), features) for s in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert not np.allclose(first, other)
+
+
+def test_the_papers_network_has_its_size():
+    """Two LSTM layers of 100 units with two bias vectors each, one dense layer."""
+    network = build_network("lstm", Shape(6, 9))
+    layers = 4 * 100 * (6 + 100 + 2) + 4 * 100 * (100 + 100 + 2)
+    assert sum(p.numel() for p in network.parameters()) == layers + 100 * 9 + 9
+
+
+def test_the_papers_network_begins_as_in_matlab():
+    """Orthogonal recurrent weights; a forget gate that starts open, about sigmoid(1)."""
+    network = build_network("lstm", Shape(6, 9))
+    for layer in (network.first, network.second):
+        back = layer.weight_hh_l0.detach()
+        torch.testing.assert_close(back.T @ back, torch.eye(100), atol=1e-5, rtol=0.0)
+        bias = (layer.bias_ih_l0 + layer.bias_hh_l0).detach().reshape(4, 100)
+        torch.testing.assert_close(bias, torch.tensor([0.0, 1.0, 0.0, 0.0])[:, None].expand(4, 100))
+
+
+def test_nothing_is_dropped_when_nothing_is_learned():
+    network = build_network("lstm", SHAPE)
+    features, _ = toy(8)
+    np.testing.assert_array_equal(scores_of(network, features), scores_of(network, features))
+
+
+def test_an_unknown_network_is_refused():
+    with pytest.raises(InputError, match="Did you mean 'lstm'"):
+        build_network("lstms", SHAPE)
+
+
+def test_the_rate_falls_to_zero_or_stays():
+    assert [Pace(100, 0.1).rate(i) for i in (0, 99)] == [0.1, 0.1]
+    falling = [Pace(100, 0.1, decay=True).rate(i) for i in (0, 50, 100)]
+    assert falling == pytest.approx([0.1, 0.05, 0.0])
+
+
+def test_an_epoch_is_101_batches_of_the_papers_data():
+    batches = shuffled_batches(
+        np.arange(3240, dtype=np.float32)[:, None, None],
+        np.zeros(3240, dtype=np.int64),
+        32,
+        np.random.default_rng(0),
+    )
+    epoch = np.concatenate([next(batches)[0].ravel() for _ in range(101)])
+    assert len(np.unique(epoch)) == len(epoch) == 3232
+
+
+def test_standardised_channels_have_unit_spread():
+    features = np.random.default_rng(0).normal(3.0, 5.0, (50, 20, 4)).astype(np.float32)
+    features[..., 3] = 7.0
+    made = Standard.of(features)(features)
+    np.testing.assert_allclose(made.mean(axis=(0, 1)), 0.0, atol=1e-5)
+    np.testing.assert_allclose(made.std(axis=(0, 1)), [1.0, 1.0, 1.0, 0.0], atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def recipe(armpi, measured_armpi):
+    return Recipe(armpi, measured_armpi, seed=4)
+
+
+def test_chunks_depend_on_seed_and_number_alone(armpi, measured_armpi, recipe):
+    encoder = Encoder("robust", armpi, expectation_of(armpi, measured_armpi))
+    first, classes = recipe.chunk(0, 12, encoder)
+    again, same = Recipe(armpi, measured_armpi, seed=4).chunk(0, 12, encoder)
+    np.testing.assert_array_equal(first, again)
+    np.testing.assert_array_equal(classes, same)
+    assert not np.array_equal(first, recipe.chunk(1, 12, encoder)[0])
+    assert not np.array_equal(first, Recipe(armpi, measured_armpi, 5).chunk(0, 12, encoder)[0])
+
+
+def test_classes_stay_with_their_runs(armpi, recipe):
+    """A stuck motor 1 is seen in plain features: its angle at the tool never changes."""
+    features, classes = recipe.chunk(0, 180, Encoder("original", armpi))
+    late = features[:, 30:, 4:]
+    azimuth = np.arctan2(late[..., 0], -late[..., 1])
+    # On a line through the axis: the azimuth is one angle or the one opposite.
+    spread = np.abs(np.mean(np.exp(2j * azimuth), axis=1))
+    assert np.median(spread[classes == 1]) > 0.99
+    assert np.median(spread[classes != 1]) < 0.9
+    assert set(classes) == set(range(9))
+
+
+def test_small_errors_come_most_often():
+    small = [v for v in VARIANTS if v.error_counts[0] <= 5.0]
+    assert len(small) > len(VARIANTS) / 2
+    assert (10.0, 50.0) in [v.error_counts for v in VARIANTS]  # the paper's
+
+
+def test_widened_robots_differ_more(armpi):
+    from failuretwin.digital_model.imperfections import load_imperfections
+
+    known = load_imperfections("armpi_fpv", armpi)
+    wide = widened(known, 3.0)
+    np.testing.assert_allclose(wide.variation.bias, 3.0 * np.array(known.variation.bias))
+    assert wide.settling == known.settling
+    assert widened(wide, 1.0) == wide

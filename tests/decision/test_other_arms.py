@@ -1,0 +1,150 @@
+"""Arms, runs and imperfections at the ends of what is allowed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_arms import GANTRY, SCARA, small_twin
+
+from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
+from failuretwin.connection.healthy import HealthyModel
+from failuretwin.core.hypothesis import UNKNOWN, paper_hypotheses, single_faults
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.plan import Plan
+from failuretwin.data_knowledge.settled_evidence import settled_evidence
+from failuretwin.decision import bayes
+from failuretwin.decision.scene import Scene
+from failuretwin.decision.weighing import WEIGHABLE
+from failuretwin.digital_model.imperfections import (
+    NO_IMPERFECTIONS,
+    Readings,
+    default_imperfections,
+    generic_imperfections,
+)
+from failuretwin.failure_behavior.modes import MODES, SteadyStateError
+from failuretwin.failure_behavior.random_movements import RandomMovements
+
+KINDS = {
+    "none": lambda robot: NO_IMPERFECTIONS,
+    "generic": generic_imperfections,
+    "own": default_imperfections,
+}
+
+
+def check(diagnoses):
+    for d in diagnoses:
+        chance = np.array(list(d.posterior.values()))
+        assert np.isfinite(chance).all()
+        assert chance.sum() == pytest.approx(1.0, abs=1e-9)
+        for interval in (d.onset_90, d.magnitude_90):
+            assert interval is None or (np.isfinite(interval).all() and interval[0] <= interval[1])
+
+
+def accuracy(diagnoses):
+    return np.mean([d.diagnosis == d.truth for d in diagnoses])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["armpi_fpv", "ur5e", "panda", "so101"])
+def test_bundled_arms_are_diagnosed(name, kind):
+    """Of four to six motors, calibrated or not, ideal or not: mostly right."""
+    robot = load_robot(name)
+    imperfections = KINDS[kind](robot)
+    runs = simulate(Plan(robot, paper_hypotheses(robot.motor_names), 2, 3, imperfections))
+    found = BayesDiagnoser(DigitalTwin(robot), imperfections).diagnose(runs)
+    check(found)
+    assert accuracy(found) >= 0.8
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_any_mode_can_be_weighed_in_short_runs(armpi, twin, kind, count):
+    """All hypotheses, `unknown` too; of a single movement hardly any can be told from others."""
+    imperfections = KINDS[kind](armpi)
+    modes = [mode for mode in WEIGHABLE if mode != "torque_loss"]
+    faults = single_faults(["motor_2"], modes)
+    plan = Plan(armpi, faults, 1, 3, imperfections, RandomMovements(count=count))
+    weighed = (*single_faults(["motor_2", "motor_3"], WEIGHABLE), UNKNOWN)
+    check(BayesDiagnoser(twin, imperfections, weighed).diagnose(simulate(plan)))
+
+
+def test_runs_of_sixty_movements_are_diagnosed(armpi, twin):
+    """Faults for sure; of a healthy run, a motor may always have got stuck at the very end."""
+    known = default_imperfections(armpi)
+    faults = paper_hypotheses(armpi.motor_names)[::4]
+    runs = simulate(Plan(armpi, faults, 1, 3, known, RandomMovements(count=60)))
+    found = BayesDiagnoser(twin, known).diagnose(runs)
+    check(found)
+    assert [d.diagnosis for d in found] == [d.truth for d in found]
+    assert all(d.posterior[d.truth] > (0.85 if d.truth == "healthy" else 0.999) for d in found)
+
+
+def test_long_runs_are_weighed_a_few_at_a_time():
+    """What nodes of drift take grows with the square of the movements."""
+    assert bayes._runs_at_a_time(0) == bayes._runs_at_a_time(5) == bayes.CHUNK_RUNS
+    assert bayes._runs_at_a_time(60) == 1
+    taken = [bayes._runs_at_a_time(count) * count**2 for count in range(5, 40)]
+    assert max(taken) <= 25 * bayes.CHUNK_RUNS
+
+
+@pytest.fixture(scope="module")
+def gantry(tmp_path_factory):
+    return small_twin(tmp_path_factory.mktemp("gantry"), "gantry", GANTRY)
+
+
+@pytest.fixture(scope="module")
+def scara(tmp_path_factory):
+    return small_twin(tmp_path_factory.mktemp("scara"), "scara", SCARA, tool="0.2 0 0")
+
+
+@pytest.mark.parametrize("arm", ["gantry", "scara"])
+def test_arms_with_slides_are_diagnosed(request, arm):
+    """Offsets are metres for a slide and rad for a joint that turns; a live sensor flickers."""
+    twin = request.getfixturevalue(arm)
+    robot = twin.robot
+    known = replace(generic_imperfections(robot), readings=Readings(10.0, noise_m=1e-4))
+    errors = {**MODES, "steady_state_error": SteadyStateError(magnitude=(0.08, 0.2))}
+    plan = Plan(robot, paper_hypotheses(robot.motor_names), 3, 1, known, modes=errors)
+    found = BayesDiagnoser(twin, known).diagnose(simulate(plan))
+    check(found)
+    assert accuracy(found) >= 0.85
+
+
+def test_a_slide_is_where_the_tool_is(gantry, run_of):
+    """Three slides at right angles: the best place of each is the tool's own coordinate."""
+    targets = np.array([[0.1, 0.2, 0.3], [-0.2, 0.1, 0.1]])
+    points = targets + np.array([[0.03, 0.0, -0.05], [0.0, 0.07, 0.0]])
+    runs = run_of(targets, points, gantry.robot.motor_names)
+    model = HealthyModel(gantry, generic_imperfections(gantry.robot))
+    scene = Scene(settled_evidence(runs), model)
+    for motor in range(3):
+        profile = scene.profile(motor)
+        np.testing.assert_allclose(profile.best[0, :, 0], points[:, motor], atol=1e-9)
+        np.testing.assert_allclose(profile.precision[0, :, 0], 1.0 / model.path_noise**2)
+
+
+def test_reach_is_that_of_links_and_slides(gantry, scara):
+    def reach(twin):
+        return HealthyModel(twin, NO_IMPERFECTIONS).reach
+
+    assert reach(gantry) == pytest.approx(0.3 + 0.4 + 0.5)
+    assert reach(scara) == pytest.approx(0.2 + 0.3 + 0.25 + 0.2)
+
+
+def test_angles_a_full_turn_apart_are_the_same(scara, run_of):
+    """A joint held at -2.6 rad when told to go to 2.6: 3.68 is nearer, and the same."""
+    targets = np.array([[0.1, 2.6, 0.5], [0.2, 2.4, -0.4]])
+    settled = targets.copy()
+    settled[:, 1] = -2.6
+    runs = run_of(targets, scara.path(settled), scara.robot.motor_names)
+    scene = Scene(settled_evidence(runs), HealthyModel(scara, generic_imperfections(scara.robot)))
+    profile = scene.profile(1)
+    angle = np.array([-2.6, 2.0 * np.pi - 2.6, 0.0])[:, None]
+    there, again, elsewhere = profile.log_density(np.broadcast_to(angle, (1, 2, 3, 1)), True)[0].T
+    np.testing.assert_allclose(there, again, atol=1e-9)
+    assert (there > elsewhere + 5.0).all()
+    (found,) = BayesDiagnoser(scara).diagnose(runs)
+    assert found.diagnosis == "motor_2:stuck"
+    assert found.magnitude == pytest.approx(-2.6, abs=0.02)

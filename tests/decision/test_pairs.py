@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from failuretwin import BayesDiagnoser
+from failuretwin.core.hypothesis import HEALTHY, Hypothesis
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.plan import Plan
+from failuretwin.data_knowledge.settled_evidence import settled_evidence
+from failuretwin.decision.onsets import OnsetPrior
+from failuretwin.decision.priors import Priors
+from failuretwin.decision.scene import Scene
+from failuretwin.decision.weighing import weigh_hypothesis
+from failuretwin.digital_model.imperfections import load_imperfections
+
+PAIRS = tuple(
+    Hypothesis.parse(text)
+    for text in (
+        "motor_1:stuck+motor_3:stuck",
+        "motor_1:steady_state_error+motor_2:stuck",
+        "motor_2:encoder_bias+motor_4:stuck",
+        "motor_1:encoder_bias+motor_3:encoder_bias",
+        "motor_1:drift+motor_4:steady_state_error",
+    )
+)
+SINGLES = tuple(
+    Hypothesis((fault,)) for fault in sorted({f for p in PAIRS for f in p.faults}, key=str)
+)
+RUNS = 2
+
+
+@pytest.fixture(scope="module")
+def runs(armpi):
+    known = load_imperfections("armpi_fpv", armpi)
+    return simulate(Plan(armpi, PAIRS, RUNS, 4, known))
+
+
+@pytest.fixture(scope="module")
+def found(twin, runs):
+    return BayesDiagnoser(twin, hypotheses=(HEALTHY, *SINGLES, *PAIRS)).diagnose(runs)
+
+
+def test_two_faults_at_once_are_found(found):
+    right = [d.diagnosis == d.truth for d in found]
+    assert sum(right) >= 0.8 * len(found)
+    assert np.mean([d.posterior[d.truth] for d in found]) > 0.75
+
+
+def test_each_of_the_two_is_named(found):
+    for d in (d for d in found if d.diagnosis == d.truth):
+        one, two = Hypothesis.parse(d.truth).faults
+        for fault in (one, two):
+            assert fault.motor.replace("_", " ") in d.verdict
+        assert d.magnitude is None
+        assert d.onset_90[0] <= d.onset_s <= d.onset_90[1]
+
+
+def test_a_single_fault_is_not_taken_for_two(twin, imperfect, found):
+    """The odds of two faults multiply; where one explains all, the second has nothing to say."""
+    rows = [20 * k + i for k in (1, 3, 5) for i in range(3)]
+    both = tuple(
+        Hypothesis.parse(text)
+        for text in ("motor_1:stuck+motor_3:stuck", "motor_1:encoder_bias+motor_3:stuck")
+    )
+    alone = tuple(
+        Hypothesis.parse(f"motor_{k}:{m}") for m in ("stuck", "steady_state_error") for k in (1, 3)
+    )
+    told = BayesDiagnoser(twin, hypotheses=(HEALTHY, *alone, *both)).diagnose(
+        imperfect.isel(run=rows)
+    )
+    assert all("+" not in (d.diagnosis or "") for d in told)
+
+
+@pytest.mark.parametrize("other", ["backlash", "encoder_bias"])
+@pytest.mark.parametrize("one", ["stuck", "steady_state_error", "encoder_scale"])
+def test_a_second_fault_that_cannot_show_changes_nothing(twin, imperfect, monkeypatch, one, other):
+    """A fault of motor 4 whose only size is nothing leaves what is said of a fault of motor 1."""
+    from failuretwin.core.quadrature import log_of
+    from failuretwin.decision import weighing
+    from failuretwin.decision.law import Law
+    from failuretwin.decision.onsets import at_once
+
+    def nothing(scene, motor, priors):
+        stretches = at_once(scene.evidence)
+        return Law(
+            motor=motor,
+            held=False,
+            angle=scene.profile(motor).expected[:, :, None],
+            log_prior=log_of(stretches.weights(0.5))[..., None],
+            size=np.zeros((1, 1)),
+            onsets=stretches.onsets(0.5),
+        )
+
+    runs = imperfect.isel(run=[5, 105])
+    scene = Scene(settled_evidence(runs), BayesDiagnoser(twin).healthy_model)
+    priors = Priors(onset=OnsetPrior(early=0.5))
+    single = weigh_hypothesis(scene, Hypothesis.parse(f"motor_1:{one}"), priors)
+    monkeypatch.setattr(weighing, "LAWS", {**weighing.LAWS, other: nothing})
+    both = Hypothesis.parse(f"motor_1:{one}+motor_4:{other}")
+    pair = weigh_hypothesis(scene, both, priors)
+    np.testing.assert_allclose(pair.log_evidence, single.log_evidence, atol=0.1)
