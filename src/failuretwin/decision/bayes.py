@@ -1,4 +1,4 @@
-"""Bayesian diagnosis: which hypothesis explains where the tool came to rest, and how surely."""
+"""Bayesian diagnosis: which hypothesis explains where the tool went, and how surely."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class _Weighed:
 
 @dataclass(frozen=True)
 class BayesDiagnoser:
-    """Posterior over hypotheses from the settled tool positions of a run.
+    """Posterior over hypotheses from where the tool settled in a run, and how it got there.
 
     Attributes:
         twin: Digital twin of the robot.
