@@ -23,8 +23,9 @@ from failuretwin.decision.priors import Priors
 from failuretwin.decision.scene import Scene
 from failuretwin.decision.weight import Estimate, Weight
 
-UNKNOWN_ODDS = 0.3
-"""Odds of `unknown` against healthy: assumed, like those of the rarer fault modes."""
+UNKNOWN_ODDS = 3.0
+"""Odds of `unknown` against healthy: who asks for it doubts the set; even so it takes no run of the
+nine from them (docs/diagnosis.md)."""
 MOST_FAULTS = 2
 """Faults that can be weighed at once."""
 
