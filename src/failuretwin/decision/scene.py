@@ -12,6 +12,7 @@ from failuretwin.core.quadrature import log_sum
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.moving_evidence import MovingEvidence
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
+from failuretwin.decision.courses import CourseJudge
 from failuretwin.decision.motor_profile import MotorProfile, motor_profile
 from failuretwin.decision.ramps import RampModel
 from failuretwin.decision.transients import Transients
@@ -67,7 +68,7 @@ class Scene:
             return None
         model = replace(self.model, blur=self.model.blur * self.way_blur)
         ramps = RampModel(model, self.evidence, self.moving)
-        return Transients(ramps, self.alternatives, *self._explained)
+        return Transients(CourseJudge(ramps, self.alternatives), *self._explained)
 
     @cached_property
     def on_way(self) -> FloatArray:
