@@ -102,7 +102,8 @@ def test_without_losses_scatter_alone_counts(twin, armpi, imperfect):
     stuck = imperfect.isel(run=range(20, 100))
     lossy = separation(twin, stuck).nats[:, 0]
     sound = separation(twin, stuck, dataclasses.replace(known, lost_commands=())).nats[:, 0]
-    assert (sound >= lossy - 1e-9).all()
+    # What healthy had set aside for losses now speaks for it: a few tenths of a nat.
+    assert (sound >= lossy - 0.5).all()
     assert sound.mean() > 1.1 * lossy.mean()
 
 
