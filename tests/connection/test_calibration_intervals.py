@@ -109,6 +109,15 @@ def test_a_session_with_many_suspect_runs_is_left_out_as_a_whole():
     assert {e.reason for e in found[2:12]} == {"its session looks faulty, in 3 of 10 runs"}
 
 
+def test_a_perfect_arm_is_seen_to_be_one_by_its_tool_alone(armpi):
+    runs = simulate(Plan(armpi, [HEALTHY], 8, 1)).drop_vars("position", errors="ignore")
+    found = calibrate(runs, armpi, "ideal", "made up", thorough=False)
+    settling = found.imperfections.settling
+    assert np.max(np.abs([settling.bias, settling.friction])) < 0.01 * COUNT
+    assert max(settling.scatter) < 0.3 * COUNT
+    assert not any(p.identified for p in found.parameters if p.name == "tail_dof")
+
+
 # Whole counts
 
 

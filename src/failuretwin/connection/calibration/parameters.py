@@ -8,6 +8,7 @@ import numpy as np
 
 from failuretwin.connection.calibration.calibration import Parameter
 from failuretwin.connection.calibration.rates import LossRates, Rate
+from failuretwin.connection.calibration.settled_errors import LEAST_DOF
 from failuretwin.connection.calibration.settled_fit import SettledFit
 from failuretwin.connection.calibration.settled_prior import DOF_PRIOR, DOF_PRIOR_SPREAD
 from failuretwin.connection.calibration.timing_fit import BOUNDS, TimingFit
@@ -62,7 +63,7 @@ def spring_remarks(settling: Sequence[Parameter]) -> list[str]:
         "negative, as if the motor rose against gravity; check its sense, the masses of the URDF "
         "and the payload. The figure is used as it is"
         for p in settling
-        if p.name == "compliance" and p.note != UNLOADED and p.value < 0.0
+        if p.name == "compliance" and p.note != UNLOADED and p.value < 0.1 * (p.value - p.high)
     ]
 
 
@@ -75,7 +76,7 @@ def _tails(fit: SettledFit) -> Parameter:
     dof = float(np.exp(fit.mode[-1]))
     inverse, deviation = 1.0 / dof, float(fit.deviation[-1]) / dof
     low, least = 1.0 / (inverse + Z_95 * deviation), inverse - Z_95 * deviation
-    learned = deviation < LEARNED * INVERSE_DOF_SPREAD
+    learned = deviation < LEARNED * INVERSE_DOF_SPREAD and dof > 1.05 * LEAST_DOF
     note = "" if learned else f"the logs hardly say; it takes {ADVICE['tail_dof']}"
     high = 1.0 / least if least > 0.0 else float("inf")
     return Parameter("tail_dof", "", "-", dof, low, high, learned, note)

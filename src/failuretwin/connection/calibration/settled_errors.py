@@ -13,6 +13,9 @@ from failuretwin.digital_model.robot import Robot
 
 ROUNDING = float(1.0 / np.sqrt(12.0))
 """Standard deviation of what whole numbers round off."""
+LEAST_DOF = 1.0
+"""Degrees of freedom below which tails grow no heavier: where every error is far smaller than what
+counts round off, ever heavier tails would fit ever better."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class SettledErrors:
         motors = self.design.shape[2]
         grouped = parameters[: 4 * motors].reshape(4, -1)
         linear, log_scatter = grouped[:3], grouped[3]
-        dof = float(np.exp(parameters[4 * motors]))
+        dof = max(float(np.exp(parameters[4 * motors])), LEAST_DOF)
         expected = np.einsum("pik,pk->ik", self.design, linear)
         scatter = np.exp(log_scatter)
         if self.jacobian is None:
