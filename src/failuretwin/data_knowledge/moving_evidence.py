@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from failuretwin.core.runs import measured_rate, time_step
-from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
 
 if TYPE_CHECKING:
@@ -65,9 +65,7 @@ def moving_evidence(runs: xr.Dataset, settled: SettledEvidence) -> MovingEvidenc
     for run, movement in np.argwhere(settled.movements.exists & (until > start)):
         first, stop = np.searchsorted(time, [start[run, movement], until[run, movement] - 1e-9])
         rows = first + np.flatnonzero(read[run, first:stop])
-        rows = rows[_apart(time[rows], least_step)]
-        if len(rows) > MOST_READINGS:
-            rows = rows[np.rint(np.linspace(0, len(rows) - 1, MOST_READINGS)).astype(int)]
+        rows = rows[spread_out(time[rows], least_step)]
         since[run, movement, : len(rows)] = time[rows] - start[run, movement]
         point[run, movement, : len(rows)] = measured[run, rows]
         seen[run, movement, : len(rows)] = True
@@ -89,11 +87,19 @@ def _corners(path: FloatArray, every: int) -> BoolArray:
     return seen & (phase == np.argmax(np.bincount(phase, bend)))
 
 
-def _apart(time: FloatArray, least_step: float) -> BoolArray:
-    """Return which of some sorted instants to keep so that none are closer than `least_step`."""
-    kept = np.zeros(len(time), dtype=bool)
-    last = -np.inf
-    for i, at in enumerate(time):
+def spread_out(time: FloatArray, least_step: float) -> IntArray:
+    """Return which readings of a movement to look at: few, none close together, (reading,).
+
+    Args:
+        time: Their times, sorted [s].
+        least_step: Least time between two [s].
+    """
+    kept, last = [], -np.inf
+    for i, at in enumerate(time.tolist()):
         if at - last >= least_step:
-            kept[i], last = True, at
-    return kept
+            kept.append(i)
+            last = at
+    if len(kept) > MOST_READINGS:
+        places = np.rint(np.linspace(0, len(kept) - 1, MOST_READINGS)).astype(int)
+        return np.array(kept)[places]
+    return np.array(kept, dtype=np.int64)

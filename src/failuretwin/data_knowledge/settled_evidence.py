@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from failuretwin.core.medians import masked_median
 from failuretwin.core.movements import Movements, find_movements
-from failuretwin.core.runs import measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 
 if TYPE_CHECKING:
@@ -25,6 +25,10 @@ STILL_M = 0.004
 """Spread of the readings above which the tool is still moving [m]; one count moves it 1 mm."""
 
 
+JUST_AFTER_S = 1e-6
+"""A plateau that nothing ends is taken to end so soon after the last reading [s]."""
+
+
 @dataclass(frozen=True)
 class SettledEvidence:
     """Settled tool positions of many runs.
@@ -33,7 +37,6 @@ class SettledEvidence:
         movements: Movements found in `command`.
         point: Median of the readings at the end of each plateau, (run, movement, axis) [m]; 0 where
             there is none.
-        count: Independent readings behind it, (run, movement).
         usable: Movements with a settled point, (run, movement).
         moving: Movements whose readings do not come to rest, (run, movement).
         begin: When the readings that count begin, (run, movement) [s].
@@ -42,7 +45,6 @@ class SettledEvidence:
 
     movements: Movements
     point: FloatArray
-    count: IntArray
     usable: BoolArray
     moving: BoolArray
     begin: FloatArray
@@ -54,12 +56,53 @@ class SettledEvidence:
         return SettledEvidence(
             Movements(m.initial[runs], m.target[runs], m.ramp_duration[runs], m.start[runs]),
             self.point[runs],
-            self.count[runs],
             self.usable[runs],
             self.moving[runs],
             self.begin[runs],
             self.end[runs],
         )
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Where the tool rests in some stretches of time, (stretch, ...).
+
+    Attributes:
+        point: Median of the readings, (stretch, axis) [m]; 0 where there is none.
+        usable: Whether there are readings and they come to rest.
+        moving: Whether there are readings that do not come to rest.
+    """
+
+    point: FloatArray
+    usable: BoolArray
+    moving: BoolArray
+
+
+def rest_begin(start: FloatArray, ramp_duration: FloatArray, end: FloatArray) -> FloatArray:
+    """Return when the readings that count for a settled point begin [s].
+
+    Args:
+        start: Start of each movement, (...) [s].
+        ramp_duration: How long its ramps take, (..., motor) [s].
+        end: End of its plateau, (...) [s].
+    """
+    reached = start + ramp_duration.max(axis=-1, initial=0.0) + SETTLING_S
+    return np.maximum(reached, end - WINDOW_S)
+
+
+def rest(samples: FloatArray, inside: BoolArray) -> Rest:
+    """Return where the tool rests in some stretches of time.
+
+    Args:
+        samples: Tool positions, (stretch, sample, axis) [m]; NaN where there is none.
+        inside: Samples that lie inside the stretch, (stretch, sample).
+    """
+    kept = inside & np.isfinite(samples).all(axis=-1)
+    point = np.stack([masked_median(samples[..., axis], kept) for axis in range(3)], axis=-1)
+    from_point = np.where(kept[..., None], samples, 0.0) - point[:, None]
+    spread = masked_median(np.linalg.norm(from_point, axis=-1), kept)
+    some, moving = kept.any(axis=1), spread > STILL_M
+    return Rest(point, some & ~moving, some & moving)
 
 
 def settled_evidence(runs: xr.Dataset) -> SettledEvidence:
@@ -72,38 +115,30 @@ def settled_evidence(runs: xr.Dataset) -> SettledEvidence:
     measured = as_floats(runs["measured"].values)
     movements = find_movements(as_floats(runs["command"].values), time)
     end = _plateau_ends(movements, measured, time)
-    begin = np.maximum(
-        movements.start + movements.ramp_duration.max(axis=-1, initial=0.0) + SETTLING_S,
-        end - WINDOW_S,
-    )
+    begin = rest_begin(movements.start, movements.ramp_duration, end)
     shape = movements.start.shape
-    point, count = np.zeros((*shape, 3)), np.zeros(shape, dtype=np.int64)
-    moving = np.zeros(shape, dtype=bool)
-    rate = measured_rate(runs)
-    for run, movement in np.argwhere(movements.exists & (begin < end)):
-        first, stop = np.searchsorted(time, [begin[run, movement], end[run, movement] - 1e-9])
-        samples = measured[run, first:stop]
-        samples = samples[np.isfinite(samples).all(axis=1)]
-        if len(samples) == 0:
-            continue
-        point[run, movement] = np.median(samples, axis=0)
-        independent = int((end - begin)[run, movement] * rate) + 1
-        count[run, movement] = min(len(samples), independent)
-        moving[run, movement] = _spread(samples) > STILL_M
-    return SettledEvidence(movements, point, count, (count > 0) & ~moving, moving, begin, end)
+    point, usable, moving = np.zeros((*shape, 3)), np.zeros(shape, bool), np.zeros(shape, bool)
+    item = np.nonzero(movements.exists & (begin < end))
+    found = rest(*_between(measured, time, item[0], begin[item], end[item]))
+    point[item], usable[item], moving[item] = found.point, found.usable, found.moving
+    return SettledEvidence(movements, point, usable, moving, begin, end)
+
+
+def _between(
+    measured: FloatArray, time: FloatArray, run: IntArray, begin: FloatArray, end: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return samples of some runs (item, sample, axis) and which lie between two times [s]."""
+    first, stop = np.searchsorted(time, begin), np.searchsorted(time, end - 1e-9)
+    at = first[:, None] + np.arange(np.max(stop - first, initial=0))
+    inside = at < stop[:, None]
+    return measured[run[:, None], np.minimum(at, len(time) - 1)], inside
 
 
 def _plateau_ends(movements: Movements, measured: FloatArray, time: FloatArray) -> FloatArray:
     """Return when each plateau ends: with the next movement or the last reading of the run."""
     seen = np.asarray(np.isfinite(measured).all(axis=-1))
     last = len(time) - 1 - np.argmax(seen[:, ::-1], axis=1)
-    step = time[1] - time[0]
-    stop = np.where(seen.any(axis=1), time[last] + step, 0.0)
+    stop = np.where(seen.any(axis=1), time[last] + JUST_AFTER_S, 0.0)
     following = np.full_like(movements.start, np.nan)
     following[:, :-1] = movements.start[:, 1:]
     return np.fmin(following, stop[:, None])
-
-
-def _spread(samples: FloatArray) -> float:
-    """Return how far readings (reading, axis) lie from their median, typically [m]."""
-    return float(np.median(np.linalg.norm(samples - np.median(samples, axis=0), axis=1)))
