@@ -1,0 +1,107 @@
+"""Movements in the references of many robots, found as soon as a reference comes to rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from failuretwin.core.movements import Movements, find_movements
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.decision.streaming.samples import Samples
+
+TURN_RAD = 1e-6
+"""A reference that changes by more than this from one sample to the next moves [rad]."""
+STILL_STEPS = 2
+"""Steps without a change after which a reference is at rest: a line needs two."""
+PLATEAU_S = 1.0
+"""How much of the rest before a movement is looked at [s]."""
+GRID_S = 0.01
+"""Step of the grid onto which references are drawn out whose times are not even [s]."""
+
+
+@dataclass
+class References:
+    """Which references move, (robot,) each.
+
+    Attributes:
+        last: The newest that is known, (robot, motor) [rad]; NaN: none yet.
+        last_s: When that was [s].
+        still: Steps for which it has not changed.
+        moved: Whether it has moved since its movements were last found.
+        rest_s: When it came to its last rest [s].
+        before_s: When it came to the rest before that [s].
+        left_s: When it left that rest [s].
+    """
+
+    last: FloatArray
+    last_s: FloatArray
+    still: IntArray
+    moved: BoolArray
+    rest_s: FloatArray
+    before_s: FloatArray
+    left_s: FloatArray
+
+    @classmethod
+    def unknown(cls, robots: int, motors: int) -> References:
+        """Return references of which nothing is known yet."""
+        return cls(
+            last=np.full((robots, motors), np.nan),
+            last_s=np.full(robots, -np.inf),
+            still=np.zeros(robots, dtype=np.int64),
+            moved=np.zeros(robots, dtype=bool),
+            rest_s=np.full(robots, -np.inf),
+            before_s=np.full(robots, -np.inf),
+            left_s=np.full(robots, -np.inf),
+        )
+
+    def see(self, time: float, command: FloatArray) -> IntArray:
+        """Take references at a time and return the robots whose movements can be found now.
+
+        What comes late, older than what is known, says nothing new of them.
+
+        Args:
+            time: When they hold [s].
+            command: (robot, motor) [rad]; NaN where not known.
+        """
+        known = np.isfinite(command).all(axis=1) & (time > self.last_s)
+        first = known & np.isnan(self.last[:, 0])
+        with np.errstate(invalid="ignore"):
+            turns = known & (np.abs(command - self.last).max(axis=1) > TURN_RAD)
+        leaves = turns & ~self.moved
+        self.left_s[leaves], self.before_s[leaves] = self.last_s[leaves], self.rest_s[leaves]
+        self.moved |= turns
+        self.rest_s[first | turns] = time
+        self.still[turns] = 0
+        self.still[known & ~turns & ~first] += 1
+        self.last[known], self.last_s[known] = command[known], time
+        return np.flatnonzero(known & self.moved & (self.still >= STILL_STEPS))
+
+    def movements(self, robot: int, samples: Samples) -> Movements:
+        """Return what a robot was told to do since it was last at rest, as one run.
+
+        Args:
+            robot: Its index.
+            samples: What was said of late.
+        """
+        self.moved[robot] = False
+        some = samples.since(max(self.before_s[robot], self.left_s[robot] - PLATEAU_S))
+        time, command = samples.time[some], samples.command[some, robot]
+        known = np.isfinite(command).all(axis=1)
+        grid, values = _evenly(time[known], command[known])
+        return find_movements(values[None], grid)
+
+
+def _evenly(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return values (time, motor) on an even grid; what is even already stays as it is."""
+    steps = np.diff(time)
+    step = float(steps.min())
+    multiples = steps / step
+    if np.abs(multiples - np.rint(multiples)).max() < 1e-3 and step >= 0.5 * GRID_S:
+        if multiples.max() < 1.5:
+            return time, values
+        grid = time[0] + step * np.arange(round((time[-1] - time[0]) / step) + 1)
+    else:
+        grid = np.append(np.arange(time[0], time[-1], GRID_S), time[-1])
+        grid = np.linspace(time[0], time[-1], len(grid))
+    return grid, np.stack([np.interp(grid, time, v) for v in values.T], axis=-1)
