@@ -7,6 +7,7 @@ numbers say all that a movement can say of this motor, and any fault of it is we
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -131,72 +132,74 @@ class MotorProfile:
         return fall
 
 
-def motor_profile(
+def motor_profiles(
     evidence: SettledEvidence,
     model: HealthyModel,
     alternatives: Alternatives,
-    motor: int,
+    motors: Sequence[int],
     *,
     other: int | None = None,
     other_angle: FloatArray | None = None,
     other_held: bool = False,
-) -> MotorProfile:
-    """Return what each movement says of one motor.
+) -> list[MotorProfile]:
+    """Return what each movement says of some motors, each by itself.
 
     Args:
         evidence: Settled positions.
         model: The healthy robot.
         alternatives: What may have become of each movement.
-        motor: Index of the motor.
+        motors: Indices of the motors.
         other: Index of another motor that has a fault of its own, if any.
         other_angle: Where it settles, (run, movement, node, alternative) [rad].
         other_held: Whether the gear holds it exactly there.
     """
     base, direction = alternatives.base, alternatives.direction
     log_weight, point = alternatives.log_weight, evidence.point[:, :, None]
-    fixed = model.none_held.copy()
+    another = model.none_held.copy()
     if other is not None and other_angle is not None:
         base, direction = base[:, :, None], direction[:, :, None]
         log_weight, point = log_weight[:, :, None], point[:, :, None]
         base = np.repeat(base, other_angle.shape[2], axis=2)
         base[..., other] = other_angle
-        fixed[other] = True
-    expected = model.settle(base, direction, fixed)
-    fixed[motor] = True
-    scale = model.scatter.copy()
-    scale[motor] = 0.0
-    if other_held and other is not None:
-        scale[other] = 0.0
-    angle = _nearest_on_circle(model, expected, motor, point)
-    pose = base.copy()
+        another[other] = True
+    expected = model.settle(base, direction, another)
+    # A leading axis for the motors: own marks each of them among all, (own, ..., motor).
+    own = np.eye(len(model.scatter), dtype=bool)[list(motors)]
+    own = own.reshape(len(motors), *(1,) * (base.ndim - 1), -1)
+    scale = np.where(own | (another & other_held), 0.0, model.scatter)
+    angle = _nearest_on_circle(model, expected, own, point)
     for _ in range(REFINEMENTS):
-        pose[..., motor] = angle
-        settled = model.settle(pose, direction, fixed)
+        pose = np.where(own, angle[..., None], base)
+        settled = model.settle(pose, direction, own | another)
         predicted, jacobian = model.twin.path_and_jacobian(settled)
-        spread = Ellipsoid.of(jacobian * scale, model.path_noise**2)
-        lever, error = jacobian[..., motor], point - predicted
+        spread = Ellipsoid.of(jacobian * scale[..., None, :], model.path_noise**2)
+        lever, error = np.sum(jacobian * own[..., None, :], axis=-1), point - predicted
         precision = spread.product(lever, lever)
         slope = spread.product(lever, error)
         step = slope / np.maximum(precision, LEAST_PRECISION)
-        angle = angle + np.clip(step, -LONGEST_STEP_RAD, LONGEST_STEP_RAD)
-    taken = np.clip(step, -LONGEST_STEP_RAD, LONGEST_STEP_RAD)
+        taken = np.clip(step, -LONGEST_STEP_RAD, LONGEST_STEP_RAD)
+        angle = angle + taken
     square = spread.product(error, error) - taken * (2.0 * slope - precision * taken)
     settled = settled + scattered(spread, jacobian, scale, error - lever * taken[..., None])
-    settled[..., motor] = angle
+    settled = np.where(own, angle[..., None], settled)
     dof = model.settling.tail_dof
-    return MotorProfile(
-        best=angle,
-        precision=precision,
-        square=np.maximum(square, 0.0),
-        log_weight=log_weight + log_norm(dof) - 0.5 * np.log(spread.determinant),
-        expected=expected[..., motor],
-        scatter=float(model.scatter[motor]),
-        dof=dof,
-        outlier=model.outlier_log_density,
-        usable=evidence.usable,
-        around=_may_turn_around(model, motor),
-        pose=settled,
-    )
+    weighed = log_weight + log_norm(dof) - 0.5 * np.log(spread.determinant)
+    return [
+        MotorProfile(
+            best=angle[i],
+            precision=precision[i],
+            square=np.maximum(square[i], 0.0),
+            log_weight=weighed[i],
+            expected=expected[..., motor],
+            scatter=float(model.scatter[motor]),
+            dof=dof,
+            outlier=model.outlier_log_density,
+            usable=evidence.usable,
+            around=_may_turn_around(model, motor),
+            pose=settled[i],
+        )
+        for i, motor in enumerate(motors)
+    ]
 
 
 def _may_turn_around(model: HealthyModel, motor: int) -> bool:
@@ -206,22 +209,30 @@ def _may_turn_around(model: HealthyModel, motor: int) -> bool:
 
 
 def _nearest_on_circle(
-    model: HealthyModel, pose: FloatArray, motor: int, point: FloatArray
+    model: HealthyModel, pose: FloatArray, own: BoolArray, point: FloatArray
 ) -> FloatArray:
-    """Return the angle of `motor` that brings the tool nearest to `point`, (...) [rad].
+    """Return the angle of each motor that brings the tool nearest to `point`, (own, ...) [rad].
 
     Three poses say where the circle lies (the line, if the joint slides).
+
+    Args:
+        model: The healthy robot.
+        pose: Angles of all motors, (..., motor) [rad].
+        own: Which motor is meant, (own, ..., motor).
+        point: Tool position, (..., axis) [m].
     """
-    poses = np.repeat(pose[..., None, :], 3, axis=-2)
-    poses[..., motor] = np.array([0.0, 0.5 * np.pi, np.pi])
-    path = model.twin.path(poses)
+    turned = np.array([0.0, 0.5 * np.pi, np.pi])[:, None]
+    path = model.twin.path(np.where(own[..., None, :], turned, pose[..., None, :]))
     first, quarter, half = path[..., 0, :], path[..., 1, :], path[..., 2, :]
-    if model.twin.robot.chain.joints[motor].prismatic:
-        along = (half - first) / np.pi
-        toward = np.sum((point - first) * along, axis=-1)
-        return np.asarray(toward / np.maximum(np.sum(along**2, axis=-1), 1e-12))
     centre = 0.5 * (first + half)
     cosine, sine, toward = first - centre, quarter - centre, point - centre
     found = np.arctan2(np.sum(toward * sine, axis=-1), np.sum(toward * cosine, axis=-1))
-    turns = np.rint((pose[..., motor] - found) / (2.0 * np.pi))
-    return np.asarray(found + 2.0 * np.pi * turns)
+    here = np.sum(pose * own, axis=-1)
+    found = found + 2.0 * np.pi * np.rint((here - found) / (2.0 * np.pi))
+    slides = np.array([joint.prismatic for joint in model.twin.robot.chain.joints])
+    if not slides.any():
+        return np.asarray(found)
+    along = (half - first) / np.pi
+    length = np.maximum(np.sum(along**2, axis=-1), 1e-12)
+    reached = np.sum((point - first) * along, axis=-1) / length
+    return np.where((own & slides).any(axis=-1), reached, found)

@@ -10,7 +10,7 @@ import numpy as np
 from failuretwin.core.quadrature import Weighted, log_sum
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.decision.law import Law
-from failuretwin.decision.motor_profile import MotorProfile, motor_profile
+from failuretwin.decision.motor_profile import MotorProfile, motor_profiles
 from failuretwin.decision.scene import Scene
 from failuretwin.decision.weight import Estimate, Weight
 
@@ -111,15 +111,16 @@ def _given(scene: Scene, one: Law, motor: int) -> MotorProfile:
     """Return the profile of a motor with another fault there, at each of its nodes."""
     shape = scene.alternatives.base.shape
     angle = np.broadcast_to(one.angle, (1, shape[1], one.angle.shape[2], shape[2]))
-    return motor_profile(
+    (profile,) = motor_profiles(
         scene.evidence,
         scene.model,
         scene.alternatives,
-        motor,
+        [motor],
         other=one.motor,
         other_angle=angle,
         other_held=one.held,
     )
+    return profile
 
 
 def _cells(density: FloatArray, law: Law) -> FloatArray:

@@ -13,7 +13,8 @@ from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.moving_evidence import MovingEvidence
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
 from failuretwin.decision.courses import CourseJudge
-from failuretwin.decision.motor_profile import MotorProfile, motor_profile
+from failuretwin.decision.findings import Findings, find
+from failuretwin.decision.motor_profile import MotorProfile
 from failuretwin.decision.ramps import RampModel
 from failuretwin.decision.transients import Transients
 
@@ -30,15 +31,14 @@ class Scene:
         model: The healthy robot.
         moving: Readings on the way; None: they are left aside.
         way_blur: Factor on the scatter of the way alone; 1 for a robot as it is.
+        remembered: What every movement says by itself, where that was computed before.
     """
 
     evidence: SettledEvidence
     model: HealthyModel
     moving: MovingEvidence | None = None
     way_blur: float = 1.0
-    _profiles: dict[int, MotorProfile] = field(
-        default_factory=dict, init=False, compare=False, repr=False
-    )
+    remembered: Findings | None = None
     _off: dict[tuple[int, bool], FloatArray] = field(
         default_factory=dict, init=False, compare=False, repr=False
     )
@@ -53,13 +53,16 @@ class Scene:
         return Scene(self.evidence[rows], self.model, moving, self.way_blur)
 
     @cached_property
+    def findings(self) -> Findings:
+        """What every movement says by itself."""
+        if self.remembered is not None and self.remembered.model is self.model:
+            return self.remembered
+        return find(self.evidence, self.model)
+
+    @property
     def alternatives(self) -> Alternatives:
         """What may have become of each movement."""
-        return self.model.alternatives(self.evidence.movements)
-
-    @cached_property
-    def _explained(self) -> tuple[FloatArray, FloatArray]:
-        return self.model.explain(self.evidence, self.alternatives)
+        return self.findings.alternatives
 
     @cached_property
     def transients(self) -> Transients | None:
@@ -68,7 +71,8 @@ class Scene:
             return None
         model = replace(self.model, blur=self.model.blur * self.way_blur)
         ramps = RampModel(model, self.evidence, self.moving)
-        return Transients(CourseJudge(ramps, self.alternatives), *self._explained)
+        found = self.findings
+        return Transients(CourseJudge(ramps, found.alternatives), found.terms, found.poses)
 
     @cached_property
     def on_way(self) -> FloatArray:
@@ -124,12 +128,12 @@ class Scene:
     @cached_property
     def log_healthy(self) -> FloatArray:
         """Log density of each settled position if no motor is faulty, (run, movement)."""
-        return with_outliers(self._explained[0], self.model.outlier_log_density, self.usable)
+        return with_outliers(self.findings.terms, self.model.outlier_log_density, self.usable)
 
     @cached_property
     def became(self) -> FloatArray:
         """Probability of each alternative if no motor is faulty, (run, movement, alternative)."""
-        return share_of(self._explained[0], self.model.outlier_log_density, self.usable)
+        return share_of(self.findings.terms, self.model.outlier_log_density, self.usable)
 
     @property
     def usable(self) -> BoolArray:
@@ -137,11 +141,8 @@ class Scene:
         return self.evidence.usable
 
     def profile(self, motor: int) -> MotorProfile:
-        """Return what each movement says of one motor, computed once."""
-        if motor not in self._profiles:
-            found = motor_profile(self.evidence, self.model, self.alternatives, motor)
-            self._profiles[motor] = found
-        return self._profiles[motor]
+        """Return what each movement says of one motor."""
+        return self.findings.profiles[motor]
 
 
 def with_outliers(terms: FloatArray, outlier: float, usable: BoolArray) -> FloatArray:
