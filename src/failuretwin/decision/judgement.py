@@ -54,7 +54,7 @@ class Judgement:
             self.scene.evidence,
             run,
             float(np.exp(self.log_posterior[run, best])),
-            self.weights[best].settled[run],
+            self.weights[best].settled(run),
             self.scene.model.outlier_log_density,
         )
 
@@ -109,7 +109,7 @@ class Judgement:
         """Return what each usable movement says of the best hypothesis against the second."""
         if len(order) < 2:
             return ()
-        best, second = (self.weights[i].by_movement[run] for i in order[:2])
+        best, second = (self.weights[i].by_movement(run) for i in order[:2])
         usable = np.flatnonzero(self.scene.evidence.usable[run])
         return tuple(MovementEvidence(int(m) + 1, float(best[m] - second[m])) for m in usable)
 

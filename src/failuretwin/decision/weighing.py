@@ -128,4 +128,5 @@ def _weigh_healthy(scene: Scene) -> Weight:
     def estimate(run: int) -> Estimate:
         return Estimate(None, None, scene.became[run])
 
-    return Weight(by_movement.sum(axis=1), by_movement, scene.log_healthy, estimate)
+    of_run, settled = by_movement.__getitem__, scene.log_healthy.__getitem__
+    return Weight(by_movement.sum(axis=1), of_run, settled, estimate)

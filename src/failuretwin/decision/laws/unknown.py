@@ -41,10 +41,6 @@ def weigh_unknown(
     joint = np.stack([weight.log_evidence for weight in found], axis=1) + prior
     log_evidence = log_sum(joint, axis=1)
     best = np.argmax(joint, axis=1)
-    run = np.arange(len(best))
-
-    def of_best(values: list[FloatArray]) -> FloatArray:
-        return np.stack(values)[best, run]
 
     def estimate(run: int) -> Estimate:
         nearest = found[best[run]].estimate(run)
@@ -52,7 +48,7 @@ def weigh_unknown(
 
     return Weight(
         log_evidence=log_evidence,
-        by_movement=of_best([weight.by_movement for weight in found]),
-        settled=of_best([weight.settled for weight in found]),
+        by_movement=lambda run: found[best[run]].by_movement(run),
+        settled=lambda run: found[best[run]].settled(run),
         estimate=estimate,
     )

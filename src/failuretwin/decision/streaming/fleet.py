@@ -21,6 +21,7 @@ from failuretwin.data_knowledge.settled_evidence import JUST_AFTER_S, rest, rest
 from failuretwin.decision.bayes import BayesDiagnoser
 from failuretwin.decision.judgement import Judgement, judge
 from failuretwin.decision.scene import Scene
+from failuretwin.decision.streaming.memory import Memory
 from failuretwin.decision.streaming.reference import References
 from failuretwin.decision.streaming.samples import Samples
 from failuretwin.decision.streaming.windows import Windows
@@ -92,6 +93,7 @@ class StreamingFleet:
             point=np.full((robots, 3), np.nan),
             read_s=np.full(robots, -np.inf),
         )
+        self._memory = Memory.empty(robots, movements)
         self._everything_counts = any(shows_on_way(h) for h in diagnoser.considered)
         self._latest: tuple[IntArray, Judgement] | None = None
 
@@ -181,6 +183,9 @@ class StreamingFleet:
         for number, start in enumerate(movements.start[0]):
             if windows.count[robot] > 0:
                 self._close(robot, start)
+            if windows.full(robot):
+                windows.forget_oldest(robot)
+                self._memory.forget_oldest(robot)
             windows.append(robot, movements, number)
             self._beliefs.point[robot] = np.nan
 
@@ -207,6 +212,7 @@ class StreamingFleet:
         at = robots, place
         begin = rest_begin(windows.start[at], windows.ramp_duration[at], end)
         windows.begin[at], windows.end[at] = begin, end
+        self._memory.fresh[at] = False
         over = begin < end
         robots, place, begin, end = robots[over], place[over], begin[over], end[over]
         if len(robots) == 0:
@@ -263,5 +269,7 @@ class StreamingFleet:
         if diagnoser.looks_on_way:
             seen = diagnoser.on_way(evidence.usable)
             moving = self._windows.on_way(robots).where(seen)
-        scene = Scene(evidence, diagnoser.healthy_model, moving)
+        model = diagnoser.healthy_model
+        findings = self._memory.findings(robots, evidence, model)
+        scene = Scene(evidence, model, moving, remembered=findings)
         return judge(scene, diagnoser.considered, diagnoser.priors)
