@@ -12,9 +12,14 @@ from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
 from failuretwin.decision.findings import Findings, find
 from failuretwin.decision.motor_profile import MotorProfile
+from failuretwin.decision.streaming.state import Arrays
 
 PER_MOTOR = ("best", "precision", "square", "log_weight", "expected", "pose", "beside")
 """What is kept of each motor's profile."""
+
+
+PER_MOVEMENT = ("base", "direction", "chance", "terms", "poses")
+"""What is kept of each movement beside."""
 
 
 @dataclass
@@ -36,6 +41,12 @@ class Memory:
     def empty(cls, robots: int, movements: int) -> Memory:
         """Return a memory of nothing yet."""
         return cls(np.zeros((robots, movements), dtype=bool))
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take over arrays of another memory, by ``memory/name``."""
+        self.fresh = arrays["memory/fresh"].copy()
+        names = [n for n in (*PER_MOVEMENT, *PER_MOTOR) if f"memory/{n}" in arrays]
+        self.arrays = {name: arrays[f"memory/{name}"].copy() for name in names}
 
     def forget_oldest(self, robot: int) -> None:
         """Drop the oldest movement of a robot."""

@@ -145,9 +145,16 @@ class Windows:
             self.since[robots, some], self.way[robots, some], self.seen[robots, some]
         )
 
+    def clear(self, robot: int, time: float) -> None:
+        """Forget all movements of a robot; what comes next begins at a time [s]."""
+        while self.count[robot] > 0:
+            self.forget_oldest(robot)
+        self.zero_s[robot] = time
+
     def forget_oldest(self, robot: int) -> None:
         """Drop the oldest movement of a robot."""
-        self.initial[robot] = self.evidence(np.array([robot])).movements.origin()[0, 1]
+        if self.count[robot] > 1:
+            self.initial[robot] = self.evidence(np.array([robot])).movements.origin()[0, 1]
         for values in (self.target, self.ramp_duration, self.start, self.begin, self.end,
                        self.point, self.usable, self.moving, self.since, self.way,
                        self.seen):  # fmt: skip
