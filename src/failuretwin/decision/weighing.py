@@ -76,9 +76,10 @@ def shows_on_way(hypothesis: Hypothesis) -> bool:
     return not hypothesis.known or any(fault.mode in TIMED for fault in hypothesis.faults)
 
 
-def log_prior(hypotheses: Sequence[Hypothesis]) -> FloatArray:
+def log_prior(hypotheses: Sequence[Hypothesis], priors: Priors) -> FloatArray:
     """Return the log prior probability of each hypothesis, (hypothesis,)."""
     odds = np.array([prior_odds(h) if h.known else UNKNOWN_ODDS for h in hypotheses])
+    odds[[h.is_healthy for h in hypotheses]] *= priors.healthy_odds
     return np.asarray(np.log(odds / odds.sum()))
 
 
@@ -88,7 +89,7 @@ def weigh_all(scene: Scene, hypotheses: Sequence[Hypothesis], priors: Priors) ->
     weights = {h: weigh_hypothesis(scene, h, priors) for h in known}
     if len(known) < len(hypotheses):
         ways = [lambda blurred, h=h: weigh_hypothesis(blurred, h, priors) for h in known]
-        weights[UNKNOWN] = weigh_unknown(scene, ways, log_prior(known))
+        weights[UNKNOWN] = weigh_unknown(scene, ways, log_prior(known, priors))
     return [weights[h] for h in hypotheses]
 
 
