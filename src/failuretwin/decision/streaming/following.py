@@ -87,12 +87,14 @@ class Following:
     def look(self, robots: IntArray) -> IntArray:
         """See where tools rest by now and return the robots whose tools do.
 
-        A tool that has just come to rest, or may not have set out yet, is left for later readings.
+        A tool that has just come to rest, or may not have set out yet, is left for later readings;
+        so is one whose reference moves: how, will be known when that comes to rest.
 
         Args:
             robots: Robots that were read.
         """
-        robots, place, begin, end = self._due(*self._present(robots))
+        still = robots[~self.references.moved[robots]]
+        robots, place, begin, end = self._due(*self._present(still))
         if len(robots) == 0:
             return robots
         samples, inside = self._readings(robots, begin, end)
