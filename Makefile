@@ -15,6 +15,7 @@ test: .venv/ready lint
 bench: .venv/ready
 	$(BIN)/python benchmarks/speed.py
 	$(BIN)/python benchmarks/scale.py
+	$(BIN)/python benchmarks/streaming.py
 	$(BIN)/python benchmarks/learning.py
 
 lint: .venv/ready

@@ -14,7 +14,7 @@ from typing import Self
 
 import numpy as np
 
-from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
+from failuretwin import DigitalTwin, load_robot
 from failuretwin.app.live.shadow import Shadow
 from failuretwin.connection.emulation.emulated_arm import FIRST_COMMAND_S
 from failuretwin.connection.links.ros_topics import RosTopics
@@ -22,7 +22,7 @@ from failuretwin.connection.links.values import CommandSent, Item, Reading
 from failuretwin.connection.ros1.sinks import Ros1Robot
 from failuretwin.connection.ros1.source import Ros1Source
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.decision.streaming.streaming import StreamingDiagnoser
+from failuretwin.decision.streaming.streaming import monitor
 from failuretwin.digital_model.robot import Robot
 
 ONSET_S = 6.0
@@ -82,7 +82,10 @@ def watch_state(robot: Robot, state: str, speed: float, seconds: float, seed: in
     with Ros1Source(robot, RosTopics()) as source:
         child = subprocess.Popen(command, stdout=subprocess.DEVNULL)
         shadow = Shadow(
-            source, StreamingDiagnoser(BayesDiagnoser(twin, whole_run=False)), twin, [commands]
+            source,
+            monitor(twin),
+            twin,
+            [commands],
         )
         deadline = np.inf
         while time.monotonic() < deadline:
@@ -105,7 +108,11 @@ def latency(robot: Robot, samples: int = 300) -> list[float]:
     rng = np.random.default_rng(0)
     taken = []
     with Ros1Source(robot, topics) as source, Ros1Robot(robot, topics) as sink:
-        shadow = Shadow(source, StreamingDiagnoser(BayesDiagnoser(twin, whole_run=False)), twin)
+        shadow = Shadow(
+            source,
+            monitor(twin),
+            twin,
+        )
         time.sleep(2.0)
         pose = np.zeros(len(robot.motors))
         for k in range(samples):

@@ -80,6 +80,21 @@ class Diagnosis:
         """The second most probable hypothesis; None where there is none."""
         return None if self.undecided or len(self.posterior) < 2 else self.ranked[1]
 
+    @classmethod
+    def from_fields(cls, fields: Mapping[str, Any]) -> Diagnosis:
+        """Return the diagnosis whose `dataclasses.asdict` went through JSON.
+
+        Raises:
+            TypeError: If a field is unknown or missing.
+        """
+        intervals = {
+            name: None if fields[name] is None else tuple(fields[name])
+            for name in ("onset_90", "magnitude_90")
+        }
+        evidence = tuple(MovementEvidence(**movement) for movement in fields["evidence"])
+        lines = {name: tuple(fields[name]) for name in ("explanation", "quality")}
+        return cls(**{**fields, **intervals, **lines, "evidence": evidence})
+
     def to_record(self) -> dict[str, Any]:
         """Return the JSON object of the contract."""
         return {

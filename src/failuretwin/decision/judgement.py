@@ -37,18 +37,16 @@ class Place:
     movements: int = 0
     before: Diagnosis | None = None
 
-    def known_onset(self, hypothesis: Hypothesis, onset_s: float) -> Diagnosis | None:
-        """Return what was said before, if the onset told then is better than one told now.
+    def known_onset(self, hypothesis: Hypothesis) -> Diagnosis | None:
+        """Return what was said before, if that was the same fault, older than the run.
 
         Args:
             hypothesis: What is said now.
-            onset_s: Since when [s].
         """
         before = self.before
         if before is None or before.onset_s is None or before.diagnosis != str(hypothesis):
             return None
-        older = before.onset_s < self.begin_s and onset_s <= self.begin_s
-        return before if older else None
+        return before if before.onset_s < self.begin_s else None
 
 
 @dataclass(frozen=True)
@@ -178,7 +176,7 @@ def _with_estimate(
     if estimate.onset is not None:
         early, middle, late = (place.begin_s + estimate.onset.quantiles(LEVELS)).tolist()
         diagnosis = replace(diagnosis, onset_s=middle, onset_90=(early, late))
-        known = place.known_onset(hypothesis, middle)
+        known = place.known_onset(hypothesis)
         if known is not None:
             diagnosis = replace(diagnosis, onset_s=known.onset_s, onset_90=known.onset_90)
     if estimate.size is not None:

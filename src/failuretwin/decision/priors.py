@@ -29,6 +29,11 @@ class Priors:
     healthy_odds: float = 1.0
 
 
+MONITORING = Priors(healthy_odds=30.0)
+"""Beliefs of who watches a robot at work: faults are rare, and a single movement that went wrong is
+more often a lost command. Chosen on emulated robots: a false alarm an hour at most."""
+
+
 def priors_of(
     robot: Robot, error_range_counts: tuple[float, float] | None, onset_s: float | None
 ) -> Priors:

@@ -110,7 +110,8 @@ class StreamingFleet:
     @property
     def stale(self) -> BoolArray:
         """Robots that have not been seen for a while: nothing is known of their present."""
-        return self._following.read_s < self.time - SILENCE_S
+        read_s = self._following.read_s
+        return np.asarray(np.isinf(read_s) | (read_s < self.time - SILENCE_S))
 
     def update(
         self, time: float, command: ArrayLike | None, measured: ArrayLike | None

@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.errors import InputError
 from failuretwin.core.fingerprint import fingerprint
 from failuretwin.data_knowledge.store import reason, replacing
@@ -21,8 +23,13 @@ SUFFIX = ".npz"
 HEADER = "header"
 
 
-def save_fleet(fleet: StreamingFleet, path: Path) -> None:
+def save_fleet(fleet: StreamingFleet, path: Path, said: Sequence[Diagnosis] = ()) -> None:
     """Write the state of a stream; a file of that name is replaced at the end, all at once.
+
+    Args:
+        fleet: The stream.
+        path: Where to.
+        said: Diagnoses to be kept with it.
 
     Raises:
         InputError: If the suffix is not .npz.
@@ -36,6 +43,7 @@ def save_fleet(fleet: StreamingFleet, path: Path) -> None:
         "robots": fleet.robots,
         "movements": fleet.movements,
         "rate_hz": fleet.rate_hz,
+        "said": [dataclasses.asdict(diagnosis) for diagnosis in said],
     }
     arrays: dict[str, Any] = {
         HEADER: np.frombuffer(json.dumps(header).encode(), dtype=np.uint8),
@@ -45,8 +53,10 @@ def save_fleet(fleet: StreamingFleet, path: Path) -> None:
         np.savez(file, allow_pickle=False, **arrays)
 
 
-def load_fleet(path: Path, diagnoser: BayesDiagnoser, robots: int | None = None) -> StreamingFleet:
-    """Return a stream as it was saved.
+def load_fleet(
+    path: Path, diagnoser: BayesDiagnoser, robots: int | None = None
+) -> tuple[StreamingFleet, list[Diagnosis]]:
+    """Return a stream as it was saved, and the diagnoses that were kept with it.
 
     Args:
         path: The file.
@@ -63,12 +73,13 @@ def load_fleet(path: Path, diagnoser: BayesDiagnoser, robots: int | None = None)
         _check(header, diagnoser, robots, path)
         fleet = StreamingFleet(diagnoser, header["robots"], header["rate_hz"], header["movements"])
         fleet.restore(arrays)
+        said = [Diagnosis.from_fields(fields) for fields in header["said"]]
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(
             f"{path}: cannot be read as a stream ({reason(error)}). Expected a file that `save` of "
             "a stream wrote."
         ) from error
-    return fleet
+    return fleet, said
 
 
 def _method(diagnoser: BayesDiagnoser) -> str:

@@ -13,8 +13,11 @@ from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.errors import unknown_name
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.decision.bayes import BayesDiagnoser
+from failuretwin.decision.priors import MONITORING
 from failuretwin.decision.streaming.fleet import MOVEMENTS, StreamingFleet
 from failuretwin.decision.streaming.saved import load_fleet, save_fleet
+from failuretwin.digital_model.imperfections import Imperfections
+from failuretwin.digital_model.twin import DigitalTwin
 
 
 class StreamingDiagnoser:
@@ -72,7 +75,7 @@ class StreamingDiagnoser:
             InputError: If the name does not end in .npz.
             OutputError: If it cannot be written.
         """
-        save_fleet(self._fleet, path)
+        save_fleet(self._fleet, path, [] if self._diagnosis is None else [self._diagnosis])
 
     @classmethod
     def load(cls, path: Path, diagnoser: BayesDiagnoser) -> StreamingDiagnoser:
@@ -85,10 +88,9 @@ class StreamingDiagnoser:
         Raises:
             InputError: If it is no such file or of another robot, method or number of robots.
         """
-        fleet = load_fleet(path, diagnoser, robots=1)
         stream = cls(diagnoser)
-        stream._fleet = fleet
-        stream._diagnosis = stream._told()
+        stream._fleet, said = load_fleet(path, diagnoser, robots=1)
+        stream._diagnosis = said[0] if said else None
         return stream
 
     def _reference(self, command: Mapping[str, float] | ArrayLike) -> FloatArray:
@@ -106,3 +108,14 @@ class StreamingDiagnoser:
     def _told(self) -> Diagnosis | None:
         found = self._fleet.diagnosis(0, self._diagnosis)
         return None if found is None else replace(found, run="stream")
+
+
+def monitor(twin: DigitalTwin, imperfections: Imperfections | None = None) -> StreamingDiagnoser:
+    """Return what watches a robot at work: settled poses, and faults are rare.
+
+    Args:
+        twin: Digital twin of the robot.
+        imperfections: How the healthy robot differs from it; None: as its profile says.
+    """
+    method = BayesDiagnoser(twin, imperfections, priors=MONITORING, whole_run=False)
+    return StreamingDiagnoser(method)

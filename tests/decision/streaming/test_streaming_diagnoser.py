@@ -1,0 +1,179 @@
+"""One robot as a stream: long operation, repairs, dead sensors, saved states."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from failuretwin import BayesDiagnoser
+from failuretwin.connection.links.values import OK, STALE
+from failuretwin.core.errors import InputError
+from failuretwin.core.movements import Movements
+from failuretwin.decision.streaming.fleet import StreamingFleet
+from failuretwin.decision.streaming.saved import load_fleet, save_fleet
+from failuretwin.decision.streaming.streaming import StreamingDiagnoser, monitor
+from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS
+
+PERIOD_S = 2.04
+STEP_S = 0.1
+
+
+@pytest.fixture
+def watcher(twin):
+    """What watches an exact arm."""
+    return monitor(twin, NO_IMPERFECTIONS)
+
+
+@pytest.fixture
+def work(twin, rng):
+    """A healthy, exact arm at work: random movements every two seconds, readings at 10 Hz."""
+
+    def samples(movements, stuck=()):
+        count, motors = movements, len(twin.robot.motors)
+        low, high = np.array([motor.movement_range for motor in twin.robot.motors]).T
+        target = rng.uniform(0.5 * low, 0.5 * high, (1, count, motors))
+        start = 0.5 + PERIOD_S * np.arange(count)[None]
+        commanded = Movements(np.zeros((1, motors)), target, np.full(target.shape, 0.8), start)
+        time = np.arange(round((0.5 + PERIOD_S * count) / STEP_S)) * STEP_S
+        reference = commanded.reference(time)[0]
+        angles = reference.copy()
+        for motor, first, last in stuck:
+            begin, end = (0.3 + PERIOD_S * number for number in (first, last))
+            inside = (time >= begin) & (time < end)
+            angles[inside, motor] = angles[np.argmax(inside), motor]
+        points = twin.path(angles) + rng.normal(0.0, 3e-4, (len(time), 3))
+        return list(zip(time.tolist(), reference, points, strict=True))
+
+    return samples
+
+
+def said(diagnoser, samples):
+    """Return the time of each answer and the probabilities of healthy and of motor 2 stuck."""
+    rows = []
+    for sample in samples:
+        answer = diagnoser.update(*sample)
+        if answer.diagnosis is not None:
+            posterior = answer.diagnosis.posterior
+            rows.append((answer.time, posterior["healthy"], posterior["motor_2:stuck"]))
+    return np.array(rows)
+
+
+def test_a_late_fault_is_found_as_fast_as_an_early_one(twin, work):
+    """The movements after the onset, until it is sure, are as few after 200 as after 5."""
+    delays = []
+    for first in (5, 200):
+        rows = said(monitor(twin, NO_IMPERFECTIONS), work(first + 6, stuck=[(1, first, first + 6)]))
+        onset = 0.5 + PERIOD_S * first
+        sure = rows[(rows[:, 2] > 0.9) & (rows[:, 0] > onset), 0]
+        delays.append(sure[0] - onset)
+        assert (rows[rows[:, 0] < onset, 1] > 0.5).all()
+    assert delays[1] < delays[0] + 1.5 * PERIOD_S
+    assert max(delays) < 4 * PERIOD_S
+
+
+def test_a_repaired_robot_becomes_healthy_again(watcher, work):
+    rows = said(watcher, work(24, stuck=[(1, 6, 12)]))
+    repaired = 0.5 + PERIOD_S * 12
+    assert rows[rows[:, 0] < repaired, 2].max() > 0.9
+    after = rows[rows[:, 0] > repaired + 5.5 * PERIOD_S]
+    assert (after[:, 1] > 0.9).all()
+
+
+def test_the_onset_of_an_old_fault_stands(watcher, work):
+    diagnoser, samples = watcher, work(30, stuck=[(1, 6, 30)])
+    for sample in samples:
+        answer = diagnoser.update(*sample)
+    assert answer.diagnosis.diagnosis == "motor_2:stuck"
+    low, high = answer.diagnosis.onset_90
+    onset = 0.5 + PERIOD_S * 6
+    assert low - PERIOD_S < onset < high + PERIOD_S
+    assert f"since {answer.diagnosis.onset_s:.1f} s" in answer.diagnosis.verdict
+    assert answer.diagnosis.evidence[-1].movement == 30
+
+
+def test_silence_is_stale_and_what_was_known_is_kept(watcher, work):
+    diagnoser = watcher
+    for sample in work(6):
+        answer = diagnoser.update(*sample)
+    assert answer.state == OK
+    silent = diagnoser.update(answer.time + 5.2, None, None)
+    assert silent.state == STALE
+    assert silent.diagnosis is answer.diagnosis
+    assert diagnoser.update(answer.time + 5.3, None, sample[2]).state == OK
+
+
+def test_a_frozen_sensor_is_never_healthy(watcher, work):
+    diagnoser, samples = watcher, work(12)
+    for time, command, point in samples:
+        frozen = samples[100][2] if time > 10.0 else point
+        answer = diagnoser.update(time, command, frozen)
+    assert answer.diagnosis.undecided.startswith("the tool stands still")
+    assert answer.diagnosis.posterior["healthy"] < 0.8  # the prior of who watches
+    assert answer.diagnosis.probability is None
+
+
+def test_a_sensor_that_comes_back_is_believed_again(watcher, work):
+    diagnoser, samples = watcher, work(24)
+    for time, command, point in samples:
+        frozen = samples[100][2] if 10.0 < time < 22.0 else point
+        answer = diagnoser.update(time, command, frozen)
+    assert answer.diagnosis.diagnosis == "healthy"
+    assert answer.diagnosis.probability > 0.9
+
+
+def test_commands_may_be_given_by_name(twin, work):
+    samples, names = work(6), twin.robot.motor_names
+    by_array, by_name = (monitor(twin, NO_IMPERFECTIONS) for _ in range(2))
+    for time, command, point in samples:
+        one = by_array.update(time, command, point)
+        two = by_name.update(time, dict(zip(names, command.tolist(), strict=True)), point)
+    assert one.diagnosis == two.diagnosis
+    with pytest.raises(InputError, match="motor_4"):
+        by_name.update(99.0, dict.fromkeys(names[:3], 0.0), None)
+
+
+def test_a_saved_stream_goes_on_as_if_nothing_had_happened(twin, work, tmp_path):
+    samples, path = work(12, stuck=[(2, 7, 12)]), tmp_path / "stream.npz"
+    method = BayesDiagnoser(twin)
+    whole, first = StreamingDiagnoser(method), StreamingDiagnoser(method)
+    middle = len(samples) // 2
+    for sample in samples[:middle]:
+        whole.update(*sample)
+        first.update(*sample)
+    first.save(path)
+    resumed = StreamingDiagnoser.load(path, method)
+    for sample in samples[middle:]:
+        expected, answer = whole.update(*sample), resumed.update(*sample)
+        assert answer == expected
+    assert resumed.conclude() == whole.conclude()
+
+
+def test_a_fleet_can_be_saved_before_it_has_seen_anything(twin, tmp_path):
+    path, method = tmp_path / "fleet.npz", BayesDiagnoser(twin)
+    save_fleet(StreamingFleet(method, 3), path)
+    fleet, said = load_fleet(path, method)
+    assert (fleet.robots, said) == (3, [])
+
+
+@pytest.mark.parametrize(
+    "spoil", ["other method", "other number", "no file", "other file", "suffix"]
+)
+def test_what_is_no_saved_stream_is_refused(twin, tmp_path, spoil):
+    path, method = tmp_path / "fleet.npz", BayesDiagnoser(twin)
+    save_fleet(StreamingFleet(method, 2), path)
+    if spoil == "other method":
+        with pytest.raises(InputError, match="calibration"):
+            load_fleet(path, BayesDiagnoser(twin, whole_run=False))
+    elif spoil == "other number":
+        with pytest.raises(InputError, match="2 robots"):
+            StreamingDiagnoser.load(path, method)
+    elif spoil == "suffix":
+        with pytest.raises(InputError, match="npz"):
+            save_fleet(StreamingFleet(method, 2), tmp_path / "fleet.bin")
+    else:
+        if spoil == "no file":
+            path.unlink()
+        else:
+            path.write_bytes(b"something else")
+        with pytest.raises(InputError, match="cannot be read as a stream"):
+            load_fleet(path, method)

@@ -1,0 +1,145 @@
+"""Streams against recorded runs: the same data, the same answer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from failuretwin import BayesDiagnoser, Plan
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.decision.streaming.fleet import SILENCE_S, StreamingFleet
+from failuretwin.digital_model.imperfections import load_imperfections
+
+
+def posteriors(diagnoses):
+    return np.array([list(diagnosis.posterior.values()) for diagnosis in diagnoses])
+
+
+def decided(diagnoser, runs):
+    """Return the posteriors of the batch."""
+    return posteriors(diagnoser.diagnose(runs))
+
+
+def play(runs, diagnoser, robots=slice(None), order=None, skip=()):
+    """Return a fleet that has seen the runs, in some order of the samples."""
+    time, command = runs["time"].values, runs["command"].values[robots]
+    measured = runs["measured"].values[robots]
+    fleet = StreamingFleet(diagnoser, len(command), runs.attrs["measured_rate_hz"])
+    for i in range(len(time)) if order is None else order:
+        if i not in skip:
+            fleet.update(time[i], command[:, i], measured[:, i])
+    return fleet
+
+
+def test_the_end_of_a_stream_is_the_batch(live_runs, live_diagnoser):
+    fleet = play(live_runs, live_diagnoser)
+    fleet.conclude()
+    expected = decided(live_diagnoser, live_runs)
+    np.testing.assert_allclose(fleet.posterior, expected, rtol=0.0, atol=1e-9)
+    for robot, diagnosis in enumerate(live_diagnoser.diagnose(live_runs)):
+        said = fleet.diagnosis(robot)
+        assert said.diagnosis == diagnosis.diagnosis
+        assert said.onset_90 == pytest.approx(diagnosis.onset_90, abs=1e-6)
+        assert said.magnitude == pytest.approx(diagnosis.magnitude, abs=1e-9)
+        assert said.explanation == diagnosis.explanation
+
+
+def test_robots_do_not_know_each_other(live_runs, live_diagnoser):
+    together = play(live_runs, live_diagnoser).posterior
+    for robot in (0, 5, 11):
+        alone = play(live_runs, live_diagnoser, slice(robot, robot + 1)).posterior
+        np.testing.assert_allclose(alone[0], together[robot], rtol=0.0, atol=1e-12)
+
+
+def test_modes_that_show_on_the_way_count_in_streams(live_runs, twin):
+    hypotheses = parse_hypotheses(
+        ["healthy", "motor_2:lag", "motor_3:slow", "motor_1:stuck"], twin.robot.motor_names
+    )
+    diagnoser, some = BayesDiagnoser(twin, hypotheses=hypotheses), live_runs.isel(run=[0, 3])
+    fleet = play(some, diagnoser)
+    fleet.conclude()
+    expected = decided(diagnoser, some)
+    np.testing.assert_allclose(fleet.posterior, expected, rtol=0.0, atol=1e-9)
+
+
+def test_samples_may_come_late(live_runs, live_diagnoser, rng):
+    """Readings that arrive up to 0.1 s late, out of order, change nothing in the end."""
+    count = live_runs.sizes["time"]
+    order = np.argsort(np.arange(count) + rng.integers(0, 10, count), kind="stable")
+    some = live_runs.isel(run=slice(0, 9))
+    settled = BayesDiagnoser(live_diagnoser.twin, whole_run=False)
+    # What is told late of commands is not taken up, so only readings are late here.
+    time, command = some["time"].values, some["command"].values
+    measured = some["measured"].values
+    fleet = StreamingFleet(settled, 9, some.attrs["measured_rate_hz"])
+    for now, i in enumerate(order):
+        fleet.update(time[now], command[:, now], None)
+        fleet.update(time[i], None, measured[:, i])
+    fleet.conclude()
+    np.testing.assert_allclose(fleet.posterior, decided(settled, some), rtol=0.0, atol=1e-9)
+
+
+def test_missing_samples_are_no_evidence(live_runs, live_diagnoser, rng):
+    """Readings that are lost on the way to the stream might as well not have been taken."""
+    some = live_runs.isel(run=slice(0, 9)).copy(deep=True)
+    lost = rng.random(some["measured"].shape[:2]) < 0.3
+    some["measured"].values[lost] = np.nan
+    fleet = play(some, live_diagnoser)
+    fleet.conclude()
+    expected = decided(live_diagnoser, some)
+    np.testing.assert_allclose(fleet.posterior, expected, rtol=0.0, atol=1e-9)
+
+
+def test_whole_samples_may_be_missing(live_runs, live_diagnoser, rng):
+    """Commands are known as well from fewer samples: their corners are found between them."""
+    whole = play(live_runs, live_diagnoser)
+    kept = rng.random(live_runs.sizes["time"]) < 0.8
+    read = np.isfinite(live_runs["measured"].values).all(axis=2).any(axis=0)
+    kept[:30] = True
+    fewer = play(live_runs, live_diagnoser, skip=set(np.flatnonzero(~kept & ~read).tolist()))
+    for fleet in (whole, fewer):
+        fleet.conclude()
+    np.testing.assert_allclose(fewer.posterior, whole.posterior, atol=0.02)
+
+
+def test_silence_is_told(live_runs, live_diagnoser):
+    fleet = play(live_runs.isel(run=[0, 1]), live_diagnoser)
+    assert not fleet.stale.any()
+    fleet.update(fleet.time + SILENCE_S + 0.1, None, [[0.1, 0.1, 0.1], [np.nan] * 3])
+    assert fleet.stale.tolist() == [False, True]
+
+
+def test_before_the_first_movement_the_prior_stands(live_diagnoser):
+    fleet = StreamingFleet(live_diagnoser, 2)
+    assert fleet.stale.all()
+    fleet.update(0.0, np.zeros((2, 4)), np.full((2, 3), 0.1))
+    np.testing.assert_allclose(fleet.posterior, 1.0 / 9.0)
+    assert fleet.diagnosis(0) is None
+    assert not fleet.judged.any()
+
+
+@pytest.mark.parametrize(
+    ("time", "command", "measured"),
+    [(0.0, np.zeros((3, 4)), None), (0.0, None, np.zeros(3)), (np.nan, None, np.zeros((2, 3)))],
+)
+def test_a_sample_of_another_shape_is_refused(live_diagnoser, time, command, measured):
+    with pytest.raises(InputError, match="Expected"):
+        StreamingFleet(live_diagnoser, 2).update(time, command, measured)
+
+
+@pytest.mark.slow
+def test_five_hundred_runs_as_streams(armpi, twin, rng):
+    imperfect = load_imperfections(armpi.name, armpi)
+    plan = Plan(armpi, paper_hypotheses(armpi.motor_names), 56, 11, imperfect)
+    runs = simulate(plan).isel(run=slice(0, 500)).copy(deep=True)
+    lost = rng.random(runs["measured"].shape[:2]) < 0.1
+    runs["measured"].values[lost] = np.nan
+    diagnoser = BayesDiagnoser(twin)
+    fleet = play(runs, diagnoser)
+    fleet.conclude()
+    off = np.abs(fleet.posterior - decided(diagnoser, runs)).max(axis=1)
+    # A tool that stands still while motors should move is dead for a stream, at once; a recorded
+    # run is judged by what is left of it.
+    assert np.mean(off < 1e-9) > 0.99
