@@ -1,8 +1,8 @@
-"""Two motors that are off at once, each in its own way.
+"""One motor or two that are off, each in its own way, whatever may have done that.
 
 A motor is held at an angle, off by a constant, off in proportion to its angle, or off by something
-else after each movement. Given what became of each movement, that is linear regression, and the
-evidence is a closed form. What became of the movements is found step by step, so that one term of
+else after each movement; and a movement may show that or not. Given which do, that is linear
+regression, and the evidence is a closed form. Which do is found step by step, so that one term of
 the sum over it is taken: densities integrate to no more than one.
 """
 
@@ -27,7 +27,7 @@ class Kind:
 
     Attributes:
         spread: Deviation of what it is off by: as a share of its range if it is held, in rad if
-            it is off by a constant or redrawn, as a ratio if by its angle.
+            it is off by a constant or redrawn, as a ratio if by its angle; 0: it is well.
         held: Whether it stands at one angle whatever the target.
         by_angle: Whether it is off in proportion to its angle.
         redrawn: Whether each movement draws its own.
@@ -38,18 +38,24 @@ class Kind:
     by_angle: bool = False
     redrawn: bool = False
 
+    @property
+    def amount(self) -> bool:
+        """Whether it is off by an amount that holds for the run."""
+        return self.spread > 0.0 and not self.redrawn
 
-KINDS = (
-    Kind(0.4, held=True),
-    Kind(0.3),
-    Kind(0.4, by_angle=True),
-    Kind(0.4, redrawn=True),
-)
+
+WELL = Kind(0.0)
+OFF = (Kind(0.4, held=True), Kind(0.3), Kind(0.4, by_angle=True), Kind(0.4, redrawn=True))
 """Spreads are wide enough for most of what a motor can do within its range."""
+ONE_OFF = (*product(OFF, (WELL,)), *product((WELL,), OFF))
+TWO_OFF = tuple(product(OFF, OFF))
+KINDS = (*ONE_OFF, *TWO_OFF)
+LOG_CHANCE = -np.log([2 * len(ONE_OFF)] * len(ONE_OFF) + [2 * len(TWO_OFF)] * len(TWO_OFF))
+"""Log probability of each of `KINDS`: one motor as often as two."""
 
 
-def weigh_two_off(scene: Scene) -> Weight | None:
-    """Return what the runs say of any two motors being off at once; None with a single motor."""
+def weigh_off_anyhow(scene: Scene) -> Weight | None:
+    """Return what the runs say of one motor or two being off; None of an arm of a single motor."""
     pairs = list(combinations(range(len(scene.model.scatter)), 2))
     if not pairs:
         return None
@@ -71,13 +77,13 @@ def _weigh(scene: Scene, pair: tuple[int, int]) -> tuple[FloatArray, FloatArray]
     seen = two_angles(scene.evidence, scene.model, scene.alternatives, pair)
     outlier = scene.model.outlier_log_density
     course = follow(seen, _lines(scene, seen), scene.usable, outlier)
-    total = course.says.sum(axis=-1)  # (run, kind)
+    total = course.says.sum(axis=-1) + LOG_CHANCE  # (run, kind)
     best, run = np.argmax(total, axis=1), np.arange(len(total))
     says = course.says[run, best]
-    # What the other kinds add to the best belongs to no movement more than to another.
-    count = np.maximum(scene.usable.sum(axis=1), 1)
-    more = log_sum(total, axis=1) - np.log(total.shape[1]) - total[run, best]
-    says = says + np.where(scene.usable, (more / count)[:, None], 0.0)
+    # What chance and the other kinds add belongs to no movement more than to another.
+    more = log_sum(total, axis=1) - says.sum(axis=1)
+    share = np.where(scene.usable, 1.0, 0.0) / np.maximum(scene.usable.sum(axis=1), 1)[:, None]
+    says = says + share * more[:, None]
     if scene.transients is None:
         return says, np.zeros_like(says)
     return says, _on_way(scene, seen, Course(says, course.way[run, best], course.angle[run, best]))
@@ -97,25 +103,25 @@ def _on_way(scene: Scene, seen: TwoAngles, course: Course) -> FloatArray:
 
 
 def _lines(scene: Scene, seen: TwoAngles) -> Lines:
-    """Return where two motors may stand, for each kind of the one and each of the other."""
+    """Return where two motors may stand, for each of `KINDS`."""
     pair = list(seen.pair)
     motors = [scene.model.twin.robot.motors[motor] for motor in pair]
     ends = np.array([motor.movement_range for motor in motors])
     middle, length = ends.mean(axis=1), ends[:, 1] - ends[:, 0]
     target = np.nan_to_num(scene.evidence.movements.target[..., pair])
     scatter = scene.model.scatter[pair] ** 2
-    both = list(product(KINDS, KINDS))
-
-    def of(value: str) -> FloatArray:
-        return np.array([[getattr(kind, value) for kind in kinds] for kinds in both])
-
-    held, by_angle, redrawn, spread = (of(v) for v in ("held", "by_angle", "redrawn", "spread"))
+    held, by_angle, redrawn, amount = (
+        np.array([[bool(getattr(kind, name)) for kind in kinds] for kinds in KINDS])
+        for name in ("held", "by_angle", "redrawn", "amount")
+    )
+    spread = np.array([[kind.spread for kind in kinds] for kinds in KINDS])
     slope = np.where(by_angle, target[:, :, None], 1.0)
+    deviation = np.where(amount, spread * np.where(held, length, 1.0), 1.0)
     return Lines(
         centre=np.where(held, 0.0, seen.expected[:, :, None]),
-        slope=np.where(redrawn, 0.0, slope),
+        slope=np.where(amount, slope, 0.0),
         noise=np.where(held, 0.0, scatter) + np.where(redrawn, spread**2, 0.0),
-        amount=(np.where(held, middle, 0.0), (spread * np.where(held, length, 1.0)) ** 2),
+        amount=(np.where(held, middle, 0.0), deviation**2),
         well=seen.expected,
         well_noise=scatter,
     )
