@@ -26,7 +26,7 @@ BLURRED_ODDS = 0.5
 """Odds, against healthy, of far more scatter, in any of these ways."""
 OFF_ODDS = 1.0
 """The same of one motor or two being off anyhow."""
-LEFT_OUT = 0.7
+LEFT_OUT = 0.5
 """Factor on the odds of a fault that the set leaves out. All three were chosen on simulated runs,
 for no more than 2 % of the known runs lost (docs/diagnosis.md)."""
 
