@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 
-from failuretwin.decision.weight import posterior_of
+from failuretwin.decision.weight import given_others, posterior_of
 
 
 def problem(seed, movements, cells, ways):
@@ -55,7 +55,8 @@ def test_posterior_is_that_of_enumeration(seed, movements, cells, same_way):
     np.testing.assert_allclose(np.exp(found.log_share[0]), np.exp(joint - total), atol=1e-12)
     for m in range(movements):
         others = logsumexp(joint_of(whole, whole_with, prior, left_out=(m,)))
-        assert found.by_movement[0, m] == pytest.approx(total - others, abs=1e-6)
+        alone = given_others(whole[0], whole_with[0], found.log_share[0])[m]
+        assert alone == pytest.approx(total - others, abs=1e-6)
 
 
 @given(seed=st.integers(0, 10**6), movements=st.integers(1, 6), cells=st.integers(1, 5))
@@ -70,7 +71,8 @@ def test_settled_part_is_judged_in_the_light_of_all_evidence(seed, movements, ce
             for first in range(movements)
             for cell in range(cells)
         )
-        assert found.settled[0, m] == pytest.approx(-np.log(inverse), abs=1e-6)
+        settled = given_others(healthy[0], density[0], found.log_share[0])[m]
+        assert settled == pytest.approx(-np.log(inverse), abs=1e-6)
 
 
 def test_without_evidence_the_prior_stands():
@@ -79,4 +81,5 @@ def test_without_evidence_the_prior_stands():
     found = posterior_of(0.0 * healthy, 0.0 * density, prior, none)
     assert found.log_evidence[0] == pytest.approx(0.0, abs=1e-12)
     np.testing.assert_allclose(np.exp(found.log_share), np.exp(prior), atol=1e-12)
-    np.testing.assert_allclose(found.by_movement, 0.0, atol=1e-9)
+    alone = given_others(np.zeros(4), np.zeros((4, 1)), found.log_share[0])
+    np.testing.assert_allclose(alone, 0.0, atol=1e-9)

@@ -7,6 +7,7 @@ together, then a plateau until the next movement. Angles are in the log's own se
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -170,14 +171,15 @@ def _movements_of_run(
 
 def _corners(reference: FloatArray, time: FloatArray) -> _Corners:
     """Return the corners of one motor's reference (time,), the first being its start at rest."""
-    if _is_rounded(reference):
+    lines = _lines(reference)
+    if lines is None:
         times, angles = simplify(time, reference, ROUNDING_RAD)
         speeds = np.append(np.diff(angles) / np.diff(times), 0.0)
         return _Corners(times, angles, speeds)
     step = time[1] - time[0]
     found = [(float(time[0]), float(reference[0]), 0.0)]
     before = 0
-    for first, last in _lines(reference):
+    for first, last in lines:
         speed = (reference[last] - reference[first]) / (time[last] - time[first])
         if abs(speed) * step <= CORNER_TOLERANCE_RAD:
             speed = 0.0
@@ -200,18 +202,20 @@ def _corners(reference: FloatArray, time: FloatArray) -> _Corners:
     return _Corners(*np.array(found).T)
 
 
-def _is_rounded(reference: FloatArray) -> bool:
-    """Return whether a reference bends for longer than any corner: its lines are not straight."""
-    bends = np.abs(np.diff(reference, 2)) > CORNER_TOLERANCE_RAD
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], bends.astype(int), [0]])))
-    return bool(np.diff(edges)[::2].max(initial=0) > LONGEST_CORNER)
+def _lines(reference: FloatArray) -> list[tuple[int, int]] | None:
+    """Return first and last sample of every straight stretch of two steps or more.
 
-
-def _lines(reference: FloatArray) -> list[tuple[int, int]]:
-    """Return first and last sample of every straight stretch of two steps or more."""
-    straight = np.abs(np.diff(reference, 2)) <= CORNER_TOLERANCE_RAD
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], straight.astype(int), [0]])))
-    return [(int(first), int(last) + 1) for first, last in edges.reshape(-1, 2)]
+    None if the reference bends for longer than any corner: its lines are not straight.
+    """
+    steps = reference[1:] - reference[:-1]
+    bends = np.abs(steps[1:] - steps[:-1]) > CORNER_TOLERANCE_RAD
+    edges = [0, *(np.flatnonzero(bends[1:] != bends[:-1]) + 1).tolist(), len(bends)]
+    stretches = list(pairwise(edges)) if len(bends) else []
+    bent = stretches[0 if len(bends) and bends[0] else 1 :: 2]
+    if any(last - first > LONGEST_CORNER for first, last in bent):
+        return None
+    straight = stretches[1 if len(bends) and bends[0] else 0 :: 2]
+    return [(first, last + 1) for first, last in straight]
 
 
 def _merge_starts(starts: FloatArray) -> FloatArray:

@@ -10,11 +10,9 @@ import numpy as np
 from failuretwin.connection.healthy import Alternatives
 from failuretwin.core.quadrature import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.decision.motor_profile import LARGEST_OFFSET_RAD
 from failuretwin.decision.ramps import RampModel, Ramps
 
-LARGEST_OFFSET_RAD = 0.9
-"""Furthest from its target that a motor is taken to have settled without being stuck [rad]; the
-largest encoder faults that are considered."""
 STARTS_RAD = np.linspace(-LARGEST_OFFSET_RAD, LARGEST_OFFSET_RAD, 13)
 """Where a motor may stand before the run if not where it should, from there."""
 RARELY_ELSEWHERE = 0.01

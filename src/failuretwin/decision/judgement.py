@@ -24,6 +24,34 @@ LEVELS = (0.05, 0.5, 0.95)
 
 
 @dataclass(frozen=True)
+class Place:
+    """Where a run lies in a stream.
+
+    Attributes:
+        begin_s: When it begins [s].
+        movements: Movements of the stream before it.
+        before: What was said before; of a fault that is older than the run, its onset stands.
+    """
+
+    begin_s: float = 0.0
+    movements: int = 0
+    before: Diagnosis | None = None
+
+    def known_onset(self, hypothesis: Hypothesis, onset_s: float) -> Diagnosis | None:
+        """Return what was said before, if the onset told then is better than one told now.
+
+        Args:
+            hypothesis: What is said now.
+            onset_s: Since when [s].
+        """
+        before = self.before
+        if before is None or before.onset_s is None or before.diagnosis != str(hypothesis):
+            return None
+        older = before.onset_s < self.begin_s and onset_s <= self.begin_s
+        return before if older else None
+
+
+@dataclass(frozen=True)
 class Judgement:
     """Some runs with every hypothesis weighed.
 
@@ -54,7 +82,7 @@ class Judgement:
             self.scene.evidence,
             run,
             float(np.exp(self.log_posterior[run, best])),
-            self.weights[best].settled[run],
+            self.weights[best].settled(run),
             self.scene.model.outlier_log_density,
         )
 
@@ -68,7 +96,12 @@ class Judgement:
         return np.exp(self.log_prior if undecided else self.log_posterior[run])
 
     def conclude(
-        self, run: int, name: str, quality: LogQuality, truth: str | None = None
+        self,
+        run: int,
+        name: str,
+        quality: LogQuality,
+        truth: str | None = None,
+        place: Place = Place(),
     ) -> Diagnosis:
         """Return the diagnosis of a run.
 
@@ -77,6 +110,7 @@ class Judgement:
             name: What to call it.
             quality: Defects of its log.
             truth: What was wrong, where known; it is only passed on.
+            place: Where it lies in a stream, whose times and movements are told.
         """
         evidence, imperfections = self.scene.evidence, self.scene.model.imperfections
         order = np.argsort(-self.log_posterior[run], kind="stable")
@@ -95,23 +129,26 @@ class Judgement:
         )
         losses: list[str] = []
         if not undecided:
-            diagnosis = replace(diagnosis, evidence=self._evidence(run, order))
+            diagnosis = replace(diagnosis, evidence=self._evidence(run, order, place))
             estimate = best.estimate(run)
             losses = self._losses(estimate, ranked[0])
-            diagnosis = _with_estimate(diagnosis, ranked[0], estimate)
+            diagnosis = _with_estimate(diagnosis, ranked[0], estimate, place)
         return replace(
             diagnosis,
             verdict=verdict(diagnosis, ranked),
             explanation=explanation(diagnosis, ranked, losses),
         )
 
-    def _evidence(self, run: int, order: IntArray) -> tuple[MovementEvidence, ...]:
+    def _evidence(self, run: int, order: IntArray, place: Place) -> tuple[MovementEvidence, ...]:
         """Return what each usable movement says of the best hypothesis against the second."""
         if len(order) < 2:
             return ()
-        best, second = (self.weights[i].by_movement[run] for i in order[:2])
+        best, second = (self.weights[i].by_movement(run) for i in order[:2])
         usable = np.flatnonzero(self.scene.evidence.usable[run])
-        return tuple(MovementEvidence(int(m) + 1, float(best[m] - second[m])) for m in usable)
+        return tuple(
+            MovementEvidence(place.movements + int(m) + 1, float(best[m] - second[m]))
+            for m in usable
+        )
 
     def _losses(self, estimate: Estimate, hypothesis: Hypothesis) -> list[str]:
         """Return the commands that seem not to have arrived if `hypothesis` is true."""
@@ -134,11 +171,16 @@ def judge(scene: Scene, hypotheses: Sequence[Hypothesis], priors: Priors) -> Jud
     return Judgement(scene, hypotheses, prior, log_posterior, weights)
 
 
-def _with_estimate(diagnosis: Diagnosis, hypothesis: Hypothesis, estimate: Estimate) -> Diagnosis:
+def _with_estimate(
+    diagnosis: Diagnosis, hypothesis: Hypothesis, estimate: Estimate, place: Place
+) -> Diagnosis:
     """Return the diagnosis with onset and magnitude of the fault that is most probable."""
     if estimate.onset is not None:
-        early, middle, late = estimate.onset.quantiles(LEVELS).tolist()
+        early, middle, late = (place.begin_s + estimate.onset.quantiles(LEVELS)).tolist()
         diagnosis = replace(diagnosis, onset_s=middle, onset_90=(early, late))
+        known = place.known_onset(hypothesis, middle)
+        if known is not None:
+            diagnosis = replace(diagnosis, onset_s=known.onset_s, onset_90=known.onset_90)
     if estimate.size is not None:
         low, half, high = estimate.size.quantiles(LEVELS).tolist()
         unit = hypothesis.faults[0].magnitude_unit

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from failuretwin.core.quadrature import Weighted, log_sum
+from failuretwin.core.quadrature import Weighted
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.decision.motor_profile import MotorProfile
 from failuretwin.decision.scene import Scene, share_of
-from failuretwin.decision.weight import Estimate, Weight, posterior_of
+from failuretwin.decision.weight import Estimate, Weight, given_others, posterior_of
 
 
 @dataclass(frozen=True)
@@ -70,19 +70,38 @@ class Densities:
 def densities(scene: Scene, law: Law) -> Densities:
     """Return what each movement says of a fault of one motor."""
     by_node = by_cell = scene.profile(law.motor).log_density(law.angle, law.held)
-    if law.redrawn is not None:  # (run, movement, group, node) summed over nodes
-        by_cell = log_sum(by_node[:, :, None] + law.redrawn, axis=-1)
+    if law.redrawn is not None:
+        by_cell = _in_groups(by_node, law.redrawn)
     way = law.on_way
     if way is None:
         way = scene.on_way_off(law.motor, law.lasting)[..., None]
     return Densities(by_node, by_cell, way)
 
 
+def _in_groups(by_node: FloatArray, log_weight: FloatArray) -> FloatArray:
+    """Return the log of weighted sums over nodes, (run, movement, group).
+
+    Args:
+        by_node: Logs of what is summed, (run, movement, node).
+        log_weight: (group, node).
+    """
+    top = by_node.max(axis=-1, keepdims=True)
+    return np.asarray(top + np.log(np.exp(by_node - top) @ np.exp(log_weight).T))
+
+
 def weigh(scene: Scene, law: Law) -> Weight:
     """Return what the runs say of a fault of one motor."""
     profile, says = scene.profile(law.motor), densities(scene, law)
     by_node, density, way = says.by_node, says.by_cell, says.way
-    found = posterior_of(scene.log_healthy, density, law.log_prior, (scene.on_way, way))
+    healthy = scene.log_healthy
+    found = posterior_of(healthy, density, law.log_prior, (scene.on_way, way))
+
+    def by_movement(run: int) -> FloatArray:
+        usual, faulty = healthy[run] + scene.on_way[run], density[run] + way[run]
+        return given_others(usual, faulty, found.log_share[run])
+
+    def settled(run: int) -> FloatArray:
+        return given_others(healthy[run], density[run], found.log_share[run])
 
     def estimate(run: int) -> Estimate:
         share = np.exp(found.log_share[run])
@@ -97,7 +116,7 @@ def weigh(scene: Scene, law: Law) -> Weight:
         became = _became(profile, law, run, share, nodes)
         return Estimate(_onset(law, run, share), size, became)
 
-    return Weight(found.log_evidence, found.by_movement, found.settled, estimate)
+    return Weight(found.log_evidence, by_movement, settled, estimate)
 
 
 def _of_run(values: FloatArray, run: int) -> FloatArray:

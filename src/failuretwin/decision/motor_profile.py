@@ -23,6 +23,11 @@ LONGEST_STEP_RAD = 0.3
 """Bound on such a step: near a singular pose the parabola promises too much."""
 HELD_BEYOND = 1.1
 """Share of the range of movements within which a motor may stand, on one side of its target."""
+NEGLIGIBLE_NATS = 9.0
+"""What lies this far below the tool being anywhere, wherever the motor stands, is left out."""
+LARGEST_OFFSET_RAD = 0.9
+"""Furthest from its target that a motor is taken to have settled without being stuck [rad]; the
+largest encoder faults that are considered."""
 LEAST_PRECISION = 1e-3
 """Precision [1/rad2] below which a movement says nothing of the motor: the tool is on its axis."""
 
@@ -46,6 +51,9 @@ class MotorProfile:
         around: Whether angles a full turn apart, which are the same, may both come up.
         pose: Angles of all motors that explain the position best, with this motor at `best` and
             the others scattered, (..., alternative, motor) [rad].
+        beside: Angle at which the motor settles if a fault takes it off its target, apart from
+            what the fault itself adds [rad]: it sags in the pose that it is really in, for which
+            `best` stands.
     """
 
     best: FloatArray
@@ -59,6 +67,7 @@ class MotorProfile:
     usable: BoolArray
     around: bool
     pose: FloatArray
+    beside: FloatArray
 
     def __getitem__(self, run: int) -> MotorProfile:
         """Return what one of the runs says, without the axis of runs."""
@@ -71,6 +80,7 @@ class MotorProfile:
             expected=self.expected[run],
             usable=self.usable[run],
             pose=self.pose[run],
+            beside=self.beside[run],
         )
 
     def log_terms(self, angle: FloatArray, held: bool) -> FloatArray:
@@ -96,18 +106,23 @@ class MotorProfile:
             (..., node) [log 1/m3]; 0 for movements that are not usable.
         """
         precision, log_weight = self._with_scatter(held)
-        count = log_weight.shape[-1]
-        total: FloatArray | float = 1.0
+        lead = log_weight.shape[:-1]
+        angle = np.broadcast_to(angle, (*lead, *angle.shape[-2:]))
+        total = np.ones((*lead, angle.shape[-2]))
+        matters = log_weight + self._fall(self.square) > self.outlier - NEGLIGIBLE_NATS
         # Alternative by alternative: large temporary arrays would cost more than the arithmetic.
-        for k in range(count):
-            off = angle[..., k if angle.shape[-1] > 1 else 0] - self.best[..., None, k]
-            off = self._turned(off)
+        for k in range(log_weight.shape[-1]):
+            some = matters[..., k]
+            if not some.any():
+                continue
+            at = angle[some, :, k if angle.shape[-1] > 1 else 0]
+            off = self._turned(at - self.best[some, k, None])
             off *= off
-            off *= precision[..., None, k]
-            off += self.square[..., None, k]
+            off *= precision[some, k, None]
+            off += self.square[some, k, None]
             fall = self._fall(off)
-            fall += log_weight[..., None, k] - self.outlier
-            total = total + np.exp(fall, out=fall)
+            fall += log_weight[some, k, None] - self.outlier
+            total[some] += np.exp(fall, out=fall)
         found = self.outlier + np.log(total)
         usable = self.usable.reshape(self.usable.shape + (1,) * (found.ndim - 2))
         return np.where(usable, found, 0.0)
@@ -182,6 +197,7 @@ def motor_profiles(
     square = spread.product(error, error) - taken * (2.0 * slope - precision * taken)
     settled = settled + scattered(spread, jacobian, scale, error - lever * taken[..., None])
     settled = np.where(own, angle[..., None], settled)
+    beside = _beside(model, expected, direction, base, own, angle)
     dof = model.settling.tail_dof
     weighed = log_weight + log_norm(dof) - 0.5 * np.log(spread.determinant)
     return [
@@ -197,9 +213,34 @@ def motor_profiles(
             usable=evidence.usable,
             around=_may_turn_around(model, motor),
             pose=settled[i],
+            beside=beside[i],
         )
         for i, motor in enumerate(motors)
     ]
+
+
+def _beside(
+    model: HealthyModel,
+    expected: FloatArray,
+    direction: FloatArray,
+    base: FloatArray,
+    own: BoolArray,
+    angle: FloatArray,
+) -> FloatArray:
+    """Return where each motor settles that a fault takes towards some angle, (own, ...) [rad].
+
+    Args:
+        model: The healthy robot.
+        expected: Angles at which the motors settle if healthy, (..., motor) [rad].
+        direction: Sign of their last travel, (..., motor).
+        base: Angles that they go for, (..., motor) [rad].
+        own: Which motor is meant, (own, ..., motor).
+        angle: Where the fault takes it, (own, ...) [rad].
+    """
+    far = LARGEST_OFFSET_RAD
+    pose = np.where(own, np.clip(angle[..., None], expected - far, expected + far), expected)
+    offset = model.settling.offset(model.twin.robot, pose, direction)
+    return np.asarray(np.sum((base + offset) * own, axis=-1))
 
 
 def _may_turn_around(model: HealthyModel, motor: int) -> bool:

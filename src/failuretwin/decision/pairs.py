@@ -32,8 +32,8 @@ def weigh_pair(scenes: Sequence[Scene], laws: Sequence[tuple[Law, Law]]) -> Weig
     found = [_weigh_one(scene, *pair) for scene, pair in zip(scenes, laws, strict=True)]
     return Weight(
         log_evidence=np.concatenate([w.log_evidence for w in found]),
-        by_movement=np.concatenate([w.by_movement for w in found]),
-        settled=np.concatenate([w.settled for w in found]),
+        by_movement=lambda run: found[run].by_movement(0),
+        settled=lambda run: found[run].settled(0),
         estimate=lambda run: found[run].estimate(0),
     )
 
@@ -69,7 +69,6 @@ def _weigh_one(scene: Scene, one: Law, two: Law) -> Weight:
     share = np.exp(terms - log_evidence)
     at = np.unravel_index(np.argmax(share), share.shape)
     first_two = int(at[0]), int(at[1])
-    by_movement = _by_movement(healthy, alone, both, *first_two)
     onset = _earliest(one, two, share)
 
     def estimate(run: int) -> Estimate:
@@ -77,8 +76,8 @@ def _weigh_one(scene: Scene, one: Law, two: Law) -> Weight:
 
     return Weight(
         log_evidence=np.atleast_1d(log_evidence),
-        by_movement=by_movement[None],
-        settled=_by_movement(*settled, *first_two)[None],
+        by_movement=lambda run: _by_movement(healthy, alone, both, *first_two),
+        settled=lambda run: _by_movement(*settled, *first_two),
         estimate=estimate,
     )
 

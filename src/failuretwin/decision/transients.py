@@ -13,8 +13,8 @@ from functools import cached_property
 import numpy as np
 
 from failuretwin.core.types import FloatArray, IntArray
-from failuretwin.decision.courses import LARGEST_OFFSET_RAD, Course, CourseJudge
-from failuretwin.decision.motor_profile import MotorProfile
+from failuretwin.decision.courses import Course, CourseJudge
+from failuretwin.decision.motor_profile import LARGEST_OFFSET_RAD, MotorProfile
 from failuretwin.decision.ramps import Ramps
 
 TRUST = 0.1

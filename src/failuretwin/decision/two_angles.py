@@ -6,13 +6,13 @@ up, elbow down). Near each, the density of the place is Gaussian in the two angl
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from failuretwin.connection.healthy import Alternatives, HealthyModel
-from failuretwin.core.ellipsoid import Ellipsoid, log_norm
-from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.core.ellipsoid import Ellipsoid
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
 from failuretwin.decision.motor_profile import nearest_on_circle
 
@@ -73,56 +73,87 @@ def two_angles(
         pair: Indices of the motors.
     """
     kept = _kept(alternatives, pair)
-    base, direction = alternatives.base[:, :, kept], alternatives.direction[:, :, kept]
-    point = evidence.point[:, :, None, None]
-    expected = model.settle(base, direction, model.none_held)
-    start = _starts(model, expected, pair, evidence.point)
-    base = np.repeat(base[..., None, :], WAYS, axis=-2)
-    direction = np.repeat(direction[..., None, :], WAYS, axis=-2)
-    fixed, scale = model.none_held.copy(), model.scatter.copy()
-    fixed[list(pair)] = True
-    scale[list(pair)] = 0.0
-    angle = start
-    for _ in range(STEPS):
-        base[..., pair[0]], base[..., pair[1]] = angle[..., 0], angle[..., 1]
-        settled = model.settle(base, direction, fixed)
-        predicted, jacobian = model.twin.path_and_jacobian(settled)
-        error = point - predicted
-        spread = Ellipsoid.of(jacobian * scale, model.path_noise**2)
-        levers = [jacobian[..., motor] for motor in pair]
-        pulls = [spread.solve(lever) for lever in levers]
-        aa, bb, ab = (
-            np.sum(pulls[i] * levers[j], axis=-1) for i, j in ((0, 0), (1, 1), (0, 1))
-        )
-        aa, bb = aa + LEAST_PRECISION, bb + LEAST_PRECISION
-        slope_a, slope_b = (np.sum(pull * error, axis=-1) for pull in pulls)
-        determinant = aa * bb - ab * ab
-        step = np.stack([bb * slope_a - ab * slope_b, aa * slope_b - ab * slope_a], axis=-1)
-        step = step / determinant[..., None]
-        taken = np.clip(step, -LONGEST_STEP_RAD, LONGEST_STEP_RAD)
-        angle = angle + taken
-    # What the last step has gained is counted: the parabola at its end.
-    square = spread.product(error, error)
-    a, b = taken[..., 0], taken[..., 1]
-    square = square - 2.0 * (a * slope_a + b * slope_b) + aa * a * a + bb * b * b + 2.0 * ab * a * b
-    dof = model.settling.tail_dof
-    log_weight = (
-        alternatives.log_weight[:, :, kept][..., None]
-        + log_norm(dof)
-        - 0.5 * np.log(spread.determinant)
-        - 0.5 * np.log(determinant)
-        + _over_plane(np.maximum(square, 0.0), dof)
+    chosen = replace(
+        alternatives,
+        base=alternatives.base[:, :, kept],
+        direction=alternatives.direction[:, :, kept],
+        log_weight=alternatives.log_weight[:, :, kept],
     )
+    expected = model.settle(chosen.base, chosen.direction, model.none_held)
+    angle = _starts(model, expected, pair, evidence.point)
+    for _ in range(STEPS):
+        near = _near(evidence.point, model, chosen, pair, angle)
+        angle = angle + near.step
+    dof = model.settling.tail_dof
+    log_weight = chosen.log_weight[..., None] + near.log_norm + _over_plane(near.square, dof)
     log_weight = np.where(_found(model, pair, angle), log_weight, -np.inf)
     shape = (*evidence.usable.shape, len(kept) * WAYS)
-    covariance = np.stack([bb, aa, -ab], axis=-1) / determinant[..., None]
     return TwoAngles(
         pair,
         angle.reshape(*shape, 2),
-        covariance.reshape(*shape, 3),
+        near.covariance.reshape(*shape, 3),
         log_weight.reshape(shape),
         expected[:, :, 0][..., list(pair)],
         np.repeat(kept, WAYS),
+    )
+
+
+@dataclass(frozen=True)
+class _Near:
+    """The squared distance near two angles: a parabola, (run, movement, alternative, way) each.
+
+    Attributes:
+        step: From there to its lowest point, bounded, (..., motor) [rad].
+        square: Squared distance after that step, in scales of the others' scatter.
+        covariance: Inverse of its curvature, (..., 3) [rad2].
+        log_norm: Log density at its lowest point, times the area of `covariance`.
+    """
+
+    step: FloatArray
+    square: FloatArray
+    covariance: FloatArray
+    log_norm: FloatArray
+
+
+def _near(
+    point: FloatArray,
+    model: HealthyModel,
+    alternatives: Alternatives,
+    pair: tuple[int, int],
+    angle: FloatArray,
+) -> _Near:
+    """Return the squared distance of the tool to where it was seen, near two angles.
+
+    Args:
+        point: Settled positions, (run, movement, axis) [m].
+        model: The healthy robot.
+        alternatives: What may have become of each movement.
+        pair: Indices of the motors.
+        angle: Their angles, (run, movement, alternative, way, motor) [rad].
+    """
+    fixed, scale = model.none_held.copy(), model.scatter.copy()
+    fixed[list(pair)], scale[list(pair)] = True, 0.0
+    pose = np.repeat(alternatives.base[..., None, :], WAYS, axis=-2)
+    pose[..., list(pair)] = angle
+    settled = model.settle(pose, alternatives.direction[..., None, :], fixed)
+    predicted, jacobian = model.twin.path_and_jacobian(settled)
+    error = point[:, :, None, None] - predicted
+    spread = Ellipsoid.of(jacobian * scale, model.path_noise**2)
+    levers = [jacobian[..., motor] for motor in pair]
+    pulls = [spread.solve(lever) for lever in levers]
+    aa, bb, ab = (np.sum(pulls[i] * levers[j], axis=-1) for i, j in ((0, 0), (1, 1), (0, 1)))
+    aa, bb = aa + LEAST_PRECISION, bb + LEAST_PRECISION
+    slope_a, slope_b = (np.sum(pull * error, axis=-1) for pull in pulls)
+    area = 1.0 / (aa * bb - ab * ab)
+    step = np.stack([bb * slope_a - ab * slope_b, aa * slope_b - ab * slope_a], axis=-1)
+    step = np.clip(step * area[..., None], -LONGEST_STEP_RAD, LONGEST_STEP_RAD)
+    a, b = step[..., 0], step[..., 1]
+    gained = 2.0 * (a * slope_a + b * slope_b) - aa * a * a - bb * b * b - 2.0 * ab * a * b
+    return _Near(
+        step,
+        np.maximum(spread.product(error, error) - gained, 0.0),
+        np.stack([bb, aa, -ab], axis=-1) * area[..., None],
+        spread.log_norm(model.settling.tail_dof) + 0.5 * np.log(area),
     )
 
 
@@ -156,7 +187,7 @@ def _starts(
     return np.stack([grid[order], np.take_along_axis(poses[..., second], order, axis=-1)], axis=-1)
 
 
-def _found(model: HealthyModel, pair: tuple[int, int], angle: FloatArray) -> FloatArray:
+def _found(model: HealthyModel, pair: tuple[int, int], angle: FloatArray) -> BoolArray:
     """Return whether each way is within the range of both motors and no copy of one before."""
     there = np.ones(angle.shape[:-1], dtype=bool)
     for k, motor in enumerate(pair):

@@ -88,7 +88,9 @@ def weigh_all(scene: Scene, hypotheses: Sequence[Hypothesis], priors: Priors) ->
     weights = {h: weigh_hypothesis(scene, h, priors) for h in known}
     if len(known) < len(hypotheses):
         ways = [lambda blurred, h=h: weigh_hypothesis(blurred, h, priors) for h in known]
-        others = [(prior_odds(h), weigh_hypothesis(scene, h, priors)) for h in left_out(scene, known)]
+        others = [
+            (prior_odds(h), weigh_hypothesis(scene, h, priors)) for h in left_out(scene, known)
+        ]
         weights[UNKNOWN] = weigh_unknown(scene, ways, log_prior(known), others)
     return [weights[h] for h in hypotheses]
 
@@ -135,4 +137,5 @@ def _weigh_healthy(scene: Scene) -> Weight:
     def estimate(run: int) -> Estimate:
         return Estimate(None, None, scene.became[run])
 
-    return Weight(by_movement.sum(axis=1), by_movement, scene.log_healthy, estimate)
+    of_run, settled = by_movement.__getitem__, scene.log_healthy.__getitem__
+    return Weight(by_movement.sum(axis=1), of_run, settled, estimate)

@@ -32,14 +32,15 @@ class Weight:
 
     Attributes:
         log_evidence: Log marginal likelihood of each run, (run,).
-        by_movement: Log density of each movement given all others, (run, movement).
+        by_movement: Log density of each movement of a run given all others, (movement,), by the
+            run's index; asked for few hypotheses alone.
         settled: The same of its settled position alone.
         estimate: Onset and size in a run, by its index; asked for the best hypothesis alone.
     """
 
     log_evidence: FloatArray
-    by_movement: FloatArray
-    settled: FloatArray
+    by_movement: Callable[[int], FloatArray]
+    settled: Callable[[int], FloatArray]
     estimate: Callable[[int], Estimate]
 
 
@@ -50,14 +51,10 @@ class Posterior:
     Attributes:
         log_evidence: (run,).
         log_share: Log posterior, (run, movement first spoilt, cell).
-        by_movement: Log density of each movement given all others, (run, movement).
-        settled: The same of its settled position alone.
     """
 
     log_evidence: FloatArray
     log_share: FloatArray
-    by_movement: FloatArray
-    settled: FloatArray
 
 
 def posterior_of(
@@ -81,22 +78,21 @@ def posterior_of(
     joint = before[:, :, None] + after + log_prior
     log_evidence = log_sum(joint, axis=(1, 2))
     log_share = joint - log_evidence[:, None, None]
-    return Posterior(
-        log_evidence,
-        log_share,
-        _by_movement(healthy, faulty, log_share),
-        _by_movement(log_healthy, density, log_share),
-    )
+    return Posterior(log_evidence, log_share)
 
 
-def _by_movement(log_healthy: FloatArray, density: FloatArray, log_share: FloatArray) -> FloatArray:
-    """Return the log density of each movement given all others, (run, movement).
+def given_others(healthy: FloatArray, faulty: FloatArray, log_share: FloatArray) -> FloatArray:
+    """Return the log density of each movement of a run given all others, (movement,).
 
     It is one over the posterior mean of one over its density.
+
+    Args:
+        healthy: Log density of each movement if all is well, (movement,).
+        faulty: The same with the fault, (movement, cell).
+        log_share: Log posterior of first movement spoilt and cell, (movement, cell).
     """
-    affected = np.logaddexp.accumulate(log_share, axis=1)
-    not_yet = np.full_like(log_healthy, -np.inf)
-    later = log_sum(log_share, axis=2)[:, ::-1]
-    not_yet[:, :-1] = np.logaddexp.accumulate(later, axis=1)[:, ::-1][:, 1:]
-    inverse = np.logaddexp(log_sum(affected - density, axis=2), not_yet - log_healthy)
-    return -inverse
+    affected = np.logaddexp.accumulate(log_share, axis=0)
+    not_yet = np.full_like(healthy, -np.inf)
+    later = log_sum(log_share, axis=1)[::-1]
+    not_yet[:-1] = np.logaddexp.accumulate(later)[::-1][1:]
+    return -np.logaddexp(log_sum(affected - faulty, axis=1), not_yet - healthy)

@@ -8,8 +8,7 @@ from failuretwin.core.quadrature import log_of, log_sum, weighted_quantiles
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.knowledge import magnitude_range
 from failuretwin.decision.law import Law
-from failuretwin.decision.laws.beside import pointed, settled_beside
-from failuretwin.decision.laws.nodes import size_nodes
+from failuretwin.decision.laws.nodes import pointed, size_nodes
 from failuretwin.decision.onsets import SHARES, Stretches, at_once
 from failuretwin.decision.scene import Scene
 
@@ -26,8 +25,7 @@ def drift_law(scene: Scene, motor: int, early: float) -> Law:
         early: Probability that it slips from the start of the run.
     """
     middle = np.nan_to_num(0.5 * (scene.evidence.begin + scene.evidence.end))
-    highest = magnitude_range("drift")[1]
-    settled = settled_beside(scene, motor, highest * middle[..., None])
+    settled = scene.profile(motor).beside
     rate, log_rate = _rates(scene, motor, settled, middle)
     onset, log_onset = _onsets(at_once(scene.evidence), early)  # (run, movement, onset)
     runs, movements, onsets = onset.shape

@@ -14,8 +14,7 @@ from failuretwin.core.quadrature import log_of
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.knowledge import magnitude_range
 from failuretwin.decision.law import Law
-from failuretwin.decision.laws.beside import pointed, settled_beside
-from failuretwin.decision.laws.nodes import size_nodes
+from failuretwin.decision.laws.nodes import pointed, size_nodes
 from failuretwin.decision.onsets import at_once
 from failuretwin.decision.scene import Scene
 from failuretwin.digital_model.settling import sag
@@ -85,8 +84,7 @@ def lasting_law(scene: Scene, motor: int, mode: str, early: float) -> Law:
     """
     amount, profile = AMOUNTS[mode], scene.profile(motor)
     gain = amount.gain(scene, motor)
-    largest = amount.of_size(np.array(magnitude_range(mode)[1]))
-    settled = settled_beside(scene, motor, np.abs(gain) * largest)
+    settled = profile.beside
     best, width = pointed(profile, settled[..., 0], gain[..., 0])
     best = np.clip(best, -1e3, 1e3)
     slope = _slope(amount, best)

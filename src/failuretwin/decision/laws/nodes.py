@@ -6,6 +6,7 @@ import numpy as np
 
 from failuretwin.core.quadrature import log_sum, log_trapezoid_weights
 from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.decision.motor_profile import MotorProfile
 
 LOCAL_STEPS = np.array([-8, -5, -3.5, -2.5, -1.75, -1, -0.5, 0, 0.5, 1, 1.75, 2.5, 3.5, 5, 8.0])
 """Nodes around the value that a movement points to, in its own standard deviations."""
@@ -52,3 +53,12 @@ def size_nodes(
     # Both sides moved together: what lies between the lowest sizes has no mass.
     mass = log_trapezoid_weights(nodes - np.sign(nodes) * low)
     return nodes, mass - log_sum(mass, axis=1)[:, None]
+
+
+def pointed(
+    profile: MotorProfile, settled: FloatArray, gain: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the amount that each movement points to and its deviation, (run, movement)."""
+    safe = np.where(np.abs(gain) > 1e-9, gain, 1.0)
+    spread = np.sqrt(1.0 / np.maximum(profile.precision[..., 0], 1e-6) + profile.scatter**2)
+    return (profile.best[..., 0] - settled) / safe, spread / np.abs(safe)

@@ -15,7 +15,8 @@ import numpy as np
 
 from failuretwin.core.quadrature import log_sum
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.laws.two_amounts import Course, Lines, follow
+from failuretwin.decision.laws.two_amounts import Lines
+from failuretwin.decision.laws.two_followed import Course, follow
 from failuretwin.decision.scene import Scene
 from failuretwin.decision.two_angles import TwoAngles, two_angles
 from failuretwin.decision.weight import Estimate, Weight
@@ -62,12 +63,12 @@ def weigh_off_anyhow(scene: Scene) -> Weight | None:
     settled, ways = zip(*(_weigh(scene, pair) for pair in pairs), strict=True)
     says = [one + way for one, way in zip(settled, ways, strict=True)]
     whole = np.stack([one.sum(axis=1) for one in says], axis=1)
-    best, run = np.argmax(whole, axis=1), np.arange(len(whole))
+    best = np.argmax(whole, axis=1)
     none = np.zeros(scene.alternatives.log_weight.shape[1:])
     return Weight(
         log_evidence=log_sum(whole, axis=1) - np.log(len(pairs)),
-        by_movement=np.stack(says)[best, run],
-        settled=np.stack(settled)[best, run],
+        by_movement=lambda run: says[best[run]][run],
+        settled=lambda run: settled[best[run]][run],
         estimate=lambda run: Estimate(None, None, none),
     )
 

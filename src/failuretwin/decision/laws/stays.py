@@ -75,7 +75,7 @@ def weigh_misses(scene: Scene, motor: int, mode: str, early: float) -> Weight:
         )
 
     settled = by_movement - np.maximum(scene.on_way, scene.on_way_off(motor))
-    return Weight(log_evidence, by_movement, settled, estimate)
+    return Weight(log_evidence, by_movement.__getitem__, settled.__getitem__, estimate)
 
 
 def log_densities(scene: Scene, motor: int, mode: str) -> FloatArray:

@@ -13,7 +13,6 @@ import numpy as np
 from failuretwin.core.quadrature import log_of
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.law import Law
-from failuretwin.decision.laws.beside import settled_beside
 from failuretwin.decision.onsets import at_movement_starts
 from failuretwin.decision.scene import Scene
 
@@ -41,13 +40,12 @@ def error_law(scene: Scene, motor: int, ranges: Sequence[Range], early: float) -
         early: Probability that it was there before the run.
     """
     offset, log_weight = offset_nodes(ranges)
-    farthest = np.full(scene.alternatives.base.shape[:3], np.abs(offset).max())
     stretches = at_movement_starts(scene.evidence.movements)
     log_first = log_of(stretches.weights(early))
     return Law(
         motor=motor,
         held=False,
-        angle=settled_beside(scene, motor, farthest)[:, :, None] + offset[:, None],
+        angle=scene.profile(motor).beside[:, :, None] + offset[:, None],
         log_prior=np.repeat(log_first[..., None] - np.log(len(ranges)), len(ranges), axis=2),
         size=offset[None],
         onsets=stretches.onsets(early),

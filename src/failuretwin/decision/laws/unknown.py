@@ -70,14 +70,13 @@ def _best(weights: Sequence[Weight], log_prior: FloatArray) -> Weight:
     """Return what the runs say of the best explanation of each, without a size."""
     joint = np.stack([weight.log_evidence for weight in weights], axis=1) + log_prior
     best = np.argmax(joint, axis=1)
-    run = np.arange(len(best))
 
     def estimate(run: int) -> Estimate:
         return replace(weights[best[run]].estimate(run), size=None)
 
     return Weight(
-        log_evidence=joint[run, best],
-        by_movement=np.stack([weight.by_movement for weight in weights])[best, run],
-        settled=np.stack([weight.settled for weight in weights])[best, run],
+        log_evidence=joint[np.arange(len(best)), best],
+        by_movement=lambda run: weights[best[run]].by_movement(run),
+        settled=lambda run: weights[best[run]].settled(run),
         estimate=estimate,
     )

@@ -16,14 +16,12 @@ from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.data_knowledge.log_quality import LogQuality
-from failuretwin.data_knowledge.moving_evidence import spread_out
-from failuretwin.data_knowledge.settled_evidence import JUST_AFTER_S, rest, rest_begin
 from failuretwin.decision.bayes import BayesDiagnoser
-from failuretwin.decision.judgement import Judgement, judge
+from failuretwin.decision.judgement import Judgement, Place, judge
 from failuretwin.decision.scene import Scene
-from failuretwin.decision.streaming.reference import References
-from failuretwin.decision.streaming.samples import Samples
-from failuretwin.decision.streaming.windows import Windows
+from failuretwin.decision.streaming.following import Following
+from failuretwin.decision.streaming.state import Arrays, arrays_of, put_arrays
+from failuretwin.decision.streaming.stillness import Stillness
 from failuretwin.decision.weighing import log_prior, shows_on_way
 
 MOVEMENTS = 5
@@ -34,6 +32,9 @@ what a healthy one scatters."""
 SILENCE_S = 5.0
 """Without a reading for so long nothing is known of the present [s]; the bus of the ArmPi stalls
 for 4 s."""
+DEAD = LogQuality(
+    fatal="the tool stands still though motors are told to move: the sensor or the arm is dead"
+)
 
 
 @dataclass
@@ -45,13 +46,13 @@ class Beliefs:
         judged: Whether anything was judged yet, (robot,).
         point: Where the tool was taken to rest after the present movement, (robot, axis) [m]; NaN
             if that movement does not count yet.
-        read_s: Time of the newest reading, (robot,) [s].
+        dead: Robots whose tools stand still though they should move, (robot,).
     """
 
     posterior: FloatArray
     judged: BoolArray
     point: FloatArray
-    read_s: FloatArray
+    dead: BoolArray
 
 
 class StreamingFleet:
@@ -66,7 +67,7 @@ class StreamingFleet:
         robots: How many robots there are.
         rate_hz: True rate of their tool sensors [Hz]; readings that come closer together than it
             says are taken for drawn out; None: all readings are real.
-        movements: Movements that are remembered.
+        movements: Movements that are remembered, the present one included.
     """
 
     def __init__(
@@ -79,18 +80,16 @@ class StreamingFleet:
         motors = len(diagnoser.twin.robot.motors)
         self.diagnoser = diagnoser
         self.hypotheses = [str(hypothesis) for hypothesis in diagnoser.considered]
+        self.robots, self.rate_hz, self.movements = robots, rate_hz, movements
         self.time = -np.inf
-        self._shape = (robots, motors)
-        self._least_step = 0.0 if rate_hz is None else 0.9 / rate_hz
-        self._samples = Samples(robots, motors)
-        self._references = References.unknown(robots, motors)
-        self._windows = Windows.empty(robots, movements, motors)
-        prior = np.exp(log_prior(diagnoser.considered))
+        self._following = Following(robots, motors, movements, rate_hz)
+        self._stillness = Stillness.unknown(robots, motors)
+        self._prior = np.exp(log_prior(diagnoser.considered))
         self._beliefs = Beliefs(
-            posterior=np.tile(prior, (robots, 1)),
+            posterior=np.tile(self._prior, (robots, 1)),
             judged=np.zeros(robots, dtype=bool),
             point=np.full((robots, 3), np.nan),
-            read_s=np.full(robots, -np.inf),
+            dead=np.zeros(robots, dtype=bool),
         )
         self._everything_counts = any(shows_on_way(h) for h in diagnoser.considered)
         self._latest: tuple[IntArray, Judgement] | None = None
@@ -108,12 +107,12 @@ class StreamingFleet:
     @property
     def stale(self) -> BoolArray:
         """Robots that have not been seen for a while: nothing is known of their present."""
-        return self._beliefs.read_s < self.time - SILENCE_S
+        return self._following.read_s < self.time - SILENCE_S
 
     def update(
         self, time: float, command: ArrayLike | None, measured: ArrayLike | None
     ) -> IntArray:
-        """Take a sample and return the robots that were judged anew, (judged,).
+        """Take a sample and return the robots of which something new is believed, (robot,).
 
         Args:
             time: When it was taken [s]; a sample may come late, as long as its movement lasts.
@@ -125,43 +124,80 @@ class StreamingFleet:
         """
         reference, points = self._checked(time, command, measured)
         self.time = max(self.time, time)
-        self._samples.add(time, reference, points)
-        for robot in self._references.see(time, reference):
-            self._find_movements(int(robot))
-        read = np.flatnonzero(np.isfinite(points).all(axis=1))
-        if len(read) == 0:
-            return read
-        self._beliefs.read_s[read] = np.maximum(self._beliefs.read_s[read], time)
-        return self._judge(self._with_news(self._look(read)))
+        points, died = self._alive(time, reference, points)
+        begun, at_rest = self._following.take(time, reference, points)
+        self._beliefs.point[begun] = np.nan
+        return np.append(died, self._judge(self._with_news(at_rest)))
 
     def conclude(self) -> None:
         """Count all that has come: from now on answers are those of the recorded runs."""
-        for robot in np.flatnonzero(self._references.moved):
-            self._find_movements(int(robot))
-        there = np.flatnonzero(self._windows.count > 0)
-        self._look(there[np.isfinite(self._beliefs.read_s[there])])
-        for robot in there:
-            self._see_on_way(int(robot), int(self._windows.count[robot]) - 1)
+        following = self._following
+        for robot in np.flatnonzero(following.references.moved):
+            following.find_movements(int(robot))
+        there = np.flatnonzero(following.windows.count > 0)
+        following.look(there)
         self._judge(there)
 
-    def diagnosis(self, robot: int) -> Diagnosis | None:
-        """Return the diagnosis of a robot in words; None before its first movement.
+    def diagnosis(self, robot: int, before: Diagnosis | None = None) -> Diagnosis | None:
+        """Return the diagnosis of a robot in words; None where nothing can be said yet.
 
         Args:
             robot: Its index.
+            before: What was said of it before; of a fault that is older than what is remembered,
+                the onset told then stands.
         """
-        if not self._beliefs.judged[robot]:
+        beliefs, windows = self._beliefs, self._following.windows
+        known = beliefs.judged[robot] or beliefs.dead[robot]
+        if not known or windows.count[robot] == 0:
             return None
         if self._latest is None or robot not in self._latest[0]:
             self._latest = np.array([robot]), self._judgement(np.array([robot]))
         robots, judgement = self._latest
         at = int(np.flatnonzero(robots == robot)[0])
-        return judgement.conclude(at, f"robot {robot}", LogQuality())
+        place = Place(float(windows.zero_s[robot]), int(windows.forgotten[robot]), before)
+        quality = DEAD if beliefs.dead[robot] else LogQuality()
+        return judgement.conclude(at, f"robot {robot}", quality, place=place)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return all that the stream knows, by name."""
+        found = {"time": np.array(self.time), "read_s": self._following.read_s}
+        for name, part in self._parts.items():
+            found |= arrays_of(part, name)
+        for name in ("time", "command", "measured"):
+            found[f"samples/{name}"] = getattr(self._following.samples, name)
+        kept = self._following.memory.arrays
+        return found | {f"memory/{name}": values for name, values in kept.items()}
+
+    def restore(self, state: Arrays) -> None:
+        """Take over what `state` returned.
+
+        Raises:
+            KeyError: If something is missing.
+            ValueError: If something is of another shape.
+        """
+        following = self._following
+        self.time = float(state["time"])
+        following.read_s[:] = state["read_s"]
+        for name, part in self._parts.items():
+            put_arrays(part, name, state)
+        following.samples.restore(*(state[f"samples/{n}"] for n in ("time", "command", "measured")))
+        following.memory.restore(state)
+
+    @property
+    def _parts(self) -> dict[str, object]:
+        """What is kept of each robot, by name."""
+        return {
+            "references": self._following.references,
+            "windows": self._following.windows,
+            "memory": self._following.memory,
+            "beliefs": self._beliefs,
+            "stillness": self._stillness,
+        }
 
     def _checked(
         self, time: float, command: ArrayLike | None, measured: ArrayLike | None
     ) -> tuple[FloatArray, FloatArray]:
-        robots, motors = self._shape
+        robots, motors = self.robots, len(self.diagnoser.twin.robot.motors)
         reference = np.full((robots, motors), np.nan) if command is None else as_floats(command)
         points = np.full((robots, 3), np.nan) if measured is None else as_floats(measured)
         if reference.shape != (robots, motors) or points.shape != (robots, 3):
@@ -173,78 +209,42 @@ class StreamingFleet:
             raise InputError(f"a sample is of {time} s. Expected a finite time.")
         return reference, points
 
-    def _find_movements(self, robot: int) -> None:
-        """Add the movements of a reference that has come to rest."""
-        movements, windows = self._references.movements(robot, self._samples), self._windows
-        if windows.count[robot] == 0 and movements.start.size:
-            windows.zero_s[robot] = self._samples.time[0]
-        for number, start in enumerate(movements.start[0]):
-            if windows.count[robot] > 0:
-                self._close(robot, start)
-            windows.append(robot, movements, number)
-            self._beliefs.point[robot] = np.nan
+    def _alive(
+        self, time: float, command: FloatArray, points: FloatArray
+    ) -> tuple[FloatArray, IntArray]:
+        """Return the readings without those of dead sensors, and the robots newly found dead.
 
-    def _close(self, robot: int, end: float) -> None:
-        """Say where the tool came to rest after the present movement, which the next one ends."""
-        robots, place = np.array([robot]), self._windows.count[robot] - 1
-        self._settle(robots, np.array([end]))
-        self._see_on_way(robot, int(place))
-
-    def _look(self, robots: IntArray) -> IntArray:
-        """See where tools rest now and return those that do."""
-        some = robots[self._windows.count[robots] > 0]
-        return self._settle(some, self._beliefs.read_s[some] + JUST_AFTER_S)
-
-    def _settle(self, robots: IntArray, end: FloatArray) -> IntArray:
-        """See where tools rest after present movements that end, and return those that do.
-
-        Args:
-            robots: Indices, (item,).
-            end: Ends of the plateaus, (item,) [s].
+        What a robot's movements said before its sensor died is forgotten when it comes back: the
+        readings of the time before that was noticed are among it.
         """
-        windows = self._windows
-        place = windows.count[robots] - 1
-        at = robots, place
-        begin = rest_begin(windows.start[at], windows.ramp_duration[at], end)
-        windows.begin[at], windows.end[at] = begin, end
-        over = begin < end
-        robots, place, begin, end = robots[over], place[over], begin[over], end[over]
-        if len(robots) == 0:
-            return robots
-        samples, time = self._samples, self._samples.time
-        some = samples.since(float(begin.min()))
-        inside = (time[some] >= begin[:, None]) & (time[some] < end[:, None] - 1e-9)
-        found = rest(samples.measured[some, robots].swapaxes(0, 1), inside)
-        windows.settle(robots, place, end, found)
-        return robots[found.usable]
-
-    def _see_on_way(self, robot: int, place: int) -> None:
-        """Note what was read on the way of a movement, until the tool rested."""
-        windows, samples = self._windows, self._samples
-        at = robot, place
-        until = windows.begin[at] if windows.usable[at] else windows.end[at]
-        some = samples.since(float(windows.start[at]))
-        time, point = samples.time[some], samples.measured[some, robot]
-        there = np.isfinite(point).all(axis=1) & (time < until - 1e-9)
-        time, point = time[there], point[there]
-        chosen = spread_out(time, self._least_step)
-        windows.see_on_way(robot, place, time[chosen], point[chosen])
+        beliefs, last = self._beliefs, self._following.references.last
+        read = np.asarray(np.isfinite(points).all(axis=1))
+        known = np.where(np.isfinite(command), command, last)
+        still, alone = self._stillness.see(time, read, points, known)
+        still |= beliefs.dead & ~read
+        died, back = still & ~beliefs.dead, ~still & beliefs.dead
+        beliefs.dead[:] = still
+        beliefs.posterior[died] = self._prior
+        for robot in np.flatnonzero(back):
+            self._following.forget(int(robot), time)
+        beliefs.judged[back] = False
+        silent = still | alone.any(axis=1)
+        return np.where(silent[:, None], np.nan, points), np.flatnonzero(died)
 
     def _with_news(self, robots: IntArray) -> IntArray:
         """Return the robots whose tools rest elsewhere than they were judged to."""
-        place = self._windows.count[robots] - 1
-        off = np.abs(self._windows.point[robots, place] - self._beliefs.point[robots])
-        near = (off < NEWS_M).all(axis=1)
+        windows = self._following.windows
+        now = windows.point[robots, windows.count[robots] - 1]
+        near = (np.abs(now - self._beliefs.point[robots]) < NEWS_M).all(axis=1)
         return robots[~near]
 
     def _judge(self, robots: IntArray) -> IntArray:
         """Renew what is believed of robots by what their last movements say."""
-        windows, beliefs = self._windows, self._beliefs
+        windows, beliefs = self._following.windows, self._beliefs
         for robot in robots:
-            self._see_on_way(int(robot), int(windows.count[robot]) - 1)
-        unseen = np.arange(windows.start.shape[1]) < windows.count[robots, None]
-        unseen &= ~windows.usable[robots]
-        on_way = unseen.any(axis=1) | self._everything_counts
+            self._following.see_on_way(int(robot))
+        # The way takes long to judge, so that robots of which it does not count are apart.
+        on_way = self._on_way(robots)
         for group in (robots[on_way], robots[~on_way]):
             if len(group) == 0:
                 continue
@@ -257,11 +257,19 @@ class StreamingFleet:
         beliefs.point[robots] = windows.point[robots, windows.count[robots] - 1]
         return robots
 
+    def _on_way(self, robots: IntArray) -> BoolArray:
+        """Return of which robots readings on the way count, (robot,)."""
+        windows = self._following.windows
+        there = np.arange(self.movements) < windows.count[robots, None]
+        unseen = (there & ~windows.usable[robots]).any(axis=1)
+        return np.asarray(self.diagnoser.looks_on_way & (unseen | self._everything_counts))
+
     def _judgement(self, robots: IntArray) -> Judgement:
-        diagnoser = self.diagnoser
-        evidence, moving = self._windows.evidence(robots), None
-        if diagnoser.looks_on_way:
-            seen = diagnoser.on_way(evidence.usable)
-            moving = self._windows.on_way(robots).where(seen)
-        scene = Scene(evidence, diagnoser.healthy_model, moving)
+        diagnoser, windows = self.diagnoser, self._following.windows
+        evidence, moving = windows.evidence(robots), None
+        if self._on_way(robots).any():
+            moving = windows.on_way(robots).where(diagnoser.on_way(evidence.usable))
+        model = diagnoser.healthy_model
+        findings = self._following.memory.findings(robots, evidence, model)
+        scene = Scene(evidence, model, moving, remembered=findings)
         return judge(scene, diagnoser.considered, diagnoser.priors)

@@ -69,6 +69,11 @@ class Samples:
         """Return the samples that are no older than a time [s]."""
         return slice(int(np.searchsorted(self.time, time)), len(self.time))
 
+    def restore(self, time: FloatArray, command: FloatArray, measured: FloatArray) -> None:
+        """Take over the samples of another stream, in the order of their times."""
+        for sample in zip(time.tolist(), command, measured, strict=True):
+            self.add(*sample)
+
     def _make_room(self) -> None:
         if self._stop < len(self._time):
             return

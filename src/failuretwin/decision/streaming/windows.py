@@ -73,8 +73,12 @@ class Windows:
             seen=np.zeros((*shape, MOST_READINGS), dtype=bool),
         )
 
-    def append(self, robot: int, movements: Movements, number: int) -> int:
-        """Add a movement of a robot, forgetting the oldest if need be; return its place.
+    def full(self, robot: int) -> bool:
+        """Return whether the oldest movement of a robot must go before another can be added."""
+        return bool(self.count[robot] == self.start.shape[1])
+
+    def append(self, robot: int, movements: Movements, number: int) -> None:
+        """Add a movement of a robot.
 
         Args:
             robot: Index of the robot.
@@ -83,14 +87,11 @@ class Windows:
         """
         if self.count[robot] == 0:
             self.initial[robot] = movements.origin()[0, number]
-        elif self.count[robot] == self.start.shape[1]:
-            self._forget_oldest(robot)
         place = int(self.count[robot])
         self.target[robot, place] = movements.target[0, number]
         self.ramp_duration[robot, place] = movements.ramp_duration[0, number]
         self.start[robot, place] = movements.start[0, number]
         self.count[robot] += 1
-        return place
 
     def settle(self, robot: IntArray, place: IntArray, end: FloatArray, rest: Rest) -> None:
         """Say where tools rest after movements.
@@ -144,8 +145,16 @@ class Windows:
             self.since[robots, some], self.way[robots, some], self.seen[robots, some]
         )
 
-    def _forget_oldest(self, robot: int) -> None:
-        self.initial[robot] = self.evidence(np.array([robot])).movements.origin()[0, 1]
+    def clear(self, robot: int, time: float) -> None:
+        """Forget all movements of a robot; what comes next begins at a time [s]."""
+        while self.count[robot] > 0:
+            self.forget_oldest(robot)
+        self.zero_s[robot] = time
+
+    def forget_oldest(self, robot: int) -> None:
+        """Drop the oldest movement of a robot."""
+        if self.count[robot] > 1:
+            self.initial[robot] = self.evidence(np.array([robot])).movements.origin()[0, 1]
         for values in (self.target, self.ramp_duration, self.start, self.begin, self.end,
                        self.point, self.usable, self.moving, self.since, self.way,
                        self.seen):  # fmt: skip
