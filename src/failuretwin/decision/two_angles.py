@@ -26,8 +26,8 @@ LONGEST_STEP_RAD = 0.3
 """Bound on such a step: near a singular pose the parabola promises too much."""
 LEAST_PRECISION = 1.0
 """Precision that any pair of angles has beforehand [1/rad2]: keeps singular poses finite."""
-SAME_RAD = 0.02
-"""Ways closer than this are one."""
+SAME = 2.0
+"""Ways closer than so many deviations are one: near a straight elbow."""
 RARE = 0.002
 """Losses of commands of other motors that are rarer than this are left aside [-]."""
 
@@ -86,7 +86,7 @@ def two_angles(
         angle = angle + near.step
     dof = model.settling.tail_dof
     log_weight = chosen.log_weight[..., None] + near.log_norm + _over_plane(near.square, dof)
-    log_weight = np.where(_found(model, pair, angle), log_weight, -np.inf)
+    log_weight = np.where(_found(model, pair, angle, near.covariance), log_weight, -np.inf)
     shape = (*evidence.usable.shape, len(kept) * WAYS)
     return TwoAngles(
         pair,
@@ -187,15 +187,19 @@ def _starts(
     return np.stack([grid[order], np.take_along_axis(poses[..., second], order, axis=-1)], axis=-1)
 
 
-def _found(model: HealthyModel, pair: tuple[int, int], angle: FloatArray) -> BoolArray:
-    """Return whether each way is within the range of both motors and no copy of one before."""
+def _found(
+    model: HealthyModel, pair: tuple[int, int], angle: FloatArray, covariance: FloatArray
+) -> BoolArray:
+    """Return whether each way is within the range of both motors and no copy of the first."""
     there = np.ones(angle.shape[:-1], dtype=bool)
     for k, motor in enumerate(pair):
         low, high = model.twin.robot.motors[motor].movement_range
         margin = 0.2 * (high - low)
         there &= (angle[..., k] > low - margin) & (angle[..., k] < high + margin)
-    apart = np.abs(angle[..., 1, :] - angle[..., 0, :]).max(axis=-1) > SAME_RAD
-    there[..., 1] &= apart | ~there[..., 0]
+    a, b = np.moveaxis(angle[..., 1:, :] - angle[..., :1, :], -1, 0)
+    aa, bb, ab = np.moveaxis(covariance[..., 1:, :], -1, 0)
+    apart = bb * a * a + aa * b * b - 2.0 * ab * a * b > SAME**2 * (aa * bb - ab * ab)
+    there[..., 1:] &= apart | ~there[..., :1]
     return there
 
 
