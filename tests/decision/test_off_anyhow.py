@@ -173,4 +173,7 @@ def test_two_slides_that_are_off_are_a_closed_form(tmp_path, run_of):
 def test_an_arm_of_one_motor_has_no_pair(tmp_path, run_of):
     twin = small_twin(tmp_path, "slide", GANTRY[:1])
     runs = run_of([[0.1], [0.2]], twin.path(np.array([[0.1], [0.2]])), ("motor_1",))
-    assert weigh_off_anyhow(Scene(settled_evidence(runs), HealthyModel(twin, NO_IMPERFECTIONS))) is None
+    assert (
+        weigh_off_anyhow(Scene(settled_evidence(runs), HealthyModel(twin, NO_IMPERFECTIONS)))
+        is None
+    )

@@ -87,11 +87,10 @@ def weigh_all(scene: Scene, hypotheses: Sequence[Hypothesis], priors: Priors) ->
     known = [h for h in hypotheses if h.known]
     weights = {h: weigh_hypothesis(scene, h, priors) for h in known}
     if len(known) < len(hypotheses):
-        ways = [lambda blurred, h=h: weigh_hypothesis(blurred, h, priors) for h in known]
         others = [
             (prior_odds(h), weigh_hypothesis(scene, h, priors)) for h in left_out(scene, known)
         ]
-        weights[UNKNOWN] = weigh_unknown(scene, ways, log_prior(known), others)
+        weights[UNKNOWN] = weigh_unknown(scene, _weigh_healthy, others)
     return [weights[h] for h in hypotheses]
 
 

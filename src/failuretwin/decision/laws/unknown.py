@@ -1,8 +1,8 @@
 """What none of the known faults explains: the best of many other explanations.
 
 Faults that the set leaves out, one motor or two that are off in any regular way or none, and, for
-what is nothing of that kind, any hypothesis of the set with far more scatter. Each has odds of its
-own, and the best counts alone: many poor explanations are no good one.
+what is nothing of that kind, a healthy robot with far more scatter. Each has odds of its own, and
+the best counts alone: many poor explanations are no good one.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from failuretwin.core.quadrature import log_sum
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.laws.off_anyhow import weigh_off_anyhow
 from failuretwin.decision.scene import Scene
@@ -33,37 +32,32 @@ for no more than 2 % of the known runs lost (docs/diagnosis.md)."""
 
 def weigh_unknown(
     scene: Scene,
-    known: Sequence[Callable[[Scene], Weight]],
-    log_prior: FloatArray,
+    healthy: Callable[[Scene], Weight],
     left_out: Sequence[tuple[float, Weight]],
 ) -> Weight:
     """Return what the runs say of a fault that is not among the known ones, times its odds.
 
     Args:
         scene: The runs.
-        known: What weighs each known hypothesis.
-        log_prior: Their log prior probability, (hypothesis,).
-        left_out: Faults that are not among them: odds against healthy and what the runs say.
+        healthy: What weighs a healthy robot.
+        left_out: Faults that are not among the known ones: their odds against healthy, and what
+            the runs say of them.
     """
     found = [(LEFT_OUT * odds, weight) for odds, weight in left_out]
-    found.append((BLURRED_ODDS, _blurred(scene, known, log_prior)))
+    blurred = _blurred(scene)
+    found += [(BLURRED_ODDS / len(blurred), healthy(other)) for other in blurred]
     anyhow = weigh_off_anyhow(scene)
     if anyhow is not None:
         found.append((OFF_ODDS, anyhow))
     return _best([weight for _, weight in found], np.log([odds for odds, _ in found]))
 
 
-def _blurred(
-    scene: Scene, known: Sequence[Callable[[Scene], Weight]], log_prior: FloatArray
-) -> Weight:
-    """Return what the runs say of the known hypotheses with far more scatter, settled or moving."""
+def _blurred(scene: Scene) -> list[Scene]:
+    """Return the runs as they look to who expects far more scatter, settled or moving."""
     blurred = [replace(scene, model=replace(scene.model, blur=blur)) for blur in BLURS]
     if scene.moving is not None:
         blurred.append(replace(scene, way_blur=WAY_BLUR))
-    weights = [weigh(other) for other in blurred for weigh in known]
-    prior = np.tile(log_prior - np.log(len(blurred)), len(blurred))
-    joint = np.stack([weight.log_evidence for weight in weights], axis=1) + prior
-    return replace(_best(weights, prior), log_evidence=log_sum(joint, axis=1))
+    return blurred
 
 
 def _best(weights: Sequence[Weight], log_prior: FloatArray) -> Weight:
