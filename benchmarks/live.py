@@ -22,7 +22,7 @@ from failuretwin.connection.links.values import CommandSent, Item, Reading
 from failuretwin.connection.ros1.sinks import Ros1Robot
 from failuretwin.connection.ros1.source import Ros1Source
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.decision.recent_movements import RecentMovements
+from failuretwin.decision.streaming.streaming import StreamingDiagnoser
 from failuretwin.digital_model.robot import Robot
 
 ONSET_S = 6.0
@@ -81,7 +81,9 @@ def watch_state(robot: Robot, state: str, speed: float, seconds: float, seed: in
     twin, commands, sure_since = DigitalTwin(robot), Commands(), np.nan
     with Ros1Source(robot, RosTopics()) as source:
         child = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-        shadow = Shadow(source, RecentMovements(BayesDiagnoser(twin)), twin, [commands])
+        shadow = Shadow(
+            source, StreamingDiagnoser(BayesDiagnoser(twin, whole_run=False)), twin, [commands]
+        )
         deadline = np.inf
         while time.monotonic() < deadline:
             shadow.step(0.1)
@@ -103,7 +105,7 @@ def latency(robot: Robot, samples: int = 300) -> list[float]:
     rng = np.random.default_rng(0)
     taken = []
     with Ros1Source(robot, topics) as source, Ros1Robot(robot, topics) as sink:
-        shadow = Shadow(source, RecentMovements(BayesDiagnoser(twin)), twin)
+        shadow = Shadow(source, StreamingDiagnoser(BayesDiagnoser(twin, whole_run=False)), twin)
         time.sleep(2.0)
         pose = np.zeros(len(robot.motors))
         for k in range(samples):

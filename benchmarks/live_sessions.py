@@ -27,7 +27,7 @@ from failuretwin.connection.ros1.source import Ros1Source
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.raw_session import RawSession, read_session
 from failuretwin.data_knowledge.session_runs import session_runs, split_session
-from failuretwin.decision.recent_movements import RecentMovements
+from failuretwin.decision.streaming.streaming import StreamingDiagnoser
 from failuretwin.digital_model.robot import Robot
 
 LABELS = (0, 5, 6, 7, 8)
@@ -118,7 +118,7 @@ def stream_answers(session: RawSession, robot: Robot) -> list[str | None]:
         end = np.append(session.command_time, np.inf)[span.stop]
         events = (e for e in session_events(session, robot) if begin <= e.time < end)
         source = PacedSource("run", events, Pace(AS_FAST_AS_POSSIBLE))
-        shadow = Shadow(source, RecentMovements(BayesDiagnoser(twin)), twin)
+        shadow = Shadow(source, StreamingDiagnoser(BayesDiagnoser(twin, whole_run=False)), twin)
         while shadow.step(0.0):
             pass
         diagnosis = shadow.moment.answer.diagnosis

@@ -122,5 +122,7 @@ def test_without_evidence_unknown_is_as_rare_as_it_was(diagnoser, imperfect):
     blind = imperfect.isel(run=[0])
     blind = blind.assign(measured=np.nan * blind["measured"])
     (found,) = diagnoser.diagnose(blind)
-    prior = np.exp(log_prior((*paper_hypotheses(diagnoser.twin.robot.motor_names), UNKNOWN)))
+    prior = np.exp(
+        log_prior((*paper_hypotheses(diagnoser.twin.robot.motor_names), UNKNOWN), diagnoser.priors)
+    )
     assert found.posterior["unknown"] == pytest.approx(prior[-1])

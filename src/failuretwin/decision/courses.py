@@ -174,9 +174,10 @@ class CourseJudge:
             chance = 0.5 * chance
             chance[:, off] = 0.5
         shape = (-1,) + (1,) * (says.ndim - 2)
+        chance[:, chance.max(axis=0) <= RARELY_ELSEWHERE] = 0.0
         usual = np.log1p(-np.minimum(chance.sum(axis=1), 0.9))
         terms = [says[:, 0] + usual.reshape(shape)]
-        for motor in np.flatnonzero(chance.max(axis=0) > RARELY_ELSEWHERE):
+        for motor in np.flatnonzero(chance.any(axis=0)):
             other = self._elsewhere(course, int(motor)) + log_of(chance[:, motor])
             terms.append(np.broadcast_to(other.reshape(shape), terms[0].shape))
         says = says.copy()

@@ -165,7 +165,7 @@ def judge(scene: Scene, hypotheses: Sequence[Hypothesis], priors: Priors) -> Jud
         hypotheses: What may be the case.
         priors: Beliefs about onset and size.
     """
-    weights, prior = weigh_all(scene, hypotheses, priors), log_prior(hypotheses)
+    weights, prior = weigh_all(scene, hypotheses, priors), log_prior(hypotheses, priors)
     log_joint = np.stack([weight.log_evidence for weight in weights], axis=1) + prior
     log_posterior = log_joint - log_sum(log_joint, axis=1)[:, None]
     return Judgement(scene, hypotheses, prior, log_posterior, weights)

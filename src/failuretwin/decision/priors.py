@@ -20,10 +20,13 @@ class Priors:
     Attributes:
         onset: When a motor may have got stuck.
         error_ranges: Run-level ranges of steady-state errors [rad], equally likely.
+        healthy_odds: How many times as probable it is that all is well as the table of failure
+            modes says, which leaves no more for it than for a stuck motor.
     """
 
     onset: OnsetPrior = field(default_factory=OnsetPrior)
     error_ranges: Sequence[Range] = ERROR_RANGES
+    healthy_odds: float = 1.0
 
 
 def priors_of(

@@ -76,9 +76,10 @@ def shows_on_way(hypothesis: Hypothesis) -> bool:
     return not hypothesis.known or any(fault.mode in TIMED for fault in hypothesis.faults)
 
 
-def log_prior(hypotheses: Sequence[Hypothesis]) -> FloatArray:
+def log_prior(hypotheses: Sequence[Hypothesis], priors: Priors) -> FloatArray:
     """Return the log prior probability of each hypothesis, (hypothesis,)."""
     odds = np.array([prior_odds(h) if h.known else UNKNOWN_ODDS for h in hypotheses])
+    odds[[h.is_healthy for h in hypotheses]] *= priors.healthy_odds
     return np.asarray(np.log(odds / odds.sum()))
 
 

@@ -54,7 +54,7 @@ def watch(
     from failuretwin.connection.links.pace import Pace
     from failuretwin.connection.links.recorder import Recorder
     from failuretwin.decision.bayes import BayesDiagnoser
-    from failuretwin.decision.recent_movements import RecentMovements
+    from failuretwin.decision.streaming.streaming import StreamingDiagnoser
     from failuretwin.digital_model.imperfections import load_imperfections
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.twin import DigitalTwin
@@ -62,7 +62,7 @@ def watch(
     model, names = load_robot(robot), topics_of(topics)
     twin = DigitalTwin(model)
     healthy = None if calibration is None else load_imperfections(str(calibration), model)
-    diagnoser = RecentMovements(BayesDiagnoser(twin, healthy))
+    diagnoser = StreamingDiagnoser(BayesDiagnoser(twin, healthy, whole_run=False))
     length = math.inf if duration is None else duration
     options = EmulationOptions(faults, imperfections, length, seed)
     with ExitStack() as stack:

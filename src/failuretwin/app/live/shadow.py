@@ -64,6 +64,10 @@ class Diagnoser(Protocol):
         """Take what is known at a time of the stream and return what is believed then."""
         ...
 
+    def conclude(self) -> Believed:
+        """Return what is believed when all that has come counts."""
+        ...
+
 
 @dataclass(frozen=True)
 class Moment:
@@ -134,6 +138,7 @@ class Shadow:
             self._take(event)
         elif self._source.ended:
             self._feed_all(np.inf)
+            self._say(self._diagnoser.conclude(), self.moment.residual)
             return False
         elif time.monotonic() - self._fed_s >= TICK_S:
             self._tick()

@@ -16,6 +16,7 @@ from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.data_knowledge.log_quality import LogQuality
+from failuretwin.data_knowledge.settled_evidence import SETTLING_S
 from failuretwin.decision.bayes import BayesDiagnoser
 from failuretwin.decision.judgement import Judgement, Place, judge
 from failuretwin.decision.scene import Scene
@@ -82,9 +83,11 @@ class StreamingFleet:
         self.hypotheses = [str(hypothesis) for hypothesis in diagnoser.considered]
         self.robots, self.rate_hz, self.movements = robots, rate_hz, movements
         self.time = -np.inf
-        self._following = Following(robots, motors, movements, rate_hz)
+        model = diagnoser.healthy_model
+        latest_s = model.imperfections.timing.late_s[1] + model.lag_s + SETTLING_S
+        self._following = Following(robots, motors, movements, rate_hz, latest_s)
         self._stillness = Stillness.unknown(robots, motors)
-        self._prior = np.exp(log_prior(diagnoser.considered))
+        self._prior = np.exp(log_prior(diagnoser.considered, diagnoser.priors))
         self._beliefs = Beliefs(
             posterior=np.tile(self._prior, (robots, 1)),
             judged=np.zeros(robots, dtype=bool),
@@ -135,7 +138,7 @@ class StreamingFleet:
         for robot in np.flatnonzero(following.references.moved):
             following.find_movements(int(robot))
         there = np.flatnonzero(following.windows.count > 0)
-        following.look(there)
+        following.conclude(there)
         self._judge(there)
 
     def diagnosis(self, robot: int, before: Diagnosis | None = None) -> Diagnosis | None:
@@ -214,20 +217,18 @@ class StreamingFleet:
     ) -> tuple[FloatArray, IntArray]:
         """Return the readings without those of dead sensors, and the robots newly found dead.
 
-        What a robot's movements said before its sensor died is forgotten when it comes back: the
-        readings of the time before that was noticed are among it.
+        What such a sensor said before that was noticed is forgotten.
         """
         beliefs, last = self._beliefs, self._following.references.last
         read = np.asarray(np.isfinite(points).all(axis=1))
         known = np.where(np.isfinite(command), command, last)
         still, alone = self._stillness.see(time, read, points, known)
         still |= beliefs.dead & ~read
-        died, back = still & ~beliefs.dead, ~still & beliefs.dead
+        died = still & ~beliefs.dead
         beliefs.dead[:] = still
         beliefs.posterior[died] = self._prior
-        for robot in np.flatnonzero(back):
-            self._following.forget(int(robot), time)
-        beliefs.judged[back] = False
+        for robot in np.flatnonzero(died):
+            self._following.spoil(int(robot), float(self._stillness.since_s(int(robot))))
         silent = still | alone.any(axis=1)
         return np.where(silent[:, None], np.nan, points), np.flatnonzero(died)
 
@@ -242,7 +243,7 @@ class StreamingFleet:
         """Renew what is believed of robots by what their last movements say."""
         windows, beliefs = self._following.windows, self._beliefs
         for robot in robots:
-            self._following.see_on_way(int(robot))
+            self._following.see_on_way(int(robot), int(windows.count[robot]) - 1)
         # The way takes long to judge, so that robots of which it does not count are apart.
         on_way = self._on_way(robots)
         for group in (robots[on_way], robots[~on_way]):

@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.data_knowledge.moving_evidence import spread_out
-from failuretwin.data_knowledge.settled_evidence import JUST_AFTER_S, rest, rest_begin
+from failuretwin.data_knowledge.settled_evidence import (
+    JUST_AFTER_S,
+    STILL_M,
+    Rest,
+    rest,
+    rest_begin,
+)
 from failuretwin.decision.streaming.memory import Memory
 from failuretwin.decision.streaming.reference import References
 from failuretwin.decision.streaming.samples import Samples
 from failuretwin.decision.streaming.windows import Windows
+
+NO_REST = Rest(np.zeros((1, 3)), np.zeros(1, dtype=bool), np.zeros(1, dtype=bool))
+LEAST_READINGS = 2
+"""Readings in the same place that show a tool at rest while it may still be moving."""
+UNMOVED_M = 0.005
+"""A tool that rests this near to where it did before has not moved [m]."""
 
 
 class Following:
@@ -21,14 +35,18 @@ class Following:
         motors: How many motors each of them has.
         movements: Movements that are remembered, the present one included.
         rate_hz: True rate of the tool sensors [Hz]; None: all readings are real.
+        latest_s: How long after its command a movement may begin at the latest [s].
     """
 
-    def __init__(self, robots: int, motors: int, movements: int, rate_hz: float | None) -> None:
+    def __init__(
+        self, robots: int, motors: int, movements: int, rate_hz: float | None, latest_s: float
+    ) -> None:
         self.samples = Samples(robots, motors)
         self.references = References.unknown(robots, motors)
         self.windows = Windows.empty(robots, movements, motors)
         self.memory = Memory.empty(robots, movements)
         self.read_s = np.full(robots, -np.inf)
+        self._latest_s = latest_s
         self._least_step = 0.0 if rate_hz is None else 0.9 / rate_hz
 
     def take(self, time: float, command: FloatArray, points: FloatArray) -> tuple[IntArray, ...]:
@@ -58,26 +76,47 @@ class Following:
             windows.zero_s[robot] = self.samples.time[0]
         for number, start in enumerate(movements.start[0]):
             if windows.count[robot] > 0:
-                self._settle(np.array([robot]), np.array([start]))
-                self.see_on_way(robot)
+                last = int(windows.count[robot]) - 1
+                self._settle(np.array([robot]), np.array([last]), np.array([start]))
+                self.see_on_way(robot, last)
             if windows.full(robot):
                 windows.forget_oldest(robot)
                 self.memory.forget_oldest(robot)
             windows.append(robot, movements, number)
 
     def look(self, robots: IntArray) -> IntArray:
-        """See where tools rest now and return the robots whose tools do.
+        """See where tools rest by now and return the robots whose tools do.
+
+        A tool that has just come to rest, or may not have set out yet, is left for later readings;
+        so is one whose reference moves: how, will be known when that comes to rest.
 
         Args:
-            robots: Robots to look at.
+            robots: Robots that were read.
         """
-        some = robots[(self.windows.count[robots] > 0) & np.isfinite(self.read_s[robots])]
-        return self._settle(some, self.read_s[some] + JUST_AFTER_S)
+        still = robots[~self.references.moved[robots]]
+        robots, place, begin, end = self._due(*self._present(still))
+        if len(robots) == 0:
+            return robots
+        samples, inside = self._readings(robots, begin, end)
+        found = rest(samples, _since_rest(samples, inside))
+        waits = self._may_start_late(robots, place, found.point)
+        found = replace(found, usable=found.usable & ~waits)
+        self.windows.settle(robots, place, end, found)
+        return robots[found.usable]
 
-    def see_on_way(self, robot: int) -> None:
-        """Note what was read on the way of the present movement, until the tool rested."""
+    def conclude(self, robots: IntArray) -> None:
+        """See where tools rest after present movements, taking them to be over."""
+        self._settle(*self._present(robots))
+
+    def _present(self, robots: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
+        """Return the robots that have a movement and readings, which, and when these end [s]."""
+        some = robots[(self.windows.count[robots] > 0) & np.isfinite(self.read_s[robots])]
+        return some, self.windows.count[some] - 1, self.read_s[some] + JUST_AFTER_S
+
+    def see_on_way(self, robot: int, place: int) -> None:
+        """Note what was read on the way of a movement, until the tool rested."""
         windows, samples = self.windows, self.samples
-        at = robot, int(windows.count[robot]) - 1
+        at = robot, place
         until = windows.begin[at] if windows.usable[at] else windows.end[at]
         some = samples.since(float(windows.start[at]))
         time, point = samples.time[some], samples.measured[some, robot]
@@ -86,31 +125,73 @@ class Following:
         chosen = spread_out(time, self._least_step)
         windows.see_on_way(*at, time[chosen], point[chosen])
 
-    def forget(self, robot: int, time: float) -> None:
-        """Forget all movements of a robot; what comes next begins at a time [s]."""
-        self.windows.clear(robot, time)
-        self.memory.fresh[robot] = False
+    def spoil(self, robot: int, since_s: float) -> None:
+        """Forget the readings of a robot since a time [s], and what they said of its movements."""
+        windows = self.windows
+        self.samples.measured[self.samples.since(since_s), robot] = np.nan
+        for place in range(int(windows.count[robot])):
+            if windows.end[robot, place] > since_s:
+                at = np.array([robot]), np.array([place])
+                windows.settle(*at, windows.end[at], NO_REST)
+                self._settle(*at, windows.end[at])
+                self.see_on_way(robot, place)
 
-    def _settle(self, robots: IntArray, end: FloatArray) -> IntArray:
-        """See where tools rest after present movements that end, and return those that do.
+    def _settle(self, robots: IntArray, place: IntArray, end: FloatArray) -> None:
+        """See where tools rest after movements that end.
 
         Args:
             robots: Indices, (item,).
+            place: Their movements, (item,).
             end: Ends of the plateaus, (item,) [s].
         """
-        windows = self.windows
-        place = windows.count[robots] - 1
-        at = robots, place
+        robots, place, begin, end = self._due(robots, place, end)
+        if len(robots):
+            found = rest(*self._readings(robots, begin, end))
+            self.windows.settle(robots, place, end, found)
+
+    def _due(
+        self, robots: IntArray, place: IntArray, end: FloatArray
+    ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+        """Return robots that may be at rest, their movements, and when to look [s]."""
+        windows, at = self.windows, (robots, place)
         begin = rest_begin(windows.start[at], windows.ramp_duration[at], end)
         windows.begin[at], windows.end[at] = begin, end
         self.memory.fresh[at] = False
         over = begin < end
-        robots, place, begin, end = robots[over], place[over], begin[over], end[over]
-        if len(robots) == 0:
-            return robots
+        return robots[over], place[over], begin[over], end[over]
+
+    def _readings(
+        self, robots: IntArray, begin: FloatArray, end: FloatArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """Return samples of robots, (robot, sample, axis), and which lie between two times."""
         some = self.samples.since(float(begin.min()))
         time = self.samples.time[some]
         inside = (time >= begin[:, None]) & (time < end[:, None] - 1e-9)
-        found = rest(self.samples.measured[some, robots].swapaxes(0, 1), inside)
-        windows.settle(robots, place, end, found)
-        return robots[found.usable]
+        return self.samples.measured[some, robots].swapaxes(0, 1), inside
+
+    def _may_start_late(self, robots: IntArray, place: IntArray, point: FloatArray) -> BoolArray:
+        """Return which tools still rest where they did before, and may yet set out, (robot,)."""
+        windows, before = self.windows, np.maximum(place - 1, 0)
+        known = (place > 0) & windows.usable[robots, before]
+        unmoved = np.linalg.norm(point - windows.point[robots, before], axis=1) < UNMOVED_M
+        since = self.read_s[robots] - windows.start[robots, place]
+        return np.asarray(known & unmoved & (since < self._latest_s))
+
+
+def _since_rest(samples: FloatArray, inside: BoolArray) -> BoolArray:
+    """Return the readings from which on all are near the newest, (robot, sample).
+
+    None where there are fewer than two: a tool is at rest if it is seen in the same place twice.
+
+    Args:
+        samples: Tool positions, (robot, sample, axis) [m]; NaN where there is none.
+        inside: Samples that count, (robot, sample).
+    """
+    there = inside & np.isfinite(samples).all(axis=-1)
+    number = np.arange(samples.shape[1])
+    newest = np.where(there, number, 0).max(axis=1)
+    off = samples - samples[np.arange(len(samples)), newest][:, None]
+    with np.errstate(invalid="ignore"):
+        far = there & (np.linalg.norm(off, axis=-1) > STILL_M)
+    kept = there & (number > np.where(far, number, -1).max(axis=1, keepdims=True))
+    return kept & (kept.sum(axis=1, keepdims=True) >= LEAST_READINGS)

@@ -77,6 +77,10 @@ class Stillness:
         tools = _Watch.empty(robots, 1, motors)
         return cls(_Watch.empty(robots, 3, motors), tools, np.full((robots, 3), np.nan))
 
+    def since_s(self, robot: int) -> float:
+        """Return since when the tool of a robot has stood where it stands [s]."""
+        return float(min(self.tools.since_s[robot, 0], self.channels.since_s[robot].max()))
+
     def see(
         self, time: float, read: BoolArray, points: FloatArray, command: FloatArray
     ) -> tuple[BoolArray, BoolArray]:

@@ -145,12 +145,6 @@ class Windows:
             self.since[robots, some], self.way[robots, some], self.seen[robots, some]
         )
 
-    def clear(self, robot: int, time: float) -> None:
-        """Forget all movements of a robot; what comes next begins at a time [s]."""
-        while self.count[robot] > 0:
-            self.forget_oldest(robot)
-        self.zero_s[robot] = time
-
     def forget_oldest(self, robot: int) -> None:
         """Drop the oldest movement of a robot."""
         if self.count[robot] > 1:

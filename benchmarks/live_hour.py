@@ -1,0 +1,138 @@
+"""An hour of a robot's life: a fault and a repair every two minutes.
+
+Arguments: how fast the robot works (default 10; 0: as fast as possible), seed (default 0), hours
+of its own time (default 1). Prints what was found, what was noticed, what was said in error, and
+how much memory it took.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
+from failuretwin.app.live.connections import EmulationOptions, emulated_robot
+from failuretwin.app.live.shadow import Shadow
+from failuretwin.connection.links.diagnostic_status import SURE
+from failuretwin.connection.links.pace import Pace
+from failuretwin.connection.links.values import CommandSent
+from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.decision.streaming.streaming import StreamingDiagnoser
+from failuretwin.failure_behavior.schedule import ScheduledFault, state_at
+
+PERIOD_S, BEGIN_S, END_S = 120.0, 40.0, 100.0
+"""A fault begins 40 s into every two minutes and is repaired at 100 s."""
+WINDOW_S = 15.0
+"""After a repair the movements before it still count for so long [s]; what is said then is neither
+right nor a false alarm."""
+
+
+@dataclass(frozen=True)
+class Said:
+    """Something that was said with certainty.
+
+    Attributes:
+        time: When [s].
+        name: The hypothesis.
+    """
+
+    time: float
+    name: str
+
+
+def schedule_of(motors: Sequence[str], seconds: float, seed: int) -> list[ScheduledFault]:
+    """Return a fault in every period, all kinds in turn, in random order."""
+    faults = [h.faults[0] for h in paper_hypotheses(motors) if h.faults]
+    rng, found = np.random.default_rng(seed), []
+    while len(found) * PERIOD_S < seconds:
+        for k in rng.permutation(len(faults)):
+            zero = len(found) * PERIOD_S
+            found.append(ScheduledFault(faults[k], zero + BEGIN_S, zero + END_S))
+    return [fault for fault in found if fault.end_s <= seconds]
+
+
+def live(
+    schedule: Sequence[ScheduledFault], speed: float, seconds: float, seed: int
+) -> tuple[list[Said], list[CommandSent], list[float]]:
+    """Return what was said, all commands, and the memory taken in between [MB]."""
+    robot = load_robot("armpi_fpv")
+    twin = DigitalTwin(robot)
+    texts = [f"{one.fault}@{one.start_s}-{one.end_s}" for one in schedule]
+    options = EmulationOptions(texts, None, seconds, seed)
+    said, memory = [Said(0.0, "healthy")], []
+    commands = Commands()
+    with emulated_robot(robot, options, Pace(speed)) as source:
+        diagnoser = StreamingDiagnoser(BayesDiagnoser(twin, whole_run=False))
+        shadow = Shadow(source, diagnoser, twin, [commands])
+        while shadow.step(0.1):
+            answer = shadow.moment.answer
+            if answer.time > 600.0 * (len(memory) + 1):
+                memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0)
+            if answer.diagnosis is None or answer.diagnosis.undecided:
+                continue
+            best = answer.diagnosis.ranked[0]
+            if best != said[-1].name and answer.diagnosis.posterior[best] >= SURE:
+                said.append(Said(answer.time, best))
+    return said, commands.sent, memory
+
+
+class Commands:
+    """A sink that keeps commands."""
+
+    name, trouble = "commands", ""
+
+    def __init__(self) -> None:
+        self.sent: list[CommandSent] = []
+
+    def put(self, item: object) -> None:
+        """Keep a command."""
+        if isinstance(item, CommandSent):
+            self.sent.append(item)
+
+
+def first_reached(commands: Sequence[CommandSent], time: float) -> float:
+    """Return when the first movement that begins after a time [s] ends its ramp."""
+    after = next(one for one in commands if one.time >= time)
+    return after.time + float(after.duration.max())
+
+
+def main() -> None:
+    """Print one line for each fault, then the sums."""
+    speed, seed, hours = (float(a) for a in [*sys.argv[1:], *["10", "0", "1"][len(sys.argv) - 1 :]])
+    motors = load_robot("armpi_fpv").motor_names
+    schedule = schedule_of(motors, 3600.0 * hours, int(seed))
+    said, commands, memory = live(schedule, speed, 3600.0 * hours, int(seed))
+    delays, repairs = [], []
+    for one in schedule:
+        name = str(one.fault)
+        found = [s.time for s in said if s.name == name and one.start_s <= s.time < one.end_s]
+        healthy = [
+            s.time
+            for s in said
+            if s.name == "healthy" and one.end_s <= s.time < one.end_s + PERIOD_S - END_S + BEGIN_S
+        ]
+        delays.append(found[0] - first_reached(commands, one.start_s) if found else np.nan)
+        repairs.append(healthy[0] - one.end_s if healthy else np.nan)
+        print(
+            f"{name:28s} found after {delays[-1]:5.1f} s, repair noticed after {repairs[-1]:5.1f} s"
+        )
+    ends = np.array([one.end_s for one in schedule])
+    wrong = [s for s in said if s.name != state_at(schedule, s.time, motors)]
+    wrong = [s for s in wrong if not any(0.0 <= s.time - end < WINDOW_S for end in ends)]
+    alarms = [s for s in wrong if state_at(schedule, s.time, motors) == "healthy"]
+    for s in wrong:
+        print(f"at {s.time:.1f} s: {s.name}, truth {state_at(schedule, s.time, motors)}")
+    print(
+        f"{np.isfinite(delays).sum()} of {len(delays)} faults found, median delay "
+        f"{np.nanmedian(delays):.1f} s; {np.isfinite(repairs).sum()} repairs noticed, median delay "
+        f"{np.nanmedian(repairs):.1f} s; {len(alarms)} false alarms, {len(wrong) - len(alarms)} "
+        f"faults misnamed; memory {memory[0]:.0f} to {memory[-1]:.0f} MB"
+    )
+
+
+if __name__ == "__main__":
+    main()
