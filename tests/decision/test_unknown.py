@@ -85,12 +85,10 @@ def test_modes_without_a_law_are_unknown(twin, armpi, foreign, monkeypatch):
 
 
 def test_known_faults_stay_known(diagnoser, imperfect, diagnoses):
-    """Offering `unknown` turns hardly any right diagnosis."""
-    rows = list(range(0, 180, 3))
-    found = diagnoser.diagnose(imperfect.isel(run=rows))
-    before = sum(diagnoses[i].diagnosis == diagnoses[i].truth for i in rows)
-    after = sum(d.diagnosis == d.truth for d in found)
-    assert after >= before - 2
+    """Offering `unknown` turns hardly any right diagnosis: 1.7 % of 900 (docs/diagnosis.md)."""
+    right = np.flatnonzero([d.diagnosis == d.truth for d in diagnoses])
+    found = diagnoser.diagnose(imperfect.isel(run=right))
+    assert np.mean([d.diagnosis == d.truth for d in found]) >= 0.96
 
 
 def test_known_hypotheses_weigh_the_same_beside_unknown(diagnoser, imperfect, armpi):
