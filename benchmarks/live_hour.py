@@ -11,6 +11,7 @@ import resource
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from failuretwin.app.live.connections import EmulationOptions, emulated_robot
 from failuretwin.app.live.shadow import Shadow
 from failuretwin.connection.links.diagnostic_status import SURE
 from failuretwin.connection.links.pace import Pace
-from failuretwin.connection.links.values import CommandSent
+from failuretwin.connection.links.values import CommandSent, Item
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.decision.streaming.streaming import StreamingDiagnoser
 from failuretwin.failure_behavior.schedule import ScheduledFault, state_at
@@ -47,7 +48,8 @@ class Said:
 def schedule_of(motors: Sequence[str], seconds: float, seed: int) -> list[ScheduledFault]:
     """Return a fault in every period, all kinds in turn, in random order."""
     faults = [h.faults[0] for h in paper_hypotheses(motors) if h.faults]
-    rng, found = np.random.default_rng(seed), []
+    rng = np.random.default_rng(seed)
+    found: list[ScheduledFault] = []
     while len(found) * PERIOD_S < seconds:
         for k in rng.permutation(len(faults)):
             zero = len(found) * PERIOD_S
@@ -63,8 +65,8 @@ def live(
     twin = DigitalTwin(robot)
     texts = [f"{one.fault}@{one.start_s}-{one.end_s}" for one in schedule]
     options = EmulationOptions(texts, None, seconds, seed)
-    said, memory = [Said(0.0, "healthy")], []
-    commands = Commands()
+    said, commands = [Said(0.0, "healthy")], Commands()
+    memory: list[float] = []
     with emulated_robot(robot, options, Pace(speed)) as source:
         diagnoser = StreamingDiagnoser(BayesDiagnoser(twin, whole_run=False))
         shadow = Shadow(source, diagnoser, twin, [commands])
@@ -88,10 +90,16 @@ class Commands:
     def __init__(self) -> None:
         self.sent: list[CommandSent] = []
 
-    def put(self, item: object) -> None:
+    def put(self, item: Item) -> None:
         """Keep a command."""
         if isinstance(item, CommandSent):
             self.sent.append(item)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing to be closed."""
 
 
 def first_reached(commands: Sequence[CommandSent], time: float) -> float:

@@ -85,7 +85,7 @@ class StreamingFleet:
         self.time = -np.inf
         model = diagnoser.healthy_model
         latest_s = model.imperfections.timing.late_s[1] + model.lag_s + SETTLING_S
-        self._following = Following(robots, motors, movements, rate_hz, latest_s)
+        self._following = Following(robots, diagnoser.twin, movements, rate_hz, latest_s)
         self._stillness = Stillness.unknown(robots, motors)
         self._prior = np.exp(log_prior(diagnoser.considered, diagnoser.priors))
         self._beliefs = Beliefs(

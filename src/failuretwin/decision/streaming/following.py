@@ -10,7 +10,6 @@ from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.data_knowledge.moving_evidence import spread_out
 from failuretwin.data_knowledge.settled_evidence import (
     JUST_AFTER_S,
-    STILL_M,
     Rest,
     rest,
     rest_begin,
@@ -19,12 +18,15 @@ from failuretwin.decision.streaming.memory import Memory
 from failuretwin.decision.streaming.reference import References
 from failuretwin.decision.streaming.samples import Samples
 from failuretwin.decision.streaming.windows import Windows
+from failuretwin.digital_model.twin import DigitalTwin
 
 NO_REST = Rest(np.zeros((1, 3)), np.zeros(1, dtype=bool), np.zeros(1, dtype=bool))
-LEAST_READINGS = 2
-"""Readings in the same place that show a tool at rest while it may still be moving."""
-UNMOVED_M = 0.005
-"""A tool that rests this near to where it did before has not moved [m]."""
+REST_S = 0.15
+"""Time in the same place that shows a tool at rest while it may still be moving [s]."""
+SAME_PLACE_M = 0.002
+"""How near readings then lie [m]: some counts of the servos, and slower than 2 cm/s."""
+UNMOVED_M = 0.02
+"""A tool this near to where it rested before may not have set out yet [m]."""
 
 
 class Following:
@@ -32,21 +34,27 @@ class Following:
 
     Args:
         robots: How many robots there are.
-        motors: How many motors each of them has.
+        twin: Digital twin of each of them.
         movements: Movements that are remembered, the present one included.
         rate_hz: True rate of the tool sensors [Hz]; None: all readings are real.
         latest_s: How long after its command a movement may begin at the latest [s].
     """
 
     def __init__(
-        self, robots: int, motors: int, movements: int, rate_hz: float | None, latest_s: float
+        self,
+        robots: int,
+        twin: DigitalTwin,
+        movements: int,
+        rate_hz: float | None,
+        latest_s: float,
     ) -> None:
+        motors = len(twin.robot.motors)
         self.samples = Samples(robots, motors)
         self.references = References.unknown(robots, motors)
         self.windows = Windows.empty(robots, movements, motors)
         self.memory = Memory.empty(robots, movements)
         self.read_s = np.full(robots, -np.inf)
-        self._latest_s = latest_s
+        self._twin, self._latest_s = twin, latest_s
         self._least_step = 0.0 if rate_hz is None else 0.9 / rate_hz
 
     def take(self, time: float, command: FloatArray, points: FloatArray) -> tuple[IntArray, ...]:
@@ -97,8 +105,8 @@ class Following:
         robots, place, begin, end = self._due(*self._present(still))
         if len(robots) == 0:
             return robots
-        samples, inside = self._readings(robots, begin, end)
-        found = rest(samples, _since_rest(samples, inside))
+        samples, time, inside = self._readings(robots, begin, end)
+        found = rest(samples, _since_rest(samples, time, inside))
         waits = self._may_start_late(robots, place, found.point)
         found = replace(found, usable=found.usable & ~waits)
         self.windows.settle(robots, place, end, found)
@@ -146,7 +154,8 @@ class Following:
         """
         robots, place, begin, end = self._due(robots, place, end)
         if len(robots):
-            found = rest(*self._readings(robots, begin, end))
+            samples, _, inside = self._readings(robots, begin, end)
+            found = rest(samples, inside)
             self.windows.settle(robots, place, end, found)
 
     def _due(
@@ -162,29 +171,32 @@ class Following:
 
     def _readings(
         self, robots: IntArray, begin: FloatArray, end: FloatArray
-    ) -> tuple[FloatArray, BoolArray]:
-        """Return samples of robots, (robot, sample, axis), and which lie between two times."""
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return samples (robot, sample, axis) [m], their times (sample,) [s], which to take."""
         some = self.samples.since(float(begin.min()))
         time = self.samples.time[some]
         inside = (time >= begin[:, None]) & (time < end[:, None] - 1e-9)
-        return self.samples.measured[some, robots].swapaxes(0, 1), inside
+        return self.samples.measured[some, robots].swapaxes(0, 1), time, inside
 
     def _may_start_late(self, robots: IntArray, place: IntArray, point: FloatArray) -> BoolArray:
         """Return which tools still rest where they did before, and may yet set out, (robot,)."""
         windows, before = self.windows, np.maximum(place - 1, 0)
-        known = (place > 0) & windows.usable[robots, before]
-        unmoved = np.linalg.norm(point - windows.point[robots, before], axis=1) < UNMOVED_M
+        seen = (place > 0) & windows.usable[robots, before]
+        told = np.where(place[:, None] > 0, windows.target[robots, before], windows.initial[robots])
+        rested = np.where(seen[:, None], windows.point[robots, before], self._twin.path(told))
+        unmoved = np.linalg.norm(point - rested, axis=1) < UNMOVED_M
         since = self.read_s[robots] - windows.start[robots, place]
-        return np.asarray(known & unmoved & (since < self._latest_s))
+        return np.asarray(unmoved & (since < self._latest_s))
 
 
-def _since_rest(samples: FloatArray, inside: BoolArray) -> BoolArray:
+def _since_rest(samples: FloatArray, time: FloatArray, inside: BoolArray) -> BoolArray:
     """Return the readings from which on all are near the newest, (robot, sample).
 
-    None where there are fewer than two: a tool is at rest if it is seen in the same place twice.
+    None where they span too short a time to tell rest from a slow start.
 
     Args:
         samples: Tool positions, (robot, sample, axis) [m]; NaN where there is none.
+        time: When they were taken, (sample,) [s].
         inside: Samples that count, (robot, sample).
     """
     there = inside & np.isfinite(samples).all(axis=-1)
@@ -192,6 +204,7 @@ def _since_rest(samples: FloatArray, inside: BoolArray) -> BoolArray:
     newest = np.where(there, number, 0).max(axis=1)
     off = samples - samples[np.arange(len(samples)), newest][:, None]
     with np.errstate(invalid="ignore"):
-        far = there & (np.linalg.norm(off, axis=-1) > STILL_M)
+        far = there & (np.linalg.norm(off, axis=-1) > SAME_PLACE_M)
     kept = there & (number > np.where(far, number, -1).max(axis=1, keepdims=True))
-    return kept & (kept.sum(axis=1, keepdims=True) >= LEAST_READINGS)
+    first = np.where(kept, time, np.inf).min(axis=1)
+    return kept & (time[newest] - first >= REST_S)[:, None]
