@@ -1,12 +1,21 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from failuretwin import BayesDiagnoser
-from failuretwin.core.hypothesis import UNKNOWN, Hypothesis, paper_hypotheses
+from failuretwin.core.hypothesis import UNKNOWN, Hypothesis, paper_hypotheses, single_faults
 from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.plan import Plan
+from failuretwin.data_knowledge.settled_evidence import settled_evidence
+from failuretwin.decision import weighing
+from failuretwin.decision.laws.unknown import LEFT_OUT, weigh_unknown
+from failuretwin.decision.scene import Scene
+from failuretwin.decision.separation import separation
+from failuretwin.decision.weighing import weigh_all
+from failuretwin.decision.weight import Weight
 from failuretwin.digital_model.imperfections import load_imperfections
 
 TWO_AT_ONCE = (
@@ -35,8 +44,7 @@ def test_two_faults_that_are_not_offered_are_unknown(diagnoser, thrown_off):
     """No single fault brings the tool there; it is not said to be one of those offered."""
     found = diagnoser.diagnose(thrown_off)
     told = [d.diagnosis for d in found]
-    assert told.count("unknown") + told.count(None) >= 0.8 * len(found)
-    assert told.count("unknown") >= 0.6 * len(found)
+    assert told.count("unknown") >= 0.9 * len(found)
     for d in (d for d in found if d.diagnosis == "unknown"):
         assert d.verdict.startswith("something that none of the known faults explains")
         assert (d.magnitude, d.magnitude_90, d.magnitude_unit) == (None, None, None)
@@ -48,13 +56,62 @@ def test_two_faults_that_are_offered_are_known(twin, armpi, thrown_off):
     assert [d.diagnosis for d in found] == [d.truth for d in found]
 
 
+FOREIGN = ("encoder_scale", "drift", "lag", "lost_commands")
+
+
+@pytest.fixture(scope="module")
+def foreign(twin, armpi):
+    """Faults of modes that are not offered, clearly apart from everything that is."""
+    known = load_imperfections("armpi_fpv", armpi)
+    faults = [h for h in single_faults(armpi.motor_names, FOREIGN) if h.faults]
+    runs = simulate(Plan(armpi, faults, 5, 9, known))
+    nearest = separation(twin, runs, known, paper_hypotheses(armpi.motor_names)).nearest
+    return runs.isel(run=np.flatnonzero(nearest >= 8.0))
+
+
+def test_modes_that_are_not_offered_are_unknown(diagnoser, foreign):
+    found = diagnoser.diagnose(foreign)
+    assert {d.truth.split(":")[1] for d in found} == set(FOREIGN)
+    assert np.mean([d.diagnosis == "unknown" for d in found]) >= 0.9
+
+
+def test_modes_without_a_law_are_unknown(twin, armpi, foreign, monkeypatch):
+    """Wrong scales, as if nobody had ever thought of them, nor of anything like them."""
+    monkeypatch.setattr(weighing, "WEIGHABLE", ("stuck", "steady_state_error"))
+    scales = np.char.endswith(foreign["fault"].values.astype(str), "encoder_scale")
+    offered = (*paper_hypotheses(armpi.motor_names), UNKNOWN)
+    found = BayesDiagnoser(twin, hypotheses=offered).diagnose(foreign.isel(run=scales))
+    assert np.mean([d.diagnosis == "unknown" for d in found]) >= 0.8
+
+
 def test_known_faults_stay_known(diagnoser, imperfect, diagnoses):
-    """Offering `unknown` turns hardly any right diagnosis."""
-    rows = list(range(0, 180, 5))
-    found = diagnoser.diagnose(imperfect.isel(run=rows))
-    before = sum(diagnoses[i].diagnosis == diagnoses[i].truth for i in rows)
-    after = sum(d.diagnosis == d.truth for d in found)
-    assert after >= before - 2
+    """Offering `unknown` turns hardly any right diagnosis: 1.7 % of 900 (docs/diagnosis.md)."""
+    right = np.flatnonzero([d.diagnosis == d.truth for d in diagnoses])
+    found = diagnoser.diagnose(imperfect.isel(run=right))
+    assert np.mean([d.diagnosis == d.truth for d in found]) >= 0.96
+
+
+def test_known_hypotheses_weigh_the_same_beside_unknown(diagnoser, imperfect, armpi):
+    scene = Scene(settled_evidence(imperfect.isel(run=[0, 30, 120])), diagnoser.healthy_model)
+    nine = paper_hypotheses(armpi.motor_names)
+    alone = weigh_all(scene, nine, diagnoser.priors)
+    beside = weigh_all(scene, (*nine, UNKNOWN), diagnoser.priors)
+    for one, other in zip(alone, beside[:-1], strict=True):
+        np.testing.assert_array_equal(one.log_evidence, other.log_evidence)
+
+
+def test_unknown_counts_its_best_explanation_alone(diagnoser, imperfect):
+    """A left-out fault that explains a run counts by its odds; poor ones beside it add nothing."""
+    scene = Scene(settled_evidence(imperfect.isel(run=[0, 30])), diagnoser.healthy_model)
+    sure = Weight(np.full(2, 500.0), *(np.zeros((2, 5)).__getitem__,) * 2, lambda run: None)
+
+    def says(left_out):
+        return weigh_unknown(scene, lambda other: sure, left_out).log_evidence
+
+    good = replace(sure, log_evidence=np.full(2, 600.0))
+    expected = np.log(0.3 * LEFT_OUT) + 600.0
+    np.testing.assert_allclose(says([(0.3, good)]), expected)
+    np.testing.assert_allclose(says([(0.3, good), *[(0.3, sure)] * 20]), expected)
 
 
 def test_without_evidence_unknown_is_as_rare_as_it_was(diagnoser, imperfect):

@@ -182,7 +182,7 @@ def motor_profiles(
     own = np.eye(len(model.scatter), dtype=bool)[list(motors)]
     own = own.reshape(len(motors), *(1,) * (base.ndim - 1), -1)
     scale = np.where(own | (another & other_held), 0.0, model.scatter)
-    angle = _nearest_on_circle(model, expected, own, point)
+    angle = nearest_on_circle(model, expected, own, point)
     for _ in range(REFINEMENTS):
         pose = np.where(own, angle[..., None], base)
         settled = model.settle(pose, direction, own | another)
@@ -249,7 +249,7 @@ def _may_turn_around(model: HealthyModel, motor: int) -> bool:
     return not model.twin.robot.chain.joints[motor].prismatic and HELD_BEYOND * (high - low) > np.pi
 
 
-def _nearest_on_circle(
+def nearest_on_circle(
     model: HealthyModel, pose: FloatArray, own: BoolArray, point: FloatArray
 ) -> FloatArray:
     """Return the angle of each motor that brings the tool nearest to `point`, (own, ...) [rad].

@@ -108,11 +108,25 @@ class Transients:
         if lasting:
             unseen = unseen + self._usually_off(_at(near - profile.expected, seen))
         ends[..., motor] = np.where(self.judge.usable[..., None], near, unseen)
+        return self.toward(ends, seen, motor)
+
+    def toward(self, ends: FloatArray, became: IntArray, off: int) -> FloatArray:
+        """Return the log density if the motors go from one given pose to the next.
+
+        Args:
+            ends: Where each movement led, for each that may have become of it,
+                (run, movement, alternative, motor) [rad].
+            became: What did, where its end was seen, (run, movement).
+            off: Motor that may have been off before the run.
+
+        Returns:
+            (run, movement).
+        """
         course, luck = self.judge.settle(
-            Course(ends, seen, self.judge.alternatives.lost, self.judge.first)
+            Course(ends, became, self.judge.alternatives.lost, self.judge.first)
         )
         return self._trusted(
-            self.judge.from_anywhere(course, self.judge.log_density(course), motor) + luck
+            self.judge.from_anywhere(course, self.judge.log_density(course), off) + luck
         )
 
     def _usually_off(self, offset: FloatArray) -> FloatArray:

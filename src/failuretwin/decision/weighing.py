@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import UNKNOWN, Fault, Hypothesis
+from failuretwin.core.hypothesis import UNKNOWN, Fault, Hypothesis, single_faults
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.knowledge import prior_odds
 from failuretwin.decision.law import Law, weigh
@@ -23,9 +23,9 @@ from failuretwin.decision.priors import Priors
 from failuretwin.decision.scene import Scene
 from failuretwin.decision.weight import Estimate, Weight
 
-UNKNOWN_ODDS = 3.0
-"""Odds of `unknown` against healthy: who asks for it doubts the set; even so it takes no run of the
-nine from them (docs/diagnosis.md)."""
+UNKNOWN_ODDS = 1.0
+"""Odds of `unknown` against healthy where nothing is seen; each explanation of what is seen has
+odds of its own in its evidence, none has more."""
 MOST_FAULTS = 2
 """Faults that can be weighed at once."""
 
@@ -88,9 +88,17 @@ def weigh_all(scene: Scene, hypotheses: Sequence[Hypothesis], priors: Priors) ->
     known = [h for h in hypotheses if h.known]
     weights = {h: weigh_hypothesis(scene, h, priors) for h in known}
     if len(known) < len(hypotheses):
-        ways = [lambda blurred, h=h: weigh_hypothesis(blurred, h, priors) for h in known]
-        weights[UNKNOWN] = weigh_unknown(scene, ways, log_prior(known, priors))
+        others = [
+            (prior_odds(h), weigh_hypothesis(scene, h, priors)) for h in left_out(scene, known)
+        ]
+        weights[UNKNOWN] = weigh_unknown(scene, _weigh_healthy, others)
     return [weights[h] for h in hypotheses]
+
+
+def left_out(scene: Scene, known: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return the single faults that can be weighed but are not among the known hypotheses."""
+    names = scene.model.twin.robot.motor_names
+    return [h for h in single_faults(names, WEIGHABLE) if h.faults and h not in known]
 
 
 def weigh_hypothesis(scene: Scene, hypothesis: Hypothesis, priors: Priors) -> Weight:

@@ -1,0 +1,128 @@
+"""One motor or two that are off, each in its own way, whatever may have done that.
+
+A motor is held at an angle, off by a constant, off in proportion to its angle, or off by something
+else after each movement; and a movement may show that or not. Given which do, that is linear
+regression, and the evidence is a closed form. Which do is found step by step, so that one term of
+the sum over it is taken: densities integrate to no more than one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations, product
+
+import numpy as np
+
+from failuretwin.core.quadrature import log_sum
+from failuretwin.core.types import FloatArray
+from failuretwin.decision.laws.two_amounts import Lines
+from failuretwin.decision.laws.two_followed import Course, follow
+from failuretwin.decision.scene import Scene
+from failuretwin.decision.two_angles import TwoAngles, two_angles
+from failuretwin.decision.weight import Estimate, Weight
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How a motor is off.
+
+    Attributes:
+        spread: Deviation of what it is off by: as a share of its range if it is held, in rad if
+            it is off by a constant or redrawn, as a ratio if by its angle; 0: it is well.
+        held: Whether it stands at one angle whatever the target.
+        by_angle: Whether it is off in proportion to its angle.
+        redrawn: Whether each movement draws its own.
+    """
+
+    spread: float
+    held: bool = False
+    by_angle: bool = False
+    redrawn: bool = False
+
+    @property
+    def amount(self) -> bool:
+        """Whether it is off by an amount that holds for the run."""
+        return self.spread > 0.0 and not self.redrawn
+
+
+WELL = Kind(0.0)
+OFF = (Kind(0.4, held=True), Kind(0.3), Kind(0.4, by_angle=True), Kind(0.4, redrawn=True))
+"""Spreads are wide enough for most of what a motor can do within its range."""
+ONE_OFF = (*product(OFF, (WELL,)), *product((WELL,), OFF))
+TWO_OFF = tuple(product(OFF, OFF))
+KINDS = (*ONE_OFF, *TWO_OFF)
+LOG_CHANCE = -np.log([2 * len(ONE_OFF)] * len(ONE_OFF) + [2 * len(TWO_OFF)] * len(TWO_OFF))
+"""Log probability of each of `KINDS`: one motor as often as two."""
+
+
+def weigh_off_anyhow(scene: Scene) -> Weight | None:
+    """Return what the runs say of one motor or two being off; None of an arm of a single motor."""
+    pairs = list(combinations(range(len(scene.model.scatter)), 2))
+    if not pairs:
+        return None
+    settled, ways = zip(*(_weigh(scene, pair) for pair in pairs), strict=True)
+    says = [one + way for one, way in zip(settled, ways, strict=True)]
+    whole = np.stack([one.sum(axis=1) for one in says], axis=1)
+    best = np.argmax(whole, axis=1)
+    none = np.zeros(scene.alternatives.log_weight.shape[1:])
+    return Weight(
+        log_evidence=log_sum(whole, axis=1) - np.log(len(pairs)),
+        by_movement=lambda run: says[best[run]][run],
+        settled=lambda run: settled[best[run]][run],
+        estimate=lambda run: Estimate(None, None, none),
+    )
+
+
+def _weigh(scene: Scene, pair: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    """Return log densities of settled positions and of the way, (run, movement) each."""
+    seen = two_angles(scene.evidence, scene.model, scene.alternatives, pair)
+    outlier = scene.model.outlier_log_density
+    course = follow(seen, _lines(scene, seen), scene.usable, outlier)
+    total = course.says.sum(axis=-1) + LOG_CHANCE  # (run, kind)
+    best, run = np.argmax(total, axis=1), np.arange(len(total))
+    says = course.says[run, best]
+    # What chance and the other kinds add belongs to no movement more than to another.
+    more = log_sum(total, axis=1) - says.sum(axis=1)
+    share = np.where(scene.usable, 1.0, 0.0) / np.maximum(scene.usable.sum(axis=1), 1)[:, None]
+    says = says + share * more[:, None]
+    if scene.transients is None:
+        return says, np.zeros_like(says)
+    return says, _on_way(scene, seen, Course(says, course.way[run, best], course.angle[run, best]))
+
+
+def _on_way(scene: Scene, seen: TwoAngles, course: Course) -> FloatArray:
+    """Return log densities of the way if the two motors went where they were seen to settle."""
+    transients, pair = scene.transients, list(seen.pair)
+    assert transients is not None
+    followed = course.way >= 0
+    way = np.maximum(course.way, 0)[..., None]
+    at = np.take_along_axis(seen.angle, way[..., None], axis=2)[:, :, 0]
+    ends = transients.judge.expected.copy()
+    ends[..., pair] = np.where(followed[..., None], at, course.angle)[:, :, None]
+    became = np.where(followed, seen.became[way[..., 0]], 0)
+    return transients.toward(ends, became, seen.pair[0])
+
+
+def _lines(scene: Scene, seen: TwoAngles) -> Lines:
+    """Return where two motors may stand, for each of `KINDS`."""
+    pair = list(seen.pair)
+    motors = [scene.model.twin.robot.motors[motor] for motor in pair]
+    ends = np.array([motor.movement_range for motor in motors])
+    middle, length = ends.mean(axis=1), ends[:, 1] - ends[:, 0]
+    target = np.nan_to_num(scene.evidence.movements.target[..., pair])
+    scatter = scene.model.scatter[pair] ** 2
+    held, by_angle, redrawn, amount = (
+        np.array([[bool(getattr(kind, name)) for kind in kinds] for kinds in KINDS])
+        for name in ("held", "by_angle", "redrawn", "amount")
+    )
+    spread = np.array([[kind.spread for kind in kinds] for kinds in KINDS])
+    slope = np.where(by_angle, target[:, :, None], 1.0)
+    deviation = np.where(amount, spread * np.where(held, length, 1.0), 1.0)
+    return Lines(
+        centre=np.where(held, 0.0, seen.expected[:, :, None]),
+        slope=np.where(amount, slope, 0.0),
+        noise=np.where(held, 0.0, scatter) + np.where(redrawn, spread**2, 0.0),
+        amount=(np.where(held, middle, 0.0), deviation**2),
+        well=seen.expected,
+        well_noise=scatter,
+    )
