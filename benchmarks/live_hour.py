@@ -23,6 +23,7 @@ from failuretwin.connection.links.diagnostic_status import SURE
 from failuretwin.connection.links.pace import Pace
 from failuretwin.connection.links.values import CommandSent, Item
 from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.streaming import monitor
 from failuretwin.failure_behavior.schedule import ScheduledFault, state_at
 
@@ -104,10 +105,10 @@ class Commands:
         """Nothing to be closed."""
 
 
-def first_reached(commands: Sequence[CommandSent], time: float) -> float:
-    """Return when the first movement that begins after a time [s] ends its ramp."""
-    after = next(one for one in commands if one.time >= time)
-    return after.time + float(after.duration.max())
+def ramp_ends(commands: Sequence[CommandSent], time: float) -> FloatArray:
+    """Return when the movements that begin after a time [s] end their ramps, in order [s]."""
+    ends = [one.time + float(one.duration.max()) for one in commands if one.time >= time]
+    return np.array(ends)
 
 
 def main() -> None:
@@ -118,6 +119,7 @@ def main() -> None:
     said, commands, memory = live(schedule, speed, 3600.0 * hours, int(seed))
     sure = [s for s in said if s.sure]
     delays, first_named, repairs = [], [], []
+    number, after_it = [], []
     for one in schedule:
         name = str(one.fault)
         there = [s for s in said if s.name == name and one.start_s <= s.time < one.end_s]
@@ -127,9 +129,13 @@ def main() -> None:
             for s in sure
             if s.name == "healthy" and one.end_s <= s.time < one.end_s + PERIOD_S - END_S + BEGIN_S
         ]
-        reached = first_reached(commands, one.start_s)
-        first_named.append(there[0].time - reached if there else np.nan)
-        delays.append(found[0] - reached if found else np.nan)
+        reached = ramp_ends(commands, one.start_s)
+        first_named.append(there[0].time - reached[0] if there else np.nan)
+        delays.append(found[0] - reached[0] if found else np.nan)
+        if found:
+            deciding = max(int(np.sum(reached <= found[0])), 1)
+            number.append(deciding)
+            after_it.append(found[0] - reached[deciding - 1])
         repairs.append(healthy[0] - one.end_s if healthy else np.nan)
         print(
             f"{name:28s} found after {delays[-1]:5.1f} s, repair noticed after {repairs[-1]:5.1f} s"
@@ -144,7 +150,8 @@ def main() -> None:
     print(
         f"{np.isfinite(delays).sum()} of {len(delays)} faults found, most probable after "
         f"{np.nanmedian(first_named):.1f} s, sure after {np.nanmedian(delays):.1f} s (from the end "
-        "of the first ramp); "
+        f"of the first ramp); that was in movement {np.median(number):.0f} after the onset, "
+        f"{np.median(after_it):.1f} s after its ramp (medians); "
         f"{np.isfinite(repairs).sum()} repairs noticed, median {np.nanmedian(repairs):.1f} s; "
         f"{len(alarms)} false alarms, {len(wrong) - len(alarms)} faults misnamed; "
         f"memory {memory[0]:.0f} to {memory[-1]:.0f} MB"

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from failuretwin.decision.ambiguity import ambiguity
     from failuretwin.decision.bayes import BayesDiagnoser
     from failuretwin.decision.priors import Priors
+    from failuretwin.decision.streaming.streaming import StreamingDiagnoser
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.twin import DigitalTwin
 
@@ -27,6 +28,7 @@ _HOME = {
     "Plan": "data_knowledge.plan",
     "Priors": "decision.priors",
     "ReadOptions": "data_knowledge.reading",
+    "StreamingDiagnoser": "decision.streaming.streaming",
     "ambiguity": "decision.ambiguity",
     "iterate": "data_knowledge.generation",
     "load_robot": "digital_model.robot",
@@ -40,6 +42,7 @@ __all__ = [
     "Plan",
     "Priors",
     "ReadOptions",
+    "StreamingDiagnoser",
     "__version__",
     "ambiguity",
     "iterate",
