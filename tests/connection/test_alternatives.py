@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from failuretwin.connection.healthy import OUTLIER_RATE, RARE, HealthyModel
+from failuretwin.connection.healthy import HealthyModel
+from failuretwin.connection.lost_commands import OUTLIER_RATE, RARE
 from failuretwin.core.movements import Movements
 from failuretwin.digital_model.imperfections import Imperfections, LostCommand, Timing
 

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scipy import integrate, stats
 
 from failuretwin import BayesDiagnoser
-from failuretwin.connection.healthy import OUTLIER_RATE, PATH_NOISE_M, HealthyModel
+from failuretwin.connection.healthy import PATH_NOISE_M, HealthyModel
+from failuretwin.connection.lost_commands import OUTLIER_RATE
 from failuretwin.core.ellipsoid import log_student
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements

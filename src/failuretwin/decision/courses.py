@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from failuretwin.connection.healthy import Alternatives
+from failuretwin.connection.lost_commands import Alternatives
 from failuretwin.core.quadrature import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.decision.ramps import RampModel, Ramps

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.connection.healthy import Alternatives, HealthyModel, scattered
+from failuretwin.connection.healthy import HealthyModel, scattered
+from failuretwin.connection.lost_commands import Alternatives
 from failuretwin.core.ellipsoid import Ellipsoid, log_norm
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence

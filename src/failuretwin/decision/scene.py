@@ -7,7 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from failuretwin.connection.healthy import Alternatives, HealthyModel
+from failuretwin.connection.healthy import HealthyModel
+from failuretwin.connection.lost_commands import Alternatives
 from failuretwin.core.quadrature import log_sum
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.moving_evidence import MovingEvidence
