@@ -127,6 +127,23 @@ class HealthyModel:
         """Return what may become of each movement; the first is that every command arrives."""
         return self.lost_commands.alternatives(movements)
 
+    def given_before(
+        self, evidence: SettledEvidence, alternatives: Alternatives, terms: FloatArray
+    ) -> Alternatives:
+        """Return alternatives with their probability given what was seen of the movements before.
+
+        Args:
+            evidence: Settled positions.
+            alternatives: What may have become of each movement, whatever was seen.
+            terms: How well they explain the settled positions, from `explain`.
+        """
+        density = np.where(
+            np.isfinite(alternatives.log_weight), terms - alternatives.log_weight, -np.inf
+        )
+        says = np.logaddexp(np.log1p(-OUTLIER_RATE) + density, self.outlier_log_density)
+        says = np.where(evidence.usable[..., None], says, 0.0)
+        return self.lost_commands.given_before(evidence.movements, alternatives, says)
+
     def late(self, movements: Movements) -> FloatArray:
         """Return the probability that each movement started late, (run, movement)."""
         return self.lost_commands.late(movements)

@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from failuretwin.connection.losses_in_a_row import LossesInARow
 from failuretwin.core.movements import Movements
 from failuretwin.core.quadrature import log_of
-from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.imperfections import Imperfections
 from failuretwin.digital_model.robot import Robot
 
 OUTLIER_RATE = 0.01
 """Share of movements after which the tool may be anywhere in its workspace [-]."""
 RARE = 1e-3
-"""Two losses in a row that are less probable than this are left to the outliers [-]."""
+"""Losses in a row that are less probable than this, even if all are late, are left out [-]."""
+NEGLIGIBLE = 1e-5
+"""What is less probable than this given the movements before is left to the outliers [-]."""
 LATE_MARGIN_S = 0.15
 """A movement that lasts this much longer than the schedule allows started late [s]."""
 
 
 @dataclass(frozen=True)
 class Alternatives:
-    """What may become of each movement: every set of motors that may lose its command.
+    """What may become of each movement: which motors lost how many commands in a row.
 
     Attributes:
         lost: Motors that lose their command, (alternative, motor).
@@ -58,55 +61,57 @@ class LostCommands:
         """Return what may become of each movement; the first is that every command arrives.
 
         A motor that misses a command stays where it went last: at the target before, or, if it
-        had missed that one too, at the target before that. Padding is filled with zeros; no
-        evidence belongs to it.
+        had missed that one too, at the target before that, and so on. Padding is filled with
+        zeros; no evidence belongs to it.
         """
         origin, target = np.nan_to_num(movements.origin()), np.nan_to_num(movements.target)
-        travel = np.sign(target - origin)
-        lost, rates = self._losses(self.late(movements))
-        again = self._in_a_row
-        before = _before(rates)
-        # Chance that of the motors that miss a command now, these had missed the one before too.
-        chances = [before @ _meets(lost, lost[now], had) for now, had in again]
-        twice = [rates[..., now] * chance for (now, _), chance in zip(again, chances, strict=True)]
-        single = rates.copy()
-        for (now, _), weight in zip(again, twice, strict=True):
-            single[..., now] -= weight
-        missing = np.array([*lost, *(lost[now] for now, _ in again)])
-        had = np.array([*np.zeros_like(lost), *(had for _, had in again)])
-        weights = np.stack([*np.moveaxis(single, -1, 0), *twice], axis=-1)
+        travel, rows = np.sign(target - origin), self._in_a_row
         return Alternatives(
-            lost=missing,
-            base=_choose(target, (missing, origin), (had, _before(origin))),
-            direction=_choose(travel, (missing, _before(travel)), (had, _before(_before(travel)))),
-            log_weight=log_of(weights * (1.0 - OUTLIER_RATE)),
+            lost=rows.missed > 0,
+            base=_of_last_made(target, origin, rows.missed),
+            direction=_of_last_made(travel, _before(travel), rows.missed),
+            log_weight=self._log_weight(rows.chances(self._rates(self.late(movements)))),
         )
 
-    def _losses(self, late: FloatArray) -> tuple[BoolArray, FloatArray]:
-        """Return which motors each alternative loses, and how probable it is.
+    def given_before(
+        self, movements: Movements, alternatives: Alternatives, log_likelihood: FloatArray
+    ) -> Alternatives:
+        """Return alternatives with their probability given what was seen of the movements before.
 
-        (alternative, motor), and (run, movement, alternative). The first loses none.
+        A motor that was seen to arrive has missed nothing before; one that was seen to stay has.
+
+        Args:
+            movements: The movements.
+            alternatives: What may become of them.
+            log_likelihood: What was seen of each movement says of each alternative, up to a
+                constant, (run, movement, alternative); 0 where nothing was seen.
+        """
+        rates = self._rates(self.late(movements))
+        chances = self._in_a_row.chances(rates, log_likelihood)
+        chances[chances < NEGLIGIBLE] = 0.0
+        return replace(alternatives, log_weight=self._log_weight(chances))
+
+    def _rates(self, late: FloatArray) -> FloatArray:
+        """Return the probability of each loss, (run, movement, loss); the first: of none.
+
+        Args:
+            late: Probability that each movement started late, (run, movement).
         """
         entries = self.imperfections.lost_commands
-        lost = np.zeros((1 + len(entries), len(self.robot.motors)), dtype=bool)
-        rates = np.zeros((*late.shape, 1 + len(entries)))
-        for i, entry in enumerate(entries, start=1):
-            lost[i, [self.robot.motor_names.index(motor) for motor in entry.motors]] = True
-            rates[..., i] = entry.rate + (entry.rate_when_late - entry.rate) * late
-        rates[..., 0] = np.maximum(1.0 - rates.sum(axis=-1), 0.0)  # rounding may exceed one
-        return lost, rates
+        rates = [entry.rate + (entry.rate_when_late - entry.rate) * late for entry in entries]
+        none = np.maximum(1.0 - sum(rates, np.zeros_like(late)), 0.0)  # rounding may exceed one
+        return np.stack([none, *rates], axis=-1)
 
     @cached_property
-    def _in_a_row(self) -> list[tuple[int, BoolArray]]:
-        """Losses that may well follow on another: which one, and who had missed two, (motor,)."""
-        lost, rates = self._losses(np.array([[0.0, 1.0]]))
-        most = rates[0].max(axis=0)
-        found = []
-        for now in range(1, len(lost)):
-            for had in np.unique(lost[1:] & lost[now], axis=0):
-                if had.any() and most[now] * (most @ _meets(lost, lost[now], had)) > RARE:
-                    found.append((now, had))
-        return found
+    def _in_a_row(self) -> LossesInARow:
+        names, entries = self.robot.motor_names, self.imperfections.lost_commands
+        losses = [np.isin(names, motors) for motors in ((), *(e.motors for e in entries))]
+        most = self._rates(np.array([0.0, 1.0])).max(axis=0)
+        return LossesInARow.of(np.array(losses), most, RARE)
+
+    @staticmethod
+    def _log_weight(chances: FloatArray) -> FloatArray:
+        return log_of(chances * (1.0 - OUTLIER_RATE))
 
     def late(self, movements: Movements) -> FloatArray:
         """Return the probability that each movement started late, (run, movement).
@@ -122,23 +127,19 @@ class LostCommands:
         return late
 
 
-def _meets(lost: BoolArray, now: BoolArray, had: BoolArray) -> FloatArray:
-    """Return 1 for the losses that hit exactly `had` of the motors `now`, (alternative,)."""
-    return np.asarray((lost & now == had).all(axis=1), dtype=np.float64)
-
-
-def _choose(arrived: FloatArray, *missed: tuple[BoolArray, FloatArray]) -> FloatArray:
-    """Return the values of each alternative, (run, movement, alternative, motor).
+def _of_last_made(values: FloatArray, after: FloatArray, missed: IntArray) -> FloatArray:
+    """Return what belongs to the last movement that a motor made, (run, movement, state, motor).
 
     Args:
-        arrived: Value of a motor that got its command, (run, movement, motor).
-        missed: Motors that did not, (alternative, motor), and their value, (run, movement, motor);
-            the last that names a motor counts.
+        values: What belongs to each movement, (run, movement, motor).
+        after: What belongs to the movement before each, (run, movement, motor).
+        missed: Commands that each motor has missed in a row, (state, motor).
     """
-    chosen = arrived[:, :, None]
-    for mask, value in missed:
-        chosen = np.where(mask, value[:, :, None], chosen)
-    return np.asarray(chosen)
+    earlier = [values, after]
+    while len(earlier) <= missed.max():
+        earlier.append(_before(earlier[-1]))
+    chosen = np.stack(earlier)[missed, :, :, np.arange(missed.shape[1])]
+    return np.moveaxis(chosen, (0, 1), (2, 3)).copy()
 
 
 def _before(values: FloatArray) -> FloatArray:

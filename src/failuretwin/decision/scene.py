@@ -55,12 +55,23 @@ class Scene:
 
     @cached_property
     def alternatives(self) -> Alternatives:
-        """What may have become of each movement."""
-        return self.model.alternatives(self.evidence.movements)
+        """What may have become of each movement, given the movements before."""
+        return self._followed[0]
+
+    @property
+    def _explained(self) -> tuple[FloatArray, FloatArray]:
+        return self._followed[1:]
 
     @cached_property
-    def _explained(self) -> tuple[FloatArray, FloatArray]:
-        return self.model.explain(self.evidence, self.alternatives)
+    def _followed(self) -> tuple[Alternatives, FloatArray, FloatArray]:
+        """Return the alternatives given the movements before, and how well each explains one."""
+        usual = self.model.alternatives(self.evidence.movements)
+        terms, pose = self.model.explain(self.evidence, usual)
+        found = self.model.given_before(self.evidence, usual, terms)
+        with np.errstate(invalid="ignore"):
+            gain = found.log_weight - usual.log_weight
+        terms = np.where(np.isfinite(found.log_weight), terms + gain, -np.inf)
+        return found, terms, pose
 
     @cached_property
     def transients(self) -> Transients | None:
