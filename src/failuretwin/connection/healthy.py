@@ -137,9 +137,8 @@ class HealthyModel:
             alternatives: What may have become of each movement, whatever was seen.
             terms: How well they explain the settled positions, from `explain`.
         """
-        density = np.where(
-            np.isfinite(alternatives.log_weight), terms - alternatives.log_weight, -np.inf
-        )
+        possible = np.isfinite(alternatives.log_weight)
+        density = terms - np.where(possible, alternatives.log_weight, 0.0)
         says = np.logaddexp(np.log1p(-OUTLIER_RATE) + density, self.outlier_log_density)
         says = np.where(evidence.usable[..., None], says, 0.0)
         return self.lost_commands.given_before(evidence.movements, alternatives, says)

@@ -18,7 +18,7 @@ OUTLIER_RATE = 0.01
 """Share of movements after which the tool may be anywhere in its workspace [-]."""
 RARE = 1e-3
 """Losses in a row that are less probable than this, even if all are late, are left out [-]."""
-NEGLIGIBLE = 1e-5
+NEGLIGIBLE = 1e-4
 """What is less probable than this given the movements before is left to the outliers [-]."""
 LATE_MARGIN_S = 0.15
 """A movement that lasts this much longer than the schedule allows started late [s]."""

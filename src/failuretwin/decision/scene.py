@@ -68,9 +68,8 @@ class Scene:
         usual = self.model.alternatives(self.evidence.movements)
         terms, pose = self.model.explain(self.evidence, usual)
         found = self.model.given_before(self.evidence, usual, terms)
-        with np.errstate(invalid="ignore"):
-            gain = found.log_weight - usual.log_weight
-        terms = np.where(np.isfinite(found.log_weight), terms + gain, -np.inf)
+        possible = np.isfinite(found.log_weight)
+        terms = terms + found.log_weight - np.where(possible, usual.log_weight, 0.0)
         return found, terms, pose
 
     @cached_property
