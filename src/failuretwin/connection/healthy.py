@@ -141,11 +141,18 @@ class HealthyModel:
         density = terms - np.where(possible, alternatives.log_weight, 0.0)
         says = np.logaddexp(np.log1p(-OUTLIER_RATE) + density, self.outlier_log_density)
         says = np.where(evidence.usable[..., None], says, 0.0)
-        return self.lost_commands.given_before(evidence.movements, alternatives, says)
+        late = self.late(evidence.movements, evidence.resumed)
+        return self.lost_commands.given_before(alternatives, late, says)
 
-    def late(self, movements: Movements) -> FloatArray:
-        """Return the probability that each movement started late, (run, movement)."""
-        return self.lost_commands.late(movements)
+    def late(self, movements: Movements, resumed: FloatArray | None = None) -> FloatArray:
+        """Return the probability that each movement started late, (run, movement).
+
+        Args:
+            movements: The movements.
+            resumed: Time from each command to the first reading after it, (run, movement) [s];
+                None: not known.
+        """
+        return self.lost_commands.late(movements, resumed)
 
     def settle(self, base: FloatArray, direction: FloatArray, held: BoolArray) -> FloatArray:
         """Return the angles at which the motors settle, (..., motor) [rad].

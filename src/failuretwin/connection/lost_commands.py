@@ -74,20 +74,19 @@ class LostCommands:
         )
 
     def given_before(
-        self, movements: Movements, alternatives: Alternatives, log_likelihood: FloatArray
+        self, alternatives: Alternatives, late: FloatArray, log_likelihood: FloatArray
     ) -> Alternatives:
         """Return alternatives with their probability given what was seen of the movements before.
 
         A motor that was seen to arrive has missed nothing before; one that was seen to stay has.
 
         Args:
-            movements: The movements.
-            alternatives: What may become of them.
+            alternatives: What may have become of the movements.
+            late: Probability that each started late, (run, movement).
             log_likelihood: What was seen of each movement says of each alternative, up to a
                 constant, (run, movement, alternative); 0 where nothing was seen.
         """
-        rates = self._rates(self.late(movements))
-        chances = self._in_a_row.chances(rates, log_likelihood)
+        chances = self._in_a_row.chances(self._rates(late), log_likelihood)
         chances[chances < NEGLIGIBLE] = 0.0
         return replace(alternatives, log_weight=self._log_weight(chances))
 
@@ -113,13 +112,23 @@ class LostCommands:
     def _log_weight(chances: FloatArray) -> FloatArray:
         return log_of(chances * (1.0 - OUTLIER_RATE))
 
-    def late(self, movements: Movements) -> FloatArray:
+    def late(self, movements: Movements, resumed: FloatArray | None = None) -> FloatArray:
         """Return the probability that each movement started late, (run, movement).
 
-        A late start holds up the next command, so the time between commands betrays it; for the
-        last movement of a run only the rate is known.
+        A late start holds up the next command, so the time between commands betrays it. Of the
+        last movement of a run the readings tell: they come back when a late one starts.
+
+        Args:
+            movements: The movements.
+            resumed: Time from each command to the first reading after it, (run, movement) [s], NaN
+                where it is not known; None: nowhere. What is not told so is the rate.
         """
-        late = np.full(movements.start.shape, self.imperfections.timing.late_rate)
+        timing, readings = self.imperfections.timing, self.imperfections.readings
+        late = np.full(movements.start.shape, timing.late_rate)
+        if resumed is not None and timing.late_rate > 0.0:
+            between = 1.0 / readings.rate_hz if readings is not None else 0.0
+            late[resumed < 0.5 * timing.late_s[0]] = 0.0
+            late[resumed > 0.5 * timing.late_s[0] + between] = 1.0
         longest = self.imperfections.schedule.period_s[1] + LATE_MARGIN_S
         known = movements.exists[:, 1:]
         lasted = np.diff(movements.start, axis=1)

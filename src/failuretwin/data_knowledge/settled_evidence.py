@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from failuretwin.core.movements import Movements, find_movements
-from failuretwin.core.runs import measured_rate
+from failuretwin.core.runs import measured_rate, time_step
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 
 if TYPE_CHECKING:
@@ -38,6 +38,8 @@ class SettledEvidence:
         moving: Movements whose readings do not come to rest, (run, movement).
         begin: When the readings that count begin, (run, movement) [s].
         end: End of each plateau, (run, movement) [s].
+        resumed: Time from each command to the first reading after it, (run, movement) [s]; NaN
+            where there is none or where straight lines fill the gaps between readings.
     """
 
     movements: Movements
@@ -47,6 +49,7 @@ class SettledEvidence:
     moving: BoolArray
     begin: FloatArray
     end: FloatArray
+    resumed: FloatArray
 
     def __getitem__(self, runs: slice) -> SettledEvidence:
         """Return the evidence of some of the runs."""
@@ -59,6 +62,7 @@ class SettledEvidence:
             self.moving[runs],
             self.begin[runs],
             self.end[runs],
+            self.resumed[runs],
         )
 
 
@@ -90,7 +94,31 @@ def settled_evidence(runs: xr.Dataset) -> SettledEvidence:
         independent = int((end - begin)[run, movement] * rate) + 1
         count[run, movement] = min(len(samples), independent)
         moving[run, movement] = _spread(samples) > STILL_M
-    return SettledEvidence(movements, point, count, (count > 0) & ~moving, moving, begin, end)
+    usable, resumed = (count > 0) & ~moving, _resumed(movements, runs)
+    return SettledEvidence(movements, point, count, usable, moving, begin, end, resumed)
+
+
+def drawn_out(seen: BoolArray, every: int) -> bool:
+    """Return whether straight lines fill a path between readings.
+
+    Args:
+        seen: Samples that are there, (time,).
+        every: Samples from one reading of the sensor to the next.
+    """
+    return every >= 2 and 2 * int(np.count_nonzero(seen)) >= len(seen)
+
+
+def _resumed(movements: Movements, runs: xr.Dataset) -> FloatArray:
+    """Return the time from each command to the first reading after it, (run, movement) [s]."""
+    time = as_floats(runs["time"].values)
+    seen = np.asarray(np.isfinite(as_floats(runs["measured"].values)).all(axis=-1))
+    every = round(1.0 / (measured_rate(runs) * time_step(runs)))
+    found = np.full(movements.start.shape, np.nan)
+    for run, readings in enumerate(seen):
+        if not drawn_out(readings, every):
+            at = np.append(time[readings], np.nan)
+            found[run] = at[np.searchsorted(at[:-1], movements.start[run] - 1e-9)]
+    return found - movements.start
 
 
 def _plateau_ends(movements: Movements, measured: FloatArray, time: FloatArray) -> FloatArray:

@@ -53,6 +53,11 @@ class Scene:
         moving = None if self.moving is None else self.moving[rows]
         return Scene(self.evidence[rows], self.model, moving, self.way_blur)
 
+    @property
+    def late(self) -> FloatArray:
+        """Probability that each movement started late, (run, movement)."""
+        return self.model.late(self.evidence.movements, self.evidence.resumed)
+
     @cached_property
     def alternatives(self) -> Alternatives:
         """What may have become of each movement, given the movements before."""
