@@ -16,9 +16,9 @@ from failuretwin.digital_model.robot import Robot
 
 OUTLIER_RATE = 0.01
 """Share of movements after which the tool may be anywhere in its workspace [-]."""
-RARE = 1e-3
+RARE = 1e-4
 """Losses in a row that are less probable than this, even if all are late, are left out [-]."""
-NEGLIGIBLE = 1e-4
+NEGLIGIBLE = 1e-5
 """What is less probable than this given the movements before is left to the outliers [-]."""
 LATE_MARGIN_S = 0.15
 """A movement that lasts this much longer than the schedule allows started late [s]."""
@@ -98,8 +98,10 @@ class LostCommands:
         """
         entries = self.imperfections.lost_commands
         rates = [entry.rate + (entry.rate_when_late - entry.rate) * late for entry in entries]
-        none = np.maximum(1.0 - sum(rates, np.zeros_like(late)), 0.0)  # rounding may exceed one
-        return np.stack([none, *rates], axis=-1)
+        total = sum(rates, np.zeros_like(late))
+        none = np.maximum(1.0 - total, 0.0)
+        shares = np.stack([none, *rates], axis=-1)
+        return shares / np.maximum(total, 1.0)[..., None]  # rounding may exceed one
 
     @cached_property
     def _in_a_row(self) -> LossesInARow:
