@@ -101,3 +101,12 @@ def test_one_motor_misses_as_many_in_a_row_as_are_not_too_rare():
 def test_chains_end_although_losses_are_certain():
     chain = LossesInARow.of(losses_of([(0,), (1,)]), np.array([0.0, 1.0, 1.0]), 1e-4)
     assert len(chain.missed) == MOST_STATES
+
+
+def test_what_is_impossible_is_not_made_probable_by_what_was_seen():
+    """Nobody has missed two commands with the first movement, whatever it looks like."""
+    chain = LossesInARow.of(losses_of([(0,)]), np.array([0.9, 0.1]), 1e-3)
+    looks = np.zeros((1, 2, len(chain.missed)))
+    looks[:, 0, 2] = 1e4
+    found = chain.chances(np.full((1, 2, 2), [0.9, 0.1]), looks)
+    np.testing.assert_allclose(found[0, 1, :3], [0.9, 0.09, 0.01], rtol=1e-12)

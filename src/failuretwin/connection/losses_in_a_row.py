@@ -36,24 +36,11 @@ class LossesInARow:
             chance: Highest probability of each, (loss,).
             rare: Losses in a row that are less probable are left out.
         """
-        none = (0,) * losses.shape[1]
-        newest = {_one_more(none, loss): float(p) for loss, p in zip(losses, chance, strict=True)}
-        found = newest
-        while newest:
-            longer: dict[tuple[int, ...], float] = {}
-            for state, before in newest.items():
-                for loss, now in zip(losses, chance, strict=True):
-                    missed = _one_more(state, loss)
-                    if missed not in found:
-                        longer[missed] = longer.get(missed, 0.0) + before * float(now)
-            ranked = sorted((p, missed) for missed, p in longer.items() if p > rare)[::-1]
-            newest = {missed: p for p, missed in ranked[: max(MOST_STATES - len(found), 0)]}
-            found = found | newest
-        states = list(found)
+        states = _states(losses, chance, rare)
         leads = np.zeros((len(losses), len(states), len(states)))
         for i, loss in enumerate(losses):
             for j, state in enumerate(states):
-                leads[i, j, states.index(_known(_one_more(state, loss), found))] = 1.0
+                leads[i, j, states.index(_known(_one_more(state, loss), states))] = 1.0
         return LossesInARow(np.array(states), leads)
 
     def chances(self, rates: FloatArray, log_likelihood: FloatArray | None = None) -> FloatArray:
@@ -71,10 +58,28 @@ class LossesInARow:
         for m in range(count):
             chances[:, m] = state = np.einsum("rl,rd,lds->rs", rates[:, m], state, self.leads)
             if log_likelihood is not None:
-                says = log_likelihood[:, m]
+                says = np.where(state > 0.0, log_likelihood[:, m], -np.inf)
                 state = state * np.exp(says - says.max(axis=-1, keepdims=True))
                 state = state / state.sum(axis=-1, keepdims=True)
         return chances
+
+
+def _states(losses: BoolArray, chance: FloatArray, rare: float) -> list[tuple[int, ...]]:
+    """Return the states that are not too rare, from few losses in a row to many."""
+    none = (0,) * losses.shape[1]
+    newest = {_one_more(none, loss): float(p) for loss, p in zip(losses, chance, strict=True)}
+    found = list(newest)
+    while newest:
+        longer: dict[tuple[int, ...], float] = {}
+        for state, before in newest.items():
+            for loss, now in zip(losses, chance, strict=True):
+                missed = _one_more(state, loss)
+                if missed not in found:
+                    longer[missed] = longer.get(missed, 0.0) + before * float(now)
+        ranked = sorted((p, missed) for missed, p in longer.items() if p > rare)[::-1]
+        newest = {missed: p for p, missed in ranked[: max(MOST_STATES - len(found), 0)]}
+        found += newest
+    return found
 
 
 def _one_more(missed: tuple[int, ...], loss: BoolArray) -> tuple[int, ...]:
@@ -82,8 +87,8 @@ def _one_more(missed: tuple[int, ...], loss: BoolArray) -> tuple[int, ...]:
     return tuple(n + 1 if hit else 0 for n, hit in zip(missed, loss, strict=True))
 
 
-def _known(missed: tuple[int, ...], states: dict[tuple[int, ...], float]) -> tuple[int, ...]:
-    """Return the state of `states` that comes nearest: with fewer losses in the longest rows."""
+def _known(missed: tuple[int, ...], states: list[tuple[int, ...]]) -> tuple[int, ...]:
+    """Return the state of `states` that comes nearest: with fewer losses in the longest row."""
     while missed not in states:
         longest = max(missed)
         missed = tuple(n - 1 if n == longest else n for n in missed)
