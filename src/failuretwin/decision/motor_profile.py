@@ -32,6 +32,7 @@ class MotorProfile:
     """Evidence on the settled angle of one motor, (..., alternative) each.
 
     Leading axes are run and movement, and one more where another motor takes several angles.
+    Alternatives that are not possible are zero throughout, their weight aside.
 
     Attributes:
         best: Angle that brings the tool nearest to where it was seen [rad].
@@ -97,17 +98,19 @@ class MotorProfile:
         """
         precision, log_weight = self._with_scatter(held)
         count = log_weight.shape[-1]
-        total: FloatArray | float = 1.0
         # Alternative by alternative: large temporary arrays would cost more than the arithmetic.
+        shape = (*log_weight.shape[:-1], angle.shape[-2])
+        total = np.ones(shape)
         for k in range(count):
-            off = angle[..., k if angle.shape[-1] > 1 else 0] - self.best[..., None, k]
-            off = self._turned(off)
+            some = np.isfinite(log_weight[..., k])
+            off = np.broadcast_to(angle[..., k if angle.shape[-1] > 1 else 0], shape)[some]
+            off = self._turned(off - self.best[some, None, k])
             off *= off
-            off *= precision[..., None, k]
-            off += self.square[..., None, k]
+            off *= precision[some, None, k]
+            off += self.square[some, None, k]
             fall = self._fall(off)
-            fall += log_weight[..., None, k] - self.outlier
-            total = total + np.exp(fall, out=fall)
+            fall += log_weight[some, None, k] - self.outlier
+            total[some] += np.exp(fall, out=fall)
         found = self.outlier + np.log(total)
         usable = self.usable.reshape(self.usable.shape + (1,) * (found.ndim - 2))
         return np.where(usable, found, 0.0)
@@ -162,6 +165,13 @@ def motor_profile(
         base = np.repeat(base, other_angle.shape[2], axis=2)
         base[..., other] = other_angle
         fixed[other] = True
+    lead = base.shape[:-1]
+    worthwhile = np.isfinite(log_weight)
+    worthwhile[..., 0] = True  # where the motor settles if it gets its command is always told
+    possible = np.broadcast_to(worthwhile, lead)
+    base, direction = base[possible], np.broadcast_to(direction, base.shape)[possible]
+    point = np.broadcast_to(point, (*lead, 3))[possible]
+    log_weight = np.broadcast_to(log_weight, lead)[possible]
     expected = model.settle(base, direction, fixed)
     fixed[motor] = True
     scale = model.scatter.copy()
@@ -185,18 +195,25 @@ def motor_profile(
     settled = settled + scattered(spread, jacobian, scale, error - lever * taken[..., None])
     settled[..., motor] = angle
     dof = model.settling.tail_dof
+    log_weight = log_weight + log_norm(dof) - 0.5 * np.log(spread.determinant)
+
+    def everywhere(values: FloatArray, elsewhere: float = 0.0) -> FloatArray:
+        found = np.full((*lead, *values.shape[1:]), elsewhere)
+        found[possible] = values
+        return found
+
     return MotorProfile(
-        best=angle,
-        precision=precision,
-        square=np.maximum(square, 0.0),
-        log_weight=log_weight + log_norm(dof) - 0.5 * np.log(spread.determinant),
-        expected=expected[..., motor],
+        best=everywhere(angle),
+        precision=everywhere(precision),
+        square=everywhere(np.maximum(square, 0.0)),
+        log_weight=everywhere(log_weight, -np.inf),
+        expected=everywhere(expected[..., motor]),
         scatter=float(model.scatter[motor]),
         dof=dof,
         outlier=model.outlier_log_density,
         usable=evidence.usable,
         around=_may_turn_around(model, motor),
-        pose=settled,
+        pose=everywhere(settled),
     )
 
 
