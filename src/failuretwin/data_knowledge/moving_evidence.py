@@ -9,7 +9,7 @@ import numpy as np
 
 from failuretwin.core.runs import measured_rate, time_step
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
-from failuretwin.data_knowledge.settled_evidence import SettledEvidence
+from failuretwin.data_knowledge.settled_evidence import SettledEvidence, drawn_out
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -79,7 +79,7 @@ def _corners(path: FloatArray, every: int) -> BoolArray:
     all that are there.
     """
     seen = np.asarray(np.isfinite(path).all(axis=-1))
-    if every < 2 or 2 * np.count_nonzero(seen) < len(seen):
+    if not drawn_out(seen, every):
         return seen
     bend = np.zeros(len(path))
     bend[1:-1] = np.linalg.norm(np.nan_to_num(np.diff(path, 2, axis=0)), axis=-1)

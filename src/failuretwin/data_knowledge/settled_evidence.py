@@ -12,6 +12,7 @@ import numpy as np
 
 from failuretwin.core.medians import masked_median
 from failuretwin.core.movements import Movements, find_movements
+from failuretwin.core.runs import measured_rate, time_step
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 
 if TYPE_CHECKING:
@@ -41,6 +42,8 @@ class SettledEvidence:
         moving: Movements whose readings do not come to rest, (run, movement).
         begin: When the readings that count begin, (run, movement) [s].
         end: End of each plateau, (run, movement) [s].
+        resumed: Time from each command to the first reading after it, (run, movement) [s]; NaN
+            where there is none or where straight lines fill the gaps between readings.
     """
 
     movements: Movements
@@ -49,6 +52,7 @@ class SettledEvidence:
     moving: BoolArray
     begin: FloatArray
     end: FloatArray
+    resumed: FloatArray
 
     def __getitem__(self, runs: slice) -> SettledEvidence:
         """Return the evidence of some of the runs."""
@@ -60,6 +64,7 @@ class SettledEvidence:
             self.moving[runs],
             self.begin[runs],
             self.end[runs],
+            self.resumed[runs],
         )
 
 
@@ -121,7 +126,8 @@ def settled_evidence(runs: xr.Dataset) -> SettledEvidence:
     item = np.nonzero(movements.exists & (begin < end))
     found = rest(*_between(measured, time, item[0], begin[item], end[item]))
     point[item], usable[item], moving[item] = found.point, found.usable, found.moving
-    return SettledEvidence(movements, point, usable, moving, begin, end)
+    resumed = _resumed(movements, runs)
+    return SettledEvidence(movements, point, usable, moving, begin, end, resumed)
 
 
 def _between(
@@ -132,6 +138,29 @@ def _between(
     at = first[:, None] + np.arange(np.max(stop - first, initial=0))
     inside = at < stop[:, None]
     return measured[run[:, None], np.minimum(at, len(time) - 1)], inside
+
+
+def drawn_out(seen: BoolArray, every: int) -> bool:
+    """Return whether straight lines fill a path between readings.
+
+    Args:
+        seen: Samples that are there, (time,).
+        every: Samples from one reading of the sensor to the next.
+    """
+    return every >= 2 and 2 * int(np.count_nonzero(seen)) >= len(seen)
+
+
+def _resumed(movements: Movements, runs: xr.Dataset) -> FloatArray:
+    """Return the time from each command to the first reading after it, (run, movement) [s]."""
+    time = as_floats(runs["time"].values)
+    seen = np.asarray(np.isfinite(as_floats(runs["measured"].values)).all(axis=-1))
+    every = round(1.0 / (measured_rate(runs) * time_step(runs)))
+    found = np.full(movements.start.shape, np.nan)
+    for run, readings in enumerate(seen):
+        if not drawn_out(readings, every):
+            at = np.append(time[readings], np.nan)
+            found[run] = at[np.searchsorted(at[:-1], movements.start[run] - 1e-9)]
+    return found - movements.start
 
 
 def _plateau_ends(movements: Movements, measured: FloatArray, time: FloatArray) -> FloatArray:

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from failuretwin.connection.healthy import Alternatives
+from failuretwin.connection.lost_commands import Alternatives
 from failuretwin.core.quadrature import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.decision.motor_profile import LARGEST_OFFSET_RAD
@@ -104,21 +104,38 @@ class CourseJudge:
         run, movement = np.nonzero(self.ramps.settled.movements.exists & ~self.usable)
         if len(run) == 0:
             return course, luck
-        origin, destination = course.origin(), course.destination()
-        cases = course.ends[run, movement]  # (item, alternative, motor)
-        begin = np.where(course.lost, cases, origin[run, movement][:, None])
-        says = self.weigh(run, movement, begin, cases)
-        follows = movement + 1 < self.usable.shape[1]
-        after = np.where(follows, movement + 1, movement)
-        end = np.repeat(destination[run, after][:, None], cases.shape[1], axis=1)
-        missed = course.lost[chosen[run, after]][:, None]
-        begin = np.where(missed, end, cases)
-        says += np.where(follows[:, None], self.weigh(run, after, begin, end), 0.0)
-        weighed = says + self.alternatives.log_weight[run, movement]
+        log_weight = self.alternatives.log_weight[run, movement]
+        item, case = np.nonzero(np.isfinite(log_weight))
+        says = np.full(log_weight.shape, -np.inf)
+        says[item, case] = self._way_and_next(course, run[item], movement[item], case)
+        weighed = says + np.where(np.isfinite(says), log_weight, 0.0)
         best = np.argmax(weighed, axis=-1)
         chosen[run, movement] = best
         luck[run, movement] = log_sum(weighed, axis=-1) - says[np.arange(len(best)), best]
         return replace(course, chosen=chosen), luck
+
+    def _way_and_next(
+        self, course: Course, run: IntArray, movement: IntArray, became: IntArray
+    ) -> FloatArray:
+        """Return log densities of some movements and of those that follow them, (item,).
+
+        Args:
+            course: Where all others led.
+            run: Which run each movement belongs to, (item,).
+            movement: Its number in the run, (item,).
+            became: What became of it, (item,).
+        """
+        origin, destination = course.origin(), course.destination()
+        here = course.ends[run, movement, became]
+        begin = np.where(course.lost[became], here, origin[run, movement])
+        says = self.weigh(run, movement, begin[:, None], here[:, None])[:, 0]
+        follows = movement + 1 < self.usable.shape[1]
+        after = np.where(follows, movement + 1, movement)
+        end = destination[run, after]
+        begin = np.where(course.lost[course.chosen[run, after]], end, here)
+        return says + np.where(
+            follows, self.weigh(run, after, begin[:, None], end[:, None])[:, 0], 0.0
+        )
 
     def log_density(self, course: Course, spread_m: float = 0.0) -> FloatArray:
         """Return log densities of all movements of a course, (run, movement)."""

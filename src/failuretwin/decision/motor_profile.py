@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.connection.healthy import Alternatives, HealthyModel, scattered
+from failuretwin.connection.healthy import HealthyModel, scattered
+from failuretwin.connection.lost_commands import Alternatives
 from failuretwin.core.ellipsoid import Ellipsoid, log_norm
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
@@ -37,6 +38,7 @@ class MotorProfile:
     """Evidence on the settled angle of one motor, (..., alternative) each.
 
     Leading axes are run and movement, and one more where another motor takes several angles.
+    Alternatives that are not possible are zero throughout, their weight aside.
 
     Attributes:
         best: Angle that brings the tool nearest to where it was seen [rad].
@@ -177,10 +179,16 @@ def motor_profiles(
         base = np.repeat(base, other_angle.shape[2], axis=2)
         base[..., other] = other_angle
         another[other] = True
+    lead = base.shape[:-1]
+    worthwhile = np.isfinite(log_weight)
+    worthwhile[..., 0] = True  # where the motor settles if it gets its command is always told
+    possible = np.broadcast_to(worthwhile, lead)
+    base, direction = base[possible], np.broadcast_to(direction, base.shape)[possible]
+    point = np.broadcast_to(point, (*lead, 3))[possible]
+    log_weight = np.broadcast_to(log_weight, lead)[possible]
     expected = model.settle(base, direction, another)
-    # A leading axis for the motors: own marks each of them among all, (own, ..., motor).
-    own = np.eye(len(model.scatter), dtype=bool)[list(motors)]
-    own = own.reshape(len(motors), *(1,) * (base.ndim - 1), -1)
+    # A leading axis for the motors: own marks each of them among all, (own, 1, motor).
+    own = np.eye(len(model.scatter), dtype=bool)[list(motors)][:, None]
     scale = np.where(own | (another & other_held), 0.0, model.scatter)
     angle = nearest_on_circle(model, expected, own, point)
     for _ in range(REFINEMENTS):
@@ -200,20 +208,26 @@ def motor_profiles(
     beside = _beside(model, expected, direction, base, own, angle)
     dof = model.settling.tail_dof
     weighed = log_weight + log_norm(dof) - 0.5 * np.log(spread.determinant)
+
+    def everywhere(values: FloatArray, elsewhere: float = 0.0) -> FloatArray:
+        found = np.full((*lead, *values.shape[1:]), elsewhere)
+        found[possible] = values
+        return found
+
     return [
         MotorProfile(
-            best=angle[i],
-            precision=precision[i],
-            square=np.maximum(square[i], 0.0),
-            log_weight=weighed[i],
-            expected=expected[..., motor],
+            best=everywhere(angle[i]),
+            precision=everywhere(precision[i]),
+            square=everywhere(np.maximum(square[i], 0.0)),
+            log_weight=everywhere(weighed[i], -np.inf),
+            expected=everywhere(expected[..., motor]),
             scatter=float(model.scatter[motor]),
             dof=dof,
             outlier=model.outlier_log_density,
             usable=evidence.usable,
             around=_may_turn_around(model, motor),
-            pose=settled[i],
-            beside=beside[i],
+            pose=everywhere(settled[i]),
+            beside=everywhere(beside[i]),
         )
         for i, motor in enumerate(motors)
     ]

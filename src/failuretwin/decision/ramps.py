@@ -104,7 +104,7 @@ class RampModel:
     @cached_property
     def _late(self) -> FloatArray:
         """Log probability that each movement starts late, (run, movement)."""
-        return log_of(self.model.late(self.settled.movements))
+        return log_of(self.model.late(self.settled.movements, self.settled.resumed))
 
     @cached_property
     def anywhere(self) -> float:

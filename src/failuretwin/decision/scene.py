@@ -7,7 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from failuretwin.connection.healthy import Alternatives, HealthyModel
+from failuretwin.connection.healthy import HealthyModel
+from failuretwin.connection.lost_commands import Alternatives
 from failuretwin.core.quadrature import log_sum
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.moving_evidence import MovingEvidence
@@ -63,6 +64,11 @@ class Scene:
     def alternatives(self) -> Alternatives:
         """What may have become of each movement."""
         return self.findings.alternatives
+
+    @property
+    def late(self) -> FloatArray:
+        """Probability that each movement started late, (run, movement)."""
+        return self.model.late(self.evidence.movements, self.evidence.resumed)
 
     @cached_property
     def transients(self) -> Transients | None:

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.connection.healthy import Alternatives, HealthyModel
+from failuretwin.connection.healthy import HealthyModel
+from failuretwin.connection.lost_commands import Alternatives
 from failuretwin.core.ellipsoid import Ellipsoid
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence

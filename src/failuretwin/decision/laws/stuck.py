@@ -148,7 +148,7 @@ def _stretches(scene: Scene, motor: int) -> tuple[FloatArray, FloatArray]:
     """
     movements, model = scene.evidence.movements, scene.model
     late_s = float(np.mean(model.imperfections.timing.late_s))
-    start = movements.start + model.lag_s + model.late(movements) * late_s
+    start = movements.start + model.lag_s + scene.late * late_s
     reached = start + movements.ramp_duration[..., motor] * (1.0 - model.shortening)
     plateau_begin = np.concatenate([np.zeros_like(start[:, :1]), reached[:, :-1]], axis=1)
     begin = np.stack([np.minimum(plateau_begin, start), start], axis=-1)
@@ -193,7 +193,7 @@ def _onsets(
     travel = target - origin
     span = np.where(np.abs(travel) > 1e-6, travel, np.inf)
     done = np.clip((angle - origin[:, None]) / span[:, None], 0.0, 1.0)
-    shift, shift_share = _starts(model, model.late(movements)[0])
+    shift, shift_share = _starts(model, scene.late[0])
     ramp = np.nan_to_num(movements.ramp_duration[0, :, motor]) * (1.0 - model.shortening)
     on_ramp = np.nan_to_num(movements.start[0])[:, None] + done * ramp[:, None]
     on_ramp = np.maximum(on_ramp[..., None] + shift, 0.0)

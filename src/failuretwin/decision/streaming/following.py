@@ -128,8 +128,12 @@ class Following:
         until = windows.begin[at] if windows.usable[at] else windows.end[at]
         some = samples.since(float(windows.start[at]))
         time, point = samples.time[some], samples.measured[some, robot]
-        there = np.isfinite(point).all(axis=1) & (time < until - 1e-9)
+        there = np.isfinite(point).all(axis=1)
         time, point = time[there], point[there]
+        if len(time) and np.isnan(windows.resumed[at]):
+            windows.resumed[at] = time[0] - windows.start[at]
+        before = time < until - 1e-9
+        time, point = time[before], point[before]
         chosen = spread_out(time, self._least_step)
         windows.see_on_way(*at, time[chosen], point[chosen])
 

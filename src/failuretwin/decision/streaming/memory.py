@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from failuretwin.connection.healthy import Alternatives, HealthyModel
+from failuretwin.connection.healthy import HealthyModel
+from failuretwin.connection.lost_commands import Alternatives
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
-from failuretwin.decision.findings import Findings, find
-from failuretwin.decision.motor_profile import MotorProfile
+from failuretwin.decision.findings import Findings, explained, find, given_before
+from failuretwin.decision.motor_profile import MotorProfile, motor_profiles
 from failuretwin.decision.streaming.state import Arrays
 
 PER_MOTOR = ("best", "precision", "square", "log_weight", "expected", "pose", "beside")
 """What is kept of each motor's profile."""
 
 
-PER_MOVEMENT = ("base", "direction", "chance", "terms", "poses")
+PER_MOVEMENT = ("base", "direction", "chance", "density", "poses")
 """What is kept of each movement beside."""
 
 
@@ -65,30 +66,29 @@ class Memory:
             evidence: Where their tools settled.
             model: The healthy robot.
         """
+        usual = model.alternatives(evidence.movements)
         exists = evidence.movements.exists
         stale = np.nonzero(exists & ~self.fresh[robots, : exists.shape[1]])
+        at = robots[stale[0]], stale[1]
         if len(stale[0]):
-            found = _find_items(evidence, model, stale)
-            self._store((robots[stale[0]], stale[1]), found)
+            single, alone = _of_items(evidence, usual, stale)
+            density, poses = explained(single, model, alone)
+            self._put(at, density=density, poses=poses, base=alone.base, direction=alone.direction)
+            known = self.arrays["density"][robots, : exists.shape[1]]
+            weighed = given_before(evidence, model, usual, known)
+            alone = replace(alone, log_weight=weighed.log_weight[stale][:, None])
+            profiles = motor_profiles(single, model, alone, range(len(model.scatter)))
+            self._put(at, chance=alone.log_weight, **_together(profiles))
+            self.like = Findings(model, alone, density, poses, profiles)
+            self.fresh[at] = True
         return self._recall(robots, evidence, model)
 
-    def _store(self, at: tuple[IntArray, IntArray], found: Findings) -> None:
-        kept = {
-            "base": found.alternatives.base,
-            "direction": found.alternatives.direction,
-            "chance": found.alternatives.log_weight,
-            "terms": found.terms,
-            "poses": found.poses,
-        }
-        for name in PER_MOTOR:
-            of_motors = [getattr(profile, name) for profile in found.profiles]
-            kept[name] = np.stack(of_motors, axis=2)  # (item, 1, motor, ...)
-        for name, values in kept.items():
+    def _put(self, at: tuple[IntArray, IntArray], **values: FloatArray) -> None:
+        """Keep values of single movements, (item, 1, ...)."""
+        for name, value in values.items():
             if name not in self.arrays:
-                self.arrays[name] = np.zeros((*self.fresh.shape, *values.shape[2:]))
-            self.arrays[name][at] = values[:, 0]
-        self.fresh[at] = True
-        self.like = found
+                self.arrays[name] = np.zeros((*self.fresh.shape, *value.shape[2:]))
+            self.arrays[name][at] = value[:, 0]
 
     def _recall(self, robots: IntArray, evidence: SettledEvidence, model: HealthyModel) -> Findings:
         some = robots, slice(0, evidence.usable.shape[1])
@@ -104,7 +104,7 @@ class Memory:
             direction=recalled["direction"],
             log_weight=recalled["chance"],
         )
-        return Findings(model, alternatives, recalled["terms"], recalled["poses"], profiles)
+        return Findings(model, alternatives, recalled["density"], recalled["poses"], profiles)
 
 
 def _profile(
@@ -123,18 +123,27 @@ def _profile(
     )
 
 
-def _find_items(
-    evidence: SettledEvidence, model: HealthyModel, item: tuple[IntArray, ...]
-) -> Findings:
-    """Return what single movements say, as runs of one movement each."""
-    whole = model.alternatives(evidence.movements)
-    alone = Alternatives(
-        whole.lost,
-        *(values[item][:, None] for values in (whole.base, whole.direction, whole.log_weight)),
-    )
+def _together(profiles: Sequence[MotorProfile]) -> dict[str, FloatArray]:
+    """Return what is kept of profiles, (item, 1, motor, ...), by name."""
+    return {
+        name: np.stack([getattr(profile, name) for profile in profiles], axis=2)
+        for name in PER_MOTOR
+    }
+
+
+def _of_items(
+    evidence: SettledEvidence, alternatives: Alternatives, item: tuple[IntArray, ...]
+) -> tuple[SettledEvidence, Alternatives]:
+    """Return single movements as runs of one movement each."""
     single = replace(
         evidence,
         point=evidence.point[item][:, None],
         usable=evidence.usable[item][:, None],
     )
-    return find(single, model, alone)
+    alone = replace(
+        alternatives,
+        base=alternatives.base[item][:, None],
+        direction=alternatives.direction[item][:, None],
+        log_weight=alternatives.log_weight[item][:, None],
+    )
+    return single, alone

@@ -27,6 +27,8 @@ class Windows:
         start: (robot, movement) [s].
         begin: When the readings that count begin, (robot, movement) [s].
         end: End of each plateau, (robot, movement) [s].
+        resumed: Time from each command to the first reading after it, (robot, movement) [s]; NaN
+            where there was none yet.
         point: Where the tool rests, (robot, movement, axis) [m]; 0 where that is not known.
         usable: Movements after which it rests, (robot, movement).
         moving: Movements whose readings do not come to rest, (robot, movement).
@@ -44,6 +46,7 @@ class Windows:
     start: FloatArray
     begin: FloatArray
     end: FloatArray
+    resumed: FloatArray
     point: FloatArray
     usable: BoolArray
     moving: BoolArray
@@ -65,6 +68,7 @@ class Windows:
             start=np.full(shape, np.nan),
             begin=np.full(shape, np.nan),
             end=np.full(shape, np.nan),
+            resumed=np.full(shape, np.nan),
             point=np.zeros((*shape, 3)),
             usable=np.zeros(shape, dtype=bool),
             moving=np.zeros(shape, dtype=bool),
@@ -136,6 +140,7 @@ class Windows:
             self.moving[robots, some],
             self.begin[robots, some] - zero,
             self.end[robots, some] - zero,
+            self.resumed[robots, some],
         )
 
     def on_way(self, robots: IntArray) -> MovingEvidence:
@@ -149,11 +154,12 @@ class Windows:
         """Drop the oldest movement of a robot."""
         if self.count[robot] > 1:
             self.initial[robot] = self.evidence(np.array([robot])).movements.origin()[0, 1]
-        for values in (self.target, self.ramp_duration, self.start, self.begin, self.end,
+        times = (self.start, self.begin, self.end, self.resumed)
+        for values in (self.target, self.ramp_duration, *times,
                        self.point, self.usable, self.moving, self.since, self.way,
                        self.seen):  # fmt: skip
             values[robot, :-1] = values[robot, 1:].copy()
-        for values in (self.target, self.ramp_duration, self.start, self.begin, self.end):
+        for values in (self.target, self.ramp_duration, *times):
             values[robot, -1] = np.nan
         self.point[robot, -1] = 0.0
         self.usable[robot, -1] = self.moving[robot, -1] = False
