@@ -131,6 +131,7 @@ def of_points(scene, points):
         one < 0,
         one * scene.evidence.begin,
         one * scene.evidence.end,
+        one * scene.evidence.resumed,
     )
     return Scene(evidence, scene.model)
 

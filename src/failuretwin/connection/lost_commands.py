@@ -114,6 +114,13 @@ class LostCommands:
     def _log_weight(chances: FloatArray) -> FloatArray:
         return log_of(chances * (1.0 - OUTLIER_RATE))
 
+    @property
+    def late_after_s(self) -> float:
+        """Readings that come back later than this after a command say that it started late [s]."""
+        timing, readings = self.imperfections.timing, self.imperfections.readings
+        between = 1.0 / readings.rate_hz if readings is not None else 0.0
+        return 0.5 * timing.late_s[0] + between if timing.late_rate > 0.0 else np.inf
+
     def late(self, movements: Movements, resumed: FloatArray | None = None) -> FloatArray:
         """Return the probability that each movement started late, (run, movement).
 
@@ -125,12 +132,11 @@ class LostCommands:
             resumed: Time from each command to the first reading after it, (run, movement) [s], NaN
                 where it is not known; None: nowhere. What is not told so is the rate.
         """
-        timing, readings = self.imperfections.timing, self.imperfections.readings
+        timing = self.imperfections.timing
         late = np.full(movements.start.shape, timing.late_rate)
         if resumed is not None and timing.late_rate > 0.0:
-            between = 1.0 / readings.rate_hz if readings is not None else 0.0
             late[resumed < 0.5 * timing.late_s[0]] = 0.0
-            late[resumed > 0.5 * timing.late_s[0] + between] = 1.0
+            late[resumed > self.late_after_s] = 1.0
         longest = self.imperfections.schedule.period_s[1] + LATE_MARGIN_S
         known = movements.exists[:, 1:]
         lasted = np.diff(movements.start, axis=1)

@@ -20,7 +20,7 @@ from failuretwin.data_knowledge.settled_evidence import SETTLING_S
 from failuretwin.decision.bayes import BayesDiagnoser
 from failuretwin.decision.judgement import Judgement, Place, judge
 from failuretwin.decision.scene import Scene
-from failuretwin.decision.streaming.following import Following
+from failuretwin.decision.streaming.following import Following, Starts
 from failuretwin.decision.streaming.state import Arrays, arrays_of, put_arrays
 from failuretwin.decision.streaming.stillness import Stillness
 from failuretwin.decision.weighing import log_prior, shows_on_way
@@ -85,7 +85,8 @@ class StreamingFleet:
         self.time = -np.inf
         model = diagnoser.healthy_model
         latest_s = model.imperfections.timing.late_s[1] + model.lag_s + SETTLING_S
-        self._following = Following(robots, diagnoser.twin, movements, rate_hz, latest_s)
+        starts = Starts(latest_s, model.lost_commands.late_after_s)
+        self._following = Following(robots, diagnoser.twin, movements, rate_hz, starts)
         self._stillness = Stillness.unknown(robots, motors)
         self._prior = np.exp(log_prior(diagnoser.considered, diagnoser.priors))
         self._beliefs = Beliefs(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.data_knowledge.moving_evidence import spread_out
 from failuretwin.data_knowledge.settled_evidence import (
     JUST_AFTER_S,
+    SETTLING_S,
     Rest,
     rest,
     rest_begin,
@@ -29,6 +30,19 @@ UNMOVED_M = 0.02
 """A tool this near to where it rested before may not have set out yet [m]."""
 
 
+@dataclass(frozen=True)
+class Starts:
+    """When movements begin after their commands.
+
+    Attributes:
+        latest_s: At the latest [s].
+        late_after_s: Readings that come back later than this say that it begins late [s].
+    """
+
+    latest_s: float
+    late_after_s: float
+
+
 class Following:
     """What is known of the last movements of many robots.
 
@@ -37,7 +51,7 @@ class Following:
         twin: Digital twin of each of them.
         movements: Movements that are remembered, the present one included.
         rate_hz: True rate of the tool sensors [Hz]; None: all readings are real.
-        latest_s: How long after its command a movement may begin at the latest [s].
+        starts: When movements begin.
     """
 
     def __init__(
@@ -46,7 +60,7 @@ class Following:
         twin: DigitalTwin,
         movements: int,
         rate_hz: float | None,
-        latest_s: float,
+        starts: Starts,
     ) -> None:
         motors = len(twin.robot.motors)
         self.samples = Samples(robots, motors)
@@ -54,7 +68,7 @@ class Following:
         self.windows = Windows.empty(robots, movements, motors)
         self.memory = Memory.empty(robots, movements)
         self.read_s = np.full(robots, -np.inf)
-        self._twin, self._latest_s = twin, latest_s
+        self._twin, self._starts = twin, starts
         self._least_step = 0.0 if rate_hz is None else 0.9 / rate_hz
 
     def take(self, time: float, command: FloatArray, points: FloatArray) -> tuple[IntArray, ...]:
@@ -107,7 +121,7 @@ class Following:
             return robots
         samples, time, inside = self._readings(robots, begin, end)
         found = rest(samples, _since_rest(samples, time, inside))
-        waits = self._may_start_late(robots, place, found.point)
+        waits = self._under_way(robots, place) | self._may_start_late(robots, place, found.point)
         found = replace(found, usable=found.usable & ~waits)
         self.windows.settle(robots, place, end, found)
         return robots[found.usable]
@@ -123,17 +137,14 @@ class Following:
 
     def see_on_way(self, robot: int, place: int) -> None:
         """Note what was read on the way of a movement, until the tool rested."""
+        self._resume(robot, place)
         windows, samples = self.windows, self.samples
         at = robot, place
         until = windows.begin[at] if windows.usable[at] else windows.end[at]
         some = samples.since(float(windows.start[at]))
         time, point = samples.time[some], samples.measured[some, robot]
-        there = np.isfinite(point).all(axis=1)
+        there = np.isfinite(point).all(axis=1) & (time < until - 1e-9)
         time, point = time[there], point[there]
-        if len(time) and np.isnan(windows.resumed[at]):
-            windows.resumed[at] = time[0] - windows.start[at]
-        before = time < until - 1e-9
-        time, point = time[before], point[before]
         chosen = spread_out(time, self._least_step)
         windows.see_on_way(*at, time[chosen], point[chosen])
 
@@ -182,6 +193,26 @@ class Following:
         inside = (time >= begin[:, None]) & (time < end[:, None] - 1e-9)
         return self.samples.measured[some, robots].swapaxes(0, 1), time, inside
 
+    def _under_way(self, robots: IntArray, place: IntArray) -> BoolArray:
+        """Return which movements must still be on their way, as readings came back late."""
+        windows, at = self.windows, (robots, place)
+        for k in np.flatnonzero(np.isnan(windows.resumed[at])):
+            self._resume(int(robots[k]), int(place[k]))
+        resumed, ramp = windows.resumed[at], windows.ramp_duration[at].max(axis=-1)
+        over = self.read_s[robots] - windows.start[at] > resumed + ramp + SETTLING_S
+        return np.asarray((resumed > self._starts.late_after_s) & ~over)
+
+    def _resume(self, robot: int, place: int) -> None:
+        """Note when readings came back after the command of a movement."""
+        windows, samples = self.windows, self.samples
+        if np.isfinite(windows.resumed[robot, place]):
+            return
+        start = float(windows.start[robot, place])
+        some = samples.since(start)
+        there = np.isfinite(samples.measured[some, robot]).all(axis=1)
+        if there.any():
+            windows.resumed[robot, place] = samples.time[some][np.argmax(there)] - start
+
     def _may_start_late(self, robots: IntArray, place: IntArray, point: FloatArray) -> BoolArray:
         """Return which tools still rest where they did before, and may yet set out, (robot,)."""
         windows, before = self.windows, np.maximum(place - 1, 0)
@@ -190,7 +221,7 @@ class Following:
         rested = np.where(seen[:, None], windows.point[robots, before], self._twin.path(told))
         unmoved = np.linalg.norm(point - rested, axis=1) < UNMOVED_M
         since = self.read_s[robots] - windows.start[robots, place]
-        return np.asarray(unmoved & (since < self._latest_s))
+        return np.asarray(unmoved & (since < self._starts.latest_s))
 
 
 def _since_rest(samples: FloatArray, time: FloatArray, inside: BoolArray) -> BoolArray:
