@@ -136,7 +136,7 @@ def outcomes(
     diagnoses = diagnoser.diagnose(runs)
     sound = without_spoilt(runs, log_quality(runs))
     evidence = settled_evidence(sound)
-    moving = moving_evidence(sound, evidence)
+    moving = moving_evidence(sound, evidence).where(diagnoser.on_way(evidence.usable))
     names = runs["fault"].values
     for name in dict.fromkeys(names):
         rows = np.flatnonzero(names == name)

@@ -22,8 +22,8 @@ class Weighted:
         return weighted_quantiles(self.values, self.weights, levels)
 
     def draw(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Return draws, (count,)."""
-        return rng.choice(self.values, count, p=self.weights / self.weights.sum())
+        """Return draws, (count,): between the values by straight lines, as quantiles are."""
+        return self.quantiles(tuple(rng.random(count).tolist()))
 
 
 def log_sum(values: FloatArray, axis: int | tuple[int, ...]) -> FloatArray:

@@ -71,6 +71,12 @@ class Scene:
         return self.model.late(self.evidence.movements, self.evidence.resumed)
 
     @cached_property
+    def start(self) -> FloatArray:
+        """Pose of a healthy arm before the run, (run, motor) [rad]."""
+        initial = self.evidence.movements.initial
+        return self.model.settle(initial, np.zeros_like(initial), self.model.none_held)
+
+    @cached_property
     def transients(self) -> Transients | None:
         """What the readings on the way say; None where they are left aside."""
         if self.moving is None:

@@ -13,7 +13,6 @@ from scipy.special import gammaln
 from failuretwin.connection.healthy import HealthyModel
 from failuretwin.core.quadrature import log_of, log_sum, log_trapezoid_weights
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.settled_evidence import SettledEvidence
 from failuretwin.decision.law import Law
 from failuretwin.decision.laws.nodes import nodes_around
 from failuretwin.decision.onsets import SHARES, OnsetPrior
@@ -76,7 +75,7 @@ def _angle_nodes(scene: Scene, motor: int, prior: OnsetPrior) -> FloatArray:
     width = np.sqrt(1.0 / np.maximum(profile.precision[..., 0], 1.0) + 1e-10)
     local = nodes_around(profile.best[..., 0], width, profile.usable, low)
     coarse = np.broadcast_to(np.linspace(low, high, COARSE_NODES), (runs, COARSE_NODES))
-    origin, _ = _ends(scene.evidence, motor)
+    origin, _ = _ends(scene, motor)
     scale = max(profile.scatter, 1e-4)
     tied = [origin[..., None] + SETTLED_SCALE * scale * PRIOR_STEPS]
     if prior.known_s is not None:
@@ -95,8 +94,7 @@ def _log_prior(scene: Scene, motor: int, angle: FloatArray, prior: OnsetPrior) -
     Each stretch has its share of the prior; within it the nodes carry the density of the angle
     times the weights of the trapezoidal rule, normalised so that no mass is lost between nodes.
     """
-    evidence = scene.evidence
-    origin, target = _ends(evidence, motor)
+    origin, target = _ends(scene, motor)
     scale = max(float(scene.model.scatter[motor]), 1e-4)
     low, high = scene.held_range(motor)
     plateau = _student(angle[:, None] - origin[..., None], SETTLED_SCALE * scale, 4.0)
@@ -127,17 +125,23 @@ def _between(x: FloatArray, a: FloatArray, b: FloatArray, margin: float) -> Floa
 def _position_at(scene: Scene, motor: int, onset_s: float) -> FloatArray:
     """Return where each ramp has come to at `onset_s`, lag counted, (run, movement) [rad]."""
     movements = scene.evidence.movements
-    origin, target = _ends(scene.evidence, motor)
+    origin, target = _ends(scene, motor)
     duration = np.maximum(movements.ramp_duration[..., motor], 1e-6)
     done = np.clip((onset_s - scene.model.lag_s - movements.start) / duration, 0.0, 1.0)
     return origin + (target - origin) * np.nan_to_num(done)
 
 
-def _ends(evidence: SettledEvidence, motor: int) -> tuple[FloatArray, FloatArray]:
-    """Return where each ramp of `motor` begins and ends, (run, movement) [rad]; padding is 0."""
-    movements = evidence.movements
-    origin, target = movements.origin()[..., motor], movements.target[..., motor]
-    return np.nan_to_num(origin), np.nan_to_num(target)
+def _ends(scene: Scene, motor: int) -> tuple[FloatArray, FloatArray]:
+    """Return where each ramp of `motor` begins and ends, (run, movement) [rad]; padding is 0.
+
+    These are the angles at which it settles, off its targets as it is when healthy.
+    """
+    movements = scene.evidence.movements
+    settled = scene.profile(motor).expected[..., 0]
+    off = np.nan_to_num(settled - movements.target[..., motor])
+    at_first = scene.start[:, motor] - movements.initial[:, motor]
+    before = np.concatenate([at_first[:, None], off[:, :-1]], axis=1)
+    return np.nan_to_num(movements.origin()[..., motor]) + before, np.nan_to_num(settled)
 
 
 def _stretches(scene: Scene, motor: int) -> tuple[FloatArray, FloatArray]:
@@ -189,7 +193,7 @@ def _onsets(
     """
     movements, model = scene.evidence.movements, scene.model
     begin, end = (np.nan_to_num(x[0]) for x in _stretches(scene, motor))
-    origin, target = (x[0] for x in _ends(scene.evidence, motor))
+    origin, target = (x[0] for x in _ends(scene, motor))
     travel = target - origin
     span = np.where(np.abs(travel) > 1e-6, travel, np.inf)
     done = np.clip((angle - origin[:, None]) / span[:, None], 0.0, 1.0)
