@@ -22,7 +22,7 @@ COARSE_NODES = 49
 """Nodes spread evenly over the range of the held angle."""
 PRIOR_STEPS = np.array([-5, -2.5, -1, 0, 1, 2.5, 5.0])
 """Nodes around each angle that the prior favours, in the scale of its peak."""
-SETTLED_SCALE, ON_THE_WAY_SCALE = 2.0, 8.0
+SETTLED_SCALE, ON_THE_WAY_SCALE = 1.0, 8.0
 """How sharply the prior ties the held angle to where the motor had settled, and to where its ramp
 was at a known onset, in scatters of the motor."""
 LAG_STEPS_S = np.array([-0.03, -0.015, 0.0, 0.015, 0.03])
@@ -182,8 +182,9 @@ def _onsets(
 ) -> tuple[FloatArray, FloatArray]:
     """Return onsets of one run [s] and their share of their stretch, (movement, node, sample).
 
-    The first samples are for the plateau, where any time is as likely (before the first movement:
-    before the run); the others for the ramp, where the held angle says when.
+    The first samples are for the plateau, where any time is as likely; before the first movement
+    that is before the run, or, with its share of the run's length, until then. The others are for
+    the ramp, where the held angle says when.
 
     Args:
         scene: A single run.
@@ -202,12 +203,15 @@ def _onsets(
     on_ramp = np.nan_to_num(movements.start[0])[:, None] + done * ramp[:, None]
     on_ramp = np.maximum(on_ramp[..., None] + shift, 0.0)
     on_plateau = begin[:, 0, None] + SHARES * (end - begin)[:, 0, None]
-    on_plateau[0, :-2] = 0.0  # before the run; the rest: before the first ramp
+    on_plateau[0, 0] = 0.0
+    plateau_share = np.full((len(begin), len(SHARES)), 1 / len(SHARES))
+    waits = end[0, 0] / max(float(end.max()), 1e-9)
+    plateau_share[0] = np.append(1.0 - waits, np.full(len(SHARES) - 1, waits / (len(SHARES) - 1)))
     on_plateau = np.repeat(on_plateau[:, None], len(angle), axis=1)
     onset = np.concatenate([on_plateau, on_ramp], axis=-1)
     if known_s is not None:
         onset = np.full_like(onset, known_s)
-    share = np.concatenate([np.full((len(begin), len(SHARES)), 1 / len(SHARES)), shift_share], -1)
+    share = np.concatenate([plateau_share, shift_share], axis=-1)
     return onset, np.broadcast_to(share[:, None], onset.shape)
 
 
