@@ -12,6 +12,7 @@ from failuretwin.core.movements import Movements
 from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
+from failuretwin.decision.scene import Scene
 from failuretwin.digital_model.disturbances import draw_disturbances
 from failuretwin.digital_model.imperfections import LostCommand, Timing, load_imperfections
 
@@ -115,9 +116,7 @@ def test_seen_losses_count_once(twin, armpi, known, run_of):
         for m in lost:
             stands[m, 0] = stands[m - 1, 0]
         pose = model.settle(stands, np.zeros_like(stands), model.none_held)
-        scene = diagnoser._weigh(
-            settled_evidence(run_of(targets, twin.path(pose), MOTORS, rate=10.0)), None
-        ).scene
-        return scene.log_healthy.sum()
+        evidence = settled_evidence(run_of(targets, twin.path(pose), MOTORS, rate=10.0))
+        return Scene(evidence, model).log_healthy.sum()
 
     assert healthy((2, 3)) == pytest.approx(healthy((2, 4)), abs=1.0)

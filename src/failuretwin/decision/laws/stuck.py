@@ -22,7 +22,7 @@ COARSE_NODES = 49
 """Nodes spread evenly over the range of the held angle."""
 PRIOR_STEPS = np.array([-5, -2.5, -1, 0, 1, 2.5, 5.0])
 """Nodes around each angle that the prior favours, in the scale of its peak."""
-SETTLED_SCALE, ON_THE_WAY_SCALE = 1.0, 8.0
+SETTLED_SCALE, ON_THE_WAY_SCALE = 2.0, 8.0
 """How sharply the prior ties the held angle to where the motor had settled, and to where its ramp
 was at a known onset, in scatters of the motor."""
 LAG_STEPS_S = np.array([-0.03, -0.015, 0.0, 0.015, 0.03])
