@@ -68,17 +68,17 @@ class StreamingDiagnoser:
         self._diagnosis = self._told()
         return self._answer()
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write the state, all at once; a stream that goes on from it gives the same answers.
 
         Raises:
             InputError: If the name does not end in .npz.
             OutputError: If it cannot be written.
         """
-        save_fleet(self._fleet, path, [] if self._diagnosis is None else [self._diagnosis])
+        save_fleet(self._fleet, Path(path), [] if self._diagnosis is None else [self._diagnosis])
 
     @classmethod
-    def load(cls, path: Path, diagnoser: BayesDiagnoser) -> StreamingDiagnoser:
+    def load(cls, path: str | Path, diagnoser: BayesDiagnoser) -> StreamingDiagnoser:
         """Return a stream as it was saved.
 
         Args:
@@ -89,7 +89,7 @@ class StreamingDiagnoser:
             InputError: If it is no such file or of another robot, method or number of robots.
         """
         stream = cls(diagnoser)
-        stream._fleet, said = load_fleet(path, diagnoser, robots=1)
+        stream._fleet, said = load_fleet(Path(path), diagnoser, robots=1)
         stream._diagnosis = said[0] if said else None
         return stream
 
