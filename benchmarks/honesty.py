@@ -26,12 +26,12 @@ from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.log_quality import log_quality, without_spoilt
 from failuretwin.data_knowledge.moving_evidence import moving_evidence
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses.onsets import OnsetPrior
+from failuretwin.decision.hypotheses.priors import Priors
+from failuretwin.decision.hypotheses.weighing import weigh_hypothesis
 from failuretwin.decision.metrics.ranks import check_ranks, rank_of_truth
 from failuretwin.decision.metrics.reliability import calibrated_error, equal_edges, reliability
-from failuretwin.decision.onsets import OnsetPrior
-from failuretwin.decision.priors import Priors
-from failuretwin.decision.scene import Scene
-from failuretwin.decision.weighing import weigh_hypothesis
 from failuretwin.digital_model.imperfections import load_imperfections
 from failuretwin.failure_behavior.fault_value import FaultValue
 from failuretwin.failure_behavior.modes import MODES

@@ -25,8 +25,8 @@ from failuretwin.app.results import Record, score_line, write_json_lines
 from failuretwin.connection.calibration.calibration import Calibration
 from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.data_knowledge.raw_session import find_sessions
+from failuretwin.decision.hypotheses.priors import priors_of
 from failuretwin.decision.metrics import log_score, log_score_gain, mcnemar
-from failuretwin.decision.priors import priors_of
 from failuretwin.digital_model.imperfections import generic_imperfections
 from failuretwin.digital_model.robot import Robot
 

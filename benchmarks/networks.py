@@ -19,7 +19,7 @@ from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.generation import simulate
-from failuretwin.decision.hybrid import HybridDiagnoser
+from failuretwin.decision.learned.hybrid import HybridDiagnoser
 from failuretwin.decision.learned.networks import NETWORKS
 from failuretwin.decision.learned.storage import load_network, save_network
 from failuretwin.decision.metrics import (

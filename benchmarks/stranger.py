@@ -24,7 +24,7 @@ from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.metrics.coverage import IntervalCase, coverage_by_mode
-from failuretwin.decision.separation import separation
+from failuretwin.decision.telling_apart.separation import separation
 from failuretwin.digital_model.imperfections import Imperfections, load_imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.modes import MODES, FaultMode

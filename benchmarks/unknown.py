@@ -37,9 +37,9 @@ from failuretwin.core.hypothesis import (
     single_faults,
 )
 from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.decision.hypotheses.weighing import WEIGHABLE
 from failuretwin.decision.metrics.paired import log_score_gain
-from failuretwin.decision.separation import Judge, separation, truth_and_faults
-from failuretwin.decision.weighing import WEIGHABLE
+from failuretwin.decision.telling_apart.separation import Judge, separation, truth_and_faults
 from failuretwin.digital_model.imperfections import Imperfections, load_imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.fault_value import FaultGroup
@@ -119,7 +119,7 @@ def main() -> None:
         plan = ft.Plan(robot, true, per_class, options.seed, healthy, engine=options.engine)
         runs = ft.simulate(plan)
         known_laws = tuple(mode for mode in WEIGHABLE if mode != name or not options.forget)
-        with patch("failuretwin.decision.weighing.WEIGHABLE", known_laws):
+        with patch("failuretwin.decision.hypotheses.weighing.WEIGHABLE", known_laws):
             said = np.array([_kind(d) for d in diagnoser.diagnose(runs)])
         nats_ahead = ahead(diagnoser, runs, nine, healthy)
         tell(name, said, nats_ahead >= FOREIGN_NATS)

@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from failuretwin.data_knowledge.generation import iterate, simulate
     from failuretwin.data_knowledge.plan import Plan
     from failuretwin.data_knowledge.reading import ReadOptions, read_runs
-    from failuretwin.decision.ambiguity import ambiguity
     from failuretwin.decision.bayes import BayesDiagnoser
-    from failuretwin.decision.priors import Priors
+    from failuretwin.decision.hypotheses.priors import Priors
     from failuretwin.decision.streaming.streaming import StreamingDiagnoser
+    from failuretwin.decision.telling_apart.ambiguity import ambiguity
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.twin import DigitalTwin
 
@@ -26,10 +26,10 @@ _HOME = {
     "BayesDiagnoser": "decision.bayes",
     "DigitalTwin": "digital_model.twin",
     "Plan": "data_knowledge.plan",
-    "Priors": "decision.priors",
+    "Priors": "decision.hypotheses.priors",
     "ReadOptions": "data_knowledge.reading",
     "StreamingDiagnoser": "decision.streaming.streaming",
-    "ambiguity": "decision.ambiguity",
+    "ambiguity": "decision.telling_apart.ambiguity",
     "iterate": "data_knowledge.generation",
     "load_robot": "digital_model.robot",
     "read_runs": "data_knowledge.reading",

@@ -12,7 +12,7 @@ from failuretwin import BayesDiagnoser, load_robot, read_runs
 from failuretwin.app import training
 from failuretwin.app.cli import cli
 from failuretwin.core.errors import FailureTwinError, InputError
-from failuretwin.decision.blend import blended
+from failuretwin.decision.learned.blend import blended
 from failuretwin.decision.learned.storage import load_network, save_network
 
 

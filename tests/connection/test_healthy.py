@@ -15,8 +15,8 @@ from failuretwin.core.ellipsoid import log_student
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision.onsets import OnsetPrior
-from failuretwin.decision.priors import priors_of
+from failuretwin.decision.hypotheses.onsets import OnsetPrior
+from failuretwin.decision.hypotheses.priors import priors_of
 from failuretwin.digital_model.imperfections import Imperfections, LostCommand, Timing, Variation
 from failuretwin.digital_model.settling import Settling
 

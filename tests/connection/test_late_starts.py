@@ -12,7 +12,7 @@ from failuretwin.core.movements import Movements
 from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision.scene import Scene
+from failuretwin.decision.evidence.scene import Scene
 from failuretwin.digital_model.disturbances import draw_disturbances
 from failuretwin.digital_model.imperfections import LostCommand, Timing, load_imperfections
 

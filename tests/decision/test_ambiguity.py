@@ -15,11 +15,11 @@ from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses, s
 from failuretwin.core.movements import Movements
 from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.plan import Plan
-from failuretwin.decision.ambiguity import _groups, _motions
-from failuretwin.decision.noise_free_scene import shrink
-from failuretwin.decision.priors import Priors
-from failuretwin.decision.separation import Judge
-from failuretwin.decision.trials import Trials
+from failuretwin.decision.hypotheses.priors import Priors
+from failuretwin.decision.telling_apart.ambiguity import _groups, _motions
+from failuretwin.decision.telling_apart.noise_free_scene import shrink
+from failuretwin.decision.telling_apart.separation import Judge
+from failuretwin.decision.telling_apart.trials import Trials
 from failuretwin.digital_model.imperfections import Imperfections, Readings
 from failuretwin.digital_model.settling import Settling
 from failuretwin.failure_behavior.modes import MODES, SteadyStateError

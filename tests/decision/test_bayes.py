@@ -13,9 +13,9 @@ from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
 from failuretwin.decision import bayes
-from failuretwin.decision.laws import steady_state_error, stuck
-from failuretwin.decision.priors import Priors, priors_of
-from failuretwin.decision.scene import Scene
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses.laws import steady_state_error, stuck
+from failuretwin.decision.hypotheses.priors import Priors, priors_of
 from failuretwin.digital_model.imperfections import default_imperfections
 
 PAPER = [str(h) for h in paper_hypotheses([f"motor_{k}" for k in range(1, 5)])]

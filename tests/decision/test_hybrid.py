@@ -7,8 +7,8 @@ import pytest
 
 from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.errors import InputError
-from failuretwin.decision.blend import Weights, blended, fit_weights, gated
-from failuretwin.decision.hybrid import HybridDiagnoser
+from failuretwin.decision.learned.blend import Weights, blended, fit_weights, gated
+from failuretwin.decision.learned.hybrid import HybridDiagnoser
 
 CLASSES = ("healthy", "motor_1:stuck", "motor_2:stuck")
 

@@ -10,16 +10,16 @@ from failuretwin.core.hypothesis import UNKNOWN, Hypothesis, single_faults
 from failuretwin.data_knowledge.knowledge import magnitude_range
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
 from failuretwin.decision import pairs
-from failuretwin.decision.laws.drift import drift_law
-from failuretwin.decision.laws.lasting import AMOUNTS, lasting_law
-from failuretwin.decision.laws.nodes import size_nodes
-from failuretwin.decision.laws.steady_state_error import error_law, offset_nodes
-from failuretwin.decision.laws.stuck import stuck_law
-from failuretwin.decision.laws.timed import lag_law, slow_law
-from failuretwin.decision.onsets import OnsetPrior
-from failuretwin.decision.priors import Priors
-from failuretwin.decision.scene import Scene
-from failuretwin.decision.weighing import WEIGHABLE, weigh_all, weigh_hypothesis
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses.laws.drift import drift_law
+from failuretwin.decision.hypotheses.laws.lasting import AMOUNTS, lasting_law
+from failuretwin.decision.hypotheses.laws.nodes import size_nodes
+from failuretwin.decision.hypotheses.laws.steady_state_error import error_law, offset_nodes
+from failuretwin.decision.hypotheses.laws.stuck import stuck_law
+from failuretwin.decision.hypotheses.laws.timed import lag_law, slow_law
+from failuretwin.decision.hypotheses.onsets import OnsetPrior
+from failuretwin.decision.hypotheses.priors import Priors
+from failuretwin.decision.hypotheses.weighing import WEIGHABLE, weigh_all, weigh_hypothesis
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 RANGES = ((0.02, 0.08), (0.04, 0.2))

@@ -13,7 +13,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.plan import Plan
-from failuretwin.decision.blend import Weights
+from failuretwin.decision.learned.blend import Weights
 from failuretwin.decision.learned.encoder import Encoder
 from failuretwin.decision.learned.estimator import LearnedDiagnoser
 from failuretwin.decision.learned.networks import NETWORKS

@@ -7,7 +7,7 @@ from scipy import optimize, stats
 from failuretwin.connection.healthy import PATH_NOISE_M, HealthyModel
 from failuretwin.connection.lost_commands import OUTLIER_RATE
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision.scene import Scene
+from failuretwin.decision.evidence.scene import Scene
 from failuretwin.digital_model.imperfections import Imperfections, LostCommand
 from failuretwin.digital_model.settling import Settling
 

@@ -12,10 +12,10 @@ from small_arms import GANTRY, small_twin
 from failuretwin.connection.healthy import HealthyModel
 from failuretwin.core.movements import Movements
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence, settled_evidence
-from failuretwin.decision.laws.off_anyhow import weigh_off_anyhow
-from failuretwin.decision.laws.two_amounts import Belief
-from failuretwin.decision.scene import Scene
-from failuretwin.decision.two_angles import two_angles
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.evidence.two_angles import two_angles
+from failuretwin.decision.hypotheses.laws.off_anyhow import weigh_off_anyhow
+from failuretwin.decision.hypotheses.laws.two_amounts import Belief
 from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, Imperfections
 from failuretwin.digital_model.settling import Settling
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from failuretwin.core.movements import Movements
-from failuretwin.decision.onsets import OnsetPrior, Stretches, at_movement_starts
+from failuretwin.decision.hypotheses.onsets import OnsetPrior, Stretches, at_movement_starts
 
 lengths = st.lists(st.floats(0.0, 5.0), min_size=1, max_size=8)
 earlies = st.floats(0.0, 1.0)

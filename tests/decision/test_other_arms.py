@@ -15,8 +15,8 @@ from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
 from failuretwin.decision import bayes
-from failuretwin.decision.scene import Scene
-from failuretwin.decision.weighing import WEIGHABLE
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses.weighing import WEIGHABLE
 from failuretwin.digital_model.imperfections import (
     NO_IMPERFECTIONS,
     Readings,

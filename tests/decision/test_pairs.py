@@ -8,10 +8,10 @@ from failuretwin.core.hypothesis import HEALTHY, Hypothesis
 from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision.onsets import OnsetPrior
-from failuretwin.decision.priors import Priors
-from failuretwin.decision.scene import Scene
-from failuretwin.decision.weighing import weigh_hypothesis
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses.onsets import OnsetPrior
+from failuretwin.decision.hypotheses.priors import Priors
+from failuretwin.decision.hypotheses.weighing import weigh_hypothesis
 from failuretwin.digital_model.imperfections import load_imperfections
 
 PAIRS = tuple(
@@ -78,8 +78,8 @@ def test_a_second_fault_that_cannot_show_changes_nothing(twin, imperfect, monkey
     """A fault of motor 4 whose only size is nothing leaves what is said of a fault of motor 1."""
     from failuretwin.core.quadrature import log_of
     from failuretwin.decision import weighing
-    from failuretwin.decision.law import Law
-    from failuretwin.decision.onsets import at_once
+    from failuretwin.decision.hypotheses.law import Law
+    from failuretwin.decision.hypotheses.onsets import at_once
 
     def nothing(scene, motor, priors):
         stretches = at_once(scene.evidence)

@@ -9,7 +9,15 @@ from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
 from failuretwin.data_knowledge.moving_evidence import moving_evidence
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision.ramps import DOF, GLITCH_RATE, ROUGHNESS_M, SEEN, UNSEEN, RampModel, Ramps
+from failuretwin.decision.evidence.ramps import (
+    DOF,
+    GLITCH_RATE,
+    ROUGHNESS_M,
+    SEEN,
+    UNSEEN,
+    RampModel,
+    Ramps,
+)
 from failuretwin.digital_model.imperfections import Imperfections, Readings, Timing
 from failuretwin.digital_model.settling import Settling
 

@@ -11,8 +11,8 @@ from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
 from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.noise_free import without_chance
 from failuretwin.data_knowledge.plan import Plan
-from failuretwin.decision.priors import Priors
-from failuretwin.decision.separation import Judge, separation, truth_and_faults
+from failuretwin.decision.hypotheses.priors import Priors
+from failuretwin.decision.telling_apart.separation import Judge, separation, truth_and_faults
 from failuretwin.digital_model.imperfections import default_imperfections
 from failuretwin.failure_behavior.modes import MODES
 

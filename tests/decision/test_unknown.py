@@ -11,11 +11,11 @@ from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
 from failuretwin.decision import weighing
-from failuretwin.decision.laws.unknown import LEFT_OUT, weigh_unknown
-from failuretwin.decision.scene import Scene
-from failuretwin.decision.separation import separation
-from failuretwin.decision.weighing import weigh_all
-from failuretwin.decision.weight import Weight
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses.laws.unknown import LEFT_OUT, weigh_unknown
+from failuretwin.decision.hypotheses.weighing import weigh_all
+from failuretwin.decision.hypotheses.weight import Weight
+from failuretwin.decision.telling_apart.separation import separation
 from failuretwin.digital_model.imperfections import load_imperfections
 
 TWO_AT_ONCE = (
@@ -115,7 +115,7 @@ def test_unknown_counts_its_best_explanation_alone(diagnoser, imperfect):
 
 
 def test_without_evidence_unknown_is_as_rare_as_it_was(diagnoser, imperfect):
-    from failuretwin.decision.weighing import log_prior
+    from failuretwin.decision.hypotheses.weighing import log_prior
 
     blind = imperfect.isel(run=[0])
     blind = blind.assign(measured=np.nan * blind["measured"])

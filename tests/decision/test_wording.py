@@ -5,7 +5,7 @@ import pytest
 
 from failuretwin.core.diagnosis import Diagnosis, MovementEvidence
 from failuretwin.core.hypothesis import HEALTHY, MAGNITUDE_UNITS, UNKNOWN, Hypothesis
-from failuretwin.decision.weighing import WEIGHABLE
+from failuretwin.decision.hypotheses.weighing import WEIGHABLE
 from failuretwin.decision.wording import SURE, explanation, percent, possible_hypotheses, verdict
 
 SIZED = {

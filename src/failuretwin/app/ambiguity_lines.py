@@ -9,8 +9,8 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
 from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.knowledge import plain_name
-from failuretwin.decision.ambiguity import Ambiguity, ambiguity
 from failuretwin.decision.bayes import BayesDiagnoser
+from failuretwin.decision.telling_apart.ambiguity import Ambiguity, ambiguity
 from failuretwin.decision.wording import size_words
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from failuretwin.connection.calibration.trust import MOST_SUSPECT, SUSPECT
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.suspicion import suspicion
+from failuretwin.decision.telling_apart.suspicion import suspicion
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from failuretwin.app.learning import check_learning
 from failuretwin.core.errors import InputError
 from failuretwin.decision.bayes import BayesDiagnoser
-from failuretwin.decision.hybrid import Diagnoser, HybridDiagnoser
+from failuretwin.decision.learned.hybrid import Diagnoser, HybridDiagnoser
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:

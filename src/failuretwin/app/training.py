@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from failuretwin.decision.bayes import BayesDiagnoser
-from failuretwin.decision.blend import fit_weights
-from failuretwin.decision.hybrid import Diagnoser, HybridDiagnoser
+from failuretwin.decision.learned.blend import fit_weights
 from failuretwin.decision.learned.encoder import Encoder
 from failuretwin.decision.learned.estimator import LearnedDiagnoser
+from failuretwin.decision.learned.hybrid import Diagnoser, HybridDiagnoser
 from failuretwin.decision.learned.recipe import Recipe, widened
 from failuretwin.decision.learned.robust_features import expectation_of
 from failuretwin.decision.learned.stream import Stream

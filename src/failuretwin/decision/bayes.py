@@ -18,10 +18,10 @@ from failuretwin.core.types import BoolArray
 from failuretwin.data_knowledge.log_quality import log_quality, without_spoilt
 from failuretwin.data_knowledge.moving_evidence import moving_evidence
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses.priors import Priors
+from failuretwin.decision.hypotheses.weighing import check_weighable, shows_on_way
 from failuretwin.decision.judgement import judge
-from failuretwin.decision.priors import Priors
-from failuretwin.decision.scene import Scene
-from failuretwin.decision.weighing import check_weighable, shows_on_way
 from failuretwin.digital_model.imperfections import Imperfections, default_imperfections
 from failuretwin.digital_model.twin import DigitalTwin
 

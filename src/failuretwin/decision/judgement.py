@@ -13,10 +13,10 @@ from failuretwin.core.quadrature import log_sum
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.data_knowledge.log_quality import LogQuality
 from failuretwin.decision.assessment import lost_commands, unused_movements, why_undecided
-from failuretwin.decision.priors import Priors
-from failuretwin.decision.scene import Scene
-from failuretwin.decision.weighing import log_prior, weigh_all
-from failuretwin.decision.weight import Estimate, Weight
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses.priors import Priors
+from failuretwin.decision.hypotheses.weighing import log_prior, weigh_all
+from failuretwin.decision.hypotheses.weight import Estimate, Weight
 from failuretwin.decision.wording import explanation, verdict
 
 LEVELS = (0.05, 0.5, 0.95)

@@ -90,7 +90,7 @@ def diagnose(
     )
     from failuretwin.core.hypothesis import parse_hypotheses
     from failuretwin.decision.bayes import BayesDiagnoser
-    from failuretwin.decision.priors import priors_of
+    from failuretwin.decision.hypotheses.priors import priors_of
     from failuretwin.digital_model.imperfections import load_imperfections
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.twin import DigitalTwin

@@ -17,7 +17,7 @@ from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import check_motors, check_runs, truth_of
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.blend import Weights
+from failuretwin.decision.learned.blend import Weights
 from failuretwin.decision.learned.encoder import Encoder, Floats
 from failuretwin.decision.learned.experience import (
     movement_counts,

@@ -21,7 +21,7 @@ from failuretwin.core.config import from_table
 from failuretwin.core.errors import InputError
 from failuretwin.core.fingerprint import fingerprint
 from failuretwin.data_knowledge.store import reason, replacing
-from failuretwin.decision.blend import Weights
+from failuretwin.decision.learned.blend import Weights
 from failuretwin.decision.learned.encoder import Encoder
 from failuretwin.decision.learned.estimator import LearnedDiagnoser, network_shape
 from failuretwin.decision.learned.networks import build_network

@@ -18,12 +18,12 @@ from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.data_knowledge.log_quality import LogQuality
 from failuretwin.data_knowledge.settled_evidence import SETTLING_S
 from failuretwin.decision.bayes import BayesDiagnoser
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses.weighing import log_prior, shows_on_way
 from failuretwin.decision.judgement import Judgement, Place, judge
-from failuretwin.decision.scene import Scene
 from failuretwin.decision.streaming.following import Following, Starts
 from failuretwin.decision.streaming.state import Arrays, arrays_of, put_arrays
 from failuretwin.decision.streaming.stillness import Stillness
-from failuretwin.decision.weighing import log_prior, shows_on_way
 
 MOVEMENTS = 5
 """Movements that are remembered, the present one included: as many as a run of the paper has."""

@@ -11,8 +11,8 @@ from failuretwin.connection.healthy import HealthyModel
 from failuretwin.connection.lost_commands import Alternatives
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
-from failuretwin.decision.findings import Findings, explained, find, given_before
-from failuretwin.decision.motor_profile import MotorProfile, motor_profiles
+from failuretwin.decision.evidence.findings import Findings, explained, find, given_before
+from failuretwin.decision.evidence.motor_profile import MotorProfile, motor_profiles
 from failuretwin.decision.streaming.state import Arrays
 
 PER_MOTOR = ("best", "precision", "square", "log_weight", "expected", "pose", "beside")

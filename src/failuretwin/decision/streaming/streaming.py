@@ -13,7 +13,7 @@ from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.errors import unknown_name
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.decision.bayes import BayesDiagnoser
-from failuretwin.decision.priors import MONITORING
+from failuretwin.decision.hypotheses.priors import MONITORING
 from failuretwin.decision.streaming.fleet import MOVEMENTS, StreamingFleet
 from failuretwin.decision.streaming.saved import load_fleet, save_fleet
 from failuretwin.digital_model.imperfections import Imperfections

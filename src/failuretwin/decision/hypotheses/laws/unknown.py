@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.laws.off_anyhow import weigh_off_anyhow
-from failuretwin.decision.scene import Scene
-from failuretwin.decision.weight import Estimate, Weight
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses.laws.off_anyhow import weigh_off_anyhow
+from failuretwin.decision.hypotheses.weight import Estimate, Weight
 
 BLURS = (3.0, 8.0, 25.0)
 """Factors on the scatter: just more than tails allow, to anywhere near."""

@@ -14,9 +14,9 @@ import numpy as np
 
 from failuretwin.core.quadrature import Weighted
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.decision.motor_profile import MotorProfile
-from failuretwin.decision.scene import Scene, share_of
-from failuretwin.decision.weight import Estimate, Weight, given_others, posterior_of
+from failuretwin.decision.evidence.motor_profile import MotorProfile
+from failuretwin.decision.evidence.scene import Scene, share_of
+from failuretwin.decision.hypotheses.weight import Estimate, Weight, given_others, posterior_of
 
 
 @dataclass(frozen=True)

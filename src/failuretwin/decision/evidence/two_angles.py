@@ -15,7 +15,7 @@ from failuretwin.connection.lost_commands import Alternatives
 from failuretwin.core.ellipsoid import Ellipsoid
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
-from failuretwin.decision.motor_profile import nearest_on_circle
+from failuretwin.decision.evidence.motor_profile import nearest_on_circle
 
 SCANNED = 16
 """Angles of the first motor from which a way is looked for; more find no other ways."""

@@ -16,10 +16,10 @@ from failuretwin.core.movements import find_movements
 from failuretwin.core.runs import RunTable
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.data_knowledge.knowledge import magnitude_range
-from failuretwin.decision.priors import Priors
-from failuretwin.decision.separation import Judge
-from failuretwin.decision.smallest import smallest_sizes
-from failuretwin.decision.trials import Trials
+from failuretwin.decision.hypotheses.priors import Priors
+from failuretwin.decision.telling_apart.separation import Judge
+from failuretwin.decision.telling_apart.smallest import smallest_sizes
+from failuretwin.decision.telling_apart.trials import Trials
 from failuretwin.digital_model.imperfections import Imperfections, default_imperfections
 from failuretwin.digital_model.twin import DigitalTwin
 

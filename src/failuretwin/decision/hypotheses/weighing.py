@@ -10,18 +10,18 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import UNKNOWN, Fault, Hypothesis, single_faults
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.knowledge import prior_odds
-from failuretwin.decision.law import Law, weigh
-from failuretwin.decision.laws.drift import drift_law
-from failuretwin.decision.laws.lasting import AMOUNTS, lasting_law
-from failuretwin.decision.laws.stays import MISSES, weigh_misses
-from failuretwin.decision.laws.steady_state_error import error_law
-from failuretwin.decision.laws.stuck import stuck_law
-from failuretwin.decision.laws.timed import lag_law, slow_law
-from failuretwin.decision.laws.unknown import weigh_unknown
-from failuretwin.decision.pairs import weigh_pair
-from failuretwin.decision.priors import Priors
-from failuretwin.decision.scene import Scene
-from failuretwin.decision.weight import Estimate, Weight
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses.law import Law, weigh
+from failuretwin.decision.hypotheses.laws.drift import drift_law
+from failuretwin.decision.hypotheses.laws.lasting import AMOUNTS, lasting_law
+from failuretwin.decision.hypotheses.laws.stays import MISSES, weigh_misses
+from failuretwin.decision.hypotheses.laws.steady_state_error import error_law
+from failuretwin.decision.hypotheses.laws.stuck import stuck_law
+from failuretwin.decision.hypotheses.laws.timed import lag_law, slow_law
+from failuretwin.decision.hypotheses.laws.unknown import weigh_unknown
+from failuretwin.decision.hypotheses.pairs import weigh_pair
+from failuretwin.decision.hypotheses.priors import Priors
+from failuretwin.decision.hypotheses.weight import Estimate, Weight
 
 UNKNOWN_ODDS = 1.0
 """Odds of `unknown` against healthy where nothing is seen; each explanation of what is seen has

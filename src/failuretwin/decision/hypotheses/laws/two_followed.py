@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.decision.laws.two_amounts import Belief, Lines
-from failuretwin.decision.two_angles import WAYS, TwoAngles
+from failuretwin.decision.evidence.two_angles import WAYS, TwoAngles
+from failuretwin.decision.hypotheses.laws.two_amounts import Belief, Lines
 
 SHOWS = np.array([[True, True], [True, False], [False, True]])
 """Which of two faults a movement shows, (state, motor): either may begin late, or come and go."""

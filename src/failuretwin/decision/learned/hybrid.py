@@ -13,7 +13,7 @@ import numpy as np
 
 from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.errors import InputError
-from failuretwin.decision.blend import Weights, blended, gated
+from failuretwin.decision.learned.blend import Weights, blended, gated
 from failuretwin.decision.learned.telling import told
 
 if TYPE_CHECKING:

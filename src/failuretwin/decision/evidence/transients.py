@@ -13,9 +13,9 @@ from functools import cached_property
 import numpy as np
 
 from failuretwin.core.types import FloatArray, IntArray
-from failuretwin.decision.courses import Course, CourseJudge
-from failuretwin.decision.motor_profile import LARGEST_OFFSET_RAD, MotorProfile
-from failuretwin.decision.ramps import Ramps
+from failuretwin.decision.evidence.courses import Course, CourseJudge
+from failuretwin.decision.evidence.motor_profile import LARGEST_OFFSET_RAD, MotorProfile
+from failuretwin.decision.evidence.ramps import Ramps
 
 TRUST = 0.1
 """Power to which what the way says is taken: its readings share errors of timing and of both ends

@@ -13,11 +13,11 @@ from failuretwin.core.quadrature import log_sum
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.moving_evidence import MovingEvidence
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
-from failuretwin.decision.courses import CourseJudge
-from failuretwin.decision.findings import Findings, find
-from failuretwin.decision.motor_profile import MotorProfile
-from failuretwin.decision.ramps import RampModel
-from failuretwin.decision.transients import Transients
+from failuretwin.decision.evidence.courses import CourseJudge
+from failuretwin.decision.evidence.findings import Findings, find
+from failuretwin.decision.evidence.motor_profile import MotorProfile
+from failuretwin.decision.evidence.ramps import RampModel
+from failuretwin.decision.evidence.transients import Transients
 
 HELD_ANGLES = 25
 """Held angles at which the way is judged, over the range of a motor."""

@@ -13,8 +13,8 @@ from functools import cached_property
 import numpy as np
 
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.motor_profile import MotorProfile
-from failuretwin.decision.scene import Scene
+from failuretwin.decision.evidence.motor_profile import MotorProfile
+from failuretwin.decision.evidence.scene import Scene
 
 MOST_NATS = 40.0
 """What one movement counts at most [nats]: about what a tool that may be anywhere costs."""

@@ -14,9 +14,9 @@ import numpy as np
 from failuretwin.core.quadrature import Weighted, log_of, log_sum
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.knowledge import magnitude_range
-from failuretwin.decision.onsets import at_movement_starts
-from failuretwin.decision.scene import Scene
-from failuretwin.decision.weight import Estimate, Weight
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses.onsets import at_movement_starts
+from failuretwin.decision.hypotheses.weight import Estimate, Weight
 
 SHARES = 12
 """Shares of movements that are missed, to sum over."""

@@ -22,10 +22,10 @@ from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.moving_evidence import moving_evidence
 from failuretwin.data_knowledge.noise_free import noise_free_path
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision.best_fit import best_fit, first_spoilt
-from failuretwin.decision.noise_free_scene import NoiseFreeScene
-from failuretwin.decision.priors import Priors
-from failuretwin.decision.weighing import TIMED, check_weighable
+from failuretwin.decision.hypotheses.priors import Priors
+from failuretwin.decision.hypotheses.weighing import TIMED, check_weighable
+from failuretwin.decision.telling_apart.best_fit import best_fit, first_spoilt
+from failuretwin.decision.telling_apart.noise_free_scene import NoiseFreeScene
 from failuretwin.digital_model.imperfections import Imperfections, default_imperfections
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.fault_value import FaultValue

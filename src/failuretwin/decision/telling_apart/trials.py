@@ -10,7 +10,7 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Fault, Hypothesis
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.separation import Judge
+from failuretwin.decision.telling_apart.separation import Judge
 from failuretwin.failure_behavior.course import STEP
 from failuretwin.failure_behavior.fault_value import FaultValue
 from failuretwin.failure_behavior.modes.base import FaultMode

@@ -6,7 +6,7 @@ import numpy as np
 
 from failuretwin.core.quadrature import log_sum, log_trapezoid_weights
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.decision.motor_profile import MotorProfile
+from failuretwin.decision.evidence.motor_profile import MotorProfile
 
 LOCAL_STEPS = np.array([-8, -5, -3.5, -2.5, -1.75, -1, -0.5, 0, 0.5, 1, 1.75, 2.5, 3.5, 5, 8.0])
 """Nodes around the value that a movement points to, in its own standard deviations."""

@@ -15,11 +15,11 @@ import numpy as np
 
 from failuretwin.core.quadrature import log_sum
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.laws.two_amounts import Lines
-from failuretwin.decision.laws.two_followed import Course, follow
-from failuretwin.decision.scene import Scene
-from failuretwin.decision.two_angles import TwoAngles, two_angles
-from failuretwin.decision.weight import Estimate, Weight
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.evidence.two_angles import TwoAngles, two_angles
+from failuretwin.decision.hypotheses.laws.two_amounts import Lines
+from failuretwin.decision.hypotheses.laws.two_followed import Course, follow
+from failuretwin.decision.hypotheses.weight import Estimate, Weight
 
 
 @dataclass(frozen=True)

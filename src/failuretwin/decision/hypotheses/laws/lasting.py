@@ -13,10 +13,10 @@ import numpy as np
 from failuretwin.core.quadrature import log_of
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.knowledge import magnitude_range
-from failuretwin.decision.law import Law
-from failuretwin.decision.laws.nodes import pointed, size_nodes
-from failuretwin.decision.onsets import at_once
-from failuretwin.decision.scene import Scene
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses.law import Law
+from failuretwin.decision.hypotheses.laws.nodes import pointed, size_nodes
+from failuretwin.decision.hypotheses.onsets import at_once
 from failuretwin.digital_model.settling import sag
 
 

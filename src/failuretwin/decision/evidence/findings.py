@@ -11,7 +11,7 @@ from failuretwin.connection.healthy import HealthyModel
 from failuretwin.connection.lost_commands import Alternatives
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.settled_evidence import SettledEvidence
-from failuretwin.decision.motor_profile import MotorProfile, motor_profiles
+from failuretwin.decision.evidence.motor_profile import MotorProfile, motor_profiles
 
 
 @dataclass(frozen=True)

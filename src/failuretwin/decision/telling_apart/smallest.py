@@ -6,7 +6,7 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.trials import Trials
+from failuretwin.decision.telling_apart.trials import Trials
 
 FOUND_NATS = 5.0
 """A fault is found if it is expected to be ahead by this: odds of 150."""

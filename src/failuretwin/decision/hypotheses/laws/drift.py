@@ -7,10 +7,10 @@ import numpy as np
 from failuretwin.core.quadrature import log_of, log_sum, weighted_quantiles
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.knowledge import magnitude_range
-from failuretwin.decision.law import Law
-from failuretwin.decision.laws.nodes import pointed, size_nodes
-from failuretwin.decision.onsets import SHARES, Stretches, at_once
-from failuretwin.decision.scene import Scene
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses.law import Law
+from failuretwin.decision.hypotheses.laws.nodes import pointed, size_nodes
+from failuretwin.decision.hypotheses.onsets import SHARES, Stretches, at_once
 
 ONSETS = SHARES[[1, 4, 8]]
 """Onsets to sum over in each stretch, as shares of its length."""

@@ -9,10 +9,10 @@ import numpy as np
 
 from failuretwin.core.quadrature import Weighted, log_sum
 from failuretwin.core.types import FloatArray, IntArray
-from failuretwin.decision.law import Law
-from failuretwin.decision.motor_profile import MotorProfile, motor_profiles
-from failuretwin.decision.scene import Scene
-from failuretwin.decision.weight import Estimate, Weight
+from failuretwin.decision.evidence.motor_profile import MotorProfile, motor_profiles
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses.law import Law
+from failuretwin.decision.hypotheses.weight import Estimate, Weight
 
 FEWEST_NATS = 14.0
 """Nodes of the first fault this far below its best, given any movement, are left out."""

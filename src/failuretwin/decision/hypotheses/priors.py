@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from failuretwin.core.errors import InputError
-from failuretwin.decision.laws.steady_state_error import ERROR_RANGES, Range
-from failuretwin.decision.onsets import OnsetPrior
+from failuretwin.decision.hypotheses.laws.steady_state_error import ERROR_RANGES, Range
+from failuretwin.decision.hypotheses.onsets import OnsetPrior
 from failuretwin.digital_model.robot import Robot
 
 

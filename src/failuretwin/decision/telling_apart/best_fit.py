@@ -12,11 +12,11 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.core.quadrature import log_of
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.decision.law import Law, densities
-from failuretwin.decision.laws.stays import MISSES, log_densities
-from failuretwin.decision.priors import Priors
-from failuretwin.decision.scene import Scene
-from failuretwin.decision.weighing import law_of, motor_of
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses.law import Law, densities
+from failuretwin.decision.hypotheses.laws.stays import MISSES, log_densities
+from failuretwin.decision.hypotheses.priors import Priors
+from failuretwin.decision.hypotheses.weighing import law_of, motor_of
 
 
 def first_spoilt(movements: Movements, onset: FloatArray) -> BoolArray:

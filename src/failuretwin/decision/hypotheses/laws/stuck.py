@@ -13,10 +13,10 @@ from scipy.special import gammaln
 from failuretwin.connection.healthy import HealthyModel
 from failuretwin.core.quadrature import log_of, log_sum, log_trapezoid_weights
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.law import Law
-from failuretwin.decision.laws.nodes import nodes_around
-from failuretwin.decision.onsets import SHARES, OnsetPrior
-from failuretwin.decision.scene import Scene
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses.law import Law
+from failuretwin.decision.hypotheses.laws.nodes import nodes_around
+from failuretwin.decision.hypotheses.onsets import SHARES, OnsetPrior
 
 COARSE_NODES = 49
 """Nodes spread evenly over the range of the held angle."""

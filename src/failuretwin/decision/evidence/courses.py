@@ -10,8 +10,8 @@ import numpy as np
 from failuretwin.connection.lost_commands import Alternatives
 from failuretwin.core.quadrature import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.decision.motor_profile import LARGEST_OFFSET_RAD
-from failuretwin.decision.ramps import RampModel, Ramps
+from failuretwin.decision.evidence.motor_profile import LARGEST_OFFSET_RAD
+from failuretwin.decision.evidence.ramps import RampModel, Ramps
 
 STARTS_RAD = np.linspace(-LARGEST_OFFSET_RAD, LARGEST_OFFSET_RAD, 13)
 """Where a motor may stand before the run if not where it should, from there."""

@@ -7,9 +7,9 @@ import numpy as np
 from failuretwin.core.quadrature import log_of
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.knowledge import magnitude_range
-from failuretwin.decision.law import Law
-from failuretwin.decision.onsets import at_movement_starts
-from failuretwin.decision.scene import Scene
+from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses.law import Law
+from failuretwin.decision.hypotheses.onsets import at_movement_starts
 
 NODES = 12
 """Magnitudes to sum over."""

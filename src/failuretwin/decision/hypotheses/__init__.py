@@ -1,0 +1,1 @@
+"""What runs say of each hypothesis: laws of faults, priors, sums over all that is unknown."""

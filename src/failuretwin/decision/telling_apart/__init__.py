@@ -1,0 +1,1 @@
+"""What a motion can tell apart at all, before anything has happened."""
