@@ -118,7 +118,7 @@ def stream_answers(session: RawSession, robot: Robot) -> list[str | None]:
         end = np.append(session.command_time, np.inf)[span.stop]
         events = (e for e in session_events(session, robot) if begin <= e.time < end)
         source = PacedSource("run", events, Pace(AS_FAST_AS_POSSIBLE))
-        shadow = Shadow(source, StreamingDiagnoser(BayesDiagnoser(twin, whole_run=False)), twin)
+        shadow = Shadow(source, StreamingDiagnoser(BayesDiagnoser(twin)), twin)
         while shadow.step(0.0):
             pass
         diagnosis = shadow.moment.answer.diagnosis

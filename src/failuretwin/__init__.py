@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from failuretwin.core.errors import InputError
     from failuretwin.data_knowledge.generation import iterate, simulate
     from failuretwin.data_knowledge.plan import Plan
     from failuretwin.data_knowledge.reading import ReadOptions, read_runs
@@ -25,6 +26,7 @@ __version__ = "0.1.0"
 _HOME = {
     "BayesDiagnoser": "decision.bayes",
     "DigitalTwin": "digital_model.twin",
+    "InputError": "core.errors",
     "Plan": "data_knowledge.plan",
     "Priors": "decision.hypotheses.priors",
     "ReadOptions": "data_knowledge.reading",
@@ -39,6 +41,7 @@ _HOME = {
 __all__ = [
     "BayesDiagnoser",
     "DigitalTwin",
+    "InputError",
     "Plan",
     "Priors",
     "ReadOptions",

@@ -167,6 +167,22 @@ def test_motor_readings_alone_are_silence(twin, clock):
     assert shadow.moment.answer.state == STALE
 
 
+def test_a_robot_that_is_silent_at_first_is_waited_for(twin, clock):
+    """Until the first event there is no time of the stream."""
+    script, notebook = Script([]), Notebook()
+    script.events.extend([None] * 4)
+    shadow = Shadow(script, notebook, twin)
+    for _ in range(4):
+        clock[0] += 1.0
+        shadow.step(0.0)
+    script.events.extend([reading(50.0), reading(50.1)])
+    shadow.step(0.0)
+    shadow.step(0.0)
+    times = [time for time, _, _ in notebook.told]
+    np.testing.assert_allclose(times[:-2], 0.0)
+    np.testing.assert_allclose(times[-2:], [0.0, 0.1], atol=1e-9)
+
+
 def test_before_any_data_nothing_is_known(twin):
     assert Shadow(Script([]), Notebook(), twin).moment.answer == Answer(0.0, STALE, None)
 

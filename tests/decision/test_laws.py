@@ -9,8 +9,8 @@ from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import UNKNOWN, Hypothesis, single_faults
 from failuretwin.data_knowledge.knowledge import magnitude_range
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision import pairs
 from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses import pairs
 from failuretwin.decision.hypotheses.laws.drift import drift_law
 from failuretwin.decision.hypotheses.laws.lasting import AMOUNTS, lasting_law
 from failuretwin.decision.hypotheses.laws.nodes import size_nodes

@@ -77,7 +77,7 @@ def test_a_single_fault_is_not_taken_for_two(twin, imperfect, found):
 def test_a_second_fault_that_cannot_show_changes_nothing(twin, imperfect, monkeypatch, one, other):
     """A fault of motor 4 whose only size is nothing leaves what is said of a fault of motor 1."""
     from failuretwin.core.quadrature import log_of
-    from failuretwin.decision import weighing
+    from failuretwin.decision.hypotheses import weighing
     from failuretwin.decision.hypotheses.law import Law
     from failuretwin.decision.hypotheses.onsets import at_once
 

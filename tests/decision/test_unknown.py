@@ -10,8 +10,8 @@ from failuretwin.core.hypothesis import UNKNOWN, Hypothesis, paper_hypotheses, s
 from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision import weighing
 from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.hypotheses import weighing
 from failuretwin.decision.hypotheses.laws.unknown import LEFT_OUT, weigh_unknown
 from failuretwin.decision.hypotheses.weighing import weigh_all
 from failuretwin.decision.hypotheses.weight import Weight

@@ -5,14 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from failuretwin import BayesDiagnoser
+from failuretwin import BayesDiagnoser, DigitalTwin, Plan, load_robot
 from failuretwin.connection.links.values import OK, STALE
 from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Movements
+from failuretwin.data_knowledge.generation import simulate
 from failuretwin.decision.streaming.fleet import StreamingFleet
 from failuretwin.decision.streaming.saved import load_fleet, save_fleet
 from failuretwin.decision.streaming.streaming import StreamingDiagnoser, monitor
-from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS
+from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, load_imperfections
 
 PERIOD_S = 2.04
 STEP_S = 0.1
@@ -177,3 +179,79 @@ def test_what_is_no_saved_stream_is_refused(twin, tmp_path, spoil):
             path.write_bytes(b"something else")
         with pytest.raises(InputError, match="cannot be read as a stream"):
             load_fleet(path, method)
+
+
+@pytest.mark.parametrize("noise", [1e-8, 1e-7, 1e-6, 3e-6])
+def test_references_may_be_noisy(watcher, work, rng, noise):
+    for time, command, point in work(8):
+        answer = watcher.update(time, command + rng.normal(0.0, noise, 4), point)
+    assert answer.diagnosis.diagnosis == "healthy"
+    assert answer.diagnosis.probability > 0.9
+
+
+def test_clocks_may_count_from_1970(watcher, work):
+    """Stamps that large are exact to a quarter of a microsecond only."""
+    time = 1.7e9
+    for _, command, point in work(8):
+        answer = watcher.update(time, command, point)
+        time += STEP_S
+    assert answer.time == pytest.approx(time - STEP_S)
+    assert answer.diagnosis.diagnosis == "healthy"
+    assert answer.diagnosis.probability > 0.9
+
+
+def test_a_sample_from_long_ago_is_refused(watcher, work):
+    for sample in work(3):
+        watcher.update(*sample)
+    watcher.update(3600.0, None, None)
+    with pytest.raises(InputError, match="begin a new stream"):
+        watcher.update(8.0, None, [0.1, 0.1, 0.1])
+
+
+@pytest.mark.parametrize("step", [31.0, 3600.0])
+def test_samples_far_apart_tell_of_no_movement(watcher, rng, step):
+    for k in range(5):
+        answer = watcher.update(step * k, rng.uniform(-0.5, 0.5, 4), [0.1, 0.1, 0.2])
+    assert answer.diagnosis is None
+    assert watcher.conclude().diagnosis is None
+
+
+def test_between_two_judgements_nothing_said_changes(twin, work):
+    """A fleet can be asked at any time, also while a movement is under way."""
+    fleet = StreamingFleet(BayesDiagnoser(twin, NO_IMPERFECTIONS, whole_run=False), 1)
+    said = None
+    for time, command, point in work(12, stuck=[(1, 4, 12)]):
+        changed = fleet.update(time, command[None], point[None])
+        found = fleet.diagnosis(0)
+        if said is not None and not len(changed):
+            assert found == said
+        said = found
+    assert said.diagnosis == "motor_2:stuck"
+
+
+@pytest.mark.parametrize("kwargs", [{"robots": 0}, {"robots": 1, "movements": 0},
+                                    {"robots": 1, "rate_hz": 0.0}])  # fmt: skip
+def test_a_stream_of_nothing_is_refused(twin, kwargs):
+    with pytest.raises(InputError, match="Expected one"):
+        StreamingFleet(BayesDiagnoser(twin), **kwargs)
+
+
+@pytest.mark.parametrize("name", ["ur5e", "panda", "so101"])
+@pytest.mark.parametrize("rate_hz", [10.0, 100.0])
+def test_other_arms_are_streamed_as_they_are_recorded(name, rate_hz):
+    robot = load_robot(name)
+    hypotheses = paper_hypotheses(robot.motor_names)
+    generic = load_imperfections("none", robot)
+    runs = simulate(Plan(robot, hypotheses, 1, 3, generic)).isel(run=[0, 2])
+    method = BayesDiagnoser(DigitalTwin(robot), whole_run=False)
+    fleet = StreamingFleet(method, 2, rate_hz)
+    every = round(1.0 / (rate_hz * 0.01))
+    points = runs["measured"].values
+    points[:, np.arange(points.shape[1]) % every != 0] = np.nan
+    for i, time in enumerate(runs["time"].values):
+        fleet.update(time, runs["command"].values[:, i], points[:, i])
+    fleet.conclude()
+    thinned = runs.assign(measured=(runs["measured"].dims, points))
+    thinned.attrs["measured_rate_hz"] = rate_hz
+    expected = [list(d.posterior.values()) for d in method.diagnose(thinned)]
+    np.testing.assert_allclose(fleet.posterior, expected, rtol=0.0, atol=1e-9)

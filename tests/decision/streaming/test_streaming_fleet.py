@@ -137,7 +137,13 @@ def test_five_hundred_runs_as_streams(armpi, twin, rng):
     lost = rng.random(runs["measured"].shape[:2]) < 0.1
     runs["measured"].values[lost] = np.nan
     diagnoser = BayesDiagnoser(twin)
-    fleet = play(runs, diagnoser)
+    # Readings arrive up to 0.3 s late, out of order.
+    time, command, measured = (runs[name].values for name in ("time", "command", "measured"))
+    order = np.argsort(np.arange(len(time)) + rng.integers(0, 30, len(time)), kind="stable")
+    fleet = StreamingFleet(diagnoser, 500, runs.attrs["measured_rate_hz"])
+    for now, i in enumerate(order):
+        fleet.update(time[now], command[:, now], None)
+        fleet.update(time[i], None, measured[:, i])
     fleet.conclude()
     off = np.abs(fleet.posterior - decided(diagnoser, runs)).max(axis=1)
     # A tool that stands still while motors should move is dead for a stream, at once; a recorded

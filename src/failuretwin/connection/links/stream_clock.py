@@ -39,7 +39,9 @@ class StreamClock:
         return time
 
     def at(self, now_s: float) -> float:
-        """Return the stream time [s] at a time of our own clock [s]."""
+        """Return the stream time [s] at a time of our own clock [s]; 0 until an event comes."""
+        if self._offset is None:
+            return self._newest
         return self._newest + max(0.0, now_s - self._seen_s)
 
     def stamp(self, time: float) -> float:

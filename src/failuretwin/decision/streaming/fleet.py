@@ -7,7 +7,7 @@ its last movements say, with the same arithmetic as a recorded run.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,6 +22,7 @@ from failuretwin.decision.evidence.scene import Scene
 from failuretwin.decision.hypotheses.weighing import log_prior, shows_on_way
 from failuretwin.decision.judgement import Judgement, Place, judge
 from failuretwin.decision.streaming.following import Following, Starts
+from failuretwin.decision.streaming.samples import KEEP_S
 from failuretwin.decision.streaming.state import Arrays, arrays_of, put_arrays
 from failuretwin.decision.streaming.stillness import Stillness
 
@@ -56,6 +57,21 @@ class Beliefs:
     dead: BoolArray
 
 
+@dataclass(frozen=True)
+class _Latest:
+    """What was judged last, and where it lay in the stream.
+
+    Attributes:
+        robots: The robots, (run,).
+        judgement: What was judged; None: nothing yet.
+        places: Where the run of each lay in its stream.
+    """
+
+    robots: IntArray
+    judgement: Judgement | None
+    places: list[Place]
+
+
 class StreamingFleet:
     """Streaming diagnosis of many robots of one kind.
 
@@ -69,6 +85,9 @@ class StreamingFleet:
         rate_hz: True rate of their tool sensors [Hz]; readings that come closer together than it
             says are taken for drawn out; None: all readings are real.
         movements: Movements that are remembered, the present one included.
+
+    Raises:
+        InputError: If there is no robot, no movement, or the rate is not above 0.
     """
 
     def __init__(
@@ -79,10 +98,16 @@ class StreamingFleet:
         movements: int = MOVEMENTS,
     ) -> None:
         motors = len(diagnoser.twin.robot.motors)
+        if robots < 1 or movements < 1 or not (rate_hz is None or rate_hz > 0.0):
+            raise InputError(
+                f"a stream of {robots} robots, {movements} movements, {rate_hz} Hz. Expected one "
+                "robot and one movement at least, and a rate above 0 or None."
+            )
         self.diagnoser = diagnoser
         self.hypotheses = [str(hypothesis) for hypothesis in diagnoser.considered]
         self.robots, self.rate_hz, self.movements = robots, rate_hz, movements
-        self.time = -np.inf
+        self._zero: float | None = None
+        self._now = -np.inf
         model = diagnoser.healthy_model
         latest_s = model.imperfections.timing.late_s[1] + model.lag_s + SETTLING_S
         starts = Starts(latest_s, model.lost_commands.late_after_s)
@@ -96,7 +121,12 @@ class StreamingFleet:
             dead=np.zeros(robots, dtype=bool),
         )
         self._everything_counts = any(shows_on_way(h) for h in diagnoser.considered)
-        self._latest: tuple[IntArray, Judgement] | None = None
+        self._latest = _Latest(np.array([], dtype=np.int64), None, [])
+
+    @property
+    def time(self) -> float:
+        """Newest time of the stream [s]."""
+        return self._now + (self._zero or 0.0)
 
     @property
     def posterior(self) -> FloatArray:
@@ -112,7 +142,7 @@ class StreamingFleet:
     def stale(self) -> BoolArray:
         """Robots that have not been seen for a while: nothing is known of their present."""
         read_s = self._following.read_s
-        return np.asarray(np.isinf(read_s) | (read_s < self.time - SILENCE_S))
+        return np.asarray(np.isinf(read_s) | (read_s < self._now - SILENCE_S))
 
     def update(
         self, time: float, command: ArrayLike | None, measured: ArrayLike | None
@@ -125,17 +155,21 @@ class StreamingFleet:
             measured: Tool positions, (robot, axis) [m]; NaN or None: no reading.
 
         Raises:
-            InputError: If the shapes do not fit or the time is not finite.
+            InputError: If the shapes do not fit, or the time is not finite or far older than the
+                newest.
         """
         reference, points = self._checked(time, command, measured)
-        self.time = max(self.time, time)
+        time = self._by_own_clock(time)
         points, died = self._alive(time, reference, points)
         begun, at_rest = self._following.take(time, reference, points)
         self._beliefs.point[begun] = np.nan
         return np.append(died, self._judge(self._with_news(at_rest)))
 
     def conclude(self) -> None:
-        """Count all that has come: from now on answers are those of the recorded runs."""
+        """Count all that has come, as if the stream were over: answers are those of recorded runs.
+
+        What comes after it is a new beginning for the movement that was under way.
+        """
         following = self._following
         for robot in np.flatnonzero(following.references.moved):
             following.find_movements(int(robot))
@@ -155,17 +189,41 @@ class StreamingFleet:
         known = beliefs.judged[robot] or beliefs.dead[robot]
         if not known or windows.count[robot] == 0:
             return None
-        if self._latest is None or robot not in self._latest[0]:
-            self._latest = np.array([robot]), self._judgement(np.array([robot]))
-        robots, judgement = self._latest
-        at = int(np.flatnonzero(robots == robot)[0])
-        place = Place(float(windows.zero_s[robot]), int(windows.forgotten[robot]), before)
+        if robot not in self._latest.robots or self._latest.judgement is None:
+            self._remember(np.array([robot]), self._judgement(np.array([robot])))
+        latest = self._latest
+        at = int(np.flatnonzero(latest.robots == robot)[0])
         quality = DEAD if beliefs.dead[robot] else LogQuality()
-        return judgement.conclude(at, f"robot {robot}", quality, place=place)
+        assert latest.judgement is not None
+        place = replace(latest.places[at], before=before)
+        return latest.judgement.conclude(at, f"robot {robot}", quality, place=place)
+
+    def _remember(self, robots: IntArray, judgement: Judgement) -> None:
+        """Keep a judgement for whoever asks for it in words."""
+        windows, zero = self._following.windows, self._zero or 0.0
+        places = [
+            Place(float(windows.zero_s[robot]) + zero, int(windows.forgotten[robot]))
+            for robot in robots
+        ]
+        self._latest = _Latest(robots, judgement, places)
+
+    def _by_own_clock(self, time: float) -> float:
+        """Return the time since the first sample [s]; small numbers are exact."""
+        if self._zero is None:
+            self._zero = time
+        own = time - self._zero
+        if own < self._now - KEEP_S:
+            raise InputError(
+                f"a sample is of {time} s, but the newest is of {self.time} s. Expected none older "
+                f"than {KEEP_S:g} s before the newest; where a clock was set, begin a new stream."
+            )
+        self._now = max(self._now, own)
+        return own
 
     def state(self) -> dict[str, np.ndarray]:
         """Return all that the stream knows, by name."""
-        found = {"time": np.array(self.time), "read_s": self._following.read_s}
+        zero = np.nan if self._zero is None else self._zero
+        found = {"clock": np.array([zero, self._now]), "read_s": self._following.read_s}
         for name, part in self._parts.items():
             found |= arrays_of(part, name)
         for name in ("time", "command", "measured"):
@@ -181,7 +239,8 @@ class StreamingFleet:
             ValueError: If something is of another shape.
         """
         following = self._following
-        self.time = float(state["time"])
+        zero, self._now = state["clock"].tolist()
+        self._zero = None if np.isnan(zero) else zero
         following.read_s[:] = state["read_s"]
         for name, part in self._parts.items():
             put_arrays(part, name, state)
@@ -255,7 +314,7 @@ class StreamingFleet:
             for at, robot in enumerate(group):
                 undecided = judgement.undecided(at, LogQuality())
                 beliefs.posterior[robot] = judgement.posterior(at, undecided)
-            self._latest = group, judgement
+            self._remember(group, judgement)
         beliefs.judged[robots] = True
         beliefs.point[robots] = windows.point[robots, windows.count[robots] - 1]
         return robots

@@ -188,9 +188,9 @@ class Following:
         self, robots: IntArray, begin: FloatArray, end: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return samples (robot, sample, axis) [m], their times (sample,) [s], which to take."""
-        some = self.samples.since(float(begin.min()))
+        some = self.samples.since(float(begin.min()) - 1e-9)
         time = self.samples.time[some]
-        inside = (time >= begin[:, None]) & (time < end[:, None] - 1e-9)
+        inside = (time >= begin[:, None] - 1e-9) & (time < end[:, None] - 1e-9)
         return self.samples.measured[some, robots].swapaxes(0, 1), time, inside
 
     def _under_way(self, robots: IntArray, place: IntArray) -> BoolArray:
@@ -235,6 +235,8 @@ def _since_rest(samples: FloatArray, time: FloatArray, inside: BoolArray) -> Boo
         inside: Samples that count, (robot, sample).
     """
     there = inside & np.isfinite(samples).all(axis=-1)
+    if not there.any():
+        return there
     number = np.arange(samples.shape[1])
     newest = np.where(there, number, 0).max(axis=1)
     off = samples - samples[np.arange(len(samples)), newest][:, None]

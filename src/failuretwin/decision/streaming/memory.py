@@ -36,7 +36,7 @@ class Memory:
 
     fresh: BoolArray
     arrays: dict[str, FloatArray] = field(default_factory=dict)
-    like: Findings | None = None
+    like: Findings | None = field(default=None, metadata={"saved": False})
 
     @classmethod
     def empty(cls, robots: int, movements: int) -> Memory:

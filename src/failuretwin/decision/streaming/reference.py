@@ -7,17 +7,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from failuretwin.core.movements import Movements, find_movements
+from failuretwin.core.polyline import simplify
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.decision.streaming.samples import Samples
 
-TURN_RAD = 1e-6
-"""A reference that changes by more than this from one sample to the next moves [rad]."""
+TURN_RAD = 1e-5
+"""A reference that is further than this from where it stood moves [rad]; less is noise."""
+NOISE_RAD = 1e-9
+"""References that typically bend by more than this from sample to sample are noisy [rad]."""
 STILL_STEPS = 2
 """Steps without a change after which a reference is at rest: a line needs two."""
 PLATEAU_S = 1.0
 """How much of the rest before a movement is looked at [s]."""
 GRID_S = 0.01
 """Step of the grid onto which references are drawn out whose times are not even [s]."""
+
+TWO_SAMPLES = GRID_S * np.arange(2.0)
 
 
 @dataclass
@@ -26,6 +31,7 @@ class References:
 
     Attributes:
         last: The newest that is known, (robot, motor) [rad]; NaN: none yet.
+        stood: Where it stood when it last turned, (robot, motor) [rad].
         last_s: When that was [s].
         still: Steps for which it has not changed.
         moved: Whether it has moved since its movements were last found.
@@ -35,6 +41,7 @@ class References:
     """
 
     last: FloatArray
+    stood: FloatArray
     last_s: FloatArray
     still: IntArray
     moved: BoolArray
@@ -47,6 +54,7 @@ class References:
         """Return references of which nothing is known yet."""
         return cls(
             last=np.full((robots, motors), np.nan),
+            stood=np.full((robots, motors), np.nan),
             last_s=np.full(robots, -np.inf),
             still=np.zeros(robots, dtype=np.int64),
             moved=np.zeros(robots, dtype=bool),
@@ -67,11 +75,11 @@ class References:
         known = np.isfinite(command).all(axis=1) & (time > self.last_s)
         first = known & np.isnan(self.last[:, 0])
         with np.errstate(invalid="ignore"):
-            turns = known & (np.abs(command - self.last).max(axis=1) > TURN_RAD)
+            turns = known & (np.abs(command - self.stood).max(axis=1) > TURN_RAD)
         leaves = turns & ~self.moved
         self.left_s[leaves], self.before_s[leaves] = self.last_s[leaves], self.rest_s[leaves]
         self.moved |= turns
-        self.rest_s[first | turns] = time
+        self.rest_s[first | turns], self.stood[first | turns] = time, command[first | turns]
         self.still[turns] = 0
         self.still[known & ~turns & ~first] += 1
         self.last[known], self.last_s[known] = command[known], time
@@ -88,8 +96,24 @@ class References:
         some = samples.since(max(self.before_s[robot], self.left_s[robot] - PLATEAU_S))
         time, command = samples.time[some], samples.command[some, robot]
         known = np.isfinite(command).all(axis=1)
+        if known.sum() < 2:  # all others are too old to be remembered
+            return find_movements(np.repeat(self.last[None, [robot]], 2, axis=1), TWO_SAMPLES)
         grid, values = _evenly(time[known], command[known])
+        if _noisy(values):
+            values = np.stack([_smooth(grid, value) for value in values.T], axis=-1)
         return find_movements(values[None], grid)
+
+
+def _noisy(values: FloatArray) -> bool:
+    """Return whether references (time, motor) typically bend from sample to sample."""
+    bends = np.abs(np.diff(values, 2, axis=0))
+    return bool(len(bends) and np.median(bends, axis=0).max() > NOISE_RAD)
+
+
+def _smooth(time: FloatArray, value: FloatArray) -> FloatArray:
+    """Return a noisy reference (time,) as the straight lines that it is meant to be."""
+    at, corner = simplify(time, value, TURN_RAD)
+    return np.asarray(np.interp(time, at, corner))
 
 
 def _evenly(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -23,7 +23,7 @@ SUFFIX = ".npz"
 HEADER = "header"
 
 
-def save_fleet(fleet: StreamingFleet, path: Path, said: Sequence[Diagnosis] = ()) -> None:
+def save_fleet(fleet: StreamingFleet, path: str | Path, said: Sequence[Diagnosis] = ()) -> None:
     """Write the state of a stream; a file of that name is replaced at the end, all at once.
 
     Args:
@@ -35,6 +35,7 @@ def save_fleet(fleet: StreamingFleet, path: Path, said: Sequence[Diagnosis] = ()
         InputError: If the suffix is not .npz.
         OutputError: If it cannot be written.
     """
+    path = Path(path)
     if path.suffix != SUFFIX:
         raise InputError(f"{path}: the file of a stream ends in {SUFFIX}.")
     header = {
@@ -54,7 +55,7 @@ def save_fleet(fleet: StreamingFleet, path: Path, said: Sequence[Diagnosis] = ()
 
 
 def load_fleet(
-    path: Path, diagnoser: BayesDiagnoser, robots: int | None = None
+    path: str | Path, diagnoser: BayesDiagnoser, robots: int | None = None
 ) -> tuple[StreamingFleet, list[Diagnosis]]:
     """Return a stream as it was saved, and the diagnoses that were kept with it.
 
@@ -66,14 +67,19 @@ def load_fleet(
     Raises:
         InputError: If it is no such file or of another robot, method or number of robots.
     """
+    path = Path(path)
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         header = json.loads(arrays.pop(HEADER).tobytes())
-        _check(header, diagnoser, robots, path)
+        wrong = _mismatch(header, diagnoser, robots)
+        if wrong:
+            raise InputError(f"{path}: {wrong}")
         fleet = StreamingFleet(diagnoser, header["robots"], header["rate_hz"], header["movements"])
         fleet.restore(arrays)
         said = [Diagnosis.from_fields(fields) for fields in header["said"]]
+    except InputError:
+        raise
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(
             f"{path}: cannot be read as a stream ({reason(error)}). Expected a file that `save` of "
@@ -88,17 +94,15 @@ def _method(diagnoser: BayesDiagnoser) -> str:
     return fingerprint(known)
 
 
-def _check(
-    header: dict[str, Any], diagnoser: BayesDiagnoser, robots: int | None, path: Path
-) -> None:
+def _mismatch(header: dict[str, Any], diagnoser: BayesDiagnoser, robots: int | None) -> str:
+    """Return why a stream does not go on from a file, empty if it does."""
     if header["format"] != FORMAT:
-        raise InputError(
-            f"{path}: is of format {header['format']}, this version reads {FORMAT}. Begin anew."
-        )
+        return f"is of format {header['format']}, this version reads {FORMAT}. Begin anew."
     if header["method"] != _method(diagnoser):
-        raise InputError(
-            f"{path}: was saved with another robot, calibration, hypotheses or priors. Name the "
-            "same, or begin anew."
+        return (
+            "was saved with another robot, calibration, hypotheses or priors. Name the same, or "
+            "begin anew."
         )
     if robots is not None and header["robots"] != robots:
-        raise InputError(f"{path}: is of {header['robots']} robots, expected {robots}.")
+        return f"is of {header['robots']} robots, expected {robots}."
+    return ""

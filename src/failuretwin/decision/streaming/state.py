@@ -12,10 +12,15 @@ Arrays = Mapping[str, np.ndarray]
 
 
 def arrays_of(part: Any, prefix: str) -> dict[str, np.ndarray]:
-    """Return the arrays of a dataclass, and of those in it, by ``prefix/name``."""
+    """Return the arrays of a dataclass, and of those in it, by ``prefix/name``.
+
+    Fields with ``saved=False`` in their metadata are left out.
+    """
     found: dict[str, np.ndarray] = {}
     for field in dataclasses.fields(part):
         value, name = getattr(part, field.name), f"{prefix}/{field.name}"
+        if not field.metadata.get("saved", True):
+            continue
         if isinstance(value, np.ndarray):
             found[name] = value
         elif dataclasses.is_dataclass(value):

@@ -75,7 +75,7 @@ class StreamingDiagnoser:
             InputError: If the name does not end in .npz.
             OutputError: If it cannot be written.
         """
-        save_fleet(self._fleet, Path(path), [] if self._diagnosis is None else [self._diagnosis])
+        save_fleet(self._fleet, path, [] if self._diagnosis is None else [self._diagnosis])
 
     @classmethod
     def load(cls, path: str | Path, diagnoser: BayesDiagnoser) -> StreamingDiagnoser:
@@ -89,7 +89,7 @@ class StreamingDiagnoser:
             InputError: If it is no such file or of another robot, method or number of robots.
         """
         stream = cls(diagnoser)
-        stream._fleet, said = load_fleet(Path(path), diagnoser, robots=1)
+        stream._fleet, said = load_fleet(path, diagnoser, robots=1)
         stream._diagnosis = said[0] if said else None
         return stream
 
