@@ -116,8 +116,11 @@ def stream_answers(session: RawSession, robot: Robot) -> list[str | None]:
     for span in split_session(session, robot):
         begin = session.command_time[span.first] - 0.5
         end = np.append(session.command_time, np.inf)[span.stop]
-        events = (e for e in session_events(session, robot) if begin <= e.time < end)
-        source = PacedSource("run", events, Pace(AS_FAST_AS_POSSIBLE))
+        events = list(session_events(session, robot))
+        # Where the arm was told to stand before the run is known from the command before it.
+        before = [e for e in events if isinstance(e, CommandSent) and e.time < begin][-1:]
+        inside = [e for e in events if begin <= e.time < end]
+        source = PacedSource("run", iter(before + inside), Pace(AS_FAST_AS_POSSIBLE))
         shadow = Shadow(source, StreamingDiagnoser(BayesDiagnoser(twin)), twin)
         while shadow.step(0.0):
             pass
