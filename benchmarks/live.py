@@ -10,15 +10,15 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
+from kept_commands import KeptCommands
 
 from failuretwin import DigitalTwin, load_robot
 from failuretwin.app.live.shadow import Shadow
 from failuretwin.connection.emulation.emulated_arm import FIRST_COMMAND_S
 from failuretwin.connection.links.ros_topics import RosTopics
-from failuretwin.connection.links.values import CommandSent, Item, Reading
+from failuretwin.connection.links.values import CommandSent, Reading
 from failuretwin.connection.ros1.sinks import Ros1Robot
 from failuretwin.connection.ros1.source import Ros1Source
 from failuretwin.core.hypothesis import paper_hypotheses
@@ -46,39 +46,13 @@ class Outcome:
     delay_s: float
 
 
-class Commands:
-    """A sink that keeps commands."""
-
-    name, trouble = "commands", ""
-
-    def __init__(self) -> None:
-        self.sent: list[CommandSent] = []
-
-    def put(self, item: Item) -> None:
-        """Keep a command."""
-        if isinstance(item, CommandSent):
-            self.sent.append(item)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Nothing to be closed."""
-
-    def first_reached_after(self, onset_s: float) -> float:
-        """Return when the first movement after an onset [s] of the robot's life ends its ramp."""
-        zero = self.sent[0].time - FIRST_COMMAND_S
-        after = next(one for one in self.sent if one.time >= zero + onset_s)
-        return after.time + float(after.duration.max())
-
-
 def watch_state(robot: Robot, state: str, speed: float, seconds: float, seed: int) -> Outcome:
     """Let a robot of a state work in a process of its own and watch it over ROS."""
     command = [sys.executable, "-m", "failuretwin", "emulate", "--seed", str(seed)]
     command += ["--speed", str(speed), "--duration", str(seconds)]
     if state != "healthy":
         command += ["--fault", f"{state}@{ONSET_S}"]
-    twin, commands, sure_since = DigitalTwin(robot), Commands(), np.nan
+    twin, commands, sure_since = DigitalTwin(robot), KeptCommands(), np.nan
     with Ros1Source(robot, RosTopics()) as source:
         child = subprocess.Popen(command, stdout=subprocess.DEVNULL)
         shadow = Shadow(
@@ -99,7 +73,13 @@ def watch_state(robot: Robot, state: str, speed: float, seconds: float, seed: in
             sure_since = (answer.time if np.isnan(sure_since) else sure_since) if right else np.nan
     diagnosis = shadow.moment.answer.diagnosis
     last = None if diagnosis is None else diagnosis.diagnosis
-    return Outcome(last, sure_since - commands.first_reached_after(ONSET_S))
+    return Outcome(last, sure_since - _first_reached(commands, ONSET_S))
+
+
+def _first_reached(commands: KeptCommands, onset_s: float) -> float:
+    """Return when the first movement after an onset [s] of the robot's life ends its ramp."""
+    zero = commands.sent[0].time - FIRST_COMMAND_S
+    return float(commands.ramp_ends(zero + onset_s)[0])
 
 
 def latency(robot: Robot, samples: int = 300) -> list[float]:

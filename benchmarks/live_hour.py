@@ -12,18 +12,16 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Self
 
 import numpy as np
+from kept_commands import KeptCommands
 
 from failuretwin import DigitalTwin, load_robot
 from failuretwin.app.live.connections import EmulationOptions, emulated_robot
 from failuretwin.app.live.shadow import Shadow
 from failuretwin.connection.links.diagnostic_status import SURE
 from failuretwin.connection.links.pace import Pace
-from failuretwin.connection.links.values import CommandSent, Item
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.streaming import monitor
 from failuretwin.failure_behavior.schedule import ScheduledFault, state_at
 
@@ -63,13 +61,13 @@ def schedule_of(motors: Sequence[str], seconds: float, seed: int) -> list[Schedu
 
 def live(
     schedule: Sequence[ScheduledFault], speed: float, seconds: float, seed: int
-) -> tuple[list[Said], list[CommandSent], list[float]]:
+) -> tuple[list[Said], KeptCommands, list[float]]:
     """Return what was said, all commands, and the memory taken in between [MB]."""
     robot = load_robot("armpi_fpv")
     twin = DigitalTwin(robot)
     texts = [f"{one.fault}@{one.start_s}-{one.end_s}" for one in schedule]
     options = EmulationOptions(texts, None, seconds, seed)
-    commands = Commands()
+    commands = KeptCommands()
     said: list[Said] = []
     memory: list[float] = []
     with emulated_robot(robot, options, Pace(speed)) as source:
@@ -82,33 +80,7 @@ def live(
                 continue
             best = answer.diagnosis.ranked[0]
             said.append(Said(answer.time, best, answer.diagnosis.posterior[best] >= SURE))
-    return said, commands.sent, memory
-
-
-class Commands:
-    """A sink that keeps commands."""
-
-    name, trouble = "commands", ""
-
-    def __init__(self) -> None:
-        self.sent: list[CommandSent] = []
-
-    def put(self, item: Item) -> None:
-        """Keep a command."""
-        if isinstance(item, CommandSent):
-            self.sent.append(item)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Nothing to be closed."""
-
-
-def ramp_ends(commands: Sequence[CommandSent], time: float) -> FloatArray:
-    """Return when the movements that begin after a time [s] end their ramps, in order [s]."""
-    ends = [one.time + float(one.duration.max()) for one in commands if one.time >= time]
-    return np.array(ends)
+    return said, commands, memory
 
 
 def main() -> None:
@@ -129,7 +101,7 @@ def main() -> None:
             for s in sure
             if s.name == "healthy" and one.end_s <= s.time < one.end_s + PERIOD_S - END_S + BEGIN_S
         ]
-        reached = ramp_ends(commands, one.start_s)
+        reached = commands.ramp_ends(one.start_s)
         first_named.append(there[0].time - reached[0] if there else np.nan)
         delays.append(found[0] - reached[0] if found else np.nan)
         if found:
