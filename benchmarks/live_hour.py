@@ -14,15 +14,18 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from can_show import CanShow
 from kept_commands import KeptCommands
 
 from failuretwin import DigitalTwin, load_robot
 from failuretwin.app.live.connections import EmulationOptions, emulated_robot
 from failuretwin.app.live.shadow import Shadow
+from failuretwin.connection.emulation.emulated_arm import Emulation
 from failuretwin.connection.links.diagnostic_status import SURE
 from failuretwin.connection.links.pace import Pace
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.decision.streaming.streaming import monitor
+from failuretwin.digital_model.imperfections import load_imperfections
 from failuretwin.failure_behavior.schedule import ScheduledFault, state_at
 
 PERIOD_S, BEGIN_S, END_S = 120.0, 40.0, 100.0
@@ -89,9 +92,12 @@ def main() -> None:
     motors = load_robot("armpi_fpv").motor_names
     schedule = schedule_of(motors, 3600.0 * hours, int(seed))
     said, commands, memory = live(schedule, speed, 3600.0 * hours, int(seed))
+    robot = load_robot("armpi_fpv")
+    emulation = Emulation(robot, load_imperfections(robot.name, robot), tuple(schedule), int(seed))
+    can_show = CanShow(emulation, 3600.0 * hours)
     sure = [s for s in said if s.sure]
     delays, first_named, repairs = [], [], []
-    number, after_it = [], []
+    number, after_shown = [], []
     for one in schedule:
         name = str(one.fault)
         there = [s for s in said if s.name == name and one.start_s <= s.time < one.end_s]
@@ -104,10 +110,10 @@ def main() -> None:
         reached = commands.ramp_ends(one.start_s)
         first_named.append(there[0].time - reached[0] if there else np.nan)
         delays.append(found[0] - reached[0] if found else np.nan)
-        if found:
-            deciding = max(int(np.sum(reached <= found[0])), 1)
-            number.append(deciding)
-            after_it.append(found[0] - reached[deciding - 1])
+        shown = can_show.movement(one)
+        if shown is not None:
+            number.append(shown)
+            after_shown.append(found[0] - reached[shown - 1] if found else np.nan)
         repairs.append(healthy[0] - one.end_s if healthy else np.nan)
         print(
             f"{name:28s} found after {delays[-1]:5.1f} s, repair noticed after {repairs[-1]:5.1f} s"
@@ -121,9 +127,10 @@ def main() -> None:
         print(f"at {s.time:.1f} s: {s.name}, truth {state_at(schedule, s.time, motors)}")
     print(
         f"{np.isfinite(delays).sum()} of {len(delays)} faults found, most probable after "
-        f"{np.nanmedian(first_named):.1f} s, sure after {np.nanmedian(delays):.1f} s (from the end "
-        f"of the first ramp); that was in movement {np.median(number):.0f} after the onset, "
-        f"{np.median(after_it):.1f} s after its ramp (medians); "
+        f"{np.nanmedian(first_named):.1f} s, sure after {np.nanmedian(delays):.1f} s (from the "
+        f"end of the first ramp), {np.nanmedian(after_shown):.1f} s after the ramp of the movement "
+        f"that can show it, which is number {np.median(number):.0f} after the onset (medians; "
+        f"{len(schedule) - len(number)} cannot be shown); "
         f"{np.isfinite(repairs).sum()} repairs noticed, median {np.nanmedian(repairs):.1f} s; "
         f"{len(alarms)} false alarms, {len(wrong) - len(alarms)} faults misnamed; "
         f"memory {memory[0]:.0f} to {memory[-1]:.0f} MB"

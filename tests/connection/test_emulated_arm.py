@@ -57,6 +57,25 @@ def test_the_same_seed_gives_the_same_life(armpi, measured_armpi):
     assert not np.array_equal(readings(one)[1][:50], readings(other)[1][:50])
 
 
+@pytest.mark.parametrize("mode", ["stuck", "steady_state_error"])
+def test_what_a_fault_does_is_the_difference_to_the_same_life_without_it(
+    armpi, measured_armpi, mode
+):
+    with_it, without = (
+        life(armpi, measured_armpi, faults) for faults in ([f"motor_1:{mode}@20-40"], [])
+    )
+    told = [
+        np.array([e.target for e in events if isinstance(e, CommandSent)])
+        for events in (with_it, without)
+    ]
+    assert_array_equal(*told)
+    (time, here), (_, there) = readings(with_it), readings(without)
+    off = np.abs(here - there)
+    assert np.all(off[time < 20.0] == 0.0)
+    assert np.median(off[(time > 23.0) & (time < 40.0), 0]) > 0.02
+    assert np.nanmax(off[:, 3]) < 0.01
+
+
 def test_a_healthy_arm_goes_where_it_is_told(armpi, measured_armpi):
     _, errors = settled_errors(life(armpi, measured_armpi, seconds=200.0))
     # Settled errors of the real arm are a few counts of 0.24 deg; a lost command is far off.

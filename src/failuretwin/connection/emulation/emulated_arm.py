@@ -88,7 +88,7 @@ class _Leg:
 
 
 class EmulatedArm:
-    """An arm that moves at random for ever; the same seed gives the same life.
+    """An arm that moves at random for ever; the same seed gives the same life, whatever fails.
 
     Args:
         emulation: What to emulate.
@@ -99,7 +99,7 @@ class EmulatedArm:
 
     def __init__(self, emulation: Emulation) -> None:
         self._emulation = emulation
-        self._rng = np.random.default_rng(emulation.seed)
+        self._rng, self._rng_of_faults = np.random.default_rng(emulation.seed).spawn(2)
         imperfections = vary(emulation.imperfections, self._rng)
         if imperfections.readings is not None:
             readings = replace(imperfections.readings, drawn_out=False)
@@ -192,7 +192,9 @@ class EmulatedArm:
 
     def _fault_value(self, scheduled: ScheduledFault, end_s: float) -> FaultValue:
         fault = scheduled.fault
-        drawn = self._emulation.modes[fault.mode].draw(fault.motor, 1, end_s, self._rng)
+        drawn = self._emulation.modes[fault.mode].draw(
+            fault.motor, 1, end_s, self._rng_of_faults
+        )
         magnitude = self._magnitude.setdefault(scheduled, drawn.magnitude)
         return replace(drawn, magnitude=magnitude, course=scheduled.course)
 
