@@ -52,7 +52,7 @@ def test_a_network_diagnoses_as_bayes_does(failuretwin, network, simulated, tmp_
     records = [json.loads(line) for line in out.read_text().splitlines()]
     expected = load_network(path, load_robot("armpi_fpv")).predict_proba(read_runs(simulated))
     got = [list(record["posterior"].values()) for record in records]
-    np.testing.assert_allclose(got, expected, atol=1e-9)
+    np.testing.assert_allclose(got, expected, atol=1e-6)  # single precision
     assert {record["protocol"] for record in records} == {"P0c"}
     assert "network cnn" in records[0]["method"]
     assert "of 9 runs right" in answer.stdout
@@ -68,7 +68,7 @@ def test_a_network_is_blended_with_bayes(network, simulated, tmp_path, armpi, tw
     bayes = [[d.posterior[c] for c in classes] for d in BayesDiagnoser(twin).diagnose(runs)]
     expected = blended(np.array(bayes), loaded.predict_proba(runs), loaded.weights_)
     got = [[record["posterior"][c] for c in classes] for record in records]
-    np.testing.assert_allclose(got, expected, atol=1e-9)
+    np.testing.assert_allclose(got, expected, atol=1e-6)  # single precision
     assert records[0]["method"].startswith("blended: bayes")
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, cast
 
 import click
 
+from failuretwin.app.commands.options import LogOptions
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.bags.reading import BagTopics
@@ -32,15 +33,14 @@ TOLD_ERROR_M = 1e-6
 def read_inputs(
     sources: Sequence[Path],
     robot: Robot,
-    how: str,
-    published_labels: bool,
-    columns: Path | None,
-    approximate: bool,
+    reading: LogOptions,
 ) -> xr.Dataset:
     """Return the runs of all inputs as one run set."""
-    options = ReadOptions(cast(As, how), published_labels, approximate=approximate)
-    if columns is not None:
-        options = _with_map(options, columns, sources, robot)
+    options = ReadOptions(
+        cast(As, reading.how), reading.published_labels, approximate=reading.approximate
+    )
+    if reading.columns is not None:
+        options = _with_map(options, reading.columns, sources, robot)
     runs = read_runs(list(sources), robot, options)
     error = float(runs.attrs.get(RECOVERY_ERROR, 0.0))
     if error > TOLD_ERROR_M:

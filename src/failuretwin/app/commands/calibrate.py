@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from failuretwin.app.commands.options import PATH, common_options, reading_options
+from failuretwin.app.commands.options import PATH, LogOptions, common_options, reading_options
 
 
 @click.command()
@@ -28,10 +28,7 @@ def calibrate(
     hold_out: str | None,
     name: str | None,
     report: Path | None,
-    how: str,
-    published_labels: bool,
-    columns: Path | None,
-    approximate: bool,
+    reading: LogOptions,
     robot: str,
     seed: int,
 ) -> None:
@@ -53,10 +50,10 @@ def calibrate(
     from failuretwin.digital_model.robot import load_robot
 
     check_calibration_file(out)
-    tests, others = split_step_tests(logs, columns)
+    tests, others = split_step_tests(logs, reading.columns)
     steps = learn_loops(tests, load_robot(robot))
     model = steps.robot
-    runs = read_inputs(others, model, how, published_labels, columns, approximate)
+    runs = read_inputs(others, model, reading)
     source = ", ".join(str(log) for log in logs)
     found, judged = learn_robot(runs, model, name or out.stem, source, hold_out)
     found = with_step_tests(found, steps)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from failuretwin.app.commands.options import PATH, common_options, reading_options
+from failuretwin.app.commands.options import PATH, LogOptions, common_options, reading_options
 
 
 @click.command()
@@ -64,10 +64,7 @@ def diagnose(
     json_file: Path | None,
     csv_file: Path | None,
     plot: Path | None,
-    how: str,
-    published_labels: bool,
-    columns: Path | None,
-    approximate: bool,
+    reading: LogOptions,
     robot: str,
     seed: int,
 ) -> None:
@@ -116,7 +113,7 @@ def diagnose(
     }
     diagnoser = chosen_diagnoser(method, bayes, settings)
     history = open_history(bayes, calibration) if track else None
-    runs = read_inputs(inputs, model, how, published_labels, columns, approximate)
+    runs = read_inputs(inputs, model, reading)
     tell_mismatch(runs, expected_name(diagnoser, bayes))
     tracked = None if history is None else diagnose_tracked(runs, bayes, history)
     diagnoses = diagnoser.diagnose(runs) if tracked is None else tracked.diagnoses

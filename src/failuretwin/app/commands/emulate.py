@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from failuretwin.app.commands.options import common_options, live_options
+from failuretwin.app.commands.options import LiveOptions, common_options, live_options
 
 FILE_S = 60.0
 """Length of what is written to a file unless told otherwise [s]."""
@@ -27,11 +27,7 @@ FILE_S = 60.0
 @common_options
 def emulate(
     target: str,
-    topics: Path | None,
-    faults: tuple[str, ...],
-    imperfections: str | None,
-    speed: float,
-    duration: float | None,
+    live: LiveOptions,
     robot: str,
     seed: int,
 ) -> None:
@@ -48,18 +44,21 @@ def emulate(
     from failuretwin.failure_behavior.schedule import ScheduledFault, state_at
 
     model = load_robot(robot)
-    schedule = [ScheduledFault.parse(text, model.motor_names) for text in faults]
+    schedule = [ScheduledFault.parse(text, model.motor_names) for text in live.faults]
     zero, on_ros = time.time(), target == "ros1"
     if not on_ros and Path(target).suffix != ".mcap":
         raise InputError(f"--to is {target!r}, expected ros1 or a file that ends in .mcap.")
-    length = duration if duration is not None else (math.inf if on_ros else FILE_S)
-    options = EmulationOptions(faults, imperfections, length, seed)
-    source = emulated_robot(model, options, Pace(speed if on_ros else AS_FAST_AS_POSSIBLE), zero)
+    endless = math.inf if on_ros else FILE_S
+    length = endless if live.duration is None else live.duration
+    options = EmulationOptions(live.faults, live.imperfections, length, seed)
+    source = emulated_robot(
+        model, options, Pace(live.speed if on_ros else AS_FAST_AS_POSSIBLE), zero
+    )
     sink: Sink
     if on_ros:
         from failuretwin.connection.ros1.sinks import Ros1Robot
 
-        sink = Ros1Robot(model, topics_of(topics))
+        sink = Ros1Robot(model, topics_of(live.topics))
     else:
         sink = Recorder(Path(target), model)
     told = ""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from failuretwin.app.commands.options import PATH, common_options, reading_options
+from failuretwin.app.commands.options import PATH, LogOptions, common_options, reading_options
 
 
 @click.command("import")
@@ -23,10 +23,7 @@ from failuretwin.app.commands.options import PATH, common_options, reading_optio
 def import_(
     sources: tuple[Path, ...],
     out: Path,
-    how: str,
-    published_labels: bool,
-    columns: Path | None,
-    approximate: bool,
+    reading: LogOptions,
     robot: str,
     seed: int,
 ) -> None:
@@ -46,6 +43,6 @@ def import_(
     if out.resolve() in [source.resolve() for source in sources]:
         raise InputError(f"{out}: is what is to be read. Give another name to write to.")
     model = load_robot(robot)
-    runs = read_inputs(sources, model, how, published_labels, columns, approximate)
+    runs = read_inputs(sources, model, reading)
     export_runs(runs, out, DigitalTwin(model))
     click.echo(f"{runs.sizes['run']} runs written to {out}")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -11,6 +13,53 @@ import click
 F = TypeVar("F", bound=Callable[..., Any])
 
 PATH = click.Path(path_type=Path)
+
+
+@dataclass(frozen=True)
+class LogOptions:
+    """How logs become runs, as the command line says it.
+
+    Attributes:
+        how: Raw sessions as `measured` or as `published`.
+        published_labels: Take the truth from the names of folders.
+        columns: File that says what the columns of a CSV file, or the topics of a bag, are.
+        approximate: Accept commands that fit a published path only approximately.
+    """
+
+    how: str
+    published_labels: bool
+    columns: Path | None
+    approximate: bool
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """Topics, the emulated robot and the pace of time, as the command line says it.
+
+    Attributes:
+        topics: File with names and types of the robot's ROS topics.
+        faults: Faults of an emulated robot, such as ``motor_3:stuck@40-80``.
+        imperfections: Name or file; None: those of the robot's profile.
+        speed: How fast the time of logs and emulated robots passes; 0: as fast as possible.
+        duration: When to stop [s]; None: with the log, or never.
+    """
+
+    topics: Path | None
+    faults: tuple[str, ...]
+    imperfections: str | None
+    speed: float
+    duration: float | None
+
+
+def _gathered(command: F, kind: type[LogOptions] | type[LiveOptions], name: str) -> F:
+    """Return the command with the options of one kind gathered in one argument."""
+
+    @wraps(command)
+    def with_one(**told: Any) -> Any:
+        own = {field.name: told.pop(field.name) for field in fields(kind)}
+        return command(**told, **{name: kind(**own)})
+
+    return with_one  # type: ignore[return-value]
 
 
 def common_options(command: F) -> F:
@@ -32,7 +81,8 @@ def common_options(command: F) -> F:
 
 
 def reading_options(command: F) -> F:
-    """Add what says how raw logs become runs."""
+    """Add what says how raw logs become runs; the command gets it as `reading`."""
+    command = _gathered(command, LogOptions, "reading")
     command = click.option(
         "--approximate",
         is_flag=True,
@@ -64,7 +114,8 @@ def reading_options(command: F) -> F:
 
 
 def live_options(command: F) -> F:
-    """Add what `emulate` and `watch` share: topics, the emulated robot, the pace of time."""
+    """Add topics, the emulated robot and the pace of time; the command gets them as `live`."""
+    command = _gathered(command, LiveOptions, "live")
     command = click.option(
         "--duration",
         type=click.FloatRange(min=0.0, min_open=True),

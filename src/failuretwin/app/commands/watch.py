@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from failuretwin.app.commands.options import PATH, common_options, live_options
+from failuretwin.app.commands.options import PATH, LiveOptions, common_options, live_options
 
 
 @click.command()
@@ -31,11 +31,7 @@ def watch(
     source: str,
     calibration: Path | None,
     record: Path | None,
-    topics: Path | None,
-    faults: tuple[str, ...],
-    imperfections: str | None,
-    speed: float,
-    duration: float | None,
+    live: LiveOptions,
     robot: str,
     seed: int,
 ) -> None:
@@ -58,14 +54,14 @@ def watch(
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.twin import DigitalTwin
 
-    model, names = load_robot(robot), topics_of(topics)
+    model, names = load_robot(robot), topics_of(live.topics)
     twin = DigitalTwin(model)
     healthy = None if calibration is None else load_imperfections(str(calibration), model)
     diagnoser = monitor(twin, healthy)
-    length = math.inf if duration is None else duration
-    options = EmulationOptions(faults, imperfections, length, seed)
+    length = math.inf if live.duration is None else live.duration
+    options = EmulationOptions(live.faults, live.imperfections, length, seed)
     with ExitStack() as stack:
-        connections = connect(source, model, names, options, Pace(speed), stack)
+        connections = connect(source, model, names, options, Pace(live.speed), stack)
         sinks = list(connections.sinks)
         if record is not None:
             sinks.append(stack.enter_context(Recorder(record, model)))

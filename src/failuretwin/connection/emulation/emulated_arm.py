@@ -192,9 +192,7 @@ class EmulatedArm:
 
     def _fault_value(self, scheduled: ScheduledFault, end_s: float) -> FaultValue:
         fault = scheduled.fault
-        drawn = self._emulation.modes[fault.mode].draw(
-            fault.motor, 1, end_s, self._rng_of_faults
-        )
+        drawn = self._emulation.modes[fault.mode].draw(fault.motor, 1, end_s, self._rng_of_faults)
         magnitude = self._magnitude.setdefault(scheduled, drawn.magnitude)
         return replace(drawn, magnitude=magnitude, course=scheduled.course)
 
