@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,9 +30,6 @@ from failuretwin.decision.metrics import (
 )
 from failuretwin.digital_model.imperfections import load_imperfections
 from failuretwin.digital_model.robot import Robot
-
-if TYPE_CHECKING:
-    pass
 
 PER_CLASS = 223
 """Runs of each class by the physics engine: 2007 in all."""
