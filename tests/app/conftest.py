@@ -26,10 +26,10 @@ def full_disk():
 @pytest.fixture(scope="session")
 def failuretwin():
     """Run the command line as a user does, without a terminal."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    environment.pop("COLUMNS", None)
 
     def run(*arguments, folder=None, disk_full=False):
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        environment.pop("COLUMNS", None)
         return subprocess.run(
             [sys.executable, "-m", "failuretwin", *map(str, arguments)],
             capture_output=True,

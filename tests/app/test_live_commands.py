@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -47,6 +48,13 @@ def test_a_recorded_fault_and_its_repair_are_found(failuretwin, recording):
     assert answer.returncode == 0, answer.stderr
     check_found(told(answer))
     assert "last answer: healthy" in answer.stdout
+
+
+def test_a_written_life_goes_on_after_its_last_fault(failuretwin, tmp_path):
+    path = tmp_path / "robot.mcap"
+    answer = failuretwin("emulate", "--to", path, "--fault", "motor_3:stuck@40-65")
+    assert [text for _, text in told(answer)] == ["healthy", "motor_3:stuck", "healthy"]
+    assert f"85 s written to {path}" in answer.stdout
 
 
 def test_an_emulated_robot_is_watched_and_recorded(failuretwin, tmp_path):
@@ -123,6 +131,8 @@ def test_without_a_master_the_user_is_told_to_start_one(failuretwin, monkeypatch
         (("emulate", "--to", "robot.bag"), "expected ros1 or a file that ends in .mcap"),
         (("emulate", "--to", "a.mcap", "--fault", "motor_3:stuck"), "is not of the form"),
         (("emulate", "--to", "no/such/folder.mcap"), "cannot be written"),
+        (("watch", "emulated", "--record", "live.bag"), "Give a name that ends in .mcap"),
+        (("watch", ".", "--fault", "motor_3:stuck@5"), "--fault and --imperfections are of an"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_line(failuretwin, tmp_path, arguments, said):
@@ -143,7 +153,8 @@ def test_a_recording_is_not_overwritten(failuretwin, tmp_path):
     assert path.read_text() == "precious"
 
 
-def test_an_interrupt_ends_the_watch_and_the_recording(recording, tmp_path):
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_ends_the_watch_and_the_recording(recording, tmp_path, how):
     path = tmp_path / "live.mcap"
     shadow = subprocess.Popen(
         [sys.executable, "-m", "failuretwin", "watch", str(recording), "--record", str(path)],
@@ -155,7 +166,7 @@ def test_an_interrupt_ends_the_watch_and_the_recording(recording, tmp_path):
         assert time.monotonic() < deadline
         time.sleep(0.1)
     time.sleep(1.5)
-    shadow.send_signal(2)
+    shadow.send_signal(how)
     said, _ = shadow.communicate(timeout=20)
     assert shadow.returncode == 0
     assert "stopped" in said

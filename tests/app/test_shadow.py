@@ -1,16 +1,20 @@
 from __future__ import annotations
 
+import time
 from collections import deque
 from io import StringIO
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from failuretwin.app.live import shadow as shadow_module
 from failuretwin.app.live.changes import Changes
 from failuretwin.app.live.shadow import Shadow
 from failuretwin.app.live.view import View
 from failuretwin.app.live.watching import watch_until_end
+from failuretwin.connection.links.commands import SampledCommands
+from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.connection.links.values import OK, STALE, Answer, CommandSent, LinkCounts, Reading
 from failuretwin.core.diagnosis import Diagnosis
 
@@ -89,6 +93,27 @@ def run(shadow):
         pass
 
 
+@pytest.mark.parametrize("rate_hz", [2.0, 5.0, 20.0, 100.0])
+def test_set_points_that_come_as_a_stream_draw_the_line_that_they_mean(twin, rate_hz):
+    """Also between two of them, where a reading comes before it is known that the arm moves."""
+    step, samples = 1.0 / rate_hz, SampledCommands()
+    ends = np.round(np.array([1.0, 2.0, 4.0, 5.0]) * rate_hz) / rate_hz
+    told = []
+    for t in np.arange(0.0, 8.0, step):
+        told.append((t, samples.add(t, np.full(4, np.interp(t, ends, [0.0, 0.8, 0.8, -0.5])))))
+    events = [(at, sent) for at, sent in told if sent is not None]
+    events += [(t, reading(t)) for t in np.arange(0.013, 7.0, 0.1)]
+    in_order_of_arrival = [event for _, event in sorted(events, key=lambda one: one[0])]
+    topics = RosTopics(command="/set_points", command_type="sensor_msgs/JointState")
+    notebook = Notebook()
+    run(Shadow(Script(in_order_of_arrival), notebook, twin, commands_late_s=topics.wait_s))
+    zero = in_order_of_arrival[0].time
+    seen = [(t + zero, value[0]) for t, value, measured in notebook.told if measured is not None]
+    assert len(seen) == 70
+    times, values = np.array(seen).T
+    np.testing.assert_allclose(values, np.interp(times, ends, [0.0, 0.8, 0.8, -0.5]), atol=1e-9)
+
+
 def test_a_diagnoser_is_told_the_reference_with_its_corners(twin):
     events = [reading(100.0), command(100.3, 0.8), reading(100.8), reading(102.0)]
     notebook = Notebook()
@@ -147,8 +172,6 @@ def test_commands_alone_are_silence(twin, clock):
 
 
 def test_the_user_is_told_how_late_commands_come(twin, armpi):
-    from rich.console import Console
-
     events = [reading(0.0), reading(2.0), command(0.2, 0.8), reading(2.1), reading(2.2)]
     script = Script(events)
     shadow = Shadow(script, Notebook(), twin)
@@ -156,6 +179,18 @@ def test_the_user_is_told_how_late_commands_come(twin, armpi):
     told = watch_until_end(shadow, script, [], armpi.motor_names, console, np.inf)
     late = "commands come late: put commands_late_s = 2.0 into the --topics file"
     assert late in [change.text for change in told.lines]
+
+
+def test_a_source_from_which_nothing_comes_is_named(twin, armpi, clock):
+    class Silent(Script):
+        def poll(self, timeout_s):
+            clock[0] += 1.0
+            return super().poll(timeout_s)
+
+    script = Silent([None] * 9)
+    shadow = Shadow(script, Notebook(), twin)
+    told = watch_until_end(shadow, script, [], armpi.motor_names, Console(file=StringIO()), np.inf)
+    assert [change.text for change in told.lines] == ["nothing comes from a script"]
 
 
 def test_motor_readings_alone_are_silence(twin, clock):
@@ -183,8 +218,10 @@ def test_a_robot_that_is_silent_at_first_is_waited_for(twin, clock):
     np.testing.assert_allclose(times[-2:], [0.0, 0.1], atol=1e-9)
 
 
-def test_before_any_data_nothing_is_known(twin):
-    assert Shadow(Script([]), Notebook(), twin).moment.answer == Answer(0.0, STALE, None)
+def test_before_any_data_nothing_is_known_and_our_clock_stands_in(twin):
+    answer = Shadow(Script([]), Notebook(), twin).moment.answer
+    assert (answer.state, answer.diagnosis) == (STALE, None)
+    assert answer.time == pytest.approx(time.time(), abs=60.0)
 
 
 @pytest.mark.parametrize("jump", [3.15e7, -3.15e7])
@@ -272,13 +309,28 @@ def test_trouble_with_the_link_is_told(armpi):
     assert [c.text for c in changes.notice(still, counts, 1, ())] == ["over: disk full"]
 
 
-def test_the_view_shows_motors_posterior_and_changes(armpi):
-    from rich.console import Console
+def test_the_posterior_over_time_goes_by_the_robots_clock(armpi):
+    """However fast a log is replayed, and with gaps where nothing was known."""
+    view = View(armpi.motor_names, "a script")
+    for k in range(200):
+        view.remember(moment(0.1 * k, OK, HEALTHY))
+    for k in range(10):
+        view.remember(moment(30.0 + 0.1 * k, OK, STUCK))
+    console = Console(width=120, file=StringIO())
+    with console.capture() as captured:
+        console.print(view.draw(moment(31.0, OK, STUCK), LinkCounts(), []))
+    (row,) = [line for line in captured.get().splitlines() if "motor_3:stuck" in line]
+    assert row.count("?") == 10
+    assert row.split("?")[-1].lstrip().startswith("█")
+    assert "█" not in row.split("?")[0]
 
+
+def test_the_view_shows_motors_posterior_and_changes(armpi):
     view, changes = View(armpi.motor_names, "a script"), Changes(armpi.motor_names)
     told = moment(3.0, OK, STUCK)
     changes.notice(told, LinkCounts(), 0, ())
     console = Console(width=120, file=StringIO())
+    view.remember(told)
     with console.capture() as captured:
         console.print(view.draw(told, LinkCounts(received=7), changes.lines))
     text = captured.get()

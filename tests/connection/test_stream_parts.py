@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -195,6 +196,13 @@ def test_topics_from_a_file(tmp_path):
     assert load_topics(path) == RosTopics("/arm/command", "trajectory_msgs/JointTrajectory")
 
 
+def test_readings_wait_for_set_points_unless_the_user_says_otherwise():
+    streamed = RosTopics(command_type="sensor_msgs/JointState")
+    assert streamed.wait_s == 0.5
+    assert replace(streamed, commands_late_s=0.1).wait_s == 0.1
+    assert RosTopics().wait_s == 0.0
+
+
 @pytest.mark.parametrize(
     ("text", "match"),
     [
@@ -203,6 +211,8 @@ def test_topics_from_a_file(tmp_path):
         ('position = ""', "neither a topic of motor readings"),
         ('tool_type = "sensor_msgs/JointState"\ntool = "/t"', "cannot be the tool"),
         ("commands_late_s = 100.0", r"expected 0 to 60"),
+        ('command_type = "std_msgs/String"', "cannot be the command"),
+        ('command = "has space"', "is no name of a topic"),
     ],
 )
 def test_topics_that_make_no_sense_are_refused(tmp_path, text, match):

@@ -7,6 +7,7 @@ users end in one line and exit code 2.
 from __future__ import annotations
 
 import os
+import signal
 import sys
 
 import click
@@ -40,6 +41,7 @@ for command in (
 
 def main() -> None:
     """Run the command line."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends work as Ctrl-C does
     try:
         cli(standalone_mode=False)
         sys.stdout.flush()

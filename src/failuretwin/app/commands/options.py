@@ -120,7 +120,8 @@ def live_options(command: F) -> F:
         "--duration",
         type=click.FloatRange(min=0.0, min_open=True),
         metavar="SECONDS",
-        help="Stop after this time. Default: with the log, or never.",
+        help="Stop after this time: by the clock of an emulated robot, else by ours. Default: with "
+        "the log, or never.",
     )(command)
     command = click.option(
         "--speed",

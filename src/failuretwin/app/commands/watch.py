@@ -47,6 +47,7 @@ def watch(
     from failuretwin.app.live.connections import EmulationOptions, connect, topics_of
     from failuretwin.app.live.shadow import Shadow
     from failuretwin.app.live.watching import watch_until_end
+    from failuretwin.connection.links.diagnostic_status import statuses
     from failuretwin.connection.links.pace import Pace
     from failuretwin.connection.links.recorder import Recorder
     from failuretwin.decision.streaming.streaming import monitor
@@ -65,12 +66,12 @@ def watch(
         sinks = list(connections.sinks)
         if record is not None:
             sinks.append(stack.enter_context(Recorder(record, model)))
-        shadow = Shadow(connections.source, diagnoser, twin, sinks, names.commands_late_s)
+        shadow = Shadow(connections.source, diagnoser, twin, sinks, names.wait_s)
         try:
             # An emulated robot ends by itself, a log when it is over.
             until = time.monotonic() + (length if source != "emulated" else math.inf)
             watch_until_end(shadow, connections.source, sinks, model.motor_names, console(), until)
         except KeyboardInterrupt:
             click.echo("stopped")
-    diagnosis = shadow.moment.answer.diagnosis
-    click.echo(f"last answer: {'none' if diagnosis is None else diagnosis.verdict}")
+    arm = statuses(shadow.moment.answer, model.motor_names)[0]
+    click.echo(f"last answer: {arm.message}")

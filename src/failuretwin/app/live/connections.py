@@ -102,10 +102,16 @@ def connect(
         stack: Closes everything in the end.
 
     Raises:
-        InputError: If it does not exist, cannot be reached, or is none of these.
+        InputError: If it does not exist, cannot be reached, is none of these, or is told what only
+            an emulated robot does.
     """
     if text == EMULATED:
         return Connections(stack.enter_context(emulated_robot(robot, emulation, pace)))
+    if emulation.faults or emulation.imperfections:
+        raise InputError(
+            f"--fault and --imperfections are of an emulated robot, but the source is {text!r}. "
+            f"Leave them out, or watch {EMULATED!r}."
+        )
     if text == ROS1:
         return _ros1(robot, topics, stack)
     if text.startswith(f"{ROSBRIDGE}://"):

@@ -115,7 +115,9 @@ class Shadow:
         self._read_s = -np.inf
         self._fed_s = time.monotonic()
         self._newest = 0.0
-        self.moment = Moment(Answer(0.0, STALE, None), 0.0, np.full(3, np.nan), 0.0)
+        self.moment = Moment(
+            Answer(self._clock.stamp(0.0), STALE, None), 0.0, np.full(3, np.nan), 0.0
+        )
 
     @property
     def clock_jumps(self) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Sequence
 
@@ -34,7 +33,7 @@ BLOCKS = " ▁▂▃▄▅▆▇█"
 COLUMNS = 60
 """Width of the posterior over time."""
 COLUMN_S = 1.0
-"""Time of our own clock that one column stands for [s]."""
+"""Time of the stream that one column stands for [s]."""
 RESIDUAL_MM = 50.0
 """Residual that fills its bar [mm]."""
 BAR = 20
@@ -54,7 +53,20 @@ class View:
         self._motors = motors
         self._source = source
         self._history: deque[dict[str, float]] = deque(maxlen=COLUMNS)
-        self._next_s = 0.0
+        self._next_s = -np.inf
+
+    def remember(self, moment: Moment) -> None:
+        """Take a moment into the posterior over time; time without any is a gap."""
+        now_s = moment.stream_time
+        if now_s < self._next_s:
+            return
+        if np.isfinite(self._next_s):
+            missing = int((now_s - self._next_s) / COLUMN_S)
+            self._history.extend([{}] * min(missing, COLUMNS))
+        self._next_s = now_s + COLUMN_S
+        diagnosis, stale = moment.answer.diagnosis, moment.answer.state != "OK"
+        known = diagnosis is not None and not stale
+        self._history.append(dict(diagnosis.posterior) if known and diagnosis else {})
 
     def draw(self, moment: Moment, counts: LinkCounts, changes: Sequence[Change]) -> RenderableType:
         """Return the view of a moment.
@@ -64,7 +76,6 @@ class View:
             counts: What the link has seen.
             changes: What has changed so far, the newest last.
         """
-        self._remember(moment)
         lines = [Text(str(change)) for change in list(changes)[-SHOWN_CHANGES:]]
         return Group(
             self._head(moment, counts),
@@ -72,15 +83,6 @@ class View:
             Panel(self._posterior(), title=f"posterior, last {COLUMNS} s", title_align="left"),
             Panel(Group(*lines), title="what changed", title_align="left"),
         )
-
-    def _remember(self, moment: Moment) -> None:
-        now_s = time.monotonic()
-        if now_s < self._next_s:
-            return
-        self._next_s = now_s + COLUMN_S
-        diagnosis, stale = moment.answer.diagnosis, moment.answer.state != "OK"
-        known = diagnosis is not None and not stale
-        self._history.append(dict(diagnosis.posterior) if known and diagnosis else {})
 
     def _head(self, moment: Moment, counts: LinkCounts) -> Text:
         arm = statuses(moment.answer, self._motors)[0]

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 
 import click
-from rich.console import Console, RenderableType
+from rich.console import Console
 from rich.live import Live
 
 from failuretwin.app.live.changes import Change, Changes
-from failuretwin.app.live.shadow import Shadow
+from failuretwin.app.live.shadow import SILENCE_S, Shadow
 from failuretwin.app.live.view import View
 from failuretwin.connection.links.values import Sink, Source
 
@@ -47,39 +47,42 @@ def watch_until_end(
     """
     changes, view = Changes(motors), View(motors, source.name)
     live = Live(console=console, auto_refresh=False) if console.is_terminal else nullcontext()
+    begun_s, drawn_s = time.monotonic(), 0.0
     with live as shown:
-        draw = _drawer(shown)
-        while shadow.step(POLL_S) and time.monotonic() < until_s:
-            troubles = _troubles(shadow, sinks)
+        going = True
+        while going:
+            going = shadow.step(POLL_S) and time.monotonic() < until_s
+            troubles = _troubles(shadow, source, sinks, time.monotonic() - begun_s)
             found = changes.notice(shadow.moment, source.counts, shadow.clock_jumps, troubles)
             if shown is None:
                 _print(found)
-            else:
-                draw(lambda: view.draw(shadow.moment, source.counts, changes.lines))
-    if shown is None:
-        _print(changes.notice(shadow.moment, source.counts, shadow.clock_jumps, ()))
+                continue
+            view.remember(shadow.moment)
+            if not going or time.monotonic() >= drawn_s + REFRESH_S:
+                drawn_s = time.monotonic()
+                picture = view.draw(shadow.moment, source.counts, changes.lines)
+                shown.update(picture, refresh=True)
     return changes
 
 
-def _troubles(shadow: Shadow, sinks: Sequence[Sink]) -> tuple[str, ...]:
-    found = tuple(sink.trouble for sink in sinks if sink.trouble)
-    if shadow.late_s < LATE_S:
-        return found
-    wait = math.ceil(2.0 * shadow.late_s) / 2.0
-    return (*found, f"commands come late: put commands_late_s = {wait} into the --topics file")
+def _troubles(
+    shadow: Shadow, source: Source, sinks: Sequence[Sink], since_s: float
+) -> tuple[str, ...]:
+    """Return what keeps the diagnosis from being made or told.
 
-
-def _drawer(live: Live | None) -> Callable[[Callable[[], RenderableType]], None]:
-    """Return what draws a view, but not more often than eyes can follow."""
-    due_s = 0.0
-
-    def draw(view: Callable[[], RenderableType]) -> None:
-        nonlocal due_s
-        if live is not None and time.monotonic() >= due_s:
-            due_s = time.monotonic() + REFRESH_S
-            live.update(view(), refresh=True)
-
-    return draw
+    Args:
+        shadow: The shadow of the robot.
+        source: The robot.
+        sinks: Where the shadow tells what it knows.
+        since_s: For how long the robot has been listened to [s].
+    """
+    found = [sink.trouble for sink in sinks if sink.trouble]
+    if source.counts.received == 0 and since_s > SILENCE_S:
+        found.append(f"nothing comes from {source.name}")
+    if shadow.late_s >= LATE_S:
+        wait = math.ceil(2.0 * shadow.late_s) / 2.0
+        found.append(f"commands come late: put commands_late_s = {wait} into the --topics file")
+    return tuple(found)
 
 
 def _print(found: Sequence[Change]) -> None:

@@ -13,7 +13,7 @@ from failuretwin.connection.links.mcap_file import McapFile
 from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.connection.links.ros_writer import Outgoing, RosWriter
 from failuretwin.connection.links.values import Answer, CommandSent, Item, Reading
-from failuretwin.core.errors import OutputError
+from failuretwin.core.errors import InputError, OutputError
 from failuretwin.data_knowledge.bags.messages import NS_PER_S
 from failuretwin.digital_model.robot import Robot
 
@@ -36,19 +36,22 @@ KEPT = 10_000
 class Recorder:
     """Records readings, commands and answers as MCAP.
 
-    If the disk is full or gone, the file so far is made whole, and every few seconds a new part is
-    begun: ``live.mcap``, ``live-2.mcap`` and so on. Diagnoses that could not be saved go first.
+    If the disk is full or gone, the file so far is closed without an index, and every few seconds a
+    new part is begun: ``live.mcap``, ``live-2.mcap`` and so on. Diagnoses that could not be saved
+    go first.
 
     Args:
         path: The file; it must not exist.
         robot: The robot.
 
     Raises:
-        InputError: If it exists or an extra is missing.
+        InputError: If it exists, does not end in .mcap, or an extra is missing.
         OutputError: If it cannot be written.
     """
 
     def __init__(self, path: Path, robot: Robot) -> None:
+        if path.suffix != ".mcap":
+            raise InputError(f"{path}: recordings are MCAP. Give a name that ends in .mcap.")
         self.name = str(path)
         self._path = path
         self._writer = RosWriter(robot, RECORDED)

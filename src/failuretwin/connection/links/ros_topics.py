@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,13 @@ AUTHORS_TYPE = "cm/msg_cm"
 MONITORING = Kind.MONITORING
 STANDARD_TYPES = {kind.value.replace("/msg/", "/"): kind for kind in Kind if kind is not MONITORING}
 """Kinds of the standard types by their ROS 1 names."""
+STANDARD_PACKAGES = ("std_msgs", "sensor_msgs", "geometry_msgs", "trajectory_msgs", "nav_msgs")
+"""Packages of ROS itself: their other types have none of the fields that are looked for."""
+TOPIC_NAME = re.compile(r"[~/]?[A-Za-z]\w*(/[A-Za-z]\w*)*")
+"""What ROS accepts as the name of a topic."""
+SET_POINTS_LATE_S = 0.5
+"""How long readings wait for set-points that come as a stream [s]: until the next has come, it is
+not known where the reference was in between. Enough for two a second."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +42,7 @@ class RosTopics:
         diagnostics: Topic of the diagnosis.
         commands_late_s: How much later than their stamps commands may arrive [s]; readings wait
             that long for them. The authors' programs publish a command two seconds after it was
-            sent.
+            sent. None: not at all, or for `SET_POINTS_LATE_S` where set-points come as a stream.
     """
 
     command: str = "position_monitoring"
@@ -44,7 +52,7 @@ class RosTopics:
     tool: str = ""
     tool_type: str = "geometry_msgs/PointStamped"
     diagnostics: str = "/diagnostics"
-    commands_late_s: float = 0.0
+    commands_late_s: float | None = None
 
     def __post_init__(self) -> None:
         if not self.command:
@@ -54,15 +62,29 @@ class RosTopics:
                 "neither a topic of motor readings (`position`) nor of the tool's position (`tool`)"
                 " is named. Name one of them."
             )
-        if not 0.0 <= self.commands_late_s <= 60.0:
-            raise InputError(f"commands_late_s is {self.commands_late_s:g}, expected 0 to 60 [s].")
-        for role, _, type_ in self.subscribed:
+        if not 0.0 <= self.wait_s <= 60.0:
+            raise InputError(f"commands_late_s is {self.wait_s:g}, expected 0 to 60 [s].")
+        for role, name, type_ in self.subscribed:
+            if not TOPIC_NAME.fullmatch(name):
+                raise InputError(
+                    f"{role} is {name!r}, which is no name of a topic. Expected letters, digits, _ "
+                    "and /, such as /arm_controller/command."
+                )
             kind = kind_of_type(type_)
-            if kind not in KINDS[role]:
+            foreign = kind is MONITORING and type_.split("/")[0] in STANDARD_PACKAGES
+            if foreign or kind not in KINDS[role]:
                 raise InputError(
                     f"{role}_type is {type_!r}, which cannot be the {role}. Expected "
                     f"{', '.join(k.value for k in KINDS[role])}."
                 )
+
+    @property
+    def wait_s(self) -> float:
+        """How long readings wait for commands that arrive later than their stamps [s]."""
+        if self.commands_late_s is not None:
+            return self.commands_late_s
+        streamed = kind_of_type(self.command_type) is Kind.JOINT_STATE
+        return SET_POINTS_LATE_S if streamed else 0.0
 
     def check_fits(self, robot: Robot) -> None:
         """Raise InputError if a message would hold servo counts and the robot has none."""

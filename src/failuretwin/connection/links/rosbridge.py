@@ -80,7 +80,8 @@ class RosbridgeSource:
     ) -> None:
         import roslibpy
 
-        self.name = f"rosbridge {ros.factory.url}"
+        names = [name for _, name, _ in topics.subscribed]
+        self.name = f"rosbridge {ros.factory.url}: {', '.join(names)}"
         self._ros = ros
         self._inbox = Inbox(robot, topics, queue)
         self._reconnects = -1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time as wall_clock
+
 LEAP_S = 60.0
 """A stamp this far ahead of the newest is a clock that was set, no silence [s]."""
 BACK_S = 5.0
@@ -45,5 +47,10 @@ class StreamClock:
         return self._newest + max(0.0, now_s - self._seen_s)
 
     def stamp(self, time: float) -> float:
-        """Return what the robot's clock would say at a stream time, both [s]."""
-        return time - (self._offset or 0.0)
+        """Return what the robot's clock would say at a stream time, both [s].
+
+        Until it has said anything, it is taken to agree with ours.
+        """
+        if self._offset is None:
+            return wall_clock.time()
+        return time - self._offset

@@ -30,7 +30,6 @@ class Ros1Source:
         InputError: If rospy is missing, no master answers, or the robot does not fit the topics.
     """
 
-    name = "ROS 1"
     ended = False
 
     def __init__(self, robot: Robot, topics: RosTopics, queue: EventQueue | None = None) -> None:
@@ -41,6 +40,7 @@ class Ros1Source:
         self._subscribers: list[Any] = []
         self._subscribe()
         names = [name for _, name, _ in topics.subscribed]
+        self.name = f"ROS 1: {', '.join(names)}"
         self._registration = Registration("subscriber", names, self._subscribe)
 
     @property

@@ -8,6 +8,8 @@ its last movements say, with the same arithmetic as a recorded run.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import isfinite
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -269,8 +271,8 @@ class StreamingFleet:
                 f"a sample has commands {reference.shape} and readings {points.shape}. Expected "
                 f"({robots}, {motors}), a row for each robot, and ({robots}, 3)."
             )
-        if not np.isfinite(time):
-            raise InputError(f"a sample is of {time} s. Expected a finite time.")
+        if not (isinstance(time, Real) and isfinite(time)):
+            raise InputError(f"a sample is of {time!r} s. Expected one finite number.")
         return reference, points
 
     def _alive(
