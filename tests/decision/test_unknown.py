@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from failuretwin import BayesDiagnoser
-from failuretwin.core.hypothesis import UNKNOWN, Hypothesis, paper_hypotheses, single_faults
+from failuretwin.core.hypothesis import (
+    HEALTHY,
+    UNKNOWN,
+    Hypothesis,
+    paper_hypotheses,
+    single_faults,
+)
 from failuretwin.data_knowledge.generation import simulate
 from failuretwin.data_knowledge.plan import Plan
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
@@ -106,7 +112,7 @@ def test_unknown_counts_its_best_explanation_alone(diagnoser, imperfect):
     sure = Weight(np.full(2, 500.0), *(np.zeros((2, 5)).__getitem__,) * 2, lambda run: None)
 
     def says(left_out):
-        return weigh_unknown(scene, lambda other: sure, left_out).log_evidence
+        return weigh_unknown(scene, lambda other: sure, left_out, []).log_evidence
 
     good = replace(sure, log_evidence=np.full(2, 600.0))
     expected = np.log(0.3 * LEFT_OUT) + 600.0
@@ -124,3 +130,16 @@ def test_without_evidence_unknown_is_as_rare_as_it_was(diagnoser, imperfect):
         log_prior((*paper_hypotheses(diagnoser.twin.robot.motor_names), UNKNOWN), diagnoser.priors)
     )
     assert found.posterior["unknown"] == pytest.approx(prior[-1])
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["motor_1:stuck+motor_2:stuck", "motor_2:encoder_bias+motor_3:stuck", "motor_2:encoder_scale"],
+)
+def test_what_is_named_is_not_taken_for_unknown(twin, measured_armpi, name, least):
+    """Also where ends of movements are unseen, and two held motors point elsewhere than each."""
+    truth = Hypothesis.parse(name)
+    runs = simulate(Plan(twin.robot, [truth], 24, 13, measured_armpi))
+    offered = [HEALTHY, truth, Hypothesis.parse("motor_1:stuck"), UNKNOWN]
+    found = BayesDiagnoser(twin, measured_armpi, offered).diagnose(runs)
+    assert sum(d.diagnosis == name for d in found) >= least

@@ -40,9 +40,7 @@ class Scene:
     moving: MovingEvidence | None = None
     way_blur: float = 1.0
     remembered: Findings | None = None
-    _off: dict[tuple[int, bool], FloatArray] = field(
-        default_factory=dict, init=False, compare=False, repr=False
-    )
+    _off: dict[int, FloatArray] = field(default_factory=dict, init=False, compare=False, repr=False)
     _held: dict[int, FloatArray] = field(
         default_factory=dict, init=False, compare=False, repr=False
     )
@@ -91,19 +89,21 @@ class Scene:
         """Log density of the readings on the way if no motor is faulty, (run, movement)."""
         return np.zeros(self.usable.shape) if self.transients is None else self.transients.healthy
 
-    def on_way_off(self, motor: int, lasting: bool = False) -> FloatArray:
+    def on_way_off(self, motor: int, gain: FloatArray | None = None) -> FloatArray:
         """Return the same with one motor that settles off its target, (run, movement).
 
         Args:
             motor: Index of the motor.
-            lasting: Whether it is off by about the same in all movements.
+            gain: By how much it is off for each unit of an amount that holds for the run,
+                (run, movement, alternative) [rad]; None: other movements do not tell.
         """
         if self.transients is None:
             return self.on_way
-        key = (motor, lasting)
-        if key not in self._off:
-            self._off[key] = self.transients.off(motor, self.profile(motor), lasting)
-        return self._off[key]
+        if gain is not None:
+            return self.transients.off(motor, self.profile(motor), gain)
+        if motor not in self._off:
+            self._off[motor] = self.transients.off(motor, self.profile(motor))
+        return self._off[motor]
 
     def on_way_held(self, motor: int, angle: FloatArray) -> FloatArray:
         """Return the same with one motor that is held at some angle or gets stuck there.

@@ -26,6 +26,9 @@ ASTRAY = 0.1
 """How far the tool strays from its way if nothing explains it, as a share of the arm's reach."""
 ASTRAY_RATE = 0.02
 """Share of movements in which it does [-]."""
+LAST = 3
+"""Movements, the last that tell, from which the size of a lasting fault is taken where the end of a
+movement was not seen."""
 
 
 @dataclass(frozen=True)
@@ -86,13 +89,14 @@ class Transients:
         found[item] = np.logaddexp(stays, stops) - np.log(2.0)
         return self._trusted(self.judge.from_anywhere(course, found) + luck[..., None])
 
-    def off(self, motor: int, profile: MotorProfile, lasting: bool) -> FloatArray:
+    def off(self, motor: int, profile: MotorProfile, gain: FloatArray | None = None) -> FloatArray:
         """Return the log density if a motor goes to where it was seen to settle.
 
         Args:
             motor: Index of the motor.
             profile: What each movement says of it.
-            lasting: Whether it is off by about the same in all movements.
+            gain: By how much it is off for each unit of an amount that holds for the run,
+                (run, movement, alternative) [rad]; None: other movements do not tell.
 
         Returns:
             (run, movement).
@@ -105,8 +109,10 @@ class Transients:
         seen = np.argmax(profile.log_terms(near, False), axis=-1)
         ends = np.where(self.judge.usable[..., None, None], profile.pose, self.judge.expected)
         unseen = self.judge.expected[..., motor]
-        if lasting:
-            unseen = unseen + self._usually_off(_at(near - profile.expected, seen))
+        if gain is not None:
+            amount = self._amount(_at(near - profile.expected, seen), _at(gain, seen))
+            largest = LARGEST_OFFSET_RAD
+            unseen = unseen + np.clip(gain * amount[:, None, None], -largest, largest)
         ends[..., motor] = np.where(self.judge.usable[..., None], near, unseen)
         return self.toward(ends, seen, motor)
 
@@ -129,11 +135,22 @@ class Transients:
             self.judge.from_anywhere(course, self.judge.log_density(course), off) + luck
         )
 
-    def _usually_off(self, offset: FloatArray) -> FloatArray:
-        """Return the median of offsets (run, movement) over the movements seen, (run, 1, 1)."""
-        some = self.judge.usable.any(axis=1, keepdims=True)
-        seen = np.where(self.judge.usable, offset, np.where(some, np.nan, 0.0))
-        return np.asarray(np.nanmedian(seen, axis=1))[:, None, None]
+    def _amount(self, offset: FloatArray, gain: FloatArray) -> FloatArray:
+        """Return the amount that makes offsets of gains, (run,).
+
+        The median of what the last movements say: those before the onset say that there is none.
+
+        Args:
+            offset: Of the movements whose ends were seen, (run, movement) [rad].
+            gain: Offset for each unit of the amount, (run, movement) [rad]; those that are small
+                beside the others say little.
+        """
+        large = np.where(self.judge.usable, np.abs(gain), 0.0)
+        tells = (large > 0.0) & (large >= 0.5 * large.max(axis=1, keepdims=True))
+        tells &= np.cumsum(tells[:, ::-1], axis=1)[:, ::-1] <= LAST
+        ratio = np.where(tells, offset / np.where(tells, gain, 1.0), np.nan)
+        ratio[~tells.any(axis=1)] = 0.0
+        return np.asarray(np.nanmedian(ratio, axis=1))
 
     @cached_property
     def astray(self) -> FloatArray:

@@ -36,7 +36,8 @@ class Law:
             its own node; None: one node holds for the whole run.
         on_way: Log density of the readings on the way at each node, (run, movement, node); None:
             as for any motor that settles off its target.
-        lasting: Whether the motor is off by about the same in all movements.
+        gain: By how much the motor is off for each unit of an amount that holds for the run,
+            (run, movement, alternative) [rad]; None: other movements do not tell.
     """
 
     motor: int
@@ -47,7 +48,7 @@ class Law:
     onsets: Callable[[int], tuple[FloatArray, FloatArray]]
     redrawn: FloatArray | None = None
     on_way: FloatArray | None = None
-    lasting: bool = False
+    gain: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def densities(scene: Scene, law: Law) -> Densities:
         by_cell = _in_groups(by_node, law.redrawn)
     way = law.on_way
     if way is None:
-        way = scene.on_way_off(law.motor, law.lasting)[..., None]
+        way = scene.on_way_off(law.motor, law.gain)[..., None]
     return Densities(by_node, by_cell, way)
 
 

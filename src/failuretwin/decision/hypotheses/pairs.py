@@ -12,6 +12,7 @@ from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.decision.evidence.motor_profile import MotorProfile, motor_profiles
 from failuretwin.decision.evidence.scene import Scene
 from failuretwin.decision.hypotheses.law import Law
+from failuretwin.decision.hypotheses.laws.off_anyhow import way_of_two
 from failuretwin.decision.hypotheses.weight import Estimate, Weight
 
 FEWEST_NATS = 14.0
@@ -45,8 +46,12 @@ def _weigh_one(scene: Scene, one: Law, two: Law) -> Weight:
     settled = scene.log_healthy[0], alone, both
     ways = [_way(scene, law) for law in (one, two)]
     alone = [values + way for values, way in zip(alone, ways, strict=True)]
-    # The way with both faults is not computed: it is no less probable than with one of them.
-    both = both + np.maximum(ways[0][:, :, None], ways[1][:, None])
+    # The way with both faults is not computed for each node: it is no less probable than with one
+    # of them, or with both motors where they are seen to settle.
+    with_two = way_of_two(scene, (one.motor, two.motor))[0]
+    both = both + np.maximum(
+        np.maximum(ways[0][:, :, None], ways[1][:, None]), with_two[:, None, None]
+    )
     healthy, count = settled[0] + scene.on_way[0], len(both)
     prior = [law.log_prior[0] for law in (one, two)]  # (movement, cell)
 
@@ -86,7 +91,7 @@ def _way(scene: Scene, law: Law) -> FloatArray:
     """Return log densities of the way with one of the faults alone, (movement, node or 1)."""
     if law.on_way is not None:
         return law.on_way[0]
-    return scene.on_way_off(law.motor, law.lasting)[0][:, None]
+    return scene.on_way_off(law.motor, law.gain)[0][:, None]
 
 
 def _alone(scene: Scene, law: Law) -> FloatArray:

@@ -11,9 +11,11 @@ from failuretwin.core.hypothesis import UNKNOWN, Fault, Hypothesis, single_fault
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.knowledge import prior_odds
 from failuretwin.decision.evidence.scene import Scene
+from failuretwin.decision.evidence.two_angles import two_angles
 from failuretwin.decision.hypotheses.law import Law, weigh
 from failuretwin.decision.hypotheses.laws.drift import drift_law
 from failuretwin.decision.hypotheses.laws.lasting import AMOUNTS, lasting_law
+from failuretwin.decision.hypotheses.laws.nodes import LOCAL_STEPS
 from failuretwin.decision.hypotheses.laws.stays import MISSES, weigh_misses
 from failuretwin.decision.hypotheses.laws.steady_state_error import error_law
 from failuretwin.decision.hypotheses.laws.stuck import stuck_law
@@ -91,7 +93,7 @@ def weigh_all(scene: Scene, hypotheses: Sequence[Hypothesis], priors: Priors) ->
         others = [
             (prior_odds(h), weigh_hypothesis(scene, h, priors)) for h in left_out(scene, known)
         ]
-        weights[UNKNOWN] = weigh_unknown(scene, _weigh_healthy, others)
+        weights[UNKNOWN] = weigh_unknown(scene, _weigh_healthy, others, known)
     return [weights[h] for h in hypotheses]
 
 
@@ -108,8 +110,7 @@ def weigh_hypothesis(scene: Scene, hypothesis: Hypothesis, priors: Priors) -> We
     if len(hypothesis.faults) == 2:
         scenes = [scene[run] for run in range(len(scene.log_healthy))]
         one, two = hypothesis.faults
-        laws = [(law_of(alone, one, priors), law_of(alone, two, priors)) for alone in scenes]
-        return weigh_pair(scenes, laws)
+        return weigh_pair(scenes, [_laws_of_two(alone, one, two, priors) for alone in scenes])
     fault = hypothesis.faults[0]
     if fault.mode in MISSES:
         early = priors.onset.before_run(fault.mode)
@@ -128,6 +129,23 @@ def law_of(scene: Scene, fault: Fault, priors: Priors) -> Law:
     if fault.mode in TIMED:
         return TIMED[fault.mode](scene, motor, priors.onset.before_run(fault.mode))
     return LAWS[fault.mode](scene, motor, priors)
+
+
+def _laws_of_two(scene: Scene, one: Fault, two: Fault, priors: Priors) -> tuple[Law, Law]:
+    """Return the laws of two faults that are there at once; those held look where both point."""
+    first, second = sorted((motor_of(scene, one), motor_of(scene, two)))
+    seen = two_angles(scene.evidence, scene.model, scene.alternatives, (first, second))
+
+    def law(fault: Fault) -> Law:
+        if fault.mode != "stuck":
+            return law_of(scene, fault, priors)
+        motor = motor_of(scene, fault)
+        at = seen.pair.index(motor)
+        width = np.sqrt(seen.covariance[..., at])
+        nodes = seen.angle[..., at, None] + width[..., None] * LOCAL_STEPS
+        return stuck_law(scene, motor, priors.onset, nodes.reshape(len(nodes), -1))
+
+    return law(one), law(two)
 
 
 def _weigh_healthy(scene: Scene) -> Weight:

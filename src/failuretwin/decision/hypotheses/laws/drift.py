@@ -10,10 +10,14 @@ from failuretwin.data_knowledge.knowledge import magnitude_range
 from failuretwin.decision.evidence.scene import Scene
 from failuretwin.decision.hypotheses.law import Law
 from failuretwin.decision.hypotheses.laws.nodes import pointed, size_nodes
-from failuretwin.decision.hypotheses.onsets import SHARES, Stretches, at_once
+from failuretwin.decision.hypotheses.onsets import Stretches, at_once
 
-ONSETS = SHARES[[1, 4, 8]]
-"""Onsets to sum over in each stretch, as shares of its length."""
+CELLS = 3
+"""Parts of a stretch, each with one onset to sum over."""
+ONSETS = (np.arange(CELLS) + 0.5) / CELLS
+"""Those onsets, as shares of its length."""
+WITHIN = np.linspace(-0.4, 0.4, 5) / CELLS
+"""Where in its part an onset may be, beside its middle, as shares of the length of the stretch."""
 
 
 def drift_law(scene: Scene, motor: int, early: float) -> Law:
@@ -27,7 +31,10 @@ def drift_law(scene: Scene, motor: int, early: float) -> Law:
     middle = np.nan_to_num(0.5 * (scene.evidence.begin + scene.evidence.end))
     settled = scene.profile(motor).beside
     rate, log_rate = _rates(scene, motor, settled, middle)
-    onset, log_onset = _onsets(at_once(scene.evidence), early)  # (run, movement, onset)
+    stretches = at_once(scene.evidence)
+    onset, log_onset = _onsets(stretches, early)  # (run, movement, onset)
+    length = np.nan_to_num(stretches.end - stretches.begin)[..., None] * np.ones_like(onset)
+    length[..., 0] = 0.0  # before the run is no stretch of it
     runs, movements, onsets = onset.shape
     since = np.maximum(middle[:, :, None] - onset.reshape(runs, 1, -1), 0.0)
     # A node is an onset and a rate; each onset belongs to one movement that it spoils first.
@@ -38,7 +45,11 @@ def drift_law(scene: Scene, motor: int, early: float) -> Law:
     rates = rate.shape[1]
 
     def of_run(run: int) -> tuple[FloatArray, FloatArray]:
-        return np.repeat(onset[run].reshape(1, -1, 1), rates, axis=1), np.ones((1, 1, 1))
+        at = onset[run][..., None] + length[run][..., None] * WITHIN
+        return (
+            np.repeat(at.reshape(1, -1, len(WITHIN)), rates, axis=1),
+            np.full((1, 1, len(WITHIN)), 1.0 / len(WITHIN)),
+        )
 
     return Law(
         motor=motor,

@@ -104,7 +104,7 @@ def lasting_law(scene: Scene, motor: int, mode: str, early: float) -> Law:
         log_prior=log_of(stretches.weights(early))[..., None] + log_size[:, None],
         size=size,
         onsets=stretches.onsets(early),
-        lasting=True,
+        gain=gain,
     )
 
 

@@ -8,13 +8,15 @@ the sum over it is taken: densities integrate to no more than one.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
 
 import numpy as np
 
+from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.quadrature import log_sum
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.decision.evidence.scene import Scene
 from failuretwin.decision.evidence.two_angles import TwoAngles, two_angles
 from failuretwin.decision.hypotheses.laws.two_amounts import Lines
@@ -46,8 +48,15 @@ class Kind:
 
 
 WELL = Kind(0.0)
-OFF = (Kind(0.4, held=True), Kind(0.3), Kind(0.4, by_angle=True), Kind(0.4, redrawn=True))
-"""Spreads are wide enough for most of what a motor can do within its range."""
+OFF_AS: Mapping[str, Kind] = {
+    "stuck": Kind(0.4, held=True),
+    "encoder_bias": Kind(0.3),
+    "encoder_scale": Kind(0.4, by_angle=True),
+    "steady_state_error": Kind(0.4, redrawn=True),
+}
+"""Kinds, by the mode that is the simplest case of each. Spreads are wide enough for most of what a
+motor can do within its range."""
+OFF = tuple(OFF_AS.values())
 ONE_OFF = (*product(OFF, (WELL,)), *product((WELL,), OFF))
 TWO_OFF = tuple(product(OFF, OFF))
 KINDS = (*ONE_OFF, *TWO_OFF)
@@ -55,12 +64,17 @@ LOG_CHANCE = -np.log([2 * len(ONE_OFF)] * len(ONE_OFF) + [2 * len(TWO_OFF)] * le
 """Log probability of each of `KINDS`: one motor as often as two."""
 
 
-def weigh_off_anyhow(scene: Scene) -> Weight | None:
-    """Return what the runs say of one motor or two being off; None of an arm of a single motor."""
+def weigh_off_anyhow(scene: Scene, known: Sequence[Hypothesis] = ()) -> Weight | None:
+    """Return what the runs say of one motor or two being off; None of an arm of a single motor.
+
+    Args:
+        scene: The runs.
+        known: Hypotheses; two motors that are off as one of them says are left out.
+    """
     pairs = list(combinations(range(len(scene.model.scatter)), 2))
     if not pairs:
         return None
-    settled, ways = zip(*(_weigh(scene, pair) for pair in pairs), strict=True)
+    settled, ways = zip(*(_weigh(scene, pair, known) for pair in pairs), strict=True)
     says = [one + way for one, way in zip(settled, ways, strict=True)]
     whole = np.stack([one.sum(axis=1) for one in says], axis=1)
     best = np.argmax(whole, axis=1)
@@ -73,12 +87,22 @@ def weigh_off_anyhow(scene: Scene) -> Weight | None:
     )
 
 
-def _weigh(scene: Scene, pair: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+def way_of_two(scene: Scene, pair: tuple[int, int]) -> FloatArray:
+    """Return log densities of the way with two motors off, (run, movement)."""
+    if scene.transients is None:
+        return scene.on_way
+    return _weigh(scene, (min(pair), max(pair)))[1]
+
+
+def _weigh(
+    scene: Scene, pair: tuple[int, int], known: Sequence[Hypothesis] = ()
+) -> tuple[FloatArray, FloatArray]:
     """Return log densities of settled positions and of the way, (run, movement) each."""
     seen = two_angles(scene.evidence, scene.model, scene.alternatives, pair)
     outlier = scene.model.outlier_log_density
     course = follow(seen, _lines(scene, seen), scene.usable, outlier)
-    total = course.says.sum(axis=-1) + LOG_CHANCE  # (run, kind)
+    chance = np.where(_among(known, scene, pair), -np.inf, LOG_CHANCE)
+    total = course.says.sum(axis=-1) + chance  # (run, kind)
     best, run = np.argmax(total, axis=1), np.arange(len(total))
     says = course.says[run, best]
     # What chance and the other kinds add belongs to no movement more than to another.
@@ -88,6 +112,14 @@ def _weigh(scene: Scene, pair: tuple[int, int]) -> tuple[FloatArray, FloatArray]
     if scene.transients is None:
         return says, np.zeros_like(says)
     return says, _on_way(scene, seen, Course(says, course.way[run, best], course.angle[run, best]))
+
+
+def _among(known: Sequence[Hypothesis], scene: Scene, pair: tuple[int, int]) -> BoolArray:
+    """Return which of `KINDS` of two motors are known hypotheses, (kind,)."""
+    names = [scene.model.twin.robot.motor_names[motor] for motor in pair]
+    said = [{fault.motor: OFF_AS.get(fault.mode) for fault in h.faults} for h in known]
+    kinds = [tuple(one[name] for name in names) for one in said if set(one) == set(names)]
+    return np.array([kind in kinds for kind in KINDS])
 
 
 def _on_way(scene: Scene, seen: TwoAngles, course: Course) -> FloatArray:

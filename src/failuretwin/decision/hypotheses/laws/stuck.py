@@ -33,15 +33,19 @@ FREE_IF_KNOWN = 0.05
 """Probability that the held angle is unrelated to the commands where the onset is known."""
 
 
-def stuck_law(scene: Scene, motor: int, prior: OnsetPrior) -> Law:
+def stuck_law(scene: Scene, motor: int, prior: OnsetPrior, likely: FloatArray | None = None) -> Law:
     """Return the law of `motor` being stuck.
 
     Args:
         scene: The runs.
         motor: Index of the motor.
         prior: When and where it may have got stuck.
+        likely: Angles to integrate over besides those that movements point to if this motor alone
+            is faulty, (run, node) [rad].
     """
     angle = _angle_nodes(scene, motor, prior)
+    if likely is not None:
+        angle = np.sort(np.concatenate([angle, likely.clip(*scene.held_range(motor))], axis=1))
     parts = _log_prior(scene, motor, angle, prior)  # (run, movement, plateau | ramp, node)
     log_prior = log_sum(parts, axis=2)
 

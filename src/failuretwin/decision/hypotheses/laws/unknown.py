@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.evidence.scene import Scene
 from failuretwin.decision.hypotheses.laws.off_anyhow import weigh_off_anyhow
@@ -34,6 +35,7 @@ def weigh_unknown(
     scene: Scene,
     healthy: Callable[[Scene], Weight],
     left_out: Sequence[tuple[float, Weight]],
+    known: Sequence[Hypothesis],
 ) -> Weight:
     """Return what the runs say of a fault that is not among the known ones, times its odds.
 
@@ -42,11 +44,12 @@ def weigh_unknown(
         healthy: What weighs a healthy robot.
         left_out: Faults that are not among the known ones: their odds against healthy, and what
             the runs say of them.
+        known: The known hypotheses; two motors that are off as one of them says are no unknown.
     """
     found = [(LEFT_OUT * odds, weight) for odds, weight in left_out]
     blurred = _blurred(scene)
     found += [(BLURRED_ODDS / len(blurred), healthy(other)) for other in blurred]
-    anyhow = weigh_off_anyhow(scene)
+    anyhow = weigh_off_anyhow(scene, known)
     if anyhow is not None:
         found.append((OFF_ODDS, anyhow))
     return _best([weight for _, weight in found], np.log([odds for odds, _ in found]))
