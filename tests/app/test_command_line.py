@@ -146,6 +146,19 @@ def test_wrong_diagnoses_are_marked(failuretwin, simulated, tmp_path):
     assert "0 of 2 runs right: accuracy 0.0 %" in answer.stdout
 
 
+def test_a_fault_that_is_not_named_is_rightly_called_unknown(failuretwin, simulated, tmp_path):
+    save_run_set(load_run_set(simulated).isel(run=[0, 2]), tmp_path / "two.nc")
+    arguments = ("two.nc", "--hypotheses", "healthy,motor_1:stuck,unknown", "--plot", "page")
+    answer = failuretwin("diagnose", *arguments, folder=tmp_path)
+    assert "WRONG" not in answer.stdout
+    assert "2 of 2 runs right" in answer.stdout
+    line = "judged as unknown, since not among the hypotheses: motor_2:stuck (1 run)"
+    assert line in answer.stdout.splitlines()
+    page = (tmp_path / "page" / "index.html").read_text()
+    assert line in page
+    assert 'class="wrong"' not in page
+
+
 def test_without_truth_there_is_nothing_to_score(failuretwin, simulated, tmp_path):
     save_run_set(load_run_set(simulated).drop_vars("fault"), tmp_path / "runs.nc")
     answer = failuretwin("diagnose", "runs.nc", folder=tmp_path)

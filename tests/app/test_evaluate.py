@@ -29,6 +29,14 @@ def record(run, truth, said, sure=0.8, **more):
     }
 
 
+def with_unknown(records, said):
+    """Return diagnoses that offer healthy, a stuck motor and `unknown`, which is `said` of runs."""
+    for told in records:
+        best = "unknown" if told["run"] in said else "healthy"
+        sure = {name: 0.8 if name == best else 0.1 for name in ("healthy", STUCK, "unknown")}
+        yield {**told, "diagnosis": best, "posterior": sure, "onset_90": [0.0, 0.5]}
+
+
 RECORDS = [
     record("a", "healthy", "healthy"),
     record("b", "healthy", STUCK),
@@ -47,6 +55,7 @@ def folder(tmp_path):
     write("ours.jsonl", RECORDS)
     better = [record(r["run"], r["truth"], r["truth"], sure=0.9) for r in RECORDS]
     write("better.jsonl", better[::-1])  # runs are matched by name
+    write("unknown.jsonl", with_unknown(RECORDS, said="e"))
     write("fewer.jsonl", RECORDS[:4])
     write("twice.jsonl", [*RECORDS, RECORDS[0]])
     write("other.jsonl", [*RECORDS[:5], {**RECORDS[5], "truth": STUCK}])
@@ -135,6 +144,31 @@ def test_a_truth_that_was_ruled_out_is_said(evaluate):
     )
     alone = evaluate("certain.jsonl").stdout
     assert "log score inf nats a run (of 4 runs the truth was given no probability" in alone
+
+
+def test_a_fault_that_is_no_hypothesis_is_judged_as_unknown(evaluate, folder):
+    arguments = ("--truth", "runs.nc", "--latex", "x.tex", "--against", "ours.jsonl")
+    text = evaluate("unknown.jsonl", *arguments).stdout
+    # of both runs that drift, the first is called unknown
+    assert "2 of 6 runs right" not in text
+    assert "3 of 6 runs right" in text
+    assert line_of(text, "judged as unknown, since") == (
+        "judged as unknown, since not among the hypotheses: motor_2:drift (2 runs)"
+    )
+    nats = -(3 * np.log(0.8) + 3 * np.log(0.1)) / 6
+    assert line_of(text, "log score ") == f"log score {nats:.3f} nats a run"
+    assert "unknown 2 1.000 0.500 0.667" in " ".join(text.split())
+    assert "motor_2:drift 2" not in " ".join(text.split())
+    # all six are 80 % sure, three are right
+    assert line_of(text, "calibration error").startswith("calibration error 0.300 in 10 bins")
+    assert line_of(text, "onset of unknown").startswith("onset of unknown 1 100.0 %")
+    assert line_of(text, "missed-detection").startswith("missed-detection rate 75.0 %")
+    # the other result, without `unknown`, is judged as it names things itself
+    assert line_of(text, "right: ").startswith("right: both 1, only A 2, only B 2, neither 1")
+    assert line_of(text, "judged as unknown: ").startswith("judged as unknown: by A 2 runs, by B 0")
+    table = (folder / "x.tex").read_text()
+    assert r"unknown & 2 & 1.000 & 0.500 & 0.667 \\" in table
+    assert "judged as unknown & 2 runs" in table
 
 
 @pytest.mark.parametrize(

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.store import replacing
-from failuretwin.decision.metrics import LogScore, Scores, score
+from failuretwin.decision.metrics import LogScore, Scores, judged_truth, score
 
 Record = dict[str, Any]
 """One diagnosis as the JSON object of the contract."""
@@ -97,8 +98,32 @@ def _check_probabilities(posterior: Sequence[float], where: str) -> None:
 
 
 def judged_records(records: Sequence[Record]) -> list[Record]:
-    """Return the records whose truth is known."""
-    return [record for record in records if record["truth"]]
+    """Return the records whose truth is known, with the truth that they are judged by."""
+    return [
+        {**record, "truth": judged_truth(record["truth"], record["posterior"])}
+        for record in records
+        if record["truth"]
+    ]
+
+
+def truths_as_unknown(records: Sequence[Record]) -> Counter[str]:
+    """Return how many runs of each truth are judged as `unknown`, by the truth."""
+    known = [record for record in records if record["truth"]]
+    judged = judged_records(records)
+    return Counter(
+        told["truth"]
+        for told, record in zip(known, judged, strict=True)
+        if told["truth"] != record["truth"]
+    )
+
+
+def as_unknown_line(records: Sequence[Record]) -> str:
+    """Return which truths are judged as `unknown`, in words; empty if none is."""
+    found = truths_as_unknown(records)
+    if not found:
+        return ""
+    truths = [f"{truth} ({count} run{'s' * (count > 1)})" for truth, count in found.items()]
+    return f"judged as unknown, since not among the hypotheses: {', '.join(truths)}"
 
 
 def protocol_of(records: Sequence[Record]) -> str:
