@@ -139,6 +139,7 @@ def test_misspelt_command_line(refused, arguments, words):
     [
         (["--sse-range", "20", "5"], "--sse-range is 20 5, expected 0 <= LOW < HIGH"),
         (["--sse-range", "0", "inf"], "--sse-range"),
+        (["--sse-range", "10", "1001"], "turn through 1000 servo units (240 deg)"),
         (["--onset", "-1"], "--onset is -1 s, expected 0 or more"),
         (["--hypotheses", "motor_9:stuck"], "unknown motor 'motor_9'"),
         (["--hypotheses", "motor_1:stuk"], "Did you mean 'stuck'?"),

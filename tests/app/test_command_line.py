@@ -138,6 +138,16 @@ def test_what_such_motions_show_is_told(results, failuretwin, simulated):
     assert "not for certain, however large: motor 1 weak" in said
 
 
+@pytest.mark.parametrize("range_counts", [(0, 10), (10, 1000)])
+def test_errors_of_any_size_that_a_motor_can_have_may_be_told(
+    failuretwin, simulated, tmp_path, range_counts
+):
+    save_run_set(load_run_set(simulated).isel(run=[0]), tmp_path / "run.nc")
+    answer = failuretwin("diagnose", "run.nc", "--sse-range", *range_counts, folder=tmp_path)
+    assert answer.returncode == 0, answer.stderr
+    assert "misses its targets" in answer.stdout
+
+
 def test_wrong_diagnoses_are_marked(failuretwin, simulated, tmp_path):
     runs = load_run_set(simulated).isel(run=[1, 2])
     save_run_set(runs.assign(fault=("run", runs["fault"].values[::-1])), tmp_path / "lies.nc")

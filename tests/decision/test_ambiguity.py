@@ -135,6 +135,22 @@ def test_the_smallest_size_is_where_half_the_squared_distance_says(coaxial, scat
     assert found.detected["motor_1:encoder_bias"] == pytest.approx(expected, rel=0.01)
 
 
+def test_sizes_may_begin_at_nothing(coaxial):
+    """The smallest size found does not depend on where the range begins."""
+    targets = np.random.default_rng(0).uniform(-1, 1, (5, 2))
+    name = "motor_1:steady_state_error"
+    said = {}
+    for low in (0.0, 0.001, 0.01):
+        priors = Priors(error_ranges=((low, 0.4),))
+        found = ambiguity(
+            coaxial, motion(targets), TIME, scattered([0.02] * 2), faults(name), priors
+        )
+        said[low] = found.detected[name]
+        assert np.isfinite(found.nats).all()
+    assert said[0.0] == pytest.approx(said[0.001], rel=0.1)
+    assert said[0.0] == pytest.approx(said[0.01], rel=0.3)
+
+
 def test_separation_grows_with_the_square_of_the_size(twin):
     """Compare with half of the squared distance, linearised at the healthy poses."""
     bias, scatter = Hypothesis.parse("motor_3:encoder_bias"), 0.03

@@ -76,7 +76,7 @@ def diagnose(
     del seed  # nothing here is drawn by chance
     from failuretwin.app.ambiguity_lines import ambiguity_lines
     from failuretwin.app.inputs import read_inputs, tell_mismatch
-    from failuretwin.app.method import chosen_diagnoser, expected_name
+    from failuretwin.app.method import chosen_diagnoser, expected_name, told_priors
     from failuretwin.app.results import write_csv, write_json_lines
     from failuretwin.app.tables import print_diagnoses, print_lines, print_scores
     from failuretwin.app.tracking import (
@@ -87,7 +87,6 @@ def diagnose(
     )
     from failuretwin.core.hypothesis import parse_hypotheses
     from failuretwin.decision.bayes import BayesDiagnoser
-    from failuretwin.decision.hypotheses.priors import priors_of
     from failuretwin.digital_model.imperfections import load_imperfections
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.twin import DigitalTwin
@@ -102,7 +101,7 @@ def diagnose(
             if hypotheses is None
             else parse_hypotheses(hypotheses.split(","), model.motor_names)
         ),
-        priors=priors_of(model, sse_range, onset),
+        priors=told_priors(model, sse_range, onset),
     )
     settings = {
         "--calibration": calibration,

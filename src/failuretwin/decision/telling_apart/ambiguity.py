@@ -30,6 +30,8 @@ APART_NATS = 3.0
 """Faults are told apart if the true one is expected to be ahead by this: odds of 20."""
 SEEN_HZ = 10.0
 """Rate at which the tool is taken to be seen [Hz]."""
+LEAST_TYPICAL = 0.02
+"""Nothing below this share of the largest size is typical: ranges of errors may begin at 0."""
 
 
 @dataclass(frozen=True)
@@ -85,8 +87,7 @@ def ambiguity(
     judge = Judge(model, tuple(dict.fromkeys((HEALTHY, *asked))), priors or Priors())
     trials = Trials(judge, _motions(twin, command, time), onset_s)
     considered = {h: _sizes(h, judge.priors) for h in judge.hypotheses}
-    typical = [(h, float(np.sqrt(low * high))) for h, (low, high) in considered.items()]
-    nats = trials.ahead(typical)
+    nats = trials.ahead([(h, _typical(*sizes)) for h, sizes in considered.items()])
     smallest = {
         str(h): smallest_sizes(trials, h, sizes)
         for h, sizes in considered.items()
@@ -136,6 +137,11 @@ def _sizes(hypothesis: Hypothesis, priors: Priors) -> tuple[float, float]:
         lows, highs = zip(*priors.error_ranges, strict=True)
         return min(lows), max(highs)
     return magnitude_range(hypothesis.faults[0].mode)
+
+
+def _typical(low: float, high: float) -> float:
+    """Return the geometric mean of a range of sizes; NaN where there is none."""
+    return float(np.sqrt(np.maximum(low, LEAST_TYPICAL * high) * high))
 
 
 def _groups(names: Sequence[str], alike: BoolArray) -> tuple[tuple[str, ...], ...]:
