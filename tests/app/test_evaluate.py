@@ -58,8 +58,14 @@ def folder(tmp_path):
     write("unknown.jsonl", with_unknown(RECORDS, said="e"))
     write("fewer.jsonl", RECORDS[:4])
     write("twice.jsonl", [*RECORDS, RECORDS[0]])
+    write("numbered.jsonl", [*RECORDS, {**RECORDS[0], "run": "a#2"}])
+    write("stranger.jsonl", [*RECORDS, {**RECORDS[0], "run": "z#2"}])
     write("other.jsonl", [*RECORDS[:5], {**RECORDS[5], "truth": STUCK}])
     write("certain.jsonl", [record(r["run"], r["truth"], "healthy", sure=1.0) for r in RECORDS])
+    hopeless = {"healthy": STUCK, STUCK: DRIFT, DRIFT: "healthy"}
+    write(
+        "hopeless.jsonl", [record(r["run"], r["truth"], hopeless[r["truth"]], 1.0) for r in RECORDS]
+    )
     known = Truth(
         fault=[r["truth"] for r in RECORDS],
         detail=[{}] * 6,
@@ -123,6 +129,12 @@ def test_coverage_needs_the_true_values(evaluate):
     assert "--truth" not in text
 
 
+def test_a_truth_that_was_always_ruled_out_leaves_no_other_runs(evaluate):
+    text = evaluate("hopeless.jsonl").stdout
+    line = line_of(text, "0 of 6 runs right")
+    assert line.endswith("log score inf nats a run (the truth was given no probability in any run)")
+
+
 def test_results_are_compared_run_by_run(evaluate):
     text = evaluate("ours.jsonl", "--against", "better.jsonl").stdout
     assert line_of(text, "A: ") == "A: ours.jsonl (protocol P0)"
@@ -177,6 +189,9 @@ def test_a_fault_that_is_no_hypothesis_is_judged_as_unknown(evaluate, folder):
         (["ours.jsonl", "--against", "fewer.jsonl"], "fewer.jsonl: lacks 2 runs of ours.jsonl (e"),
         (["fewer.jsonl", "--against", "ours.jsonl"], "fewer.jsonl: lacks 2 runs of ours.jsonl (e"),
         (["ours.jsonl", "--against", "twice.jsonl"], "twice.jsonl: a given twice"),
+        (["twice.jsonl"], "twice.jsonl: a given twice. Expected each run once: remove"),
+        (["numbered.jsonl", "--truth", "runs.nc"], "It holds 'a'; diagnose numbers runs"),
+        (["stranger.jsonl", "--truth", "runs.nc"], "Expected the runs that were diagnosed"),
         (["ours.jsonl", "--against", "other.jsonl"], "run 'f' is motor_1:stuck there, but motor_2"),
         (["ours.jsonl", "--against", "nowhere.jsonl"], "nowhere.jsonl: cannot be read"),
         (["ours.jsonl", "--published-labels"], "Add --truth RUNS"),

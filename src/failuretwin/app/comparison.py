@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from failuretwin.app.results import Record, judged_records, protocol_of, truths_as_unknown
+from failuretwin.app.results import (
+    Record,
+    check_each_once,
+    judged_records,
+    protocol_of,
+    some_names,
+    truths_as_unknown,
+)
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.decision.metrics import (
@@ -18,9 +24,6 @@ from failuretwin.decision.metrics import (
     log_score_gain,
     mcnemar,
 )
-
-NAMED_RUNS = 3
-"""So many runs are named in an error."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +110,8 @@ def _paired(first: Results, second: Results) -> tuple[list[Record], list[Record]
     ):
         if missing:
             raise InputError(
-                f"{lacks.name}: lacks {len(missing)} runs of {has.name} ({_some(missing)}). Two "
-                "methods are compared on the same runs: diagnose the same inputs with both."
+                f"{lacks.name}: lacks {len(missing)} runs of {has.name} ({some_names(missing)}). "
+                "Two methods are compared on the same runs: diagnose the same inputs with both."
             )
     known = [record for record in first.records if record["truth"]]
     matched = [theirs[record["run"]] for record in known]
@@ -124,13 +127,5 @@ def _paired(first: Results, second: Results) -> tuple[list[Record], list[Record]
 
 
 def _by_run(results: Results) -> dict[str, Record]:
-    by_run = {record["run"]: record for record in results.records}
-    if len(by_run) < len(results.records):
-        count = Counter(record["run"] for record in results.records)
-        twice = [run for run, times in count.items() if times > 1]
-        raise InputError(f"{results.name}: {_some(twice)} given twice. Expected each run once.")
-    return by_run
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:NAMED_RUNS]) + (", ..." if len(names) > NAMED_RUNS else "")
+    check_each_once(results.records, results.name)
+    return {record["run"]: record for record in results.records}

@@ -17,6 +17,8 @@ Record = dict[str, Any]
 """One diagnosis as the JSON object of the contract."""
 
 NEEDED = ("run", "truth", "diagnosis", "posterior")
+NAMED_RUNS = 3
+"""So many runs are named in an error."""
 SUM_ERROR = 1e-6
 """Probabilities of a run may sum to 1 plus or minus this."""
 
@@ -32,7 +34,7 @@ def read_json_lines(path: Path) -> list[Record]:
     """Read what `write_json_lines` wrote.
 
     Raises:
-        InputError: If the file cannot be read or a line is not a diagnosis.
+        InputError: If the file cannot be read, a line is not a diagnosis, or a run is there twice.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -46,7 +48,32 @@ def read_json_lines(path: Path) -> list[Record]:
             records.append(_read_record(line, f"{path}: line {number}"))
     if not records:
         raise InputError(f"{path}: is empty. Expected the output of diagnose --json.")
+    check_each_once(records, str(path))
     return records
+
+
+def check_each_once(records: Sequence[Record], where: str) -> None:
+    """Refuse results that hold a run twice, which would count it twice.
+
+    Args:
+        records: Diagnoses.
+        where: What to call them in the error.
+
+    Raises:
+        InputError: If a run is there twice.
+    """
+    count = Counter(record["run"] for record in records)
+    twice = [run for run, times in count.items() if times > 1]
+    if twice:
+        raise InputError(
+            f"{where}: {some_names(twice)} given twice. Expected each run once: remove the lines "
+            "that repeat one, or write the file anew with diagnose --json."
+        )
+
+
+def some_names(names: Sequence[str]) -> str:
+    """Return the first few names, and whether there are more."""
+    return ", ".join(names[:NAMED_RUNS]) + (", ..." if len(names) > NAMED_RUNS else "")
 
 
 def _read_record(line: str, where: str) -> Record:
@@ -162,6 +189,8 @@ def log_score_text(surprise: LogScore) -> str:
     if not surprise.impossible:
         return text
     rest = surprise.nats.size - surprise.impossible
+    if not rest:
+        return f"{text} (the truth was given no probability in any run)"
     return (
         f"{text} (of {surprise.impossible} runs the truth was given no probability; the other "
         f"{rest}: {surprise.mean_of_rest:.3f})"
