@@ -214,7 +214,11 @@ def test_stuck_motors_of_real_motions_are_told_apart(twin, armpi, measured_armpi
     found = ambiguity(twin, *real_motions, measured_armpi)
     assert found.hypotheses == tuple(map(str, paper_hypotheses(armpi.motor_names)))
     assert found.groups == ()
-    assert list(found.detected) == list(found.isolated) == list(found.hypotheses[5:])
+    for by_fault in (found.detected, found.isolated, found.typical, found.largest):
+        assert list(by_fault) == list(found.hypotheses[5:])
+    # geometric mean of 4 and 50 servo counts
+    assert np.rad2deg(list(found.typical.values())) / 0.24 == pytest.approx(np.sqrt(200.0))
+    assert np.rad2deg(list(found.largest.values())) / 0.24 == pytest.approx(50.0)
     assert all(
         found.detected[name] <= found.isolated[name] < np.deg2rad(5.0) for name in found.isolated
     )
@@ -258,6 +262,12 @@ def test_wrong_requests_are_refused(twin):
     two = [Hypothesis.parse("motor_1:stuck+motor_2:stuck")]
     with pytest.raises(InputError, match="Expected healthy or one fault"):
         ambiguity(twin, motion(TARGETS), TIME, hypotheses=two)
+
+
+@pytest.mark.parametrize("onset_s", [-1.0, 10.0, 50.0, np.nan])
+def test_an_onset_outside_the_motion_is_refused(twin, onset_s):
+    with pytest.raises(InputError, match=rf"`onset_s` is {onset_s:g} s, expected .* to 9.99 s"):
+        ambiguity(twin, motion(TARGETS), TIME, onset_s=onset_s)
 
 
 def test_the_page_prints_what_it_says(capsys):

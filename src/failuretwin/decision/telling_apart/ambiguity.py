@@ -47,6 +47,9 @@ class Ambiguity:
         detected: Smallest size at which each fault is told from a healthy robot, by hypothesis, in
             the unit of the mode; None: no size considered is. Held angles are no size.
         isolated: Smallest size at which it is told from everything else too.
+        typical: Size of each fault that `nats` and `groups` are of, by hypothesis, in the unit of
+            the mode; of those that have a size.
+        largest: Largest size that is considered, likewise.
     """
 
     hypotheses: tuple[str, ...]
@@ -54,6 +57,8 @@ class Ambiguity:
     groups: tuple[tuple[str, ...], ...]
     detected: Mapping[str, float | None]
     isolated: Mapping[str, float | None]
+    typical: Mapping[str, float]
+    largest: Mapping[str, float]
 
 
 def ambiguity(
@@ -79,20 +84,19 @@ def ambiguity(
         onset_s: When faults begin [s]; 0: they are there before the motion.
 
     Raises:
-        InputError: If nothing moves, the shapes do not fit, or a hypothesis has several faults or
-            cannot be weighed.
+        InputError: If nothing moves, the shapes do not fit, the onset is not within the motion, or
+            a hypothesis has several faults or cannot be weighed.
     """
     asked = hypotheses or paper_hypotheses(twin.robot.motor_names)
     model = HealthyModel(twin, imperfections or default_imperfections(twin.robot))
     judge = Judge(model, tuple(dict.fromkeys((HEALTHY, *asked))), priors or Priors())
-    trials = Trials(judge, _motions(twin, command, time), onset_s)
+    motions = _motions(twin, command, time)
+    _check_onset(onset_s, float(motions["time"].values[-1]))
+    trials = Trials(judge, motions, onset_s)
     considered = {h: _sizes(h, judge.priors) for h in judge.hypotheses}
     nats = trials.ahead([(h, _typical(*sizes)) for h, sizes in considered.items()])
-    smallest = {
-        str(h): smallest_sizes(trials, h, sizes)
-        for h, sizes in considered.items()
-        if np.isfinite(sizes).all()
-    }
+    sized = {h: sizes for h, sizes in considered.items() if np.isfinite(sizes).all()}
+    smallest = {str(h): smallest_sizes(trials, h, sizes) for h, sizes in sized.items()}
     names = tuple(str(h) for h in judge.hypotheses)
     return Ambiguity(
         hypotheses=names,
@@ -100,7 +104,18 @@ def ambiguity(
         groups=_groups(names, nats[1:] < APART_NATS),
         detected={name: found[0] for name, found in smallest.items()},
         isolated={name: found[1] for name, found in smallest.items()},
+        typical={str(h): _typical(*sizes) for h, sizes in sized.items()},
+        largest={str(h): sizes[1] for h, sizes in sized.items()},
     )
+
+
+def _check_onset(onset_s: float, end_s: float) -> None:
+    """Refuse an onset that is not within a motion that ends at `end_s` [s]."""
+    if not 0.0 <= onset_s <= end_s:
+        raise InputError(
+            f"`onset_s` is {onset_s:g} s, expected a time of the motion: 0 (or before it) to "
+            f"{end_s:g} s."
+        )
 
 
 def _motions(twin: DigitalTwin, command: ArrayLike, time: ArrayLike) -> xr.Dataset:
