@@ -144,7 +144,11 @@ def test_misspelt_command_line(refused, arguments, words):
         (["--hypotheses", "motor_9:stuck"], "unknown motor 'motor_9'"),
         (["--hypotheses", "motor_1:stuk"], "Did you mean 'stuck'?"),
         (["--hypotheses", "healthy,healthy"], "given twice"),
-        (["--hypotheses", ""], "Expected 'healthy' or"),
+        (["--hypotheses", ""], "Expected 'healthy', 'unknown', a fault such as"),
+        (["--hypotheses", "pairs"], "several joined by '+'"),
+        (["--hypotheses", "all"], "encoder_scale, lost_commands."),
+        (["--hypotheses", "stuck"], "such as 'motor_1:stuck'"),
+        (["--hypotheses", "motor_1:stuck"], "names only motor_1:stuck, so every run"),
         (["--published-labels", "--truth", "x"], "No such option '--truth'"),
     ],
 )

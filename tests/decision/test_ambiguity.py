@@ -264,6 +264,14 @@ def test_wrong_requests_are_refused(twin):
         ambiguity(twin, motion(TARGETS), TIME, hypotheses=two)
 
 
+def test_hypotheses_may_be_given_as_text(twin):
+    texts = ["motor_1:stuck", "motor_2:stuck"]
+    found = ambiguity(twin, motion(TARGETS), TIME, hypotheses=texts)
+    assert found.hypotheses == ("healthy", *texts)
+    with pytest.raises(InputError, match="unknown motor 'motor_9'"):
+        ambiguity(twin, motion(TARGETS), TIME, hypotheses=["motor_9:stuck"])
+
+
 @pytest.mark.parametrize("onset_s", [-1.0, 10.0, 50.0, np.nan])
 def test_an_onset_outside_the_motion_is_refused(twin, onset_s):
     with pytest.raises(InputError, match=rf"`onset_s` is {onset_s:g} s, expected .* to 9.99 s"):

@@ -37,8 +37,8 @@ def ambiguity_lines(runs: xr.Dataset, diagnoser: BayesDiagnoser) -> list[str]:
     if len(single) > MOST_HYPOTHESES:
         return [
             f"which of these {len(single)} hypotheses such motions tell apart may take longer to "
-            f"work out than the diagnosis (done for up to {MOST_HYPOTHESES}): call failuretwin.ambiguity in "
-            "Python (docs/ambiguity.md), or name fewer with --hypotheses",
+            f"work out than the diagnosis (done for up to {MOST_HYPOTHESES}): call "
+            "failuretwin.ambiguity in Python (docs/ambiguity.md), or name fewer with --hypotheses",
             *left_out,
         ]
     command = as_floats(runs["command"].values)

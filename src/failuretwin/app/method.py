@@ -10,6 +10,7 @@ import numpy as np
 
 from failuretwin.app.learning import check_learning
 from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Hypothesis, parse_hypotheses
 from failuretwin.decision.bayes import BayesDiagnoser
 from failuretwin.decision.hypotheses.priors import Priors, priors_of
 from failuretwin.decision.learned.hybrid import Diagnoser, HybridDiagnoser
@@ -22,6 +23,27 @@ BAYES = "bayes"
 """Name of the method that needs no file."""
 BLEND = f"{BAYES}+"
 """What stands before the file of a network that is blended with it."""
+
+
+def told_hypotheses(text: str | None, robot: Robot) -> tuple[Hypothesis, ...] | None:
+    """Return the hypotheses that the user names; None where none are named.
+
+    Args:
+        text: Hypotheses in their text form, separated by commas.
+        robot: The robot, for the names of its motors.
+
+    Raises:
+        InputError: If one cannot be read, or there is only one, which would always be certain.
+    """
+    if text is None:
+        return None
+    hypotheses = parse_hypotheses(text.split(","), robot.motor_names)
+    if len(hypotheses) < 2:
+        raise InputError(
+            f"--hypotheses names only {hypotheses[0]}, so every run would be that for certain. "
+            "Expected two at least, such as healthy,motor_1:stuck."
+        )
+    return hypotheses
 
 
 def told_priors(

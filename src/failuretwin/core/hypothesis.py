@@ -97,7 +97,9 @@ def _parse_fault(text: str, motors: Sequence[str] | None) -> Fault:
     if not separator:
         raise InputError(
             f"hypothesis {text!r} is not of the form MOTOR:MODE. "
-            "Expected 'healthy' or, for example, 'motor_1:stuck'."
+            "Expected 'healthy', 'unknown', a fault such as 'motor_1:stuck', or several joined by "
+            "'+' in chain order, such as 'motor_1:stuck+motor_2:drift'. "
+            f"Modes: {', '.join(MAGNITUDE_UNITS)}."
         )
     if motors is not None and motor not in motors:
         raise unknown_name("motor", motor, motors)
@@ -121,13 +123,25 @@ def paper_hypotheses(motors: Sequence[str]) -> tuple[Hypothesis, ...]:
     return single_faults(motors, PAPER_MODES)
 
 
-def parse_hypotheses(texts: Iterable[str], motors: Sequence[str]) -> tuple[Hypothesis, ...]:
+def parse_hypotheses(
+    given: Iterable[Hypothesis | str], motors: Sequence[str]
+) -> tuple[Hypothesis, ...]:
     """Read several hypotheses; refuses an empty list and repeats.
 
+    Args:
+        given: Hypotheses, or their text form.
+        motors: Names of the robot's motors in chain order.
+
     Raises:
-        InputError: If a text cannot be read, is given twice, or none is given.
+        InputError: If one cannot be read or names another motor, is given twice, none is given, or
+            one text is given in place of a list.
     """
-    hypotheses = tuple(Hypothesis.parse(text.strip(), motors) for text in texts)
+    if isinstance(given, str):
+        raise InputError(
+            f"hypotheses are the text {given!r}. Expected a list, such as ['healthy', "
+            "'motor_1:stuck']."
+        )
+    hypotheses = tuple(Hypothesis.parse(str(one).strip(), motors) for one in given)
     if not hypotheses:
         raise InputError("no hypotheses given. Expected at least one, such as 'healthy'.")
     if len(set(hypotheses)) < len(hypotheses):

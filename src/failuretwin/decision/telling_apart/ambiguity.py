@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from failuretwin.connection.healthy import HealthyModel
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
+from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses, parse_hypotheses
 from failuretwin.core.movements import find_movements
 from failuretwin.core.runs import RunTable
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
@@ -66,7 +66,7 @@ def ambiguity(
     command: ArrayLike,
     time: ArrayLike,
     imperfections: Imperfections | None = None,
-    hypotheses: Sequence[Hypothesis] | None = None,
+    hypotheses: Sequence[Hypothesis | str] | None = None,
     priors: Priors | None = None,
     onset_s: float = 0.0,
 ) -> Ambiguity:
@@ -78,16 +78,18 @@ def ambiguity(
             [rad]; each motion is taken as a run of its own.
         time: Uniform time grid from 0, (time,) [s].
         imperfections: How the healthy robot differs from the twin; None: as its profile says.
-        hypotheses: What may be the case, single faults; healthy always may. None: the paper's
+        hypotheses: What may be the case, single faults, as `Hypothesis` or in the text form, such
+            as ``["motor_2:stuck", "motor_2:drift"]``; healthy always may. None: the paper's
             classes.
         priors: Ranges of sizes that are considered; None: the default.
         onset_s: When faults begin [s]; 0: they are there before the motion.
 
     Raises:
         InputError: If nothing moves, the shapes do not fit, the onset is not within the motion, or
-            a hypothesis has several faults or cannot be weighed.
+            a hypothesis has several faults, or cannot be read or weighed.
     """
-    asked = hypotheses or paper_hypotheses(twin.robot.motor_names)
+    motors = twin.robot.motor_names
+    asked = paper_hypotheses(motors) if hypotheses is None else parse_hypotheses(hypotheses, motors)
     model = HealthyModel(twin, imperfections or default_imperfections(twin.robot))
     judge = Judge(model, tuple(dict.fromkeys((HEALTHY, *asked))), priors or Priors())
     motions = _motions(twin, command, time)
