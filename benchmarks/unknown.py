@@ -143,8 +143,10 @@ def _kind(diagnosis: Diagnosis) -> str:
 
 
 def tell(name: str, said: NDArray[np.str_], some: BoolArray) -> None:
-    """Print what was said of some of the runs of a kind."""
+    """Print what was said of some of the runs of a kind, if there are any."""
     chosen = said[some]
+    if not len(chosen):
+        return
     unknown, *others = (
         int(np.count_nonzero(chosen == kind))
         for kind in (str(UNKNOWN), "faulty", "other", str(HEALTHY), str(None))
@@ -183,7 +185,7 @@ def ahead(
 
 def tell_loss(runs: xr.Dataset, diagnoser: ft.BayesDiagnoser) -> None:
     """Print what `unknown` costs on runs of the nine."""
-    known = [h for h in diagnoser.hypotheses or () if h.known]
+    known = [h for h in diagnoser.considered if h.known]
     without = ft.BayesDiagnoser(diagnoser.twin, diagnoser.imperfections, known).diagnose(runs)
     found = diagnoser.diagnose(runs)
     for name, results in (("without unknown", without), ("with it", found)):

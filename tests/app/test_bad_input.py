@@ -139,11 +139,16 @@ def test_misspelt_command_line(refused, arguments, words):
     [
         (["--sse-range", "20", "5"], "--sse-range is 20 5, expected 0 <= LOW < HIGH"),
         (["--sse-range", "0", "inf"], "--sse-range"),
+        (["--sse-range", "10", "1001"], "turn through 1000 servo units (240 deg)"),
         (["--onset", "-1"], "--onset is -1 s, expected 0 or more"),
         (["--hypotheses", "motor_9:stuck"], "unknown motor 'motor_9'"),
         (["--hypotheses", "motor_1:stuk"], "Did you mean 'stuck'?"),
         (["--hypotheses", "healthy,healthy"], "given twice"),
-        (["--hypotheses", ""], "Expected 'healthy' or"),
+        (["--hypotheses", ""], "Expected 'healthy', 'unknown', a fault such as"),
+        (["--hypotheses", "pairs"], "several joined by '+'"),
+        (["--hypotheses", "all"], "encoder_scale, lost_commands."),
+        (["--hypotheses", "stuck"], "such as 'motor_1:stuck'"),
+        (["--hypotheses", "motor_1:stuck"], "names only motor_1:stuck, so every run"),
         (["--published-labels", "--truth", "x"], "No such option '--truth'"),
     ],
 )

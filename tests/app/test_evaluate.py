@@ -29,6 +29,14 @@ def record(run, truth, said, sure=0.8, **more):
     }
 
 
+def with_unknown(records, said):
+    """Return diagnoses that offer healthy, a stuck motor and `unknown`, which is `said` of runs."""
+    for told in records:
+        best = "unknown" if told["run"] in said else "healthy"
+        sure = {name: 0.8 if name == best else 0.1 for name in ("healthy", STUCK, "unknown")}
+        yield {**told, "diagnosis": best, "posterior": sure, "onset_90": [0.0, 0.5]}
+
+
 RECORDS = [
     record("a", "healthy", "healthy"),
     record("b", "healthy", STUCK),
@@ -47,10 +55,17 @@ def folder(tmp_path):
     write("ours.jsonl", RECORDS)
     better = [record(r["run"], r["truth"], r["truth"], sure=0.9) for r in RECORDS]
     write("better.jsonl", better[::-1])  # runs are matched by name
+    write("unknown.jsonl", with_unknown(RECORDS, said="e"))
     write("fewer.jsonl", RECORDS[:4])
     write("twice.jsonl", [*RECORDS, RECORDS[0]])
+    write("numbered.jsonl", [*RECORDS, {**RECORDS[0], "run": "a#2"}])
+    write("stranger.jsonl", [*RECORDS, {**RECORDS[0], "run": "z#2"}])
     write("other.jsonl", [*RECORDS[:5], {**RECORDS[5], "truth": STUCK}])
     write("certain.jsonl", [record(r["run"], r["truth"], "healthy", sure=1.0) for r in RECORDS])
+    hopeless = {"healthy": STUCK, STUCK: DRIFT, DRIFT: "healthy"}
+    write(
+        "hopeless.jsonl", [record(r["run"], r["truth"], hopeless[r["truth"]], 1.0) for r in RECORDS]
+    )
     known = Truth(
         fault=[r["truth"] for r in RECORDS],
         detail=[{}] * 6,
@@ -114,6 +129,12 @@ def test_coverage_needs_the_true_values(evaluate):
     assert "--truth" not in text
 
 
+def test_a_truth_that_was_always_ruled_out_leaves_no_other_runs(evaluate):
+    text = evaluate("hopeless.jsonl").stdout
+    line = line_of(text, "0 of 6 runs right")
+    assert line.endswith("log score inf nats a run (the truth was given no probability in any run)")
+
+
 def test_results_are_compared_run_by_run(evaluate):
     text = evaluate("ours.jsonl", "--against", "better.jsonl").stdout
     assert line_of(text, "A: ") == "A: ours.jsonl (protocol P0)"
@@ -137,12 +158,40 @@ def test_a_truth_that_was_ruled_out_is_said(evaluate):
     assert "log score inf nats a run (of 4 runs the truth was given no probability" in alone
 
 
+def test_a_fault_that_is_no_hypothesis_is_judged_as_unknown(evaluate, folder):
+    arguments = ("--truth", "runs.nc", "--latex", "x.tex", "--against", "ours.jsonl")
+    text = evaluate("unknown.jsonl", *arguments).stdout
+    # of both runs that drift, the first is called unknown
+    assert "2 of 6 runs right" not in text
+    assert "3 of 6 runs right" in text
+    assert line_of(text, "judged as unknown, since") == (
+        "judged as unknown, since not among the hypotheses: motor_2:drift (2 runs)"
+    )
+    nats = -(3 * np.log(0.8) + 3 * np.log(0.1)) / 6
+    assert line_of(text, "log score ") == f"log score {nats:.3f} nats a run"
+    assert "unknown 2 1.000 0.500 0.667" in " ".join(text.split())
+    assert "motor_2:drift 2" not in " ".join(text.split())
+    # all six are 80 % sure, three are right
+    assert line_of(text, "calibration error").startswith("calibration error 0.300 in 10 bins")
+    assert line_of(text, "onset of unknown").startswith("onset of unknown 1 100.0 %")
+    assert line_of(text, "missed-detection").startswith("missed-detection rate 75.0 %")
+    # the other result, without `unknown`, is judged as it names things itself
+    assert line_of(text, "right: ").startswith("right: both 1, only A 2, only B 2, neither 1")
+    assert line_of(text, "judged as unknown: ").startswith("judged as unknown: by A 2 runs, by B 0")
+    table = (folder / "x.tex").read_text()
+    assert r"unknown & 2 & 1.000 & 0.500 & 0.667 \\" in table
+    assert "judged as unknown & 2 runs" in table
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["ours.jsonl", "--against", "fewer.jsonl"], "fewer.jsonl: lacks 2 runs of ours.jsonl (e"),
         (["fewer.jsonl", "--against", "ours.jsonl"], "fewer.jsonl: lacks 2 runs of ours.jsonl (e"),
         (["ours.jsonl", "--against", "twice.jsonl"], "twice.jsonl: a given twice"),
+        (["twice.jsonl"], "twice.jsonl: a given twice. Expected each run once: remove"),
+        (["numbered.jsonl", "--truth", "runs.nc"], "It holds 'a'; diagnose numbers runs"),
+        (["stranger.jsonl", "--truth", "runs.nc"], "Expected the runs that were diagnosed"),
         (["ours.jsonl", "--against", "other.jsonl"], "run 'f' is motor_1:stuck there, but motor_2"),
         (["ours.jsonl", "--against", "nowhere.jsonl"], "nowhere.jsonl: cannot be read"),
         (["ours.jsonl", "--published-labels"], "Add --truth RUNS"),

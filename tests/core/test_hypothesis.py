@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -77,6 +80,12 @@ def test_every_mode_has_its_unit(mode, unit):
     assert Fault("motor_1", mode).magnitude_unit == unit
 
 
+def test_the_page_of_results_names_every_unit():
+    page = (Path(__file__).parents[2] / "docs" / "results.md").read_text()
+    rows = re.findall(r"^\| `(\w+)` \| [^|]+ \| `([^`|]+)` \|$", page, re.MULTILINE)
+    assert dict(rows) == MAGNITUDE_UNITS
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -88,7 +97,10 @@ def test_every_mode_has_its_unit(mode, unit):
         (
             "helthy",
             "hypothesis 'helthy' is not of the form MOTOR:MODE. "
-            "Expected 'healthy' or, for example, 'motor_1:stuck'.",
+            "Expected 'healthy', 'unknown', a fault such as 'motor_1:stuck', or several joined by "
+            "'+' in chain order, such as 'motor_1:stuck+motor_2:drift'. Modes: stuck, "
+            "steady_state_error, slow, lag, backlash, drift, intermittent, torque_loss, "
+            "encoder_bias, encoder_scale, lost_commands.",
         ),
         (
             "motor_3:drift+motor_1:stuck",
@@ -127,8 +139,20 @@ def test_list_of_hypotheses_may_have_spaces():
     )
 
 
+def test_list_may_hold_hypotheses_and_their_text_form():
+    stuck = Hypothesis((Fault("motor_2", "stuck"),))
+    assert parse_hypotheses([UNKNOWN, "motor_2:stuck"], MOTORS) == (UNKNOWN, stuck)
+    with pytest.raises(InputError, match="unknown motor 'motor_9'"):
+        parse_hypotheses([Hypothesis((Fault("motor_9", "stuck"),))], MOTORS)
+
+
 @pytest.mark.parametrize(
-    ("texts", "message"), [([], "no hypotheses given"), (["healthy", "healthy "], "given twice")]
+    ("texts", "message"),
+    [
+        ([], "no hypotheses given"),
+        (["healthy", "healthy "], "given twice"),
+        ("motor_1:stuck", r"the text 'motor_1:stuck'. Expected a list, such as \['healthy', "),
+    ],
 )
 def test_empty_list_and_repeats_are_refused(texts, message):
     with pytest.raises(InputError, match=message):

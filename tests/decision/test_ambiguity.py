@@ -135,6 +135,22 @@ def test_the_smallest_size_is_where_half_the_squared_distance_says(coaxial, scat
     assert found.detected["motor_1:encoder_bias"] == pytest.approx(expected, rel=0.01)
 
 
+def test_sizes_may_begin_at_nothing(coaxial):
+    """The smallest size found does not depend on where the range begins."""
+    targets = np.random.default_rng(0).uniform(-1, 1, (5, 2))
+    name = "motor_1:steady_state_error"
+    said = {}
+    for low in (0.0, 0.001, 0.01):
+        priors = Priors(error_ranges=((low, 0.4),))
+        found = ambiguity(
+            coaxial, motion(targets), TIME, scattered([0.02] * 2), faults(name), priors
+        )
+        said[low] = found.detected[name]
+        assert np.isfinite(found.nats).all()
+    assert said[0.0] == pytest.approx(said[0.001], rel=0.1)
+    assert said[0.0] == pytest.approx(said[0.01], rel=0.3)
+
+
 def test_separation_grows_with_the_square_of_the_size(twin):
     """Compare with half of the squared distance, linearised at the healthy poses."""
     bias, scatter = Hypothesis.parse("motor_3:encoder_bias"), 0.03
@@ -198,7 +214,11 @@ def test_stuck_motors_of_real_motions_are_told_apart(twin, armpi, measured_armpi
     found = ambiguity(twin, *real_motions, measured_armpi)
     assert found.hypotheses == tuple(map(str, paper_hypotheses(armpi.motor_names)))
     assert found.groups == ()
-    assert list(found.detected) == list(found.isolated) == list(found.hypotheses[5:])
+    for by_fault in (found.detected, found.isolated, found.typical, found.largest):
+        assert list(by_fault) == list(found.hypotheses[5:])
+    # geometric mean of 4 and 50 servo counts
+    assert np.rad2deg(list(found.typical.values())) / 0.24 == pytest.approx(np.sqrt(200.0))
+    assert np.rad2deg(list(found.largest.values())) / 0.24 == pytest.approx(50.0)
     assert all(
         found.detected[name] <= found.isolated[name] < np.deg2rad(5.0) for name in found.isolated
     )
@@ -242,6 +262,20 @@ def test_wrong_requests_are_refused(twin):
     two = [Hypothesis.parse("motor_1:stuck+motor_2:stuck")]
     with pytest.raises(InputError, match="Expected healthy or one fault"):
         ambiguity(twin, motion(TARGETS), TIME, hypotheses=two)
+
+
+def test_hypotheses_may_be_given_as_text(twin):
+    texts = ["motor_1:stuck", "motor_2:stuck"]
+    found = ambiguity(twin, motion(TARGETS), TIME, hypotheses=texts)
+    assert found.hypotheses == ("healthy", *texts)
+    with pytest.raises(InputError, match="unknown motor 'motor_9'"):
+        ambiguity(twin, motion(TARGETS), TIME, hypotheses=["motor_9:stuck"])
+
+
+@pytest.mark.parametrize("onset_s", [-1.0, 10.0, 50.0, np.nan])
+def test_an_onset_outside_the_motion_is_refused(twin, onset_s):
+    with pytest.raises(InputError, match=rf"`onset_s` is {onset_s:g} s, expected .* to 9.99 s"):
+        ambiguity(twin, motion(TARGETS), TIME, onset_s=onset_s)
 
 
 def test_the_page_prints_what_it_says(capsys):

@@ -281,6 +281,30 @@ def test_hypothesis_that_cannot_be_weighed_is_refused(twin, hypothesis, message)
         )
 
 
+def test_hypotheses_may_be_given_as_text(twin, few):
+    texts = ["healthy", "motor_3:stuck", "motor_1:stuck+motor_2:drift"]
+    told = BayesDiagnoser(twin, hypotheses=texts)
+    assert told.considered == tuple(Hypothesis.parse(text) for text in texts)
+    first = told.diagnose(few.isel(run=[0]))
+    assert first == BayesDiagnoser(twin, hypotheses=told.considered).diagnose(few.isel(run=[0]))
+
+
+@pytest.mark.parametrize(
+    ("hypotheses", "message"),
+    [
+        (["motor_9:stuck"], "unknown motor 'motor_9'"),
+        ([Hypothesis.parse("motor_9:stuck")], "unknown motor 'motor_9'"),
+        (["stuck"], "not of the form MOTOR:MODE"),
+        ("healthy,motor_1:stuck", "Expected a list"),
+        ([], "no hypotheses given"),
+        ([HEALTHY, "healthy"], "given twice"),
+    ],
+)
+def test_hypotheses_that_cannot_be_read_are_refused(twin, hypotheses, message):
+    with pytest.raises(InputError, match=message):
+        BayesDiagnoser(twin, hypotheses=hypotheses)
+
+
 def test_run_set_of_another_robot_is_refused(twin, few):
     other = few.assign_coords(motor=["hip", "knee", "ankle", "toe"])
     with pytest.raises(InputError, match=r"motors hip, knee, ankle, toe; robot 'armpi_fpv' has"):

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import confusion_matrix, f1_score, precision_recall_fscore_support
 
-from failuretwin.decision.metrics import NO_VERDICT, score, wilson_interval
+from failuretwin.decision.metrics import NO_VERDICT, judged_truth, score, wilson_interval
 
 TRUTH = ["a", "a", "a", "b", "b", "c"]
 SAID = ["a", "a", "b", "b", "a", "a"]
@@ -91,3 +91,17 @@ def test_truth_that_no_hypothesis_stands_for_counts_as_wrong():
     assert scores.log_score == np.inf
     assert np.isnan(scores.surprise.mean_of_rest)
     assert set(scores.classes) == {"a", "b", "d"}
+
+
+@pytest.mark.parametrize(
+    ("truth", "hypotheses", "right"),
+    [
+        ("motor_2:drift", ["healthy", "motor_1:stuck", "unknown"], "unknown"),
+        ("motor_1:stuck+motor_2:drift", ["healthy", "motor_1:stuck", "unknown"], "unknown"),
+        ("motor_1:stuck", ["healthy", "motor_1:stuck", "unknown"], "motor_1:stuck"),
+        ("motor_2:drift", ["healthy", "motor_1:stuck"], "motor_2:drift"),
+        ("healthy", ["motor_1:stuck", "unknown"], "healthy"),
+    ],
+)
+def test_unknown_means_every_fault_that_is_not_named(truth, hypotheses, right):
+    assert judged_truth(truth, hypotheses) == right

@@ -109,7 +109,8 @@ def test_without_losses_scatter_alone_counts(twin, armpi, imperfect):
 
 def test_a_truth_that_is_not_among_the_hypotheses_has_a_nearest_too(twin, imperfect):
     two = [HEALTHY, Hypothesis.parse("motor_2:stuck")]
-    found = separation(twin, imperfect, hypotheses=two)
+    found = separation(twin, imperfect, hypotheses=["healthy", "motor_2:stuck"])
+    assert found.hypotheses == tuple(two)
     assert found.nats.shape == (180, 2)
     whole = separation(twin, imperfect)
     np.testing.assert_allclose(found.nats, whole.nats[:, [0, 2]], rtol=0, atol=1e-9)

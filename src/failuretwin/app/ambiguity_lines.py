@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
+from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.knowledge import plain_name
 from failuretwin.decision.bayes import BayesDiagnoser
@@ -29,14 +30,16 @@ def ambiguity_lines(runs: xr.Dataset, diagnoser: BayesDiagnoser) -> list[str]:
         runs: The runs that were diagnosed.
         diagnoser: Who diagnosed them; of its hypotheses healthy and single faults count.
     """
-    asked = diagnoser.hypotheses or paper_hypotheses(diagnoser.twin.robot.motor_names)
-    single = [h for h in asked if h.known and len(h.faults) <= 1]
+    single = [h for h in diagnoser.considered if h.known and len(h.faults) <= 1]
+    left_out = _left_out_lines([h for h in diagnoser.considered if h not in single])
     if not any(h.faults for h in single):
-        return []
+        return left_out
     if len(single) > MOST_HYPOTHESES:
         return [
-            f"which of these {len(single)} hypotheses such motions tell apart: see "
-            "failuretwin.ambiguity (docs/ambiguity.md)"
+            f"which of these {len(single)} hypotheses such motions tell apart may take longer to "
+            f"work out than the diagnosis (done for up to {MOST_HYPOTHESES}): call "
+            "failuretwin.ambiguity in Python (docs/ambiguity.md), or name fewer with --hypotheses",
+            *left_out,
         ]
     command = as_floats(runs["command"].values)
     moving = np.flatnonzero(np.ptp(command, axis=1).any(axis=1))
@@ -50,29 +53,51 @@ def ambiguity_lines(runs: xr.Dataset, diagnoser: BayesDiagnoser) -> list[str]:
         priors=diagnoser.priors,
         onset_s=diagnoser.priors.onset.known_s or 0.0,
     )
-    return _group_lines(found) + _size_lines(found)
+    return _group_lines(found) + _size_lines(found) + left_out
+
+
+def _left_out_lines(others: Sequence[Hypothesis]) -> list[str]:
+    """Return the hypotheses that nothing is said of here: pairs of faults, and `unknown`."""
+    pairs = sum(len(h.faults) > 1 for h in others)
+    names = [f"{pairs} pair{'s' * (pairs > 1)} of faults"] * (pairs > 0)
+    names += [str(h) for h in others if not h.known]
+    if not names:
+        return []
+    return [f"what motions tell apart is said of single faults only, not of {' and '.join(names)}"]
 
 
 def _group_lines(found: Ambiguity) -> list[str]:
-    groups = [" or ".join(_name(name) for name in group) for group in found.groups]
-    return [f"cannot be told apart by such motions: {'; '.join(groups)}"] if groups else []
+    """Return the groups, with the sizes at which their faults look alike."""
+    groups = [
+        " or ".join(_name(name, found.typical.get(name)) for name in group)
+        for group in found.groups
+    ]
+    if not groups:
+        return []
+    sized = any(name in found.typical for group in found.groups for name in group)
+    when = " when faults are as large as this" if sized else ""
+    return [f"cannot be told apart by such motions{when}: {'; '.join(groups)}"]
 
 
 def _size_lines(found: Ambiguity) -> list[str]:
-    shown, hidden = [], []
-    for name, size in found.isolated.items():
-        fault = Hypothesis.parse(name).faults[0]
-        if size is None:
-            hidden.append(_name(name))
-        else:
-            shown.append(_name(name) + size_words(fault, size))
-    lines = []
-    if shown:
-        lines.append(f"smallest faults that such motions show: {', '.join(shown)}")
-    if hidden:
-        lines.append(f"not for certain, however large: {', '.join(hidden)}")
-    return lines
+    """Return the smallest sizes that are found, and what is known of faults never found."""
+    hidden = [name for name, size in found.isolated.items() if size is None]
+    alarms = {name: found.detected[name] for name in hidden}
+    lines = {
+        "smallest faults that such motions show": found.isolated,
+        "not shown for certain, even when as large as this": {n: found.largest[n] for n in hidden},
+        "of these, that something is wrong shows from this size on": alarms,
+    }
+    return [
+        f"{what}: {', '.join(_name(name, size) for name, size in sizes.items() if size)}"
+        for what, sizes in lines.items()
+        if any(sizes.values())
+    ]
 
 
-def _name(hypothesis: str) -> str:
-    return plain_name(Hypothesis.parse(hypothesis))
+def _name(hypothesis: str, size: float | None = None) -> str:
+    """Return a hypothesis as a person would say it, with the size of its fault if it has one."""
+    parsed = Hypothesis.parse(hypothesis)
+    if size is None:
+        return plain_name(parsed)
+    return plain_name(parsed) + size_words(parsed.faults[0], size).replace("+", "")  # either sign

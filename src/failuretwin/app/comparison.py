@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from failuretwin.app.results import Record, judged_records, protocol_of
+from failuretwin.app.results import (
+    Record,
+    check_each_once,
+    judged_records,
+    protocol_of,
+    some_names,
+    truths_as_unknown,
+)
 from failuretwin.core.errors import InputError
-from failuretwin.core.types import BoolArray
+from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.decision.metrics import (
     LogScoreGain,
     McNemar,
@@ -18,9 +24,6 @@ from failuretwin.decision.metrics import (
     log_score_gain,
     mcnemar,
 )
-
-NAMED_RUNS = 3
-"""So many runs are named in an error."""
 
 
 @dataclass(frozen=True)
@@ -50,12 +53,15 @@ class Comparison:
         second: Name and protocol of the second.
         split: Which runs they got right.
         gain: Nats a run that the second saves.
+        as_unknown: Runs that the first and the second judge as `unknown`, since the truth is not
+            among their own hypotheses.
     """
 
     first: str
     second: str
     split: McNemar
     gain: LogScoreGain
+    as_unknown: tuple[int, int]
 
     @property
     def runs(self) -> int:
@@ -75,27 +81,28 @@ def compare_results(first: Results, second: Results, rng: np.random.Generator) -
     Raises:
         InputError: If the runs or their truths differ.
     """
-    ours, theirs = _paired(first, second)
-    truth = [record["truth"] for record in ours]
+    paired = _paired(first, second)
+    ours, theirs = (judged_records(records) for records in paired)  # each by its own hypotheses
     return Comparison(
         first=f"{first.name} (protocol {first.protocol})",
         second=f"{second.name} (protocol {second.protocol})",
-        split=mcnemar(_right(ours, truth), _right(theirs, truth)),
-        gain=log_score_gain(
-            log_score(truth, [record["posterior"] for record in ours]).nats,
-            log_score(truth, [record["posterior"] for record in theirs]).nats,
-            rng,
-        ),
+        split=mcnemar(_right(ours), _right(theirs)),
+        gain=log_score_gain(_nats(ours), _nats(theirs), rng),
+        as_unknown=(truths_as_unknown(paired[0]).total(), truths_as_unknown(paired[1]).total()),
     )
 
 
-def _right(records: Sequence[Record], truth: Sequence[str]) -> BoolArray:
-    pairs = zip(records, truth, strict=True)
-    return np.array([record["diagnosis"] == true for record, true in pairs], dtype=np.bool_)
+def _right(records: Sequence[Record]) -> BoolArray:
+    return np.array([record["diagnosis"] == record["truth"] for record in records], dtype=np.bool_)
+
+
+def _nats(records: Sequence[Record]) -> FloatArray:
+    truth = [record["truth"] for record in records]
+    return log_score(truth, [record["posterior"] for record in records]).nats
 
 
 def _paired(first: Results, second: Results) -> tuple[list[Record], list[Record]]:
-    """Return the records of both whose truth is known, run by run."""
+    """Return the records of both whose truth is known, run by run, both with that of the first."""
     ours, theirs = _by_run(first), _by_run(second)
     for has, lacks, missing in (
         (first, second, [run for run in ours if run not in theirs]),
@@ -103,28 +110,22 @@ def _paired(first: Results, second: Results) -> tuple[list[Record], list[Record]
     ):
         if missing:
             raise InputError(
-                f"{lacks.name}: lacks {len(missing)} runs of {has.name} ({_some(missing)}). Two "
-                "methods are compared on the same runs: diagnose the same inputs with both."
+                f"{lacks.name}: lacks {len(missing)} runs of {has.name} ({some_names(missing)}). "
+                "Two methods are compared on the same runs: diagnose the same inputs with both."
             )
-    judged = judged_records(first.records)
-    matched = [theirs[record["run"]] for record in judged]
-    for one, other in zip(judged, matched, strict=True):
+    known = [record for record in first.records if record["truth"]]
+    matched = [theirs[record["run"]] for record in known]
+    for one, other in zip(known, matched, strict=True):
         if other["truth"] not in (None, "", one["truth"]):
             raise InputError(
                 f"{second.name}: run {one['run']!r} is {other['truth']} there, but {one['truth']} "
                 f"in {first.name}. Give the truth of both with --truth RUNS."
             )
-    return judged, matched
+    return known, [
+        {**other, "truth": one["truth"]} for one, other in zip(known, matched, strict=True)
+    ]
 
 
 def _by_run(results: Results) -> dict[str, Record]:
-    by_run = {record["run"]: record for record in results.records}
-    if len(by_run) < len(results.records):
-        count = Counter(record["run"] for record in results.records)
-        twice = [run for run, times in count.items() if times > 1]
-        raise InputError(f"{results.name}: {_some(twice)} given twice. Expected each run once.")
-    return by_run
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:NAMED_RUNS]) + (", ..." if len(names) > NAMED_RUNS else "")
+    check_each_once(results.records, results.name)
+    return {record["run"]: record for record in results.records}

@@ -7,7 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from failuretwin.app.results import Record, judged_records, protocol_of, score_records
+from failuretwin.app.results import (
+    Record,
+    judged_records,
+    protocol_of,
+    score_records,
+    truths_as_unknown,
+)
 from failuretwin.app.truth import RunTruth
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
@@ -49,6 +55,7 @@ class Evaluation:
     Attributes:
         protocol: How much real data the method has seen.
         untold: Runs without a verdict.
+        as_unknown: Runs that are judged as `unknown`, since their truth is no hypothesis.
         scores: Right, wrong and the log score.
         alarms: False alarms and missed detections.
         brier: Mean Brier score, 0 to 2.
@@ -58,6 +65,7 @@ class Evaluation:
 
     protocol: str
     untold: int
+    as_unknown: int
     scores: Scores
     alarms: Alarms
     brier: float
@@ -82,6 +90,7 @@ def evaluate_records(
     return Evaluation(
         protocol=protocol_of(records),
         untold=sum(record["diagnosis"] is None for record in judged),
+        as_unknown=truths_as_unknown(records).total(),
         scores=scores,
         alarms=count_alarms(truth, [record["diagnosis"] for record in judged]),
         brier=float(brier_score(truth, [record["posterior"] for record in judged]).mean()),
@@ -110,7 +119,8 @@ def _intervals(record: Record, truths: Mapping[str, RunTruth]) -> Iterator[Inter
     known = truths.get(record["run"])
     if known is None or record["diagnosis"] != record["truth"]:
         return
-    mode = "+".join(fault.mode for fault in Hypothesis.parse(record["truth"]).faults)
+    truth = Hypothesis.parse(record["truth"])
+    mode = "+".join(fault.mode for fault in truth.faults) or str(truth)  # `unknown` has no mode
     for quantity, true in (("onset", known.onset), ("magnitude", known.magnitude)):
         interval = record.get(f"{quantity}_90")
         if interval is not None and np.isfinite(true):

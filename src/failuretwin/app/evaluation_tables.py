@@ -136,7 +136,20 @@ def comparison_rows(comparison: Comparison) -> list[tuple[str, str]]:
             f"both {split.both}, only A {split.first_only}, only B {split.second_only}, neither "
             f"{split.neither}; exact McNemar p = {split.p:.3g}",
         ),
+        *_unknown_rows(comparison.as_unknown),
         *_gain_rows(comparison.gain),
+    ]
+
+
+def _unknown_rows(as_unknown: tuple[int, int]) -> list[tuple[str, str]]:
+    if not any(as_unknown):
+        return []
+    return [
+        (
+            "judged as unknown",
+            f"by A {as_unknown[0]} runs, by B {as_unknown[1]}: their truth is not among its "
+            "hypotheses",
+        )
     ]
 
 

@@ -62,7 +62,7 @@ def latex_text(evaluation: Evaluation, comparison: Comparison | None) -> str:
     ]
     parts = [
         r"% \usepackage{booktabs}",
-        latex_table("ll", ("Score", runs), summary_rows(evaluation)),
+        latex_table("ll", ("Score", runs), _score_rows(evaluation)),
         latex_table("lrrrr", ("Class", "Runs", "Precision", "Recall", "F1"), classes),
     ]
     if evaluation.coverage:
@@ -72,6 +72,14 @@ def latex_text(evaluation: Evaluation, comparison: Comparison | None) -> str:
         rows = comparison_rows(comparison)
         parts.append(latex_table("ll", ("Compared", "on the same runs"), rows))
     return "\n".join(parts)
+
+
+def _score_rows(evaluation: Evaluation) -> list[tuple[str, str]]:
+    rows = summary_rows(evaluation)
+    if evaluation.as_unknown:
+        what = f"{evaluation.as_unknown} runs, whose truth is not among the hypotheses"
+        rows.append(("judged as unknown", what))
+    return rows
 
 
 def _coverage_rows(evaluation: Evaluation) -> list[tuple[str, ...]]:

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from failuretwin import __version__
-from failuretwin.app.results import score_line
+from failuretwin.app.results import as_unknown_line, score_line
 from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.data_knowledge.knowledge import plain_name
+from failuretwin.decision.metrics import judged_truth
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -35,6 +36,7 @@ def write_page(
     """
     template = (files("failuretwin.app") / "page.html.j2").read_text(encoding="utf-8")
     page = environment().from_string(template)
+    records = [d.to_record() for d in diagnoses]
     text = page.render(
         runs=[_entry(d, picture) for d, picture in zip(diagnoses, pictures, strict=True)],
         robot=robot,
@@ -42,7 +44,8 @@ def write_page(
         protocol=diagnoses[0].protocol,
         version=__version__,
         known=any(d.truth is not None for d in diagnoses),
-        score=score_line([d.to_record() for d in diagnoses]),
+        score=score_line(records),
+        as_unknown=as_unknown_line(records),
     )
     path.write_text(text, encoding="utf-8")
 
@@ -68,7 +71,8 @@ def _entry(diagnosis: Diagnosis, picture: Path) -> dict[str, Any]:
         "name": diagnosis.run,
         "verdict": diagnosis.verdict,
         "truth": "" if truth is None else plain_name(Hypothesis.parse(truth)),
-        "wrong": truth is not None and truth != diagnosis.diagnosis,
+        "wrong": truth is not None
+        and judged_truth(truth, diagnosis.posterior) != diagnosis.diagnosis,
         "explanation": diagnosis.explanation,
         "quality": diagnosis.quality,
         "picture": base64.b64encode(picture.read_bytes()).decode("ascii"),

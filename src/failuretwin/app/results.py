@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import csv
 import json
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.store import replacing
-from failuretwin.decision.metrics import LogScore, Scores, score
+from failuretwin.decision.metrics import LogScore, Scores, judged_truth, score
 
 Record = dict[str, Any]
 """One diagnosis as the JSON object of the contract."""
 
 NEEDED = ("run", "truth", "diagnosis", "posterior")
+NAMED_RUNS = 3
+"""So many runs are named in an error."""
 SUM_ERROR = 1e-6
 """Probabilities of a run may sum to 1 plus or minus this."""
 
@@ -31,7 +34,7 @@ def read_json_lines(path: Path) -> list[Record]:
     """Read what `write_json_lines` wrote.
 
     Raises:
-        InputError: If the file cannot be read or a line is not a diagnosis.
+        InputError: If the file cannot be read, a line is not a diagnosis, or a run is there twice.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -45,7 +48,32 @@ def read_json_lines(path: Path) -> list[Record]:
             records.append(_read_record(line, f"{path}: line {number}"))
     if not records:
         raise InputError(f"{path}: is empty. Expected the output of diagnose --json.")
+    check_each_once(records, str(path))
     return records
+
+
+def check_each_once(records: Sequence[Record], where: str) -> None:
+    """Refuse results that hold a run twice, which would count it twice.
+
+    Args:
+        records: Diagnoses.
+        where: What to call them in the error.
+
+    Raises:
+        InputError: If a run is there twice.
+    """
+    count = Counter(record["run"] for record in records)
+    twice = [run for run, times in count.items() if times > 1]
+    if twice:
+        raise InputError(
+            f"{where}: {some_names(twice)} given twice. Expected each run once: remove the lines "
+            "that repeat one, or write the file anew with diagnose --json."
+        )
+
+
+def some_names(names: Sequence[str]) -> str:
+    """Return the first few names, and whether there are more."""
+    return ", ".join(names[:NAMED_RUNS]) + (", ..." if len(names) > NAMED_RUNS else "")
 
 
 def _read_record(line: str, where: str) -> Record:
@@ -97,8 +125,32 @@ def _check_probabilities(posterior: Sequence[float], where: str) -> None:
 
 
 def judged_records(records: Sequence[Record]) -> list[Record]:
-    """Return the records whose truth is known."""
-    return [record for record in records if record["truth"]]
+    """Return the records whose truth is known, with the truth that they are judged by."""
+    return [
+        {**record, "truth": judged_truth(record["truth"], record["posterior"])}
+        for record in records
+        if record["truth"]
+    ]
+
+
+def truths_as_unknown(records: Sequence[Record]) -> Counter[str]:
+    """Return how many runs of each truth are judged as `unknown`, by the truth."""
+    known = [record for record in records if record["truth"]]
+    judged = judged_records(records)
+    return Counter(
+        told["truth"]
+        for told, record in zip(known, judged, strict=True)
+        if told["truth"] != record["truth"]
+    )
+
+
+def as_unknown_line(records: Sequence[Record]) -> str:
+    """Return which truths are judged as `unknown`, in words; empty if none is."""
+    found = truths_as_unknown(records)
+    if not found:
+        return ""
+    truths = [f"{truth} ({count} run{'s' * (count > 1)})" for truth, count in found.items()]
+    return f"judged as unknown, since not among the hypotheses: {', '.join(truths)}"
 
 
 def protocol_of(records: Sequence[Record]) -> str:
@@ -137,6 +189,8 @@ def log_score_text(surprise: LogScore) -> str:
     if not surprise.impossible:
         return text
     rest = surprise.nats.size - surprise.impossible
+    if not rest:
+        return f"{text} (the truth was given no probability in any run)"
     return (
         f"{text} (of {surprise.impossible} runs the truth was given no probability; the other "
         f"{rest}: {surprise.mean_of_rest:.3f})"

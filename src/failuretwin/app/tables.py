@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.table import Table
 
-from failuretwin.app.results import Record, score_line, score_records
+from failuretwin.app.results import Record, as_unknown_line, score_line, score_records
 from failuretwin.core.diagnosis import Diagnosis
-from failuretwin.decision.metrics import Scores
+from failuretwin.decision.metrics import Scores, judged_truth
 
 TOLD_RUNS = 3
 """So few runs are explained in full on the screen; for more there are --plot and --json."""
@@ -30,9 +30,7 @@ def print_diagnoses(diagnoses: Sequence[Diagnosis]) -> None:
     for column in ("run", *(["truth", ""] if known else []), "verdict", "log"):
         table.add_column(column, overflow="fold")
     for d in diagnoses:
-        mark = "" if d.truth is None else ("right" if d.truth == d.diagnosis else "WRONG")
-        mark = "" if d.diagnosis is None else mark
-        truth = [d.truth or "", mark] if known else []
+        truth = [d.truth or "", _mark(d)] if known else []
         count = len(d.quality)
         quality = f"{count} remark{'s' * (count > 1)}" if count else ""
         table.add_row(d.run, *truth, d.verdict, quality)
@@ -44,6 +42,14 @@ def print_diagnoses(diagnoses: Sequence[Diagnosis]) -> None:
             for line in (*d.explanation, *(f"the log: {remark}" for remark in d.quality)):
                 console.print(f"  - {line}", soft_wrap=True)
     console.print(f"\n{diagnoses[0].method}", soft_wrap=True)
+
+
+def _mark(diagnosis: Diagnosis) -> str:
+    """Return whether a verdict is right; empty where there is none or the truth is not known."""
+    if diagnosis.truth is None or diagnosis.diagnosis is None:
+        return ""
+    truth = judged_truth(diagnosis.truth, diagnosis.posterior)
+    return "right" if truth == diagnosis.diagnosis else "WRONG"
 
 
 def print_lines(lines: Sequence[str]) -> None:
@@ -59,7 +65,10 @@ def print_scores(records: Sequence[Record]) -> None:
     if scores is None:
         return
     console = table_console()
-    console.print(f"\n{score_line(records)}\n")
+    console.print(f"\n{score_line(records)}")
+    if as_unknown := as_unknown_line(records):
+        console.print(as_unknown, soft_wrap=True)
+    console.print()
     console.print(_class_table(scores))
     console.print("\nconfusion matrix: a row for each truth, a column for each diagnosis")
     console.print(_confusion_table(scores))

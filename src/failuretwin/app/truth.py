@@ -83,5 +83,18 @@ def with_truth(
     """
     for record in records:
         if record["run"] not in truths:
-            raise InputError(f"{where}: holds no run {record['run']!r} of the results.")
+            raise InputError(_no_run(record["run"], truths, where))
     return [{**record, "truth": truths[record["run"]].fault} for record in records]
+
+
+def _no_run(run: str, truths: Mapping[str, RunTruth], where: str) -> str:
+    """Return what is wrong if a run is not there, and why that may be."""
+    problem = f"{where}: holds no run {run!r} of the results. "
+    name, numbered, _ = run.rpartition("#")
+    if numbered and name in truths:
+        return problem + (
+            f"It holds {name!r}; diagnose numbers runs of the same name, so it was given an input "
+            "twice, or several whose runs are called alike. Diagnose and evaluate each input once, "
+            "by itself."
+        )
+    return problem + "Expected the runs that were diagnosed."

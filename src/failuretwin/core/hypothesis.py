@@ -78,29 +78,44 @@ class Hypothesis:
         """
         if text in ("healthy", "unknown"):
             return cls(known=text == "healthy")
-        faults = tuple(_parse_fault(part, motors) for part in text.split("+"))
-        order = [] if motors is None else [motors.index(fault.motor) for fault in faults]
-        if motors is not None and order != sorted(set(order)):
+        hypothesis = cls(tuple(_parse_fault(part) for part in text.split("+")))
+        if motors is not None:
+            hypothesis.check_motors(motors)
+        return hypothesis
+
+    def check_motors(self, motors: Sequence[str]) -> None:
+        """Refuse what a robot with these motors cannot have.
+
+        Args:
+            motors: Names of the robot's motors in chain order.
+
+        Raises:
+            InputError: If a motor is unknown, there twice or out of order.
+        """
+        for fault in self.faults:
+            if fault.motor not in motors:
+                raise unknown_name("motor", fault.motor, motors)
+        order = [motors.index(fault.motor) for fault in self.faults]
+        if order != sorted(set(order)):
             raise InputError(
-                f"hypothesis {text!r} names its motors out of chain order or twice. "
+                f"hypothesis {str(self)!r} names its motors out of chain order or twice. "
                 f"Expected each motor once, in the order {', '.join(motors)}."
             )
-        return cls(faults)
 
 
 HEALTHY = Hypothesis()
 UNKNOWN = Hypothesis(known=False)
 
 
-def _parse_fault(text: str, motors: Sequence[str] | None) -> Fault:
+def _parse_fault(text: str) -> Fault:
     motor, separator, mode = text.partition(":")
     if not separator:
         raise InputError(
             f"hypothesis {text!r} is not of the form MOTOR:MODE. "
-            "Expected 'healthy' or, for example, 'motor_1:stuck'."
+            "Expected 'healthy', 'unknown', a fault such as 'motor_1:stuck', or several joined by "
+            "'+' in chain order, such as 'motor_1:stuck+motor_2:drift'. "
+            f"Modes: {', '.join(MAGNITUDE_UNITS)}."
         )
-    if motors is not None and motor not in motors:
-        raise unknown_name("motor", motor, motors)
     return Fault(motor, mode)
 
 
@@ -121,15 +136,34 @@ def paper_hypotheses(motors: Sequence[str]) -> tuple[Hypothesis, ...]:
     return single_faults(motors, PAPER_MODES)
 
 
-def parse_hypotheses(texts: Iterable[str], motors: Sequence[str]) -> tuple[Hypothesis, ...]:
+def parse_hypotheses(
+    given: Iterable[Hypothesis | str], motors: Sequence[str]
+) -> tuple[Hypothesis, ...]:
     """Read several hypotheses; refuses an empty list and repeats.
 
+    Args:
+        given: Hypotheses, or their text form.
+        motors: Names of the robot's motors in chain order.
+
     Raises:
-        InputError: If a text cannot be read, is given twice, or none is given.
+        InputError: If one cannot be read or names another motor, is given twice, none is given, or
+            one text is given in place of a list.
     """
-    hypotheses = tuple(Hypothesis.parse(text.strip(), motors) for text in texts)
+    if isinstance(given, str):
+        raise InputError(
+            f"hypotheses are the text {given!r}. Expected a list, such as ['healthy', "
+            "'motor_1:stuck']."
+        )
+    hypotheses = tuple(_as_hypothesis(one) for one in given)
+    for hypothesis in hypotheses:
+        hypothesis.check_motors(motors)
     if not hypotheses:
         raise InputError("no hypotheses given. Expected at least one, such as 'healthy'.")
     if len(set(hypotheses)) < len(hypotheses):
         raise InputError("a hypothesis is given twice. Give each of them once.")
     return hypotheses
+
+
+def _as_hypothesis(given: Hypothesis | str) -> Hypothesis:
+    # Names of motors may hold what the text form cannot: a hypothesis is taken as it is.
+    return given if isinstance(given, Hypothesis) else Hypothesis.parse(str(given).strip())

@@ -12,7 +12,7 @@ import numpy as np
 from failuretwin.connection.healthy import HealthyModel
 from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
+from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses, parse_hypotheses
 from failuretwin.core.runs import check_motors, check_runs, truth_of
 from failuretwin.core.types import BoolArray
 from failuretwin.data_knowledge.log_quality import log_quality, without_spoilt
@@ -39,16 +39,21 @@ class BayesDiagnoser:
     Attributes:
         twin: Digital twin of the robot.
         imperfections: How the healthy robot differs from it; None: as its profile says.
-        hypotheses: What may be the case, with the prior odds of the table of
-            failure modes; None: the paper's classes.
+        hypotheses: What may be the case, as `Hypothesis` or in its text form, such as
+            ``["healthy", "motor_1:stuck", "unknown"]``, with the prior odds of the table of
+            failure modes; None: the paper's classes. A single one is always certain.
         priors: Beliefs about onset and size.
         whole_run: Whether readings on the way count beside settled poses, where it is known how
             late this robot starts to move.
+
+    Raises:
+        InputError: If a hypothesis cannot be read or weighed, names a motor that the robot does
+            not have, or is given twice, or none is given.
     """
 
     twin: DigitalTwin
     imperfections: Imperfections | None = None
-    hypotheses: Sequence[Hypothesis] | None = None
+    hypotheses: Sequence[Hypothesis | str] | None = None
     priors: Priors = field(default_factory=Priors)
     whole_run: bool = True
 
@@ -59,7 +64,10 @@ class BayesDiagnoser:
     @cached_property
     def considered(self) -> Sequence[Hypothesis]:
         """What may be the case."""
-        return self.hypotheses or paper_hypotheses(self.twin.robot.motor_names)
+        motors = self.twin.robot.motor_names
+        if self.hypotheses is None:
+            return paper_hypotheses(motors)
+        return parse_hypotheses(self.hypotheses, motors)
 
     @cached_property
     def healthy_model(self) -> HealthyModel:

@@ -33,7 +33,8 @@ from failuretwin.app.commands.options import PATH, LogOptions, common_options, r
 @click.option(
     "--hypotheses",
     metavar="H,...",
-    help="What may be the case, such as healthy,motor_2:stuck. Default: the paper's nine classes.",
+    help="What may be the case, two at least: healthy, MOTOR:MODE, two of these joined by '+', "
+    "unknown. Such as healthy,motor_2:stuck. Default: the paper's nine classes.",
 )
 @click.option(
     "--sse-range",
@@ -76,7 +77,12 @@ def diagnose(
     del seed  # nothing here is drawn by chance
     from failuretwin.app.ambiguity_lines import ambiguity_lines
     from failuretwin.app.inputs import read_inputs, tell_mismatch
-    from failuretwin.app.method import chosen_diagnoser, expected_name
+    from failuretwin.app.method import (
+        chosen_diagnoser,
+        expected_name,
+        told_hypotheses,
+        told_priors,
+    )
     from failuretwin.app.results import write_csv, write_json_lines
     from failuretwin.app.tables import print_diagnoses, print_lines, print_scores
     from failuretwin.app.tracking import (
@@ -85,9 +91,7 @@ def diagnose(
         open_history,
         tracking_line,
     )
-    from failuretwin.core.hypothesis import parse_hypotheses
     from failuretwin.decision.bayes import BayesDiagnoser
-    from failuretwin.decision.hypotheses.priors import priors_of
     from failuretwin.digital_model.imperfections import load_imperfections
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.twin import DigitalTwin
@@ -97,12 +101,8 @@ def diagnose(
     bayes = BayesDiagnoser(
         twin,
         imperfections=None if calibration is None else load_imperfections(str(calibration), model),
-        hypotheses=(
-            None
-            if hypotheses is None
-            else parse_hypotheses(hypotheses.split(","), model.motor_names)
-        ),
-        priors=priors_of(model, sse_range, onset),
+        hypotheses=told_hypotheses(hypotheses, model),
+        priors=told_priors(model, sse_range, onset),
     )
     settings = {
         "--calibration": calibration,

@@ -6,7 +6,13 @@ One module for each question: right or wrong (`classes`), false alarms (`alarms`
 """
 
 from failuretwin.decision.metrics.alarms import Alarms, count_alarms
-from failuretwin.decision.metrics.classes import NO_VERDICT, ClassScore, Scores, score
+from failuretwin.decision.metrics.classes import (
+    NO_VERDICT,
+    ClassScore,
+    Scores,
+    judged_truth,
+    score,
+)
 from failuretwin.decision.metrics.coverage import Coverage, IntervalCase, coverage_by_mode
 from failuretwin.decision.metrics.delay import Delays, alarm_threshold, delays_after_onset
 from failuretwin.decision.metrics.paired import LogScoreGain, McNemar, log_score_gain, mcnemar
@@ -45,6 +51,7 @@ __all__ = [
     "coverage_by_mode",
     "delays_after_onset",
     "equal_edges",
+    "judged_truth",
     "log_score",
     "log_score_gain",
     "mcnemar",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,22 @@ from failuretwin.decision.metrics.shares import wilson_interval
 
 NO_VERDICT = "cannot tell"
 """Class of the runs that got no verdict."""
+UNKNOWN, HEALTHY = "unknown", "healthy"
+
+
+def judged_truth(truth: str, hypotheses: Container[str]) -> str:
+    """Return the hypothesis that is right for a run: its truth, or `unknown` where that means it.
+
+    `unknown` stands for every fault that is not named, so where it is among the hypotheses and
+    the true fault is not, it is the right answer. A healthy robot has no fault and stays healthy.
+
+    Args:
+        truth: True hypothesis of the run.
+        hypotheses: Those that were given a probability.
+    """
+    if truth == HEALTHY or truth in hypotheses or UNKNOWN not in hypotheses:
+        return truth
+    return UNKNOWN
 
 
 @dataclass(frozen=True)

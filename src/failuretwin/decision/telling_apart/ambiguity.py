@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from failuretwin.connection.healthy import HealthyModel
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
+from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses, parse_hypotheses
 from failuretwin.core.movements import find_movements
 from failuretwin.core.runs import RunTable
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
@@ -30,6 +30,8 @@ APART_NATS = 3.0
 """Faults are told apart if the true one is expected to be ahead by this: odds of 20."""
 SEEN_HZ = 10.0
 """Rate at which the tool is taken to be seen [Hz]."""
+LEAST_TYPICAL = 0.02
+"""Nothing below this share of the largest size is typical: ranges of errors may begin at 0."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,9 @@ class Ambiguity:
         detected: Smallest size at which each fault is told from a healthy robot, by hypothesis, in
             the unit of the mode; None: no size considered is. Held angles are no size.
         isolated: Smallest size at which it is told from everything else too.
+        typical: Size of each fault that `nats` and `groups` are of, by hypothesis, in the unit of
+            the mode; of those that have a size.
+        largest: Largest size that is considered, likewise.
     """
 
     hypotheses: tuple[str, ...]
@@ -52,6 +57,8 @@ class Ambiguity:
     groups: tuple[tuple[str, ...], ...]
     detected: Mapping[str, float | None]
     isolated: Mapping[str, float | None]
+    typical: Mapping[str, float]
+    largest: Mapping[str, float]
 
 
 def ambiguity(
@@ -59,7 +66,7 @@ def ambiguity(
     command: ArrayLike,
     time: ArrayLike,
     imperfections: Imperfections | None = None,
-    hypotheses: Sequence[Hypothesis] | None = None,
+    hypotheses: Sequence[Hypothesis | str] | None = None,
     priors: Priors | None = None,
     onset_s: float = 0.0,
 ) -> Ambiguity:
@@ -71,27 +78,27 @@ def ambiguity(
             [rad]; each motion is taken as a run of its own.
         time: Uniform time grid from 0, (time,) [s].
         imperfections: How the healthy robot differs from the twin; None: as its profile says.
-        hypotheses: What may be the case, single faults; healthy always may. None: the paper's
+        hypotheses: What may be the case, single faults, as `Hypothesis` or in the text form, such
+            as ``["motor_2:stuck", "motor_2:drift"]``; healthy always may. None: the paper's
             classes.
         priors: Ranges of sizes that are considered; None: the default.
         onset_s: When faults begin [s]; 0: they are there before the motion.
 
     Raises:
-        InputError: If nothing moves, the shapes do not fit, or a hypothesis has several faults or
-            cannot be weighed.
+        InputError: If nothing moves, the shapes do not fit, the onset is not within the motion, or
+            a hypothesis has several faults, or cannot be read or weighed.
     """
-    asked = hypotheses or paper_hypotheses(twin.robot.motor_names)
+    motors = twin.robot.motor_names
+    asked = paper_hypotheses(motors) if hypotheses is None else parse_hypotheses(hypotheses, motors)
     model = HealthyModel(twin, imperfections or default_imperfections(twin.robot))
     judge = Judge(model, tuple(dict.fromkeys((HEALTHY, *asked))), priors or Priors())
-    trials = Trials(judge, _motions(twin, command, time), onset_s)
+    motions = _motions(twin, command, time)
+    _check_onset(onset_s, float(motions["time"].values[-1]))
+    trials = Trials(judge, motions, onset_s)
     considered = {h: _sizes(h, judge.priors) for h in judge.hypotheses}
-    typical = [(h, float(np.sqrt(low * high))) for h, (low, high) in considered.items()]
-    nats = trials.ahead(typical)
-    smallest = {
-        str(h): smallest_sizes(trials, h, sizes)
-        for h, sizes in considered.items()
-        if np.isfinite(sizes).all()
-    }
+    nats = trials.ahead([(h, _typical(*sizes)) for h, sizes in considered.items()])
+    sized = {h: sizes for h, sizes in considered.items() if np.isfinite(sizes).all()}
+    smallest = {str(h): smallest_sizes(trials, h, sizes) for h, sizes in sized.items()}
     names = tuple(str(h) for h in judge.hypotheses)
     return Ambiguity(
         hypotheses=names,
@@ -99,7 +106,18 @@ def ambiguity(
         groups=_groups(names, nats[1:] < APART_NATS),
         detected={name: found[0] for name, found in smallest.items()},
         isolated={name: found[1] for name, found in smallest.items()},
+        typical={str(h): _typical(*sizes) for h, sizes in sized.items()},
+        largest={str(h): sizes[1] for h, sizes in sized.items()},
     )
+
+
+def _check_onset(onset_s: float, end_s: float) -> None:
+    """Refuse an onset that is not within a motion that ends at `end_s` [s]."""
+    if not 0.0 <= onset_s <= end_s:
+        raise InputError(
+            f"`onset_s` is {onset_s:g} s, expected a time of the motion: 0 (or before it) to "
+            f"{end_s:g} s."
+        )
 
 
 def _motions(twin: DigitalTwin, command: ArrayLike, time: ArrayLike) -> xr.Dataset:
@@ -136,6 +154,11 @@ def _sizes(hypothesis: Hypothesis, priors: Priors) -> tuple[float, float]:
         lows, highs = zip(*priors.error_ranges, strict=True)
         return min(lows), max(highs)
     return magnitude_range(hypothesis.faults[0].mode)
+
+
+def _typical(low: float, high: float) -> float:
+    """Return the geometric mean of a range of sizes; NaN where there is none."""
+    return float(np.sqrt(np.maximum(low, LEAST_TYPICAL * high) * high))
 
 
 def _groups(names: Sequence[str], alike: BoolArray) -> tuple[tuple[str, ...], ...]:

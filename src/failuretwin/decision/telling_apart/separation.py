@@ -15,7 +15,7 @@ import numpy as np
 
 from failuretwin.connection.healthy import HealthyModel
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
+from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses, parse_hypotheses
 from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.runs import check_motors, check_runs
 from failuretwin.core.types import FloatArray, as_floats
@@ -147,7 +147,7 @@ def separation(
     twin: DigitalTwin,
     runs: xr.Dataset,
     imperfections: Imperfections | None = None,
-    hypotheses: Sequence[Hypothesis] | None = None,
+    hypotheses: Sequence[Hypothesis | str] | None = None,
     priors: Priors | None = None,
 ) -> Separation:
     """Return by how much the truth of simulated runs is expected to beat each hypothesis.
@@ -158,7 +158,8 @@ def separation(
             come.
         imperfections: The declared scatter and chance of the robot that the runs are of; without
             lost commands, scatter alone counts. None: as its profile says.
-        hypotheses: What the truth is laid beside: healthy and single faults; None: the paper's.
+        hypotheses: What the truth is laid beside: healthy and single faults, as `Hypothesis` or
+            in the text form; None: the paper's.
         priors: Ranges of sizes that are considered; None: the default.
 
     Raises:
@@ -167,7 +168,8 @@ def separation(
     check_runs(runs, "the run set")
     check_motors(runs, twin.robot.name, twin.robot.motor_names)
     truth, faults = truth_and_faults(runs)
-    asked = tuple(hypotheses or paper_hypotheses(twin.robot.motor_names))
+    motors = twin.robot.motor_names
+    asked = paper_hypotheses(motors) if hypotheses is None else parse_hypotheses(hypotheses, motors)
     model = HealthyModel(twin, imperfections or default_imperfections(twin.robot))
     everything = tuple(dict.fromkeys((*asked, *truth)))
     judge = Judge(model, everything, priors or Priors())

@@ -14,6 +14,8 @@ SIZES = 5
 """Sizes tried at first, and again between the two that the smallest one lies between."""
 BELOW = 0.25
 """Smallest size tried, as a share of the smallest that is considered."""
+LEAST = 0.001
+"""No smaller share of the largest size is tried: ranges of errors may begin at 0."""
 
 
 def smallest_sizes(
@@ -37,7 +39,7 @@ def smallest_sizes(
         return np.stack([nats[:, 0], nats.min(axis=1)])
 
     low, high = considered
-    sizes = np.geomspace(BELOW * low, high, SIZES)
+    sizes = np.geomspace(max(BELOW * low, LEAST * high), high, SIZES)
     nats = ahead(sizes)
     between = np.unique(np.concatenate([_bracket(sizes, row) for row in nats]))
     if len(between):
