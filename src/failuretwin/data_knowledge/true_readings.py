@@ -1,10 +1,14 @@
 """Which samples of a path are readings of the sensor, and which lie on a line drawn between two.
 
 Where the grid is finer than the sensor's true rate, somebody has filled it. Three samples of a path
-drawn out by straight lines lie on one line, to rounding, unless a reading is in the middle; readings
-of a moving arm never do, for noise and because its path bends. So the corners are the readings, and
-a gap is a long line. A tool at rest says the same number again and again, and there a line cannot be
+drawn out by straight lines lie on one line, to rounding, unless a reading is in the middle; those
+of a real arm do not, for noise and because its path bends. So the corners are the readings, and a
+gap is a long line. A tool at rest says the same number again and again, and there a line cannot be
 told from readings: those count as often as the sensor reads.
+
+A joint that slides does move the tool along a line. A path is taken for drawn only if it is
+straight from corner to corner all along, which that of a slide that gathers speed is not;
+once drawn out, the steady part of its way counts as a line.
 """
 
 from __future__ import annotations
@@ -72,7 +76,8 @@ def true_readings(runs: xr.Dataset) -> TrueReadings:
         return TrueReadings(point, seen, assumed, filled)
     between = seen[:, 1:-1] & seen[:, :-2] & seen[:, 2:]
     dense = np.flatnonzero(between.any(axis=1))
-    shapes = _Shapes.of(point[dense], seen[dense], as_floats(runs["time"].values))
+    whole = np.where(seen[dense][..., None], point[dense], np.nan)
+    shapes = _Shapes.of(whole, seen[dense], as_floats(runs["time"].values))
     lines = shapes.drawn_by_lines()
     filled[dense] = ~lines & (2 * between[dense].sum(axis=1) >= seen.shape[1])
     dense, shapes = dense[lines], shapes[lines]
@@ -82,9 +87,8 @@ def true_readings(runs: xr.Dataset) -> TrueReadings:
     head, tail = _held(rests, as_floats(runs["command"].values[dense]), every, settle)
     held = (rests.head & head[:, None]) | (rests.tail & tail[:, None])
     assumed[dense] = rests.readings(every) & ~held
-    seen[dense] &= ~(shapes.on_line | shapes.beside_corner() | rests.inside) | assumed[dense]
-    seen[dense[head], rests.first[head]] = False
-    seen[dense[tail], rests.last[tail]] = False
+    beside = shapes.on_line | shapes.beside_corner()
+    seen[dense] &= ~(beside | (rests.inside & ~assumed[dense]))
     return TrueReadings(np.where(seen[..., None], point, np.nan), seen, assumed, filled)
 
 
@@ -97,11 +101,11 @@ def grid_steps(runs: xr.Dataset) -> int:
 class _Shapes:
     """How paths run through each of their samples, (run, time) each.
 
-    A sample with a neighbour missing is none of the first three.
+    A sample with a neighbour missing is none of the first three, except at the ends of a path.
 
     Attributes:
         on_line: Amid a straight line along which the tool moves.
-        at_rest: Amid a stretch at one place.
+        at_rest: Amid a stretch at one place, or at an end of the path that begins or ends in one.
         corner: Neither.
         bend: Change of the step from sample to sample there [m].
         seen: Samples that are there.
@@ -130,6 +134,9 @@ class _Shapes:
         at_rest, on_line = np.zeros_like(seen), np.zeros_like(seen)
         at_rest[:, 1:-1] = still[:, 1:] & still[:, :-1]
         on_line[:, 1:-1] = straight & ~at_rest[:, 1:-1]
+        row, (first, last) = np.arange(len(seen)), _ends(seen)
+        at_rest[row, first] = still[row, np.minimum(first, still.shape[1] - 1)]
+        at_rest[row, last] = still[row, np.maximum(last - 1, 0)]
         return cls(on_line, at_rest, inside & ~(on_line | at_rest), bend, seen)
 
     def __getitem__(self, runs: BoolArray) -> _Shapes:
@@ -161,6 +168,11 @@ class _Shapes:
         later = self.bend[run, first] >= self.bend[run, first + 1]
         flatter[run, first + later] = True
         return flatter
+
+
+def _ends(seen: BoolArray) -> tuple[IntArray, IntArray]:
+    """Return the first and the last sample of each path, (run,) each."""
+    return np.argmax(seen, axis=1), seen.shape[1] - 1 - np.argmax(seen[:, ::-1], axis=1)
 
 
 def _rounding(point: FloatArray) -> FloatArray:
@@ -196,19 +208,17 @@ class _Rests:
         place = np.arange(end + 1)
         since = np.maximum.accumulate(np.where(inside, 0, place), axis=1)
         until = np.minimum.accumulate(np.where(inside, end, place)[:, ::-1], axis=1)[:, ::-1]
-        first = np.argmax(shapes.seen, axis=1)
-        last = end - np.argmax(shapes.seen[:, ::-1], axis=1)
-        return cls(inside, since, until, first, last)
+        return cls(inside, since, until, *_ends(shapes.seen))
 
     @property
     def head(self) -> BoolArray:
         """Samples amid the stretch that a path begins with, (run, time)."""
-        return np.asarray(self.inside & (self.since == self.first[:, None]))
+        return np.asarray(self.inside & (self.since <= self.first[:, None]))
 
     @property
     def tail(self) -> BoolArray:
         """Samples amid the stretch that it ends with, (run, time)."""
-        return np.asarray(self.inside & (self.until == self.last[:, None]))
+        return np.asarray(self.inside & (self.until >= self.last[:, None]))
 
     def repeats(self, every: int) -> BoolArray:
         """Return whether the sensor says the same number twice before the path's end, (run,)."""
@@ -216,20 +226,32 @@ class _Rests:
         return np.asarray((self.inside & lasting & ~self.head & ~self.tail).any(axis=1))
 
     def readings(self, every: int) -> BoolArray:
-        """Return which samples inside pass for readings: one every so many, (run, time)."""
-        after, before = np.arange(self.inside.shape[1]) - self.since, self.until - self.since
-        before = before - after
-        # Of a head its end is a reading for sure, of every other stretch its beginning.
-        counted, room = np.where(self.head, (before, after), (after, before))
-        return np.asarray(self.inside & (counted % every == 0) & (room >= LEAST_PERIODS * every))
+        """Return which samples pass for readings: one every so many, (run, time).
+
+        They are counted from where a reading is for sure: where a stretch begins, or a head ends.
+        """
+        place = np.arange(self.inside.shape[1])
+        after, before = place - self.since, self.until - place
+        head, tail = self.head, self.tail
+        counted = np.where(head, before, after)
+        apart = (before >= LEAST_PERIODS * every) | head | tail
+        return np.asarray(self.inside & (counted % every == 0) & apart)
+
+    @property
+    def bounds(self) -> tuple[IntArray, IntArray]:
+        """Where heads end and tails begin, (run,) each; the path's own ends if it has none."""
+        row, first, last = np.arange(len(self.inside)), self.first, self.last
+        begun = np.where(self.inside[row, first], self.until[row, first], first)
+        ended = np.where(self.inside[row, last], self.since[row, last], last)
+        return begun, ended
 
 
 def _held(rests: _Rests, command: FloatArray, every: int, settle: int) -> tuple[BoolArray, ...]:
     """Return which paths hold their first reading backwards and their last forwards, (run,) each.
 
-    Whoever draws lines may hold the readings at both ends, as the authors of the published data did.
-    A held value looks like a tool at rest, with two exceptions: where motors are told to travel
-    that no single stuck one could hide, and where the sensor never repeats itself at rest.
+    Whoever draws lines may do so, as the usual functions for it do. A held value looks like a tool
+    at rest, and passes for one but in two cases: where motors are told to travel meanwhile that no
+    single stuck one could hide, and where the sensor does not repeat itself at any rest before.
 
     Args:
         rests: Stretches at one place.
@@ -237,10 +259,7 @@ def _held(rests: _Rests, command: FloatArray, every: int, settle: int) -> tuple[
         every: Samples from one reading to the next.
         settle: Samples after which a tool has set out.
     """
-    rows = np.arange(len(command))
-    begun = rests.until[rows, np.minimum(rests.first + 1, rests.last)]
-    ended = rests.since[rows, np.maximum(rests.last - 1, rests.first)]
-    flickers = ~rests.repeats(every)
+    (begun, ended), flickers = rests.bounds, ~rests.repeats(every)
     head, tail = np.zeros((2, len(command)), dtype=bool)
     for run, reference in enumerate(command):
         noisy = bool(flickers[run]) and _rests_between(reference, 3 * every + settle)
