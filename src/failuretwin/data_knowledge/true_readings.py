@@ -69,7 +69,7 @@ def true_readings(runs: xr.Dataset) -> TrueReadings:
             place, `command` (run, time, motor) are read.
     """
     point = as_floats(runs["measured"].values)
-    seen = np.asarray(np.isfinite(point).all(axis=-1))
+    seen = np.isfinite(_largest(point))
     assumed, filled = np.zeros_like(seen), np.zeros(len(seen), dtype=bool)
     every = grid_steps(runs)
     if every < 2:
@@ -121,13 +121,13 @@ class _Shapes:
     def of(cls, point: FloatArray, seen: BoolArray, time: FloatArray) -> _Shapes:
         """Return the shapes of paths (run, time, axis) [m] on a grid (time,) [s]."""
         step = np.diff(point, axis=1)
-        size = np.abs(step).max(axis=-1)
+        size = _largest(step)
         rounding = ROUNDINGS * _rounding(point)[:, None]
         still = size <= rounding
         grid = np.diff(time)
         share = STRAIGHT + float(np.ptp(grid) / grid.mean())  # a grid in single precision is uneven
         bend = np.zeros(seen.shape)
-        bend[:, 1:-1] = np.abs(np.diff(step, axis=1)).max(axis=-1)
+        bend[:, 1:-1] = _largest(np.diff(step, axis=1))
         straight = bend[:, 1:-1] <= rounding + share * np.maximum(size[:, 1:], size[:, :-1])
         inside = np.isfinite(bend)
         inside[:, [0, -1]] = False
@@ -168,6 +168,12 @@ class _Shapes:
         later = self.bend[run, first] >= self.bend[run, first + 1]
         flatter[run, first + later] = True
         return flatter
+
+
+def _largest(vector: FloatArray) -> FloatArray:
+    """Return the largest size of a component of (..., axis); much faster than a maximum by axis."""
+    x, y, z = (np.abs(vector[..., axis]) for axis in range(3))
+    return np.maximum(np.maximum(x, y), z)
 
 
 def _ends(seen: BoolArray) -> tuple[IntArray, IntArray]:
