@@ -94,12 +94,18 @@ def seen(twin: DigitalTwin, motions: list[Motion], every: int = 20, grid: int = 
     ).to_dataset()
 
 
-def drawn_out(runs):
-    """Return the runs with straight lines between the readings."""
+def drawn_out(runs, *, held=True):
+    """Return the runs with straight lines between the readings.
+
+    Args:
+        runs: The runs.
+        held: Whether the first and the last reading are held to the ends of the grid.
+    """
+    ends = {} if held else {"left": np.nan, "right": np.nan}
     runs = runs.copy(deep=True)
     time = runs["time"].values
     for path in runs["measured"].values:
         there = np.isfinite(path[:, 0])
         for axis in range(3):
-            path[:, axis] = np.interp(time, time[there], path[there, axis])
+            path[:, axis] = np.interp(time, time[there], path[there, axis], **ends)
     return runs

@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from failuretwin import BayesDiagnoser, DigitalTwin
-from failuretwin.core.hypothesis import single_faults
+from failuretwin.core.hypothesis import paper_hypotheses, single_faults
+from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.plan import Plan
 from failuretwin.digital_model.imperfections import default_imperfections
 
 MODES = ("stuck", "steady_state_error", "encoder_bias", "lost_commands")
@@ -168,11 +170,46 @@ def test_longer_runs_beside_it_change_nothing(twin, all_modes, runs, usual):
 @given(first=st.integers(0, 9))
 @settings(max_examples=4)
 def test_straight_lines_between_readings_are_no_evidence(twin, motions, all_modes, first):
-    """Drawn out to the grid, with the true rate kept: medians over lines shift by a hair."""
+    """Drawn out to the grid, with the true rate kept: the readings are where the lines meet."""
     lone = exact_runs.seen(twin, motions, first=first)
-    filled = exact_runs.drawn_out(lone)
-    expected, found = all_modes.diagnose(lone), all_modes.diagnose(filled)
-    np.testing.assert_allclose(chances(found), chances(expected), atol=0.02)
+    assert_same(all_modes.diagnose(exact_runs.drawn_out(lone)), all_modes.diagnose(lone), 1e-6)
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    gaps=st.lists(st.tuples(st.floats(0.0, 9.0), st.floats(0.3, 4.0)), min_size=1, max_size=3),
+)
+@settings(max_examples=6)
+def test_straight_lines_across_gaps_are_no_evidence(all_modes, runs, seed, gaps):
+    """Of a sensor that flickers by a millimetre, whose readings stop anywhere; lines run on to both
+    ends of the run, as if the first and the last reading were held."""
+    path = runs["measured"].values.copy()
+    path += np.random.default_rng(seed).normal(0.0, 0.001, path.shape)
+    for begin, lasts in gaps:
+        time = runs["time"].values
+        path[:, (time > begin) & (time < begin + lasts)] = np.nan
+    lone = runs.assign(measured=(runs["measured"].dims, path))
+    expected, found = all_modes.diagnose(lone), all_modes.diagnose(exact_runs.drawn_out(lone))
+    assert_same(found, expected, 1e-9)
+    assert [d.quality for d in found] == [d.quality for d in expected]
+
+
+@pytest.mark.parametrize(("held", "atol"), [(False, 1e-6), (True, 0.01)])
+def test_straight_lines_over_stalls_are_no_evidence(armpi, twin, known, held, atol):
+    """Whole counts, lost commands and silences of the bus, up to 6 s at a time. A tool at rest
+    repeats itself to the last digit: readings missing there are taken to be there, and of a tool
+    that has just come to rest, when the readings end, the last one counts more often."""
+    lone = simulate(Plan(armpi, paper_hypotheses(armpi.motor_names), 3, 5, known))
+    filled = exact_runs.drawn_out(lone, held=held)
+    expected, found = (BayesDiagnoser(twin).diagnose(some) for some in (lone, filled))
+    assert_same(found, expected, atol)
+    remarks = [[q for q in d.quality if "no readings from" in q] for d in found]
+    assert remarks == [[q for q in d.quality if "no readings from" in q] for d in expected]
+    assert sum(map(bool, remarks)) > 5
+
+
+def assert_same(found, expected, atol):
+    np.testing.assert_allclose(chances(found), chances(expected), atol=atol)
     assert [d.diagnosis for d in found] == [d.diagnosis for d in expected]
 
 

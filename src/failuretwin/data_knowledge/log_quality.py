@@ -10,6 +10,7 @@ import numpy as np
 
 from failuretwin.core.runs import AXES, measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.data_knowledge.true_readings import true_readings
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -61,13 +62,14 @@ class LogQuality:
 def log_quality(runs: xr.Dataset) -> list[LogQuality]:
     """Return the defects of each run's log.
 
+    Lines drawn across a gap do not hide it.
+
     Args:
         runs: A run set; `command` and `measured` are read.
     """
     time = as_floats(runs["time"].values)
     command = as_floats(runs["command"].values)
-    measured = as_floats(runs["measured"].values)
-    rate = measured_rate(runs)
+    measured, rate = true_readings(runs).point, measured_rate(runs)
     return [_quality(time, c, m, rate) for c, m in zip(command, measured, strict=True)]
 
 

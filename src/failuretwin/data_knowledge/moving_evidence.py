@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.core.runs import measured_rate, time_step
+from failuretwin.core.runs import measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
-from failuretwin.data_knowledge.settled_evidence import SettledEvidence, drawn_out
+from failuretwin.data_knowledge.settled_evidence import SettledEvidence
+from failuretwin.data_knowledge.true_readings import grid_steps, true_readings
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -45,18 +46,17 @@ def moving_evidence(runs: xr.Dataset, settled: SettledEvidence) -> MovingEvidenc
     """Return the readings of each movement before those that `settled` has used.
 
     Of densely sampled paths readings are left out evenly, so that no two lie closer than the true
-    rate of the sensor says; of paths drawn out by straight lines, those that are kept lie where the
-    lines meet.
+    rate of the sensor says; samples on lines drawn between readings do not count.
 
     Args:
         runs: A run set; `measured` (run, time, axis) is read.
         settled: Where the tool settled in the same runs.
     """
     time = as_floats(runs["time"].values)
-    measured = as_floats(runs["measured"].values)
-    rate = measured_rate(runs)
-    least_step, every = 0.9 / rate, round(1.0 / (rate * time_step(runs)))
-    read = np.array([_corners(path, every) for path in measured])
+    readings, least_step = true_readings(runs), 0.9 / measured_rate(runs)
+    measured, read = readings.point, readings.seen.copy()
+    for run in np.flatnonzero(readings.filled):
+        read[run] &= _corners(measured[run], grid_steps(runs))
     start = settled.movements.start
     until = np.where(settled.usable, settled.begin, settled.end)
     shape = (*start.shape, MOST_READINGS)
@@ -73,18 +73,15 @@ def moving_evidence(runs: xr.Dataset, settled: SettledEvidence) -> MovingEvidenc
 
 
 def _corners(path: FloatArray, every: int) -> BoolArray:
-    """Return which samples of a path (time, axis) may be readings, (time,).
+    """Return which samples of a filled path (time, axis) may be readings, (time,).
 
-    Of one drawn out by straight lines these are every so many, where it bends most; of any other,
-    all that are there.
+    Drawn out otherwise than by straight lines, as by lines between the angles of the motors: every
+    so many, where it bends most.
     """
-    seen = np.asarray(np.isfinite(path).all(axis=-1))
-    if not drawn_out(seen, every):
-        return seen
     bend = np.zeros(len(path))
     bend[1:-1] = np.linalg.norm(np.nan_to_num(np.diff(path, 2, axis=0)), axis=-1)
     phase = np.arange(len(path)) % every
-    return seen & (phase == np.argmax(np.bincount(phase, bend)))
+    return np.asarray(phase == np.argmax(np.bincount(phase, bend)))
 
 
 def spread_out(time: FloatArray, least_step: float) -> IntArray:

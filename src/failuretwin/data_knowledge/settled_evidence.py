@@ -12,8 +12,9 @@ import numpy as np
 
 from failuretwin.core.medians import masked_median
 from failuretwin.core.movements import Movements, find_movements
-from failuretwin.core.runs import measured_rate, time_step
+from failuretwin.core.runs import measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
+from failuretwin.data_knowledge.true_readings import TrueReadings, true_readings
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -22,6 +23,8 @@ SETTLING_S = 0.15
 """Time after the end of a ramp before the tool counts as settled [s]: lag of 0.06 s, twice over."""
 WINDOW_S = 0.6
 """Longest stretch at the end of a plateau that is averaged [s]; outlasts late starts."""
+SILENT_PERIODS = 2.0
+"""A tool that moves on time is read elsewhere so many readings after its command."""
 STILL_M = 0.004
 """Spread of the readings above which the tool is still moving [m]; one count moves it 1 mm."""
 
@@ -113,11 +116,13 @@ def rest(samples: FloatArray, inside: BoolArray) -> Rest:
 def settled_evidence(runs: xr.Dataset) -> SettledEvidence:
     """Return where the tool settled after each movement of each run.
 
+    Samples on lines drawn between readings do not count.
+
     Args:
         runs: A run set; `command` (run, time, motor) and `measured` (run, time, axis) are read.
     """
-    time = as_floats(runs["time"].values)
-    measured = as_floats(runs["measured"].values)
+    time, readings = as_floats(runs["time"].values), true_readings(runs)
+    measured = readings.point
     movements = find_movements(as_floats(runs["command"].values), time)
     end = _plateau_ends(movements, measured, time)
     begin = rest_begin(movements.start, movements.ramp_duration, end)
@@ -126,7 +131,7 @@ def settled_evidence(runs: xr.Dataset) -> SettledEvidence:
     item = np.nonzero(movements.exists & (begin < end))
     found = rest(*_between(measured, time, item[0], begin[item], end[item]))
     point[item], usable[item], moving[item] = found.point, found.usable, found.moving
-    resumed = _resumed(movements, runs)
+    resumed = _resumed(movements, readings, time, SILENT_PERIODS / measured_rate(runs))
     return SettledEvidence(movements, point, usable, moving, begin, end, resumed)
 
 
@@ -140,27 +145,28 @@ def _between(
     return measured[run[:, None], np.minimum(at, len(time) - 1)], inside
 
 
-def drawn_out(seen: BoolArray, every: int) -> bool:
-    """Return whether straight lines fill a path between readings.
+def _resumed(
+    movements: Movements, readings: TrueReadings, time: FloatArray, silence: float
+) -> FloatArray:
+    """Return the time from each command to the first reading after it, (run, movement) [s].
 
     Args:
-        seen: Samples that are there, (time,).
-        every: Samples from one reading of the sensor to the next.
+        movements: The movements.
+        readings: Readings of the same runs.
+        time: Uniform grid, (time,) [s].
+        silence: A tool that stays at one place for longer after a command may not be read [s].
     """
-    return every >= 2 and 2 * int(np.count_nonzero(seen)) >= len(seen)
-
-
-def _resumed(movements: Movements, runs: xr.Dataset) -> FloatArray:
-    """Return the time from each command to the first reading after it, (run, movement) [s]."""
-    time = as_floats(runs["time"].values)
-    seen = np.asarray(np.isfinite(as_floats(runs["measured"].values)).all(axis=-1))
-    every = round(1.0 / (measured_rate(runs) * time_step(runs)))
     found = np.full(movements.start.shape, np.nan)
-    for run, readings in enumerate(seen):
-        if not drawn_out(readings, every):
-            at = np.append(time[readings], np.nan)
-            found[run] = at[np.searchsorted(at[:-1], movements.start[run] - 1e-9)]
+    for run in np.flatnonzero(~readings.filled):
+        start, seen = movements.start[run], readings.seen[run]
+        first, sure = (_first_after(time[s], start) for s in (seen, seen & ~readings.assumed[run]))
+        found[run] = np.where((first == sure) | (sure - start <= silence), first, np.nan)
     return found - movements.start
+
+
+def _first_after(at: FloatArray, start: FloatArray) -> FloatArray:
+    """Return the first of some times at or after each start [s]; NaN where there is none."""
+    return np.append(at, np.nan)[np.searchsorted(at, start - 1e-9)]
 
 
 def _plateau_ends(movements: Movements, measured: FloatArray, time: FloatArray) -> FloatArray:

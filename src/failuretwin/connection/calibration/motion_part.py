@@ -13,6 +13,7 @@ from failuretwin.connection.calibration.timing_fit import Transients, motion
 from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.runs import measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.data_knowledge.true_readings import true_readings
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, sag
 from failuretwin.digital_model.twin import DigitalTwin
@@ -79,7 +80,7 @@ def lateness(movements: Movements) -> Lateness:
 def gap_starts(runs: xr.Dataset, movements: Movements, late: FloatArray) -> FloatArray:
     """Return when readings stop before late starts, after the movement before, (gap,) [s]."""
     time, rate = as_floats(runs["time"].values), measured_rate(runs)
-    seen = np.asarray(np.isfinite(as_floats(runs["measured"].values)).all(axis=2))
+    seen = true_readings(runs).seen
     found = []
     for run, movement in np.argwhere(np.nan_to_num(late) > 0.0):
         if movement == 0:
@@ -124,7 +125,7 @@ def transients(
     time = as_floats(runs["time"].values)
     used = _on_time(movements, late, part, time)
     of_motors = part.observations.position is not None
-    reading = as_floats(runs["position" if of_motors else "measured"].values)
+    reading = as_floats(runs["position"].values) if of_motors else true_readings(runs).point
     free = unloaded_movements(movements, settling)
     if of_motors:
         pose = np.nan_to_num(reading)

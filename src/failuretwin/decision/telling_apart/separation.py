@@ -22,6 +22,7 @@ from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.moving_evidence import moving_evidence
 from failuretwin.data_knowledge.noise_free import noise_free_path
 from failuretwin.data_knowledge.settled_evidence import settled_evidence
+from failuretwin.data_knowledge.true_readings import true_readings
 from failuretwin.decision.hypotheses.priors import Priors
 from failuretwin.decision.hypotheses.weighing import TIMED, check_weighable
 from failuretwin.decision.telling_apart.best_fit import best_fit, first_spoilt
@@ -124,7 +125,7 @@ class Judge:
             time,
             Injection(faults, twin.robot.motor_names, MODES),
         )
-        seen = np.isfinite(as_floats(runs["measured"].values))
+        seen = true_readings(runs).seen[..., None]
         return runs.assign(measured=(("run", "time", "axis"), np.where(seen, path, np.nan)))
 
     @property
