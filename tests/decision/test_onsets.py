@@ -5,8 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
 from failuretwin.decision.hypotheses.onsets import OnsetPrior, Stretches, at_movement_starts
+from failuretwin.decision.hypotheses.priors import Priors
 
 lengths = st.lists(st.floats(0.0, 5.0), min_size=1, max_size=8)
 earlies = st.floats(0.0, 1.0)
@@ -71,3 +73,20 @@ def test_modes_have_their_own_share_before_the_run():
     usual, told = OnsetPrior(), OnsetPrior(early=0.25)
     assert usual.before_run("backlash") > usual.before_run("stuck")
     assert {told.before_run(mode) for mode in ("backlash", "stuck")} == {0.25}
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "match"),
+    [
+        (OnsetPrior, {"known_s": -1.0}, "known_s is -1, expected 0 or more"),
+        (OnsetPrior, {"known_s": np.nan}, "known_s is nan"),
+        (OnsetPrior, {"early": 1.5}, "expected a probability"),
+        (OnsetPrior, {"free": -0.1}, "expected a probability"),
+        (Priors, {"error_ranges": ()}, "expected pairs 0 <= low < high"),
+        (Priors, {"error_ranges": ((0.2, 0.1),)}, "expected pairs"),
+        (Priors, {"healthy_odds": 0.0}, "expected above 0"),
+    ],
+)
+def test_beliefs_that_make_no_sense_are_refused(kind, values, match):
+    with pytest.raises(InputError, match=match):
+        kind(**values)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.knowledge import failure_modes
@@ -27,11 +28,21 @@ class OnsetPrior:
         free: Probability that the held angle of a stuck motor is unrelated to the commands,
             anywhere in range.
         known_s: The onset of a stuck motor, where it is known [s].
+
+    Raises:
+        InputError: If a probability or the onset makes no sense.
     """
 
     early: float | None = None
     free: float = 0.2
     known_s: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in (("early", self.early), ("free", self.free)):
+            if value is not None and not 0.0 <= value <= 1.0:
+                raise InputError(f"{name} is {value:g}, expected a probability from 0 to 1.")
+        if self.known_s is not None and not 0.0 <= self.known_s < np.inf:
+            raise InputError(f"known_s is {self.known_s:g}, expected 0 or more [s].")
 
     def before_run(self, mode: str) -> float:
         """Return the probability that a fault of this mode was there before the run."""

@@ -22,11 +22,23 @@ class Priors:
         error_ranges: Run-level ranges of steady-state errors [rad], equally likely.
         healthy_odds: How many times as probable it is that all is well as the table of failure
             modes says, which leaves no more for it than for a stuck motor.
+
+    Raises:
+        InputError: If there is no range, or one or the odds make no sense.
     """
 
     onset: OnsetPrior = field(default_factory=OnsetPrior)
     error_ranges: Sequence[Range] = ERROR_RANGES
     healthy_odds: float = 1.0
+
+    def __post_init__(self) -> None:
+        sound = all(0.0 <= low < high < np.inf for low, high in self.error_ranges)
+        if not self.error_ranges or not sound:
+            raise InputError(
+                f"error_ranges are {self.error_ranges}, expected pairs 0 <= low < high [rad]."
+            )
+        if not 0.0 < self.healthy_odds < np.inf:
+            raise InputError(f"healthy_odds are {self.healthy_odds:g}, expected above 0.")
 
 
 MONITORING = Priors(healthy_odds=30.0)
