@@ -2,6 +2,11 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import signal
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -12,7 +17,7 @@ from failuretwin.app.study.data import Exam, stand_in_test_set
 from failuretwin.app.study.plan import FEATURES, Job, StudyPlan, quick_plan
 from failuretwin.app.study.published import TABLE_2, TABLE_3
 from failuretwin.app.study.results import class_ratios, mean_confusion, spread_of
-from failuretwin.app.study.study import PLAN_FILE, WORK, run_study
+from failuretwin.app.study.study import PLAN_FILE, WORK, check_folder, run_study
 from failuretwin.app.study.trainings import Checkpoint, Training
 from failuretwin.core.errors import InputError
 
@@ -142,6 +147,24 @@ def test_the_command_refuses_a_folder_that_is_taken(studied, tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(InputError, match=PLAN_FILE):
         run("--out", tmp_path, "--resume")
+
+
+def test_an_interrupt_ends_the_trainings_and_what_was_begun_goes_on(tmp_path):
+    """Also those that wait for their turn, and also if Ctrl-C reaches every process."""
+    folder = tmp_path / "study"
+    command = [sys.executable, "-m", "failuretwin", "study", "--quick", "--out", str(folder)]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
+    deadline = time.monotonic() + 100.0
+    while not (folder / PLAN_FILE).exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.2)
+    time.sleep(6.0)  # until trainings go on
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.wait(10.0) == 1
+    (folder / PLAN_FILE).unlink()  # as if it had been interrupted a little earlier
+    for arrays in (folder / WORK).iterdir():
+        arrays.unlink()
+    check_folder(folder, resume=True)
 
 
 def test_test_runs_without_a_truth_are_refused(write_session, tmp_path):

@@ -104,6 +104,17 @@ def test_it_can_be_cloned_and_cross_validated(encoder, runs, trained):
     assert np.all((scores >= 0.0) & (scores <= 1.0))
 
 
+def test_the_share_of_right_ones_is_that_of_the_truth_in_the_run_set(runs, trained):
+    right = np.mean(trained.predict(runs) == runs["fault"].values)
+    assert trained.score(runs) == pytest.approx(right)
+
+
+@pytest.mark.parametrize("wrong", [{"iterations": 0}, {"batch_runs": 0}])
+def test_learning_from_nothing_is_refused(encoder, runs, wrong):
+    with pytest.raises(InputError, match="Expected one at least"):
+        LearnedDiagnoser("cnn", encoder, **wrong).fit(runs)
+
+
 def test_features_of_another_kind_are_refused(armpi, runs, trained):
     with pytest.raises(InputError, match="7 channels"):
         trained.predict_proba(np.zeros((2, 100, 7), dtype=np.float32))

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import re
 import sys
 
 import numpy as np
@@ -198,3 +199,39 @@ def test_the_stored_file_holds_versions(trained, tmp_path):
         configuration = json.loads(stored["configuration"].tobytes())
     assert configuration["versions"]["torch"] == torch.__version__
     assert configuration["encoder"]["features"] == "robust"
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("mean", np.nan),
+        ("spread", np.ones(3, dtype=np.float32)),
+        ("temperature", "0.0"),
+        ("temperature", '"hot"'),
+    ],
+)
+def test_a_network_with_numbers_that_make_no_sense_is_refused(
+    armpi, trained, tmp_path, name, value
+):
+    path = tmp_path / "network.npz"
+    save_network(trained["cnn"], path)
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    if isinstance(value, str):
+        text = arrays["configuration"].tobytes().decode()
+        text, times = re.subn(rf'"{name}": [0-9.]+', f'"{name}": {value}', text)
+        assert times == 1
+        arrays["configuration"] = np.frombuffer(text.encode(), dtype=np.uint8)
+    else:
+        arrays[name] = value * np.ones_like(arrays[name]) if np.ndim(value) == 0 else value
+    np.savez(path, **arrays)
+    with pytest.raises(InputError, match="cannot be read as a network"):
+        load_network(str(path), armpi)
+
+
+def test_an_array_under_the_name_of_a_network_is_refused(armpi, tmp_path):
+    path = tmp_path / "network.npz"
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+    with pytest.raises(InputError, match="cannot be read as a network"):
+        load_network(path, armpi)

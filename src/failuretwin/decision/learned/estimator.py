@@ -153,6 +153,11 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         seed: int,
         on_iteration: Callable[[int], None] = lambda done: None,
     ) -> None:
+        if self.iterations < 1 or self.batch_runs < 1:
+            raise InputError(
+                f"{self.iterations} iterations of {self.batch_runs} runs. Expected one at least of "
+                "both."
+            )
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             network = build_network(
@@ -210,6 +215,19 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         """Return the most probable class of each run."""
         best = self.scores(X).argmax(axis=1)
         return np.asarray(self.classes_[best])
+
+    def score(
+        self, X: Runs, y: ArrayLike | None = None, sample_weight: ArrayLike | None = None
+    ) -> float:
+        """Return the share of runs that are right.
+
+        Args:
+            X: A run set or an array of features.
+            y: Class of each run; None: as the run set says.
+            sample_weight: Weight of each run.
+        """
+        truth = truth_of(X) if _is_run_set(X) and y is None else y
+        return float(super().score(X, truth, sample_weight))
 
     def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
         """Return the diagnosis of each run of a run set.

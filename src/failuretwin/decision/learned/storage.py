@@ -98,7 +98,7 @@ def arm_fingerprint(robot: Robot) -> str:
     return fingerprint([robot.chain, robot.loads, robot.sense, robot.sensor_sense])
 
 
-def load_network(path: Path, robot: Robot) -> LearnedDiagnoser:
+def load_network(path: str | Path, robot: Robot) -> LearnedDiagnoser:
     """Read a trained network.
 
     Args:
@@ -108,6 +108,7 @@ def load_network(path: Path, robot: Robot) -> LearnedDiagnoser:
     Raises:
         InputError: If the file cannot be read, is no network, or is one for another robot.
     """
+    path = Path(path)
     arrays = _read(path)
     try:
         configuration = json.loads(arrays["configuration"].tobytes())
@@ -118,9 +119,9 @@ def load_network(path: Path, robot: Robot) -> LearnedDiagnoser:
                 f"{configuration['versions'].get('failuretwin')}."
             )
         return _restored(configuration, arrays, robot, path)
-    except (KeyError, TypeError, AttributeError, UnicodeDecodeError, RuntimeError) as error:
-        raise _no_network(path, error) from error
-    except json.JSONDecodeError as error:
+    except InputError:
+        raise
+    except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:
         raise _no_network(path, error) from error
 
 
@@ -128,7 +129,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, AttributeError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
         raise _no_network(path, error) from error
 
 
@@ -143,6 +144,7 @@ def _restored(
     configuration: dict[str, Any], arrays: dict[str, np.ndarray], robot: Robot, path: Path
 ) -> LearnedDiagnoser:
     encoder = _restored_encoder(configuration["encoder"], robot, path)
+    _check_numbers(arrays, float(configuration["temperature"]))
     arguments = configuration["arguments"]
     known = set(LearnedDiagnoser().get_params(deep=False)) - set(_NOT_STORED)
     if set(arguments) != known:
@@ -170,6 +172,17 @@ def _restored(
     diagnoser.network_ = network
     diagnoser.n_features_in_ = configuration["features_in"]
     return diagnoser
+
+
+def _check_numbers(arrays: dict[str, np.ndarray], temperature: float) -> None:
+    """Raise ValueError unless the numbers of a network can be reckoned with."""
+    numbers = [value for value in arrays.values() if np.issubdtype(value.dtype, np.floating)]
+    if not all(np.isfinite(value).all() for value in numbers):
+        raise ValueError("a weight is not finite")
+    if arrays["mean"].shape != arrays["spread"].shape:
+        raise ValueError("mean and spread differ in length")
+    if not 0.0 < temperature < np.inf:
+        raise ValueError(f"temperature {temperature:g}")
 
 
 def _restored_encoder(table: dict[str, Any] | None, robot: Robot, path: Path) -> Encoder | None:
