@@ -25,6 +25,7 @@ from failuretwin.decision.telling_apart.separation import separation
 from failuretwin.failure_behavior.course import STEP, Course
 from failuretwin.failure_behavior.fault_value import FaultValue
 from failuretwin.failure_behavior.modes.offsets import OFFSET, SteadyStateError
+from failuretwin.failure_behavior.random_movements import stack_movements
 from failuretwin.failure_behavior.schedule import ScheduledFault
 
 ERROR = SteadyStateError.mode
@@ -124,7 +125,7 @@ class CanShow:
             ramp_duration=np.stack([one.duration for one in told])[None],
             start=np.array([[one.time - zero for one in told]]),
         )
-        many = Movements(*(np.repeat(part, count, axis=0) for part in _parts(movements)))
+        many = stack_movements([movements] * count)
         ends = life.starts[numbers[1:] + 1] - zero
         time = np.arange(round(ends[-1] / STEP_S) + 1) * STEP_S
         measured = np.full((count, len(time), 3), np.nan)
@@ -156,7 +157,3 @@ class CanShow:
         motor = self.emulation.robot.motor_names.index(fault.fault.motor)
         off = [(self._life.rest(n) - self._without.rest(n))[motor] for n in numbers]
         return np.nan_to_num(np.array([0.0, *off[1:]]))
-
-
-def _parts(movements: Movements) -> list[FloatArray]:
-    return [movements.initial, movements.target, movements.ramp_duration, movements.start]

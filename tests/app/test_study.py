@@ -147,6 +147,8 @@ def test_the_command_refuses_a_folder_that_is_taken(studied, tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(InputError, match=PLAN_FILE):
         run("--out", tmp_path, "--resume")
+    with pytest.raises(InputError, match=PLAN_FILE):
+        run("--out", tmp_path / "mine.txt", "--resume")
 
 
 def test_an_interrupt_ends_the_trainings_and_what_was_begun_goes_on(tmp_path):

@@ -6,13 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from failuretwin.app.learning import check_learning
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis, parse_hypotheses
 from failuretwin.decision.bayes import BayesDiagnoser
-from failuretwin.decision.hypotheses.priors import Priors, priors_of
 from failuretwin.decision.learned.hybrid import Diagnoser, HybridDiagnoser
 from failuretwin.digital_model.robot import Robot
 
@@ -44,34 +41,6 @@ def told_hypotheses(text: str | None, robot: Robot) -> tuple[Hypothesis, ...] | 
             "Expected two at least, such as healthy,motor_1:stuck."
         )
     return hypotheses
-
-
-def told_priors(
-    robot: Robot, error_range_counts: tuple[float, float] | None, onset_s: float | None
-) -> Priors:
-    """Return priors with what the user knows of the faults.
-
-    Args:
-        robot: The robot.
-        error_range_counts: Range of steady-state errors [servo units].
-        onset_s: Onset of stuck faults [s].
-
-    Raises:
-        InputError: If the range is not 0 <= low < high, no motor can be off by that much, or the
-            onset is negative.
-    """
-    priors = priors_of(robot, error_range_counts, onset_s)
-    if error_range_counts is not None:
-        low, high = error_range_counts
-        units = robot.servo_units
-        most = units.high - units.low
-        if high > most:
-            raise InputError(
-                f"--sse-range is {low:g} {high:g}, but the motors turn through {most:g} servo "
-                f"units ({np.rad2deg(most * units.rad_per_count):.0f} deg) and can be off by no "
-                f"more. Expected HIGH up to {most:g}."
-            )
-    return priors
 
 
 def chosen_diagnoser(

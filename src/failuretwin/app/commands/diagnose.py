@@ -77,12 +77,7 @@ def diagnose(
     del seed  # nothing here is drawn by chance
     from failuretwin.app.ambiguity_lines import ambiguity_lines
     from failuretwin.app.inputs import read_inputs, tell_mismatch
-    from failuretwin.app.method import (
-        chosen_diagnoser,
-        expected_name,
-        told_hypotheses,
-        told_priors,
-    )
+    from failuretwin.app.method import chosen_diagnoser, expected_name, told_hypotheses
     from failuretwin.app.results import write_csv, write_json_lines
     from failuretwin.app.tables import print_diagnoses, print_lines, print_scores
     from failuretwin.app.tracking import (
@@ -92,6 +87,7 @@ def diagnose(
         tracking_line,
     )
     from failuretwin.decision.bayes import BayesDiagnoser
+    from failuretwin.decision.hypotheses.priors import priors_of
     from failuretwin.digital_model.imperfections import load_imperfections
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.twin import DigitalTwin
@@ -102,7 +98,7 @@ def diagnose(
         twin,
         imperfections=None if calibration is None else load_imperfections(str(calibration), model),
         hypotheses=told_hypotheses(hypotheses, model),
-        priors=told_priors(model, sse_range, onset),
+        priors=priors_of(model, sse_range, onset),
     )
     settings = {
         "--calibration": calibration,

@@ -33,7 +33,8 @@ def check_folder(folder: Path, resume: bool) -> None:
             f"{folder}: is there already. Go on with a study begun there (--resume), or choose "
             "another folder."
         )
-    begun = taken and [entry.name for entry in folder.iterdir()] == [WORK]  # no plan yet
+    names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
+    begun = names == [WORK]  # interrupted before it had a plan
     if taken and not begun and not (folder / PLAN_FILE).is_file():
         raise InputError(f"{folder}: holds no study to resume ({PLAN_FILE} is missing).")
 

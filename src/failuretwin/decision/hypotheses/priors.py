@@ -43,7 +43,7 @@ class Priors:
 
 MONITORING = Priors(healthy_odds=30.0)
 """Beliefs of who watches a robot at work: faults are rare, and a single movement that went wrong is
-more often a lost command. Chosen on emulated robots: a false alarm an hour at most."""
+more often a lost command. Chosen on emulated robots: about one false alarm an hour."""
 
 
 def priors_of(
@@ -57,14 +57,22 @@ def priors_of(
         onset_s: Onset of stuck faults [s].
 
     Raises:
-        InputError: If the range is not 0 <= low < high or the onset is negative.
+        InputError: If the range is not 0 <= low < high, no motor can be off by that much, or the
+            onset is negative.
     """
     priors = Priors()
     if error_range_counts is not None:
         low, high = error_range_counts
         if not 0.0 <= low < high < np.inf:
             raise InputError(f"--sse-range is {low:g} {high:g}, expected 0 <= LOW < HIGH.")
-        count = robot.servo_units.rad_per_count
+        units, count = robot.servo_units, robot.servo_units.rad_per_count
+        most = units.high - units.low
+        if high > most:
+            raise InputError(
+                f"--sse-range is {low:g} {high:g}, but the motors turn through {most:g} servo "
+                f"units ({np.rad2deg(most * count):.0f} deg) and can be off by no more. Expected "
+                f"HIGH up to {most:g}."
+            )
         priors = replace(priors, error_ranges=((low * count, high * count),))
     if onset_s is not None:
         if not 0.0 <= onset_s < np.inf:
