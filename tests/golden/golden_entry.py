@@ -1,0 +1,103 @@
+"""All that the golden cases use of the package: when its files move, this is what to rewrite."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+
+import failuretwin as ft
+from failuretwin.connection.calibration.learn import calibrate
+from failuretwin.connection.calibration.observations import observe
+from failuretwin.connection.run_evidence import run_evidence
+from failuretwin.connection.tracker import Tracker
+from failuretwin.core.hypothesis import parse_hypotheses
+from failuretwin.data_knowledge.log_quality import log_quality, without_spoilt
+from failuretwin.data_knowledge.moving_evidence import moving_evidence
+from failuretwin.data_knowledge.settled_evidence import settled_evidence
+from failuretwin.data_knowledge.store import load_run_set, save_run_set
+from failuretwin.decision import bayes, judgement
+from failuretwin.decision.hypotheses.priors import MONITORING, priors_of
+from failuretwin.decision.learned.paper_features import augmented_features, original_features
+from failuretwin.decision.learned.robust_features import RobustFeatures, expectation_of
+from failuretwin.decision.learned.signals import signals_of
+from failuretwin.decision.streaming.fleet import StreamingFleet
+from failuretwin.decision.streaming.streaming import monitor
+from failuretwin.decision.telling_apart.separation import separation
+from failuretwin.digital_model.imperfections import (
+    LostCommand,
+    Readings,
+    default_imperfections,
+    generic_imperfections,
+    load_imperfections,
+)
+from failuretwin.failure_behavior.modes import MODES
+
+__all__ = [
+    "MODES",
+    "MONITORING",
+    "LostCommand",
+    "Readings",
+    "StreamingFleet",
+    "Tracker",
+    "augmented_features",
+    "calibrate",
+    "generic_imperfections",
+    "load_run_set",
+    "log_quality",
+    "monitor",
+    "observe",
+    "original_features",
+    "parse_hypotheses",
+    "priors_of",
+    "run_evidence",
+    "save_run_set",
+    "separation",
+    "signals_of",
+]
+
+MEASURED = Path(__file__).parents[1] / "measured_armpi.toml"
+"""Imperfections of the ArmPi whose figures stay as they are, whatever the package bundles."""
+
+
+@cache
+def twin(name="armpi_fpv"):
+    return ft.DigitalTwin(ft.load_robot(name))
+
+
+def healthy(which, robot):
+    """Return imperfections by name: `own`, `generic`, `none`, `measured` or a bundled one."""
+    if which == "own":
+        return default_imperfections(robot)
+    if which == "generic":
+        return generic_imperfections(robot)
+    return load_imperfections(str(MEASURED) if which == "measured" else which, robot)
+
+
+def robust_features(robot, imperfections, runs):
+    return RobustFeatures(robot, expectation_of(robot, imperfections))(signals_of(runs))
+
+
+def evidence_of(diagnoser, runs):
+    """Return what the runs say where the tool rests, and on the way as far as that counts."""
+    sound = without_spoilt(runs, log_quality(runs))
+    settled = settled_evidence(sound)
+    if not diagnoser.looks_on_way:
+        return settled, None
+    return settled, moving_evidence(sound, settled).where(diagnoser.on_way(settled.usable))
+
+
+def with_log_evidence(diagnoser, runs):
+    """Return the diagnoses, and the log evidence before the prior, (run, hypothesis)."""
+    kept = []
+
+    def judge(*arguments):
+        kept.append(judgement.judge(*arguments))
+        return kept[-1]
+
+    with mock.patch.object(bayes, "judge", judge):
+        diagnoses = diagnoser.diagnose(runs)
+    says = [np.stack([weight.log_evidence for weight in j.weights], axis=1) for j in kept]
+    return diagnoses, np.concatenate(says)
