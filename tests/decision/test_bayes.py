@@ -120,7 +120,7 @@ def test_stuck_angle_is_found(imperfect, diagnoses):
 
     assert len(rows) >= 70
     assert np.median(np.abs(estimate - truth)) < np.deg2rad(0.5)
-    assert np.mean((low <= truth) & (truth <= high)) > 0.8
+    assert 0.86 < np.mean((low <= truth) & (truth <= high)) < 0.94  # reached: 71 of 79
     assert np.median(high - low) < np.deg2rad(3)
 
 
@@ -129,7 +129,7 @@ def test_onset_of_a_stuck_motor_is_found(diagnoses):
     onset = np.array([diagnoses[i].onset_s for i in rows])
     low, high = np.array([diagnoses[i].onset_90 for i in rows]).T
     assert np.median(np.abs(onset - 0.49)) < 0.1
-    assert np.mean((low <= 0.49) & (high >= 0.49)) > 0.7
+    assert 0.88 < np.mean((low <= 0.49) & (high >= 0.49)) < 0.97  # reached: 73 of 79
     assert ((low <= onset) & (onset <= high)).all()
 
 
@@ -141,7 +141,7 @@ def test_size_of_steady_state_errors_is_found(imperfect, diagnoses):
 
     assert len(rows) >= 70
     assert np.median(np.abs(estimate - truth)) < np.deg2rad(1)
-    assert np.mean((low <= truth) & (truth <= high)) > 0.78
+    assert 0.78 < np.mean((low <= truth) & (truth <= high)) < 0.87  # reached: 66 of 80
     assert np.median(high - low) < np.deg2rad(3)
 
 

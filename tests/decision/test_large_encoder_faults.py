@@ -44,7 +44,7 @@ def test_a_constant_error_lies_in_its_interval(found):
     """Nine in ten of some 30 runs: fewer than 23 would be a chance of 1 in 100."""
     said = of(found, "encoder_bias")
     inside = [d.magnitude_90[0] <= size <= d.magnitude_90[1] for d, size in said]
-    assert sum(inside) >= 0.75 * len(inside)
+    assert 0.82 * len(inside) <= sum(inside) <= 0.97 * len(inside)  # reached: 27 of 30
 
 
 @pytest.mark.parametrize(("mode", "most"), [("encoder_bias", 0.008), ("encoder_scale", 0.02)])

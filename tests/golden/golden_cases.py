@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from golden_compare import plain
+from golden_compare import Tolerance, plain
 from golden_entry import (
     MODES,
     MONITORING,
@@ -33,7 +33,9 @@ from golden_runs import PAPER, load
 
 import failuretwin as ft
 
-EXACT, FITTED = 1e-9, 1e-6
+EXACT = Tolerance(1e-9)
+FITTED = Tolerance(1e-6, floor=0.01)
+"""What an iterative fit gives [mostly rad or s]."""
 EVERY = ("healthy", *(f"motor_{k}:{mode}" for mode in MODES for k in range(1, 5)))
 PAIRS = (
     "motor_1:stuck+motor_3:stuck",
@@ -47,7 +49,7 @@ class Case:
     """What is worked out, as dicts and lists, and how exactly it must come out again."""
 
     work_out: Callable[[], dict]
-    tolerance: float = EXACT
+    tolerance: Tolerance = EXACT
 
 
 def told(diagnoser, runs):

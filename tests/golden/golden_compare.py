@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from numbers import Real
 
 import numpy as np
@@ -20,11 +21,19 @@ def plain(value):
     return value
 
 
-def differences(got, expected, tolerance, where=()):
-    """Return a line for each difference, such as ``run > hypothesis: got 1, expected 2``.
+@dataclass(frozen=True)
+class Tolerance:
+    """By how much numbers may differ: by a share of them, of those below `floor` by that of it."""
 
-    Numbers may differ by the tolerance, of larger ones by that share.
-    """
+    share: float
+    floor: float = 1.0
+
+    def allows(self, got, expected):
+        return bool(abs(got - expected) <= self.share * max(self.floor, abs(expected)))
+
+
+def differences(got, expected, tolerance, where=()):
+    """Return a line for each difference, such as ``run > hypothesis: got 1, expected 2``."""
     if isinstance(got, dict) and isinstance(expected, dict):
         names = [*expected, *(name for name in got if name not in expected)]
         both = [(name, got.get(name, GONE), expected.get(name, GONE)) for name in names]
@@ -42,4 +51,4 @@ def _same(got, expected, tolerance):
         return type(got) is type(expected) and got == expected
     if np.isnan(expected) or np.isinf(expected):
         return bool(np.array_equal(got, expected, equal_nan=True))
-    return bool(abs(got - expected) <= tolerance * max(1.0, abs(expected)))
+    return tolerance.allows(got, expected)

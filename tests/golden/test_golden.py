@@ -9,7 +9,7 @@ import json
 
 import pytest
 from golden_cases import CASES, outcome
-from golden_compare import differences
+from golden_compare import Tolerance, differences
 from write import expected_file
 
 SHOWN = 12
@@ -43,10 +43,15 @@ def test_every_stored_expectation_has_its_case():
     ],
 )
 def test_a_difference_is_told_with_its_place(got, expected, line):
-    assert differences(got, expected, 1e-9) == [line]
+    assert differences(got, expected, Tolerance(1e-9)) == [line]
+
+
+def test_small_figures_differ_by_less():
+    assert differences([1e-3 + 1e-8], [1e-3], Tolerance(1e-6, floor=0.01)) == []
+    assert differences([1e-3 + 2e-8], [1e-3], Tolerance(1e-6, floor=0.01)) != []
 
 
 def test_what_is_the_same_to_rounding_has_no_difference():
     got = {"a": [1.0 + 1e-10, -1e5 * (1 + 1e-10), float("nan"), float("-inf"), "x", None, True]}
     expected = {"a": [1, -1e5, float("nan"), float("-inf"), "x", None, True]}
-    assert differences(got, expected, 1e-9) == []
+    assert differences(got, expected, Tolerance(1e-9)) == []
