@@ -1,13 +1,18 @@
 """Speed of the main jobs on one core, in seconds and relative to a fixed piece of numpy work.
 
 Seconds are those of the processor, so others on the machine do not count. The ratio holds when the
-machine's speed drifts: the reference is timed in the same run.
+machine's speed drifts: the reference is timed in the same run. What a user waits for before
+anything begins is timed as whole processes.
 """
 
 from __future__ import annotations
 
+import resource
+import statistics
+import subprocess
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -21,6 +26,12 @@ PUBLISHED_GENERATION_S = 8.0 * 3600.0
 """Time that the authors' generation of 3600 runs took [s]."""
 DIAGNOSED = 180
 """Runs of five movements that are diagnosed: 10 s at 10 Hz, and what late starts add."""
+STARTS = {
+    "start of Python alone": ("-c", "pass"),
+    "import failuretwin": ("-c", "import failuretwin"),
+    "failuretwin --help": ("-m", "failuretwin", "--help"),
+}
+"""Arguments to Python, by the name of what they start."""
 
 
 def best_of(work: Callable[[], object], times: int = 3) -> float:
@@ -31,6 +42,22 @@ def best_of(work: Callable[[], object], times: int = 3) -> float:
         work()
         timings.append(time.process_time() - start)
     return min(timings)
+
+
+def process_seconds(arguments: Sequence[str]) -> float:
+    """Return user and system time of a whole Python process [s of the processor]."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run([sys.executable, *arguments], check=True, stdout=subprocess.DEVNULL)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+
+
+def print_starts(times: int = 11) -> None:
+    """Time what is to be there at once, and print the median of each."""
+    print(f"\n{f'whole processes, median of {times}':55s} {'seconds':>8s}")
+    for name, arguments in STARTS.items():
+        seconds = statistics.median(process_seconds(arguments) for _ in range(times))
+        print(f"{name:55s} {seconds:8.3f}")
 
 
 def main() -> None:
@@ -78,6 +105,7 @@ def main() -> None:
         if name.startswith("diagnosis"):
             note = f"  {1000.0 * seconds / DIAGNOSED:.1f} ms a run"
         print(f"{name:55s} {seconds:8.3f} {seconds / reference:7.2f}{note}")
+    print_starts()
 
 
 if __name__ == "__main__":

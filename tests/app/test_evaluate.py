@@ -61,6 +61,7 @@ def folder(tmp_path):
     write("numbered.jsonl", [*RECORDS, {**RECORDS[0], "run": "a#2"}])
     write("stranger.jsonl", [*RECORDS, {**RECORDS[0], "run": "z#2"}])
     write("other.jsonl", [*RECORDS[:5], {**RECORDS[5], "truth": STUCK}])
+    write("bare.jsonl", [{k: v for k, v in r.items() if k != "truth"} for r in RECORDS])
     write("certain.jsonl", [record(r["run"], r["truth"], "healthy", sure=1.0) for r in RECORDS])
     hopeless = {"healthy": STUCK, STUCK: DRIFT, DRIFT: "healthy"}
     write(
@@ -195,6 +196,7 @@ def test_a_fault_that_is_no_hypothesis_is_judged_as_unknown(evaluate, folder):
         (["ours.jsonl", "--against", "other.jsonl"], "run 'f' is motor_1:stuck there, but motor_2"),
         (["ours.jsonl", "--against", "nowhere.jsonl"], "nowhere.jsonl: cannot be read"),
         (["ours.jsonl", "--published-labels"], "Add --truth RUNS"),
+        (["bare.jsonl"], "bare.jsonl: no run says what was true. Give a run set that does with"),
         (["ours.jsonl", "--truth", "nowhere.nc"], "nowhere.nc: does not exist"),
         (["ours.jsonl", "--latex", "nowhere/x.tex"], "folder nowhere does not exist"),
     ],
@@ -242,6 +244,13 @@ def test_a_picture_of_the_reliability(evaluate, folder):
     (picture,) = (folder / "deep" / "pictures").iterdir()
     assert picture.name == "reliability.png"
     assert picture.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
+
+
+def test_results_need_no_truth_where_runs_tell_it(evaluate):
+    told = evaluate("bare.jsonl", "--truth", "runs.nc", "--against", "better.jsonl")
+    assert (told.returncode, told.stderr) == (0, "")
+    full = evaluate("ours.jsonl", "--truth", "runs.nc", "--against", "better.jsonl")
+    assert told.stdout.replace("bare.jsonl", "ours.jsonl") == full.stdout
 
 
 def test_truth_may_come_from_raw_sessions(failuretwin, write_session, tmp_path):

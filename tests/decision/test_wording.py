@@ -4,9 +4,16 @@ import numpy as np
 import pytest
 
 from failuretwin.core.diagnosis import Diagnosis, MovementEvidence
-from failuretwin.core.hypothesis import HEALTHY, MAGNITUDE_UNITS, UNKNOWN, Hypothesis
+from failuretwin.core.hypothesis import HEALTHY, MAGNITUDE_UNITS, UNKNOWN, Fault, Hypothesis
 from failuretwin.decision.hypotheses.weighing import WEIGHABLE
-from failuretwin.decision.wording import SURE, explanation, percent, possible_hypotheses, verdict
+from failuretwin.decision.wording import (
+    SURE,
+    explanation,
+    percent,
+    possible_hypotheses,
+    size_words,
+    verdict,
+)
 
 SIZED = {
     "stuck": (np.deg2rad(-12.3), "motor 3 stuck at -12 deg since 2.5 s, 98 % sure"),
@@ -62,6 +69,26 @@ def test_what_was_there_before_the_run_has_no_time(mode, onset_s):
     got = told(single(mode), onset_s=onset_s, magnitude=size, magnitude_unit=MAGNITUDE_UNITS[mode])
     before = " since before the run" if mode == "stuck" else ""
     assert got == expected.replace(" since 2.5 s", before)
+
+
+@pytest.mark.parametrize(
+    ("unit", "size", "words"),
+    [
+        ("rad", 0.05, " (2.86 deg)"),
+        ("rad/s", -0.01, " (-0.573 deg/s)"),
+        ("m", 0.0025, " (2.5 mm)"),
+        ("ratio", 1.0, " (100 %)"),
+        ("s", 0.12, " (0.12 s)"),
+        ("N m", 1.54, " (1.54 N m)"),
+    ],
+)
+def test_size_and_unit_of_a_registered_mode_are_told_alike(monkeypatch, unit, size, words):
+    monkeypatch.setitem(MAGNITUDE_UNITS, "bent_shaft", unit)
+    assert size_words(Fault("motor_3", "bent_shaft"), size) == words
+
+
+def test_a_motor_held_near_zero_is_told_without_a_sign():
+    assert size_words(Fault("motor_3", "stuck"), -0.005) == " at 0 deg"
 
 
 def test_two_faults_are_both_named():

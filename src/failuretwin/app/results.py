@@ -16,7 +16,7 @@ from failuretwin.decision.metrics import LogScore, Scores, judged_truth, score
 Record = dict[str, Any]
 """One diagnosis as the JSON object of the contract."""
 
-NEEDED = ("run", "truth", "diagnosis", "posterior")
+NEEDED = ("run", "diagnosis", "posterior")
 NAMED_RUNS = 3
 """So many runs are named in an error."""
 SUM_ERROR = 1e-6
@@ -31,7 +31,7 @@ def write_json_lines(records: Sequence[Record], path: Path) -> None:
 
 
 def read_json_lines(path: Path) -> list[Record]:
-    """Read what `write_json_lines` wrote.
+    """Read what `write_json_lines` wrote; a line without `truth` is as one whose truth is null.
 
     Raises:
         InputError: If the file cannot be read, a line is not a diagnosis, or a run is there twice.
@@ -86,6 +86,7 @@ def _read_record(line: str, where: str) -> Record:
     missing = [key for key in NEEDED if not isinstance(record, dict) or key not in record]
     if missing:
         raise InputError(f"{where}: no {', '.join(missing)}. Expected diagnose --json output.")
+    record = {"truth": None} | record
     _check_kinds(record, where)
     posterior = record["posterior"]
     numbers = isinstance(posterior, dict) and all(
@@ -97,7 +98,7 @@ def _read_record(line: str, where: str) -> Record:
             "each hypothesis, and one of them (or null) as diagnosis."
         )
     _check_probabilities(list(posterior.values()), where)
-    return dict(record)
+    return record
 
 
 def _check_kinds(record: Record, where: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -45,18 +46,27 @@ def verdict(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> str:
 
 
 _SIZES = {
-    "steady_state_error": " by about {size:.1f} deg",
-    "encoder_bias": " by {size:+.1f} deg",
-    "backlash": " of {size:.1f} deg",
-    "drift": " by {size:+.2f} deg/s",
-    "lag": " by {size:.2f} s",
-    "encoder_scale": " by {size:+.0f} %",
-    "slow": " by {size:.0f} %",
-    "torque_loss": " by {size:.0f} %",
-    "lost_commands": " ({size:.0f} % of them)",
-    "intermittent": " ({size:.0f} % of the time)",
+    "stuck": " at {size:z.0f} {unit}",
+    "steady_state_error": " by about {size:.1f} {unit}",
+    "encoder_bias": " by {size:+.1f} {unit}",
+    "backlash": " of {size:.1f} {unit}",
+    "drift": " by {size:+.2f} {unit}",
+    "lag": " by {size:.2f} {unit}",
+    "encoder_scale": " by {size:+.0f} {unit}",
+    "slow": " by {size:.0f} {unit}",
+    "torque_loss": " by {size:.0f} {unit}",
+    "lost_commands": " ({size:.0f} {unit} of them)",
+    "intermittent": " ({size:.0f} {unit} of the time)",
 }
-"""How the magnitude of a mode is told: angles in degrees, shares in per cent."""
+"""How the magnitude of a mode is told; a mode that is not here has its size in brackets."""
+
+_TOLD_UNITS = {
+    "rad": (180.0 / math.pi, "deg"),
+    "rad/s": (180.0 / math.pi, "deg/s"),
+    "m": (1e3, "mm"),
+    "ratio": (1e2, "%"),
+}
+"""Factor to the unit that people read, and its name, by unit; any other is told as it is."""
 
 
 def _size_and_onset(diagnosis: Diagnosis, hypothesis: Hypothesis) -> str:
@@ -65,24 +75,19 @@ def _size_and_onset(diagnosis: Diagnosis, hypothesis: Hypothesis) -> str:
     if len(hypothesis.faults) != 1 or diagnosis.magnitude is None:
         return since if onset else ""
     fault, size = hypothesis.faults[0], diagnosis.magnitude
-    if fault.mode == "stuck":
-        return f" at {round(float(np.rad2deg(size)))} deg{since}"
-    return size_words(fault, size) + (since if onset else "")
+    return size_words(fault, size) + (since if onset or fault.mode == "stuck" else "")
 
 
 def size_words(fault: Fault, size: float) -> str:
     """Return the size of a fault as it is told behind its name, such as `` by about 2.4 deg``.
 
     Args:
-        fault: Any but a stuck motor.
+        fault: Any, also of a mode that was registered.
         size: Its magnitude, in the unit of its mode.
     """
-    if fault.magnitude_unit in ("rad", "rad/s"):
-        size = float(np.rad2deg(size))
-    if fault.magnitude_unit == "ratio":
-        size *= 100.0
-    text = _SIZES.get(fault.mode, " ({size:.2g} {unit})")
-    return text.format(size=size, unit=fault.magnitude_unit)
+    factor, unit = _TOLD_UNITS.get(fault.magnitude_unit, (1.0, fault.magnitude_unit))
+    text = _SIZES.get(fault.mode, " ({size:.3g} {unit})")
+    return text.format(size=factor * size, unit=unit)
 
 
 def possible_hypotheses(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> Sequence[Hypothesis]:
