@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.app.calibration_tables import shown_unit
 from failuretwin.connection.calibration.calibration import Calibration, LeftOut
 from failuretwin.connection.calibration.learn import calibrate
 from failuretwin.connection.calibration.observations import session_names
@@ -17,7 +16,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.telling_apart.suspicion import suspicion
-from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.robot import Robot, shown_unit
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.app.calibration_tables import shown_unit
 from failuretwin.app.plots import BLUE, GREY, RED, clean, figure_class
 from failuretwin.connection.calibration.calibration import HeldOut
 from failuretwin.connection.calibration.example_ramp import ExampleRamp
 from failuretwin.connection.calibration.predictions import Predictions
 from failuretwin.core.runs import AXES
 from failuretwin.core.types import FloatArray
-from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.robot import Robot, shown_unit
 from failuretwin.digital_model.settling import Settling
 
 if TYPE_CHECKING:

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from failuretwin.app.calibration_tables import shown_unit
 from failuretwin.connection.calibration.calibration import Calibration, Parameter
-from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.robot import Robot, shown_unit
 
 MEANING = {
     "bias": "error of the resting motor that is there in every pose",

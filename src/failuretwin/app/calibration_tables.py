@@ -9,7 +9,7 @@ from rich.table import Table
 
 from failuretwin.app.console import console
 from failuretwin.connection.calibration.calibration import Calibration, HeldOut, Parameter
-from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.robot import Robot, shown_unit
 
 
 def print_calibration(found: Calibration, robot: Robot) -> None:
@@ -45,15 +45,6 @@ def _parameter_table(parameters: tuple[Parameter, ...], robot: Robot) -> Table:
 
 def _title(parameter: Parameter) -> str:
     return f"{parameter.name}, {parameter.motor}" if parameter.motor else parameter.name
-
-
-def shown_unit(unit: str, robot: Robot) -> tuple[float, str]:
-    """Return factor and name of the unit that people read: servo counts or degrees for angles."""
-    if not unit.startswith("rad"):
-        return 1.0, unit
-    if robot.profile.servo_units is not None:
-        return 1.0 / abs(robot.servo_units.rad_per_count), unit.replace("rad", "counts", 1)
-    return float(np.rad2deg(1.0)), unit.replace("rad", "deg", 1)
 
 
 def _held_out_table(found: Calibration, robot: Robot) -> Table:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.app.progress import progress_bar
 from failuretwin.connection.calibration.motion_part import movements_of
 from failuretwin.connection.calibration.observations import observe, session_names
 from failuretwin.connection.run_evidence import run_evidence
@@ -72,30 +71,35 @@ def open_history(diagnoser: BayesDiagnoser, calibration: Path | None) -> History
     return read_history(path, start)
 
 
-def diagnose_tracked(runs: xr.Dataset, diagnoser: BayesDiagnoser, history: History) -> Tracked:
+def diagnose_tracked(
+    runs: xr.Dataset,
+    diagnoser: BayesDiagnoser,
+    history: History,
+    advance: Callable[[int], None] = lambda done: None,
+) -> Tracked:
     """Diagnose runs in their order while the tracker follows the robot; writes nothing.
 
     Args:
         runs: The runs, oldest first.
         diagnoser: How to diagnose; its imperfections are those of the calibration.
         history: What the tracker has seen before.
+        advance: Called with the number of runs just diagnosed.
     """
     tracker, steps, known = history.tracker, list[Step](), set(history.keys)
     seen = observe(without_spoilt(runs, log_quality(runs)))
     found: list[Diagnosis] = []
-    with progress_bar("diagnosing", runs.sizes["run"]) as advance:
-        for batch in _batches(runs):
-            now = replace(diagnoser, imperfections=tracker.imperfections)
-            told = now.diagnose(runs.isel(run=batch))
-            said = run_evidence(seen, diagnoser.twin.robot, tracker.tracked_settling, batch)
-            for diagnosis, evidence in zip(told, said, strict=True):
-                if evidence.key in known:
-                    continue
-                known.add(evidence.key)
-                tracker, step = tracker.follow(evidence, _suspicion(diagnosis))
-                steps.append(step)
-            found += told
-            advance(len(batch))
+    for batch in _batches(runs):
+        now = replace(diagnoser, imperfections=tracker.imperfections)
+        told = now.diagnose(runs.isel(run=batch))
+        said = run_evidence(seen, diagnoser.twin.robot, tracker.tracked_settling, batch)
+        for diagnosis, evidence in zip(told, said, strict=True):
+            if evidence.key in known:
+                continue
+            known.add(evidence.key)
+            tracker, step = tracker.follow(evidence, _suspicion(diagnosis))
+            steps.append(step)
+        found += told
+        advance(len(batch))
     repeated = runs.sizes["run"] - len(steps)
     return Tracked(found, history, tuple(steps), tracker, repeated)
 

@@ -226,3 +226,12 @@ def _check_unique(names: Sequence[str], kind: str, path: Path) -> None:
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"{path}: {kind} {name!r} is used twice. Give each motor its own.")
+
+
+def shown_unit(unit: str, robot: Robot) -> tuple[float, str]:
+    """Return factor and name of the unit that people read: servo counts or degrees for angles."""
+    if not unit.startswith("rad"):
+        return 1.0, unit
+    if robot.profile.servo_units is not None:
+        return 1.0 / abs(robot.servo_units.rad_per_count), unit.replace("rad", "counts", 1)
+    return float(np.rad2deg(1.0)), unit.replace("rad", "deg", 1)

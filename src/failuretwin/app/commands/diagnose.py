@@ -78,6 +78,7 @@ def diagnose(
     from failuretwin.app.ambiguity_lines import ambiguity_lines
     from failuretwin.app.inputs import read_inputs, tell_mismatch
     from failuretwin.app.method import chosen_diagnoser, expected_name, told_hypotheses
+    from failuretwin.app.progress import progress_bar
     from failuretwin.app.results import write_csv, write_json_lines
     from failuretwin.app.tables import print_diagnoses, print_lines, print_scores
     from failuretwin.app.tracking import (
@@ -111,7 +112,10 @@ def diagnose(
     history = open_history(bayes, calibration) if track else None
     runs = read_inputs(inputs, model, reading)
     tell_mismatch(runs, expected_name(diagnoser, bayes))
-    tracked = None if history is None else diagnose_tracked(runs, bayes, history)
+    tracked = None
+    if history is not None:
+        with progress_bar("diagnosing", runs.sizes["run"]) as advance:
+            tracked = diagnose_tracked(runs, bayes, history, advance)
     diagnoses = diagnoser.diagnose(runs) if tracked is None else tracked.diagnoses
     records = [diagnosis.to_record() for diagnosis in diagnoses]
     if json_file is not None:
