@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING
 
 import failuretwin as ft
 from failuretwin.app.calibration_tables import mean_gain
-from failuretwin.connection.calibration.held_out import typical_size
-from failuretwin.connection.calibration.learn import calibrate
-from failuretwin.connection.calibration.predictions import predict
-from failuretwin.data_knowledge.raw_session import find_sessions
+from failuretwin.connection.calibration.calibrate import calibrate
+from failuretwin.connection.calibration.validation import predict, typical_size
+from failuretwin.data_knowledge.raw_sessions import find_sessions
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:

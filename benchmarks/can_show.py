@@ -16,17 +16,16 @@ from functools import cached_property
 import numpy as np
 
 from failuretwin import DigitalTwin
-from failuretwin.connection.emulation.emulated_arm import EmulatedArm, Emulation
-from failuretwin.connection.links.values import CommandSent, Reading
+from failuretwin.connection.emulated_arm import EmulatedArm, Emulation
+from failuretwin.connection.links.base import CommandSent, Reading
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable, Truth
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.decision.telling_apart.separation import separation
-from failuretwin.failure_behavior.course import STEP, Course
-from failuretwin.failure_behavior.fault_value import FaultValue
-from failuretwin.failure_behavior.modes.offsets import OFFSET, SteadyStateError
+from failuretwin.failure_behavior.fault import STEP, Course, FaultValue
+from failuretwin.failure_behavior.injection import ScheduledFault
+from failuretwin.failure_behavior.modes import OFFSET, SteadyStateError
 from failuretwin.failure_behavior.random_movements import stack_movements
-from failuretwin.failure_behavior.schedule import ScheduledFault
+from failuretwin.inference.expected_bayes_factors import separation
 
 ERROR = SteadyStateError.mode
 SHOWN_NATS = 5.0

@@ -19,24 +19,25 @@ from rich.progress import track
 from telling import share
 
 import failuretwin as ft
-from failuretwin.core.diagnosis import Diagnosis
-from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
-from failuretwin.core.quadrature import Weighted
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis, paper_hypotheses
+from failuretwin.core.numerics import Weighted
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.log_quality import log_quality, without_spoilt
-from failuretwin.data_knowledge.moving_evidence import moving_evidence
-from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision.evidence.scene import Scene
-from failuretwin.decision.hypotheses.onsets import OnsetPrior
-from failuretwin.decision.hypotheses.priors import Priors
-from failuretwin.decision.hypotheses.weighing import weigh_hypothesis
-from failuretwin.decision.metrics.ranks import check_ranks, rank_of_truth
-from failuretwin.decision.metrics.reliability import calibrated_error, equal_edges, reliability
-from failuretwin.digital_model.imperfections import load_imperfections
-from failuretwin.failure_behavior.fault_value import FaultValue
-from failuretwin.failure_behavior.modes import MODES
-from failuretwin.failure_behavior.modes.held import Stuck
-from failuretwin.failure_behavior.modes.offsets import SteadyStateError
+from failuretwin.decision.metrics.probability import (
+    calibrated_error,
+    check_ranks,
+    equal_edges,
+    rank_of_truth,
+    reliability,
+)
+from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.failure_behavior.fault import FaultValue
+from failuretwin.failure_behavior.modes import MODES, SteadyStateError, Stuck
+from failuretwin.inference.evidence import moving_evidence, settled_evidence
+from failuretwin.inference.log_quality import log_quality, without_spoilt
+from failuretwin.inference.onset import OnsetPrior
+from failuretwin.inference.posterior import weigh_hypothesis
+from failuretwin.inference.priors import Priors
+from failuretwin.inference.run_likelihood import Scene
 
 EARLY = 0.5
 PRIORS = Priors(onset=OnsetPrior(early=EARLY, free=0.01))

@@ -6,7 +6,7 @@ from typing import Self
 
 import numpy as np
 
-from failuretwin.connection.links.values import CommandSent, Item
+from failuretwin.connection.links.base import CommandSent, Item
 from failuretwin.core.types import FloatArray
 
 

@@ -21,11 +21,11 @@ import numpy as np
 from killian_truth import TrueRun, read_list
 
 import failuretwin as ft
-from failuretwin.app.calibrating import learn_robot
-from failuretwin.app.results import Record, score_line, score_records, write_json_lines
+from failuretwin.connection.calibrating import learn_robot
 from failuretwin.core.hypothesis import Hypothesis, single_faults
-from failuretwin.decision.metrics.shares import wilson_interval
-from failuretwin.digital_model.imperfections import Imperfections, load_imperfections
+from failuretwin.decision.metrics.probability import wilson_interval
+from failuretwin.decision.results import Record, score_line, score_records, write_json_lines
+from failuretwin.digital_model.nonidealities import Imperfections, load_imperfections
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:

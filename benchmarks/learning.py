@@ -15,19 +15,24 @@ import torch
 
 from failuretwin import load_robot
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.decision.learned.encoder import Encoder
-from failuretwin.decision.learned.estimator import LearnedDiagnoser
-from failuretwin.decision.learned.networks import NETWORKS, Shape, build_network
-from failuretwin.decision.learned.numpy_export import export_numpy
-from failuretwin.decision.learned.onnx_export import export_onnx
-from failuretwin.decision.learned.recipe import Recipe
-from failuretwin.decision.learned.robust_features import expectation_of
-from failuretwin.decision.learned.signals import signals_of
-from failuretwin.decision.learned.stream import CHUNK_RUNS, Chunk, Stream
-from failuretwin.decision.learned.training import Pace, Standard, shuffled_batches, training
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.decision.learned.data import Recipe
+from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
+from failuretwin.decision.learned.export import export_numpy, export_onnx
+from failuretwin.decision.learned.features import Encoder, expectation_of, signals_of
+from failuretwin.decision.learned.networks import (
+    CHUNK_RUNS,
+    NETWORKS,
+    Chunk,
+    Pace,
+    Shape,
+    Standard,
+    Stream,
+    build_network,
+    shuffled_batches,
+    training,
+)
+from failuretwin.digital_model.nonidealities import load_imperfections
 
 PAPER_ITERATIONS, PAPER_JOBS = 5050, 20
 STREAMED = 324

@@ -19,16 +19,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import failuretwin as ft
-from failuretwin.app.calibrating import learn_robot
 from failuretwin.app.plots import plot_runs
-from failuretwin.app.results import Record, score_line, write_json_lines
-from failuretwin.connection.calibration.calibration import Calibration
-from failuretwin.core.diagnosis import Diagnosis
-from failuretwin.data_knowledge.raw_session import find_sessions
-from failuretwin.decision.hypotheses.priors import priors_of
+from failuretwin.connection.calibrating import learn_robot
+from failuretwin.connection.calibration.result import Calibration
+from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.data_knowledge.raw_sessions import find_sessions
 from failuretwin.decision.metrics import log_score, log_score_gain, mcnemar
-from failuretwin.digital_model.imperfections import generic_imperfections
+from failuretwin.decision.results import Record, score_line, write_json_lines
+from failuretwin.digital_model.nonidealities import generic_imperfections
 from failuretwin.digital_model.robot import Robot
+from failuretwin.inference.priors import priors_of
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -19,18 +19,17 @@ from can_show import CanShow
 from kept_commands import KeptCommands
 
 from failuretwin import DigitalTwin, load_robot
-from failuretwin.app.live.shadow import Shadow
-from failuretwin.connection.emulation.emulated_arm import FIRST_COMMAND_S, Emulation
-from failuretwin.connection.links.ros_topics import RosTopics
-from failuretwin.connection.links.values import CommandSent, Reading
-from failuretwin.connection.ros1.sinks import Ros1Robot
-from failuretwin.connection.ros1.source import Ros1Source
+from failuretwin.app.shadow import Shadow
+from failuretwin.connection.emulated_arm import FIRST_COMMAND_S, Emulation
+from failuretwin.connection.links.base import CommandSent, Reading
+from failuretwin.connection.links.ros1 import Ros1Robot, Ros1Source
+from failuretwin.connection.links.ros_messages import RosTopics
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.streaming.streaming import monitor
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.decision.streaming.diagnoser import monitor
+from failuretwin.digital_model.nonidealities import load_imperfections
 from failuretwin.digital_model.robot import Robot
-from failuretwin.failure_behavior.schedule import ScheduledFault
+from failuretwin.failure_behavior.injection import ScheduledFault
 
 ONSET_S = 6.0
 """When the faults begin, by the robot's clock [s]."""

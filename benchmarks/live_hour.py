@@ -18,15 +18,15 @@ from can_show import CanShow
 from kept_commands import KeptCommands
 
 from failuretwin import DigitalTwin, load_robot
-from failuretwin.app.live.connections import EmulationOptions, emulated_robot
-from failuretwin.app.live.shadow import Shadow
-from failuretwin.connection.emulation.emulated_arm import Emulation
-from failuretwin.connection.links.diagnostic_status import SURE
-from failuretwin.connection.links.pace import Pace
+from failuretwin.app.live import EmulationOptions, emulated_robot
+from failuretwin.app.shadow import Shadow
+from failuretwin.connection.emulated_arm import Emulation
+from failuretwin.connection.links.base import Pace
+from failuretwin.connection.links.diagnostics import SURE
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.decision.streaming.streaming import monitor
-from failuretwin.digital_model.imperfections import load_imperfections
-from failuretwin.failure_behavior.schedule import ScheduledFault, state_at
+from failuretwin.decision.streaming.diagnoser import monitor
+from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.failure_behavior.injection import ScheduledFault, state_at
 
 PERIOD_S, BEGIN_S, END_S = 120.0, 40.0, 100.0
 """A fault begins 40 s into every two minutes and is repaired at 100 s."""

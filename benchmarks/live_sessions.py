@@ -15,19 +15,26 @@ from pathlib import Path
 import numpy as np
 
 from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
-from failuretwin.app.live.shadow import Shadow
-from failuretwin.connection.links.pace import AS_FAST_AS_POSSIBLE, Pace
-from failuretwin.connection.links.paced import PacedSource
-from failuretwin.connection.links.replay import replay, session_events
-from failuretwin.connection.links.ros_topics import RosTopics
-from failuretwin.connection.links.ros_writer import Outgoing, RosWriter
-from failuretwin.connection.links.values import CommandSent, Event, Reading
-from failuretwin.connection.ros1.sinks import Ros1Robot
-from failuretwin.connection.ros1.source import Ros1Source
+from failuretwin.app.shadow import Shadow
+from failuretwin.connection.links.base import (
+    AS_FAST_AS_POSSIBLE,
+    CommandSent,
+    Event,
+    Pace,
+    PacedSource,
+    Reading,
+)
+from failuretwin.connection.links.recording import replay, session_events
+from failuretwin.connection.links.ros1 import Ros1Robot, Ros1Source
+from failuretwin.connection.links.ros_messages import Outgoing, RosTopics, RosWriter
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.raw_session import RawSession, read_session
-from failuretwin.data_knowledge.session_runs import session_runs, split_session
-from failuretwin.decision.streaming.streaming import StreamingDiagnoser
+from failuretwin.data_knowledge.raw_sessions import (
+    RawSession,
+    read_session,
+    session_runs,
+    split_session,
+)
+from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser
 from failuretwin.digital_model.robot import Robot
 
 LABELS = (0, 5, 6, 7, 8)

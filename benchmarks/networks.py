@@ -13,12 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from failuretwin import BayesDiagnoser, DigitalTwin, Plan, ReadOptions, load_robot, read_runs
-from failuretwin.app.training import TrainingPlan, train_network
-from failuretwin.core.diagnosis import Diagnosis
-from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.core.hypothesis import Diagnosis, paper_hypotheses
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.decision.learned.hybrid import HybridDiagnoser
+from failuretwin.data_knowledge.generate import simulate
+from failuretwin.decision.learned.diagnoser import HybridDiagnoser
 from failuretwin.decision.learned.networks import NETWORKS
 from failuretwin.decision.learned.storage import load_network, save_network
 from failuretwin.decision.metrics import (
@@ -28,7 +26,8 @@ from failuretwin.decision.metrics import (
     mcnemar,
     reliability,
 )
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.decision.training import TrainingPlan, train_network
+from failuretwin.digital_model.nonidealities import load_imperfections
 from failuretwin.digital_model.robot import Robot
 
 PER_CLASS = 223

@@ -13,10 +13,10 @@ import numpy as np
 
 from failuretwin import load_robot
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.digital_model.engine import Drive
-from failuretwin.digital_model.imperfections import Schedule
+from failuretwin.digital_model.nonidealities import Schedule
 from failuretwin.digital_model.physics.engine import STEP_S, PhysicsEngine
 from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.twin import Drive
 from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
 
 RUNS = 3600

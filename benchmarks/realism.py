@@ -19,17 +19,16 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 import failuretwin as ft
-from failuretwin.connection.calibration.learn import calibrate
-from failuretwin.connection.calibration.motion_part import movements_of
+from failuretwin.connection.calibration.calibrate import calibrate
 from failuretwin.connection.calibration.observations import observe, session_names
+from failuretwin.connection.calibration.timing import movements_of
 from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.digital_model.imperfections import default_imperfections
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.nonidealities import default_imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.evidence import settled_evidence
 
 FOLDS = 5
 MOVEMENTS = 5

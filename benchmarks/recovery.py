@@ -18,19 +18,23 @@ from functools import partial
 import numpy as np
 
 import failuretwin as ft
-from failuretwin.connection.calibration.learn import calibrate
+from failuretwin.connection.calibration.calibrate import calibrate
 from failuretwin.connection.calibration.observations import observe
-from failuretwin.connection.calibration.settled_part import (
+from failuretwin.connection.calibration.settling import (
     fit_settled_part,
     probably_arrived,
     sort_movements,
 )
 from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.decision.metrics import wilson_interval
-from failuretwin.digital_model.imperfections import Imperfections, Variation, load_imperfections
+from failuretwin.digital_model.nonidealities import (
+    Imperfections,
+    Variation,
+    load_imperfections,
+    vary,
+)
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling
-from failuretwin.digital_model.variation import vary
 
 Key = tuple[str, str]
 SPREAD = Variation(

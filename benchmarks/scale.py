@@ -17,10 +17,9 @@ from pathlib import Path
 
 from failuretwin import load_robot
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge.generation import iterate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.data_knowledge.run_factory import produce
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.data_knowledge.generate import Plan, iterate
+from failuretwin.data_knowledge.resumable import produce
+from failuretwin.digital_model.nonidealities import load_imperfections
 
 SIZES = (1_000, 10_000, 100_000)
 CLASSES = 9

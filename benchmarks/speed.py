@@ -18,9 +18,8 @@ import numpy as np
 
 from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, load_imperfections
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, load_imperfections
 
 PUBLISHED_GENERATION_S = 8.0 * 3600.0
 """Time that the authors' generation of 3600 runs took [s]."""

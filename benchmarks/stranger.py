@@ -20,14 +20,14 @@ import xarray as xr
 from telling import calibration, nats, right, share
 
 import failuretwin as ft
-from failuretwin.core.diagnosis import Diagnosis
-from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
+from failuretwin.core.hypothesis import HEALTHY, Diagnosis, Hypothesis, paper_hypotheses
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.metrics.coverage import IntervalCase, coverage_by_mode
-from failuretwin.decision.telling_apart.separation import separation
-from failuretwin.digital_model.imperfections import Imperfections, load_imperfections
+from failuretwin.decision.metrics.probability import IntervalCase, coverage_by_mode
+from failuretwin.digital_model.nonidealities import Imperfections, load_imperfections
 from failuretwin.digital_model.robot import Robot
-from failuretwin.failure_behavior.modes import MODES, FaultMode
+from failuretwin.failure_behavior.mode import FaultMode
+from failuretwin.failure_behavior.modes import MODES
+from failuretwin.inference.expected_bayes_factors import separation
 
 SEPARABLE_NATS = 5.0
 ALARMS = (0.99, 0.999)

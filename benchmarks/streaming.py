@@ -13,9 +13,9 @@ import numpy as np
 from failuretwin import BayesDiagnoser, DigitalTwin, Plan, load_robot
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.generate import simulate
 from failuretwin.decision.streaming.fleet import StreamingFleet
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.digital_model.nonidealities import load_imperfections
 from failuretwin.digital_model.robot import Robot
 
 RATE_HZ = 10.0

@@ -6,11 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from failuretwin.core.diagnosis import Diagnosis
+from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.decision.metrics.proper import log_score
-from failuretwin.decision.metrics.reliability import calibrated_error, equal_edges, reliability
-from failuretwin.decision.metrics.shares import Share
+from failuretwin.decision.metrics.probability import (
+    Share,
+    calibrated_error,
+    equal_edges,
+    log_score,
+    reliability,
+)
 
 
 def share(count: int, total: int) -> str:

@@ -27,25 +27,24 @@ from numpy.typing import NDArray
 from telling import nats, right, share
 
 import failuretwin as ft
-from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.hypothesis import (
     HEALTHY,
     UNKNOWN,
+    Diagnosis,
     Fault,
     Hypothesis,
     paper_hypotheses,
     single_faults,
 )
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.decision.hypotheses.weighing import WEIGHABLE
-from failuretwin.decision.metrics.paired import log_score_gain
-from failuretwin.decision.telling_apart.separation import Judge, separation, truth_and_faults
-from failuretwin.digital_model.imperfections import Imperfections, load_imperfections
+from failuretwin.decision.metrics.classification import log_score_gain
+from failuretwin.digital_model.nonidealities import Imperfections, load_imperfections
 from failuretwin.digital_model.robot import Robot
-from failuretwin.failure_behavior.fault_value import FaultGroup
-from failuretwin.failure_behavior.modes.base import Range
-from failuretwin.failure_behavior.modes.registry import register
-from failuretwin.failure_behavior.modes.sized import SizedMode
+from failuretwin.failure_behavior.fault import FaultGroup
+from failuretwin.failure_behavior.mode import Range, SizedMode
+from failuretwin.failure_behavior.modes import register
+from failuretwin.inference.expected_bayes_factors import Judge, separation, truth_and_faults
+from failuretwin.inference.posterior import WEIGHABLE
 
 FOREIGN_NATS = 5.0
 DISTANCES = (FOREIGN_NATS, 15.0, 40.0, np.inf)
@@ -119,7 +118,7 @@ def main() -> None:
         plan = ft.Plan(robot, true, per_class, options.seed, healthy, engine=options.engine)
         runs = ft.simulate(plan)
         known_laws = tuple(mode for mode in WEIGHABLE if mode != name or not options.forget)
-        with patch("failuretwin.decision.hypotheses.weighing.WEIGHABLE", known_laws):
+        with patch("failuretwin.inference.posterior.WEIGHABLE", known_laws):
             said = np.array([_kind(d) for d in diagnoser.diagnose(runs)])
         nats_ahead = ahead(diagnoser, runs, nine, healthy)
         tell(name, said, nats_ahead >= FOREIGN_NATS)

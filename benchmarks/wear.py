@@ -15,17 +15,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
-from failuretwin.app.tracking import Tracked, diagnose_tracked
-from failuretwin.connection.calibration.learn import calibrate
-from failuretwin.connection.tracker import Tracker
-from failuretwin.connection.tracker_history import History
-from failuretwin.core.diagnosis import Diagnosis
-from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.connection.calibration.calibrate import calibrate
+from failuretwin.connection.tracking import Tracked, diagnose_tracked
+from failuretwin.connection.wear_history import History
+from failuretwin.connection.wear_tracker import Tracker
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import concatenate
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.generation import simulate, simulate_runs
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.digital_model.imperfections import Imperfections, load_imperfections
+from failuretwin.data_knowledge.generate import Plan, simulate, simulate_runs
+from failuretwin.digital_model.nonidealities import Imperfections, load_imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import loads_in_range
 from failuretwin.failure_behavior.modes import MODES, SteadyStateError

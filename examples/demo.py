@@ -11,12 +11,10 @@ import numpy as np
 
 from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
 from failuretwin.app.plots import run_figure
-from failuretwin.app.progress import progress_bar
-from failuretwin.app.tables import print_diagnoses, print_scores
+from failuretwin.app.tables import print_diagnoses, print_scores, progress_bar
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.nonidealities import load_imperfections
 
 RUNS_PER_CLASS = 10
 PICTURE = Path(sys.argv[1] if len(sys.argv) > 1 else "demo.png")

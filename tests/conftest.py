@@ -11,7 +11,7 @@ from hypothesis import settings
 from failuretwin import DigitalTwin, load_robot
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.digital_model.nonidealities import load_imperfections
 from roscores import Roscore, need_ros
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

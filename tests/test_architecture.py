@@ -16,6 +16,7 @@ ROOMS = (
     "digital_model",
     "failure_behavior",
     "data_knowledge",
+    "inference",
     "connection",
     "decision",
     "app",
@@ -94,9 +95,9 @@ def test_all_code_is_in_a_room():
 @pytest.mark.parametrize(
     "source",
     [
-        "import failuretwin.decision.bayes",
+        "import failuretwin.inference.diagnoser",
         "import numpy, failuretwin.decision as d",
-        "from failuretwin.decision.bayes import BayesDiagnoser",
+        "from failuretwin.inference.diagnoser import BayesDiagnoser",
         "from failuretwin import decision",
         "from failuretwin import DigitalTwin",
         "from ..decision import bayes",
@@ -104,7 +105,7 @@ def test_all_code_is_in_a_room():
         "def f():\n    from failuretwin.decision import bayes",
         "class A:\n    def f(self):\n        import failuretwin.app.cli",
         "if TYPE_CHECKING:\n    from failuretwin.digital_model.robot import Robot",
-        "import_module('failuretwin.decision.bayes')",
+        "import_module('failuretwin.inference.diagnoser')",
         "try:\n    import os\nexcept ImportError:\n    import failuretwin.connection",
     ],
 )
@@ -121,10 +122,10 @@ def test_an_arrow_to_the_right_is_caught(source):
         ("failuretwin.core.__init__", "from . import errors"),
         ("failuretwin.core.runs", "from failuretwin import __version__"),
         ("failuretwin.core.runs", "import numpy, xarray.decision"),
-        ("failuretwin.decision.bayes", "from failuretwin import DigitalTwin"),
-        ("failuretwin.decision.bayes", "from ..core import runs"),
-        ("failuretwin.app.cli", "from failuretwin.decision.bayes import BayesDiagnoser"),
-        ("failuretwin.__init__", "from failuretwin.decision.bayes import BayesDiagnoser"),
+        ("failuretwin.inference.diagnoser", "from failuretwin import DigitalTwin"),
+        ("failuretwin.inference.diagnoser", "from ..core import runs"),
+        ("failuretwin.app.cli", "from failuretwin.inference.diagnoser import BayesDiagnoser"),
+        ("failuretwin.__init__", "from failuretwin.inference.diagnoser import BayesDiagnoser"),
     ],
 )
 def test_other_arrows_are_allowed(module, source):

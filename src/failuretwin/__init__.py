@@ -11,31 +11,30 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from failuretwin.core.errors import InputError
-    from failuretwin.data_knowledge.generation import iterate, simulate
-    from failuretwin.data_knowledge.plan import Plan
-    from failuretwin.data_knowledge.reading import ReadOptions, read_runs
-    from failuretwin.decision.bayes import BayesDiagnoser
-    from failuretwin.decision.hypotheses.priors import Priors
-    from failuretwin.decision.streaming.streaming import StreamingDiagnoser
-    from failuretwin.decision.telling_apart.ambiguity import ambiguity
+    from failuretwin.data_knowledge.generate import Plan, iterate, simulate
+    from failuretwin.data_knowledge.read import ReadOptions, read_runs
+    from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.twin import DigitalTwin
+    from failuretwin.inference.diagnoser import BayesDiagnoser
+    from failuretwin.inference.isolability import ambiguity
+    from failuretwin.inference.priors import Priors
 
 __version__ = "0.1.0"
 
 _HOME = {
-    "BayesDiagnoser": "decision.bayes",
+    "BayesDiagnoser": "inference.diagnoser",
     "DigitalTwin": "digital_model.twin",
     "InputError": "core.errors",
-    "Plan": "data_knowledge.plan",
-    "Priors": "decision.hypotheses.priors",
-    "ReadOptions": "data_knowledge.reading",
-    "StreamingDiagnoser": "decision.streaming.streaming",
-    "ambiguity": "decision.telling_apart.ambiguity",
-    "iterate": "data_knowledge.generation",
+    "Plan": "data_knowledge.generate",
+    "Priors": "inference.priors",
+    "ReadOptions": "data_knowledge.read",
+    "StreamingDiagnoser": "decision.streaming.diagnoser",
+    "ambiguity": "inference.isolability",
+    "iterate": "data_knowledge.generate",
     "load_robot": "digital_model.robot",
-    "read_runs": "data_knowledge.reading",
-    "simulate": "data_knowledge.generation",
+    "read_runs": "data_knowledge.read",
+    "simulate": "data_knowledge.generate",
 }
 
 __all__ = [

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from failuretwin.app.ambiguity_lines import _group_lines, _size_lines
-from failuretwin.decision.telling_apart.ambiguity import Ambiguity
+from failuretwin.app.tables import _group_lines, _size_lines
+from failuretwin.inference.isolability import Ambiguity
 
 BIAS, SCALE, STUCK = "motor_1:encoder_bias", "motor_1:encoder_scale", "motor_2:stuck"
 

@@ -12,14 +12,25 @@ import numpy as np
 import pytest
 
 from failuretwin import load_robot
-from failuretwin.app.calibration_rows import figure, parameter_groups
-from failuretwin.app.calibration_tables import left_out_line, mean_gain, verdict_line
-from failuretwin.connection.calibration.calibration import Calibration, HeldOut, LeftOut, Parameter
-from failuretwin.connection.calibration.calibration_file import load_calibration, save_calibration
+from failuretwin.app.calibration_tables import (
+    figure,
+    left_out_line,
+    mean_gain,
+    parameter_groups,
+    verdict_line,
+)
+from failuretwin.connection.calibration.result import (
+    Calibration,
+    HeldOut,
+    LeftOut,
+    Parameter,
+    load_calibration,
+    save_calibration,
+)
 from failuretwin.core.errors import InputError, OutputError
-from failuretwin.data_knowledge.reading import ReadOptions, read_runs
+from failuretwin.data_knowledge.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import save_run_set
-from failuretwin.digital_model.imperfections import generic_imperfections, load_imperfections
+from failuretwin.digital_model.nonidealities import generic_imperfections, load_imperfections
 
 COUNT = np.deg2rad(0.24)
 REPORT = "report"

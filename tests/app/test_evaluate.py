@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from failuretwin.app.latex import escaped, latex_table
+from failuretwin.app.evaluation_tables import escaped, latex_table
 from failuretwin.core.runs import RunTable, Truth
 from failuretwin.data_knowledge.store import save_run_set
 

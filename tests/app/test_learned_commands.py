@@ -9,10 +9,10 @@ import pytest
 from click.testing import CliRunner
 
 from failuretwin import BayesDiagnoser, load_robot, read_runs
-from failuretwin.app import training
 from failuretwin.app.cli import cli
 from failuretwin.core.errors import FailureTwinError, InputError
-from failuretwin.decision.learned.blend import blended
+from failuretwin.decision import training
+from failuretwin.decision.learned.posteriors import blended
 from failuretwin.decision.learned.storage import load_network, save_network
 
 

@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from failuretwin.app.live import shadow as shadow_module
-from failuretwin.app.live.changes import Changes
-from failuretwin.app.live.shadow import Shadow
-from failuretwin.app.live.view import View
-from failuretwin.app.live.watching import watch_until_end
-from failuretwin.connection.links.commands import SampledCommands
-from failuretwin.connection.links.ros_topics import RosTopics
-from failuretwin.connection.links.values import OK, STALE, Answer, CommandSent, LinkCounts, Reading
-from failuretwin.core.diagnosis import Diagnosis
+from failuretwin.app import shadow as shadow_module
+from failuretwin.app.live import View, watch_until_end
+from failuretwin.app.shadow import Changes, Shadow
+from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, LinkCounts, Reading
+from failuretwin.connection.links.live_commands import SampledCommands
+from failuretwin.connection.links.ros_messages import RosTopics
+from failuretwin.core.hypothesis import Diagnosis
 
 HEALTHY = Diagnosis("live", {"healthy": 0.99, "motor_3:stuck": 0.01}, verdict="healthy, 99 % sure")
 STUCK = Diagnosis("live", {"healthy": 0.01, "motor_3:stuck": 0.99}, verdict="motor 3 stuck")

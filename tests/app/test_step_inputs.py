@@ -5,7 +5,7 @@ import tomllib
 import numpy as np
 import pytest
 
-from failuretwin.app.step_inputs import learn_loops, split_step_tests
+from failuretwin.app.inputs import learn_loops, split_step_tests
 from failuretwin.core.errors import InputError
 from step_writers import step_rows, write_step_test
 

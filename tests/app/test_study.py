@@ -13,12 +13,18 @@ import pytest
 from click.testing import CliRunner
 
 from failuretwin.app.cli import cli
-from failuretwin.app.study.data import Exam, stand_in_test_set
-from failuretwin.app.study.plan import FEATURES, Job, StudyPlan, quick_plan
-from failuretwin.app.study.published import TABLE_2, TABLE_3
-from failuretwin.app.study.results import class_ratios, mean_confusion, spread_of
+from failuretwin.app.study.page import TABLE_2, TABLE_3, class_ratios, mean_confusion, spread_of
 from failuretwin.app.study.study import PLAN_FILE, WORK, check_folder, run_study
-from failuretwin.app.study.trainings import Checkpoint, Training
+from failuretwin.app.study.trainings import (
+    FEATURES,
+    Checkpoint,
+    Exam,
+    Job,
+    StudyPlan,
+    Training,
+    quick_plan,
+    stand_in_test_set,
+)
 from failuretwin.core.errors import InputError
 
 TINY = StudyPlan(0, 3, (2, 4), 1, 1)

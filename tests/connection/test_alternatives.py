@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from failuretwin.connection.healthy import HealthyModel
-from failuretwin.connection.lost_commands import OUTLIER_RATE, RARE
 from failuretwin.core.movements import Movements
-from failuretwin.digital_model.imperfections import Imperfections, LostCommand, Timing
+from failuretwin.digital_model.nonidealities import Imperfections, LostCommand, Timing
+from failuretwin.inference.command_loss import OUTLIER_RATE, RARE
+from failuretwin.inference.healthy_model import HealthyModel
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 SETS = [s for size in (1, 2, 3) for s in combinations(MOTORS, size)]

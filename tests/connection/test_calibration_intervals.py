@@ -6,21 +6,19 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from failuretwin.connection.calibration.learn import calibrate
+from failuretwin.connection.calibration.calibrate import calibrate, untrusted
+from failuretwin.connection.calibration.observations import log_rounded_student
 from failuretwin.connection.calibration.parameters import (
     rate_parameter,
     settling_parameters,
     spring_remarks,
 )
 from failuretwin.connection.calibration.rates import Rate
-from failuretwin.connection.calibration.settled_errors import log_rounded_student
-from failuretwin.connection.calibration.settled_fit import SettledFit
-from failuretwin.connection.calibration.timing_fit import LAGS_S, joint_doubt
-from failuretwin.connection.calibration.trust import untrusted
+from failuretwin.connection.calibration.settling import SettledFit
+from failuretwin.connection.calibration.timing import LAGS_S, joint_doubt
 from failuretwin.core.hypothesis import HEALTHY
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.digital_model.imperfections import Timing
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.nonidealities import Timing
 
 COUNT = np.deg2rad(0.24)
 

@@ -7,27 +7,34 @@ import pytest
 from scipy import stats
 
 from failuretwin import DigitalTwin
-from failuretwin.connection.calibration.held_out import held_out_sessions, judge
-from failuretwin.connection.calibration.motion_part import gap_starts, glitch_rates, lateness
-from failuretwin.connection.calibration.observations import Observations, stayed
+from failuretwin.connection.calibration.observations import Observations, rounding, stayed
 from failuretwin.connection.calibration.rates import (
     Rate,
     loss_rates,
     median_interval,
     spread_of,
 )
-from failuretwin.connection.calibration.settled_errors import rounding
-from failuretwin.connection.calibration.settled_fit import fit_settling
-from failuretwin.connection.calibration.settled_part import fit_settled_part
-from failuretwin.connection.calibration.timing_fit import Transients, fit_timing
-from failuretwin.connection.calibration.what_if import best_payload, sense_remarks
-from failuretwin.connection.healthy import PATH_NOISE_M
+from failuretwin.connection.calibration.settling import fit_settled_part, fit_settling
+from failuretwin.connection.calibration.timing import (
+    Transients,
+    fit_timing,
+    gap_starts,
+    glitch_rates,
+    lateness,
+)
+from failuretwin.connection.calibration.validation import (
+    best_payload,
+    held_out_sessions,
+    judge,
+    sense_remarks,
+)
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
-from failuretwin.digital_model.imperfect import lagged
-from failuretwin.digital_model.imperfections import GENERIC_SCATTER_RAD
+from failuretwin.digital_model.disturbances import lagged
+from failuretwin.digital_model.nonidealities import GENERIC_SCATTER_RAD
 from failuretwin.digital_model.settling import Settling
+from failuretwin.inference.healthy_model import PATH_NOISE_M
 
 COUNT = np.deg2rad(0.24)
 NAMES = ["motor_1", "motor_2", "motor_3", "motor_4"]

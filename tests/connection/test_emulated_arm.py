@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from failuretwin.connection.emulation.emulated_arm import EmulatedArm, Emulation
-from failuretwin.connection.links.values import CommandSent, Reading
+from failuretwin.connection.emulated_arm import EmulatedArm, Emulation
+from failuretwin.connection.links.base import CommandSent, Reading
 from failuretwin.core.errors import InputError
-from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS
-from failuretwin.failure_behavior.schedule import ScheduledFault, state_at
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
+from failuretwin.failure_behavior.injection import ScheduledFault, state_at
 
 pytest.importorskip("mujoco")
 

@@ -9,16 +9,16 @@ from hypothesis import strategies as st
 from scipy import integrate, stats
 
 from failuretwin import BayesDiagnoser
-from failuretwin.connection.healthy import PATH_NOISE_M, HealthyModel
-from failuretwin.connection.lost_commands import OUTLIER_RATE
-from failuretwin.core.ellipsoid import log_student
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
-from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision.hypotheses.onsets import OnsetPrior
-from failuretwin.decision.hypotheses.priors import priors_of
-from failuretwin.digital_model.imperfections import Imperfections, LostCommand, Timing, Variation
+from failuretwin.core.numerics import log_student
+from failuretwin.digital_model.nonidealities import Imperfections, LostCommand, Timing, Variation
 from failuretwin.digital_model.settling import Settling
+from failuretwin.inference.command_loss import OUTLIER_RATE
+from failuretwin.inference.evidence import settled_evidence
+from failuretwin.inference.healthy_model import PATH_NOISE_M, HealthyModel
+from failuretwin.inference.onset import OnsetPrior
+from failuretwin.inference.priors import priors_of
 
 COUNT = np.deg2rad(0.24)
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")

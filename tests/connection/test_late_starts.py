@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 
 from failuretwin import BayesDiagnoser
-from failuretwin.connection.lost_commands import LostCommands
 from failuretwin.core.hypothesis import HEALTHY, paper_hypotheses
 from failuretwin.core.movements import Movements
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision.evidence.scene import Scene
+from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.disturbances import draw_disturbances
-from failuretwin.digital_model.imperfections import LostCommand, Timing, load_imperfections
+from failuretwin.digital_model.nonidealities import LostCommand, Timing, load_imperfections
+from failuretwin.inference.command_loss import LostCommands
+from failuretwin.inference.evidence import settled_evidence
+from failuretwin.inference.run_likelihood import Scene
 
 RUNS = 60
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")

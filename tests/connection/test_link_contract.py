@@ -12,15 +12,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 from bag_writers import MONITORING, MONITORING_TEXT, entry, write_bag
-from failuretwin.connection.emulation.emulated_arm import Emulation
-from failuretwin.connection.links.emulated import emulated
-from failuretwin.connection.links.pace import Pace
-from failuretwin.connection.links.replay import replay
-from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.emulated_arm import Emulation, emulated
+from failuretwin.connection.links.base import CommandSent, Pace, Reading
+from failuretwin.connection.links.recording import replay
+from failuretwin.connection.links.ros1 import Ros1Source
+from failuretwin.connection.links.ros_messages import RosTopics
 from failuretwin.connection.links.rosbridge import RosbridgeSource, connect, disconnect
-from failuretwin.connection.links.values import CommandSent, Reading
-from failuretwin.connection.ros1.source import Ros1Source
-from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from fake_rosbridge import FakeRosbridge
 from little_logs import LOG_COLUMNS
 from ros_peer import RosPeer
@@ -215,7 +213,7 @@ def test_a_replay_keeps_its_pace(armpi, little_log, tmp_path):
 def test_the_ros_message_of_the_authors_has_the_right_md5(roscore):
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    from failuretwin.connection.ros1.message_class import message_class
+    from failuretwin.connection.links.ros1_import import message_class
 
     store = get_typestore(Stores.ROS1_NOETIC)
     store.register(get_types_from_msg(MONITORING_TEXT, MONITORING))

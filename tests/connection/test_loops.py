@@ -6,18 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from failuretwin.connection.calibration.calibration import Calibration, LoopFit
-from failuretwin.connection.calibration.calibration_file import (
-    load_calibration,
-    save_calibration,
-)
-from failuretwin.connection.calibration.loops import (
+from failuretwin.connection.calibration.result import (
+    Calibration,
+    LoopFit,
     calibrated_robot,
+    load_calibration,
     robot_as_calibrated,
+    save_calibration,
     with_loops,
 )
 from failuretwin.core.errors import InputError
-from failuretwin.digital_model.imperfections import generic_imperfections
+from failuretwin.digital_model.nonidealities import generic_imperfections
 from failuretwin.digital_model.twin import DigitalTwin
 
 LOOPS = (LoopFit("motor_2", 0.05, 17.5, 0.012, 4.25), LoopFit("motor_4", 0.1, 15.0, 0.02, 4.5))

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from failuretwin.connection.losses_in_a_row import MOST_STATES, LossesInARow
+from failuretwin.inference.command_loss import MOST_STATES, LossesInARow
 
 SETS = [s for size in (1, 2) for s in combinations(range(3), size)]
 MOVEMENTS = 4

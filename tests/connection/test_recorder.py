@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from failuretwin.connection.emulation.emulated_arm import EmulatedArm, Emulation
-from failuretwin.connection.links import recorder
-from failuretwin.connection.links.pace import Pace
-from failuretwin.connection.links.recorder import Recorder
-from failuretwin.connection.links.replay import replay
-from failuretwin.connection.links.values import OK, Answer, CommandSent, Reading
-from failuretwin.core.diagnosis import Diagnosis
+from failuretwin.connection.emulated_arm import EmulatedArm, Emulation
+from failuretwin.connection.links import recording as recorder
+from failuretwin.connection.links.base import OK, Answer, CommandSent, Pace, Reading
+from failuretwin.connection.links.recording import Recorder, replay
 from failuretwin.core.errors import InputError, OutputError
+from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.data_knowledge.bags.file import read_messages
 
 pytest.importorskip("mcap")

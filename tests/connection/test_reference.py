@@ -6,9 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from failuretwin.connection.links.commands import SampledCommands
-from failuretwin.connection.links.values import CommandSent
-from failuretwin.connection.reference import LiveReference
+from failuretwin.connection.links.base import CommandSent
+from failuretwin.connection.links.live_commands import LiveReference, SampledCommands
 from failuretwin.core.movements import Movements
 
 

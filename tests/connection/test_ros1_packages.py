@@ -21,7 +21,7 @@ def test_of_debians_modules_only_those_of_ros_are_seen():
         pytest.skip("this is Debian's own interpreter, which sees them all")
     code = """
 import importlib.util
-from failuretwin.connection.ros1.packages import load_rospy
+from failuretwin.connection.links.ros1_import import load_rospy
 rospy = load_rospy()
 import numpy
 print(rospy.__file__)

@@ -7,12 +7,10 @@ import time
 import numpy as np
 import pytest
 
-from failuretwin.connection.links.event_queue import EventQueue
-from failuretwin.connection.links.ros_topics import RosTopics
-from failuretwin.connection.links.values import OK, STALE, Answer, CommandSent, Reading
-from failuretwin.connection.ros1.sinks import Ros1Diagnostics, Ros1Robot
-from failuretwin.connection.ros1.source import Ros1Source
-from failuretwin.core.diagnosis import Diagnosis
+from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, EventQueue, Reading
+from failuretwin.connection.links.ros1 import Ros1Diagnostics, Ros1Robot, Ros1Source
+from failuretwin.connection.links.ros_messages import RosTopics
+from failuretwin.core.hypothesis import Diagnosis
 from little_logs import LOG_COLUMNS
 from ros_peer import RosPeer
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from failuretwin.connection.links import rosbridge
-from failuretwin.connection.links.ros_topics import RosTopics
-from failuretwin.connection.links.values import OK, Answer
-from failuretwin.core.diagnosis import Diagnosis
+from failuretwin.connection.links.base import OK, Answer
+from failuretwin.connection.links.ros_messages import RosTopics
 from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Diagnosis
 from fake_rosbridge import FakeRosbridge
 from roscores import free_port
 

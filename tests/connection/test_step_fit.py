@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from failuretwin.connection.calibration.step_parameters import fit_steps
-from failuretwin.connection.calibration.step_shape import (
+from failuretwin.connection.calibration.step_parameters import (
+    fit_steps,
     mean_interval,
     overshoot,
     settling_time,

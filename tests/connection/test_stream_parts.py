@@ -9,7 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from failuretwin.connection.links.diagnostic_status import (
+from failuretwin.connection.links.base import (
+    OK,
+    STALE,
+    Answer,
+    CommandSent,
+    EventQueue,
+    Pace,
+    Reading,
+    StreamClock,
+)
+from failuretwin.connection.links.diagnostics import (
     LEVEL_ERROR,
     LEVEL_OK,
     LEVEL_STALE,
@@ -18,14 +28,10 @@ from failuretwin.connection.links.diagnostic_status import (
     Status,
     statuses,
 )
-from failuretwin.connection.links.event_queue import EventQueue
-from failuretwin.connection.links.pace import Pace
-from failuretwin.connection.links.ros_topics import RosTopics, load_topics
-from failuretwin.connection.links.stream_clock import StreamClock
-from failuretwin.connection.links.values import OK, STALE, Answer, CommandSent, Reading
-from failuretwin.connection.sequencer import Sequencer
-from failuretwin.core.diagnosis import Diagnosis
+from failuretwin.connection.links.live_commands import Sequencer
+from failuretwin.connection.links.ros_messages import RosTopics, load_topics
 from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Diagnosis
 
 YEAR_S = 3.15e7
 

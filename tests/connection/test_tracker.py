@@ -20,14 +20,21 @@ from worn_robot import (
 )
 
 from failuretwin.connection.calibration.observations import observe
-from failuretwin.connection.healthy import PATH_NOISE_M
-from failuretwin.connection.run_evidence import RunEvidence, run_evidence
-from failuretwin.connection.sudden_change import sudden_change
-from failuretwin.connection.tracker import DECLARED_NATS, DELAY, MOST_SCORE
-from failuretwin.connection.wear import WearLimits, WearState, learn, wear_unit, worn_settling
+from failuretwin.connection.wear import (
+    RunEvidence,
+    WearLimits,
+    WearState,
+    learn,
+    run_evidence,
+    sudden_change,
+    wear_unit,
+    worn_settling,
+)
+from failuretwin.connection.wear_tracker import DECLARED_NATS, DELAY, MOST_SCORE
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.reading import read_runs
-from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, load_imperfections
+from failuretwin.data_knowledge.read import read_runs
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, load_imperfections
+from failuretwin.inference.healthy_model import PATH_NOISE_M
 
 STATIC = WearLimits(rate=0.0, reach=1e3, limit=1e3)
 BY = pytest.mark.parametrize("readings", [False, True], ids=["tool path", "readings"])

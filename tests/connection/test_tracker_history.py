@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 from worn_robot import CALIBRATION, evidence_of, follow_all, fresh, truth
 
-from failuretwin.connection.run_evidence import RunEvidence
-from failuretwin.connection.tracker_history import append_history, history_path, read_history
-from failuretwin.connection.wear import WearLimits
+from failuretwin.connection.wear import RunEvidence, WearLimits
+from failuretwin.connection.wear_history import append_history, history_path, read_history
 from failuretwin.core.errors import InputError, OutputError
 
 RUNS = 90
@@ -124,7 +123,7 @@ from pathlib import Path
 import numpy as np
 from failuretwin import load_robot
 from worn_robot import evidence_of, follow_all, fresh, truth
-from failuretwin.connection.tracker_history import append_history, read_history
+from failuretwin.connection.wear_history import append_history, read_history
 robot = load_robot("armpi_fpv")
 start = fresh(robot)
 evidence = evidence_of(robot, truth(90), 0)

@@ -8,11 +8,11 @@ import numpy as np
 
 from failuretwin import DigitalTwin
 from failuretwin.connection.calibration.observations import Observations
-from failuretwin.connection.healthy import PATH_NOISE_M
-from failuretwin.connection.run_evidence import run_evidence
-from failuretwin.connection.tracker import Tracker
-from failuretwin.digital_model.imperfections import Imperfections, Variation
+from failuretwin.connection.wear import run_evidence
+from failuretwin.connection.wear_tracker import Tracker
+from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.digital_model.settling import Settling
+from failuretwin.inference.healthy_model import PATH_NOISE_M
 
 COUNT = np.deg2rad(0.24)
 MOVEMENTS = 5

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import json
 
-from failuretwin.core.diagnosis import Diagnosis
+from failuretwin.core.hypothesis import Diagnosis
 
 POSTERIOR = {"healthy": 0.2, "motor_3:stuck": 0.7, "unknown": 0.1}
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from failuretwin.core.ellipsoid import Ellipsoid, log_fall, log_norm
+from failuretwin.core.numerics import Ellipsoid, log_fall, log_norm
 
 DOFS = [1.0, 2.5, 4.0, 30.0, np.inf]
 

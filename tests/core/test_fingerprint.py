@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from failuretwin.core.fingerprint import canonical, fingerprint
+from failuretwin.core.config import canonical, fingerprint
 
 
 @dataclass(frozen=True)

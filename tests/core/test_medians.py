@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from failuretwin.core.medians import masked_median
+from failuretwin.core.numerics import masked_median
 
 
 @given(st.integers(1, 9), st.integers(0, 2**9 - 1), st.integers(0, 99))

@@ -7,12 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.special import logsumexp
 
-from failuretwin.core.quadrature import (
-    log_of,
-    log_sum,
-    log_trapezoid_weights,
-    weighted_quantiles,
-)
+from failuretwin.core.numerics import log_of, log_sum, log_trapezoid_weights, weighted_quantiles
 
 logs = st.floats(-800, 800) | st.just(-np.inf)
 grids = arrays(np.float64, (3, 4, 5), elements=logs)

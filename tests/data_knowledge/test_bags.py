@@ -11,12 +11,11 @@ from failuretwin import BayesDiagnoser
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.data_knowledge.bags.reading import BagTopics, is_bag, read_bag
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.data_knowledge.raw_session import read_session
+from failuretwin.data_knowledge.bags.read import BagTopics, is_bag, read_bag
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.data_knowledge.raw_sessions import read_session
 from failuretwin.data_knowledge.timed_log import Targets, timed_run
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.digital_model.nonidealities import load_imperfections
 
 pytest.importorskip("rosbags", reason="needs rosbags")
 

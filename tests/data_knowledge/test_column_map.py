@@ -8,10 +8,9 @@ from failuretwin import BayesDiagnoser, DigitalTwin, ReadOptions, load_robot, re
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.column_guess import column_map_text, guess_columns
-from failuretwin.data_knowledge.column_map import read_column_map
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.data_knowledge.csv_log import read_column_map
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.nonidealities import load_imperfections
 
 ARMS = ("armpi_fpv", "ur5e", "panda", "so101")
 MAP = """

@@ -17,10 +17,9 @@ from failuretwin.core.hypothesis import (
     paper_hypotheses,
 )
 from failuretwin.core.runs import check_runs
-from failuretwin.data_knowledge import generation
-from failuretwin.data_knowledge.generation import iterate, simulate, simulate_runs
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.data_knowledge import generate as generation
+from failuretwin.data_knowledge.generate import Plan, iterate, simulate, simulate_runs
+from failuretwin.digital_model.nonidealities import load_imperfections
 from failuretwin.failure_behavior.modes import MODES
 
 BOTH = pytest.mark.parametrize("imperfections", ["none", "armpi_fpv"])

@@ -9,8 +9,7 @@ import pytest
 from scipy import stats
 
 from failuretwin.core.hypothesis import HEALTHY
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
+from failuretwin.data_knowledge.generate import Plan, simulate
 
 RUNS = 500
 COUNT = np.deg2rad(0.24)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from failuretwin.core.hypothesis import HEALTHY, MAGNITUDE_UNITS, UNKNOWN, Hypothesis
-from failuretwin.data_knowledge.knowledge import failure_modes, plain_name, prior_odds
+from failuretwin.data_knowledge.failure_modes import failure_modes, plain_name, prior_odds
 
 
 def test_every_fault_mode_has_a_complete_row():

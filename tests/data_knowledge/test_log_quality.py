@@ -9,10 +9,9 @@ import pytest
 
 from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.log_quality import log_quality
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.digital_model.imperfections import Readings, load_imperfections
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.nonidealities import Readings, load_imperfections
+from failuretwin.inference.log_quality import log_quality
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
-from failuretwin.data_knowledge.moving_evidence import MOST_READINGS, moving_evidence
-from failuretwin.data_knowledge.settled_evidence import settled_evidence
+from failuretwin.inference.evidence import MOST_READINGS, moving_evidence, settled_evidence
 
 STARTS = np.array([0.03, 2.05, 4.06])
 TARGETS = np.array([[0.5, -0.3], [-0.4, 0.2], [0.1, 0.6]])

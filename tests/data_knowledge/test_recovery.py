@@ -10,17 +10,16 @@ from failuretwin import DigitalTwin, ReadOptions, read_runs
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
-from failuretwin.data_knowledge.generation import simulate_runs
-from failuretwin.data_knowledge.plan import Plan
+from failuretwin.data_knowledge.generate import Plan, simulate_runs
 from failuretwin.data_knowledge.recovery.commands import (
     path_error,
     published_time,
     published_time_bases,
     recover_movements,
 )
+from failuretwin.data_knowledge.recovery.fit import Free, PathPart, Ramps, fit_ramps
 from failuretwin.data_knowledge.recovery.inverse_kinematics import plane_arm
-from failuretwin.data_knowledge.recovery.ramp_fit import Free, PathPart, Ramps, fit_ramps
-from failuretwin.digital_model.imperfections import default_imperfections
+from failuretwin.digital_model.nonidealities import default_imperfections
 
 FROM_ZERO = np.linspace(0.0, 10.0, 1000)
 FROM_FIRST_STEP = np.arange(1, 1001) * 0.01

@@ -17,13 +17,12 @@ import xarray as xr
 from failuretwin import read_runs
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge import run_factory, run_pieces
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.lock import sole_writer
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.data_knowledge.run_factory import produce
-from failuretwin.data_knowledge.store import load_run_set, save_run_set
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.data_knowledge import resumable as run_factory
+from failuretwin.data_knowledge import resumable as run_pieces
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.data_knowledge.resumable import produce
+from failuretwin.data_knowledge.store import load_run_set, save_run_set, sole_writer
+from failuretwin.digital_model.nonidealities import load_imperfections
 
 RUNS_PER_CLASS = 2
 PIECE = 4
@@ -250,7 +249,7 @@ def test_nothing_done_leaves_nothing(monkeypatch, tmp_path, imperfect):
 HOLD = """
 import sys, time
 from pathlib import Path
-from failuretwin.data_knowledge.lock import sole_writer
+from failuretwin.data_knowledge.store import sole_writer
 with sole_writer(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(60)
@@ -301,8 +300,8 @@ import resource, sys
 from pathlib import Path
 from failuretwin import load_robot
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.data_knowledge.run_factory import produce
+from failuretwin.data_knowledge.generate import Plan
+from failuretwin.data_knowledge.resumable import produce
 produce(Plan(load_robot("armpi_fpv"), [Hypothesis()], int(sys.argv[2])), Path(sys.argv[1]))
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
@@ -328,9 +327,9 @@ import sys
 from pathlib import Path
 from failuretwin import load_robot
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.data_knowledge.run_factory import produce
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.data_knowledge.generate import Plan
+from failuretwin.data_knowledge.resumable import produce
+from failuretwin.digital_model.nonidealities import load_imperfections
 robot = load_robot("armpi_fpv")
 known = load_imperfections("armpi_fpv", robot)
 plan = Plan(robot, paper_hypotheses(robot.motor_names), 20, 5, known)

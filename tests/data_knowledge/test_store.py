@@ -13,11 +13,10 @@ from failuretwin import read_runs
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.runs import RunTable, Truth
-from failuretwin.data_knowledge import swap
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
+from failuretwin.data_knowledge import store as swap
+from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.digital_model.nonidealities import load_imperfections
 
 SUFFIXES = pytest.mark.parametrize("suffix", [".nc", ".zarr"])
 names = st.text(st.characters(codec="utf-8", exclude_categories=["C"]), min_size=1, max_size=20)

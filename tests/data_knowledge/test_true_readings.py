@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
-from failuretwin.data_knowledge.log_quality import log_quality
-from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.data_knowledge.true_readings import true_readings
+from failuretwin.inference.evidence import settled_evidence
+from failuretwin.inference.log_quality import log_quality
+from failuretwin.inference.readings import true_readings
 
 STARTS = np.array([0.03, 2.05, 4.06, 6.07])
 TARGETS = np.array([[0.5, -0.3], [-0.4, 0.2], [0.1, 0.6], [0.7, -0.5]])

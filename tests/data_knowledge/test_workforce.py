@@ -14,12 +14,11 @@ import pytest
 
 from failuretwin.core.errors import FailureTwinError, InputError, OutputError
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge import dask_client
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.data_knowledge.run_factory import produce
-from failuretwin.data_knowledge.workforce import Workforce
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.data_knowledge import workers as dask_client
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.data_knowledge.resumable import produce
+from failuretwin.data_knowledge.workers import Workforce
+from failuretwin.digital_model.nonidealities import load_imperfections
 
 PIECE = 4
 NOBODY = "tcp://127.0.0.1:1"
@@ -160,10 +159,10 @@ import sys
 from pathlib import Path
 from failuretwin import load_robot
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.data_knowledge.run_factory import produce
-from failuretwin.data_knowledge.workforce import Workforce
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.data_knowledge.generate import Plan
+from failuretwin.data_knowledge.resumable import produce
+from failuretwin.data_knowledge.workers import Workforce
+from failuretwin.digital_model.nonidealities import load_imperfections
 robot = load_robot("armpi_fpv")
 known = load_imperfections("armpi_fpv", robot)
 plan = Plan(robot, paper_hypotheses(robot.motor_names), 20, 5, known)

@@ -9,7 +9,7 @@ import numpy as np
 from failuretwin import DigitalTwin
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
-from failuretwin.digital_model.imperfections import Imperfections
+from failuretwin.digital_model.nonidealities import Imperfections
 
 FINE_S = 0.005
 """Step at which motions are computed [s]."""

@@ -9,20 +9,17 @@ import pytest
 from coaxial_arm import ARM_M, coaxial_twin
 
 from failuretwin import BayesDiagnoser, ambiguity
-from failuretwin.connection.healthy import HealthyModel
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses, single_faults
 from failuretwin.core.movements import Movements
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.decision.hypotheses.priors import Priors
-from failuretwin.decision.telling_apart.ambiguity import _groups, _motions
-from failuretwin.decision.telling_apart.noise_free_scene import shrink
-from failuretwin.decision.telling_apart.separation import Judge
-from failuretwin.decision.telling_apart.trials import Trials
-from failuretwin.digital_model.imperfections import Imperfections, Readings
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.nonidealities import Imperfections, Readings
 from failuretwin.digital_model.settling import Settling
 from failuretwin.failure_behavior.modes import MODES, SteadyStateError
+from failuretwin.inference.expected_bayes_factors import Judge, shrink
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.isolability import Trials, _groups, _motions
+from failuretwin.inference.priors import Priors
 
 TIME = 0.01 * np.arange(1000)
 TARGETS = np.array(

@@ -9,14 +9,14 @@ import xarray as xr
 from failuretwin import BayesDiagnoser, DigitalTwin
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision import bayes
-from failuretwin.decision.evidence.scene import Scene
-from failuretwin.decision.hypotheses.laws import steady_state_error, stuck
-from failuretwin.decision.hypotheses.priors import Priors, priors_of
-from failuretwin.digital_model.imperfections import default_imperfections
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.nonidealities import default_imperfections
+from failuretwin.inference import diagnoser as bayes
+from failuretwin.inference import fault_models as steady_state_error
+from failuretwin.inference import stuck
+from failuretwin.inference.evidence import settled_evidence
+from failuretwin.inference.priors import Priors, priors_of
+from failuretwin.inference.run_likelihood import Scene
 
 PAPER = [str(h) for h in paper_hypotheses([f"motor_{k}" for k in range(1, 5)])]
 COUNT = np.deg2rad(0.24)

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.errors import InputError
-from failuretwin.decision.learned.blend import Weights, blended, fit_weights, gated
-from failuretwin.decision.learned.hybrid import HybridDiagnoser
+from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.decision.learned.diagnoser import HybridDiagnoser
+from failuretwin.decision.learned.posteriors import Weights, blended, fit_weights, gated
 
 CLASSES = ("healthy", "motor_1:stuck", "motor_2:stuck")
 

@@ -7,9 +7,8 @@ import pytest
 
 from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import parse_hypotheses, single_faults
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.failure_behavior.modes.offsets import EncoderBias, EncoderScale
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.failure_behavior.modes import EncoderBias, EncoderScale
 
 LARGE = {
     "encoder_bias": EncoderBias(magnitude=(0.4, 0.7), onset_s=(0.0, 0.0)),

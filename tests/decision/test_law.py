@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 
-from failuretwin.decision.hypotheses.weight import given_others, posterior_of
+from failuretwin.inference.marginal import given_others, posterior_of
 
 
 def problem(seed, movements, cells, ways):

@@ -7,19 +7,24 @@ from hypothesis import strategies as st
 
 from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import UNKNOWN, Hypothesis, single_faults
-from failuretwin.data_knowledge.knowledge import magnitude_range
-from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision.evidence.scene import Scene
-from failuretwin.decision.hypotheses import pairs
-from failuretwin.decision.hypotheses.laws.drift import drift_law
-from failuretwin.decision.hypotheses.laws.lasting import AMOUNTS, lasting_law
-from failuretwin.decision.hypotheses.laws.nodes import size_nodes
-from failuretwin.decision.hypotheses.laws.steady_state_error import error_law, offset_nodes
-from failuretwin.decision.hypotheses.laws.stuck import stuck_law
-from failuretwin.decision.hypotheses.laws.timed import lag_law, slow_law
-from failuretwin.decision.hypotheses.onsets import OnsetPrior
-from failuretwin.decision.hypotheses.priors import Priors
-from failuretwin.decision.hypotheses.weighing import WEIGHABLE, weigh_all, weigh_hypothesis
+from failuretwin.data_knowledge.failure_modes import magnitude_range
+from failuretwin.inference import double_faults as pairs
+from failuretwin.inference.evidence import settled_evidence
+from failuretwin.inference.fault_models import (
+    AMOUNTS,
+    drift_law,
+    error_law,
+    lag_law,
+    lasting_law,
+    offset_nodes,
+    size_nodes,
+    slow_law,
+)
+from failuretwin.inference.onset import OnsetPrior
+from failuretwin.inference.posterior import WEIGHABLE, weigh_all, weigh_hypothesis
+from failuretwin.inference.priors import Priors
+from failuretwin.inference.run_likelihood import Scene
+from failuretwin.inference.stuck import stuck_law
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 RANGES = ((0.02, 0.08), (0.04, 0.2))

@@ -11,17 +11,13 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.decision.learned import stream as stream_module
-from failuretwin.decision.learned.encoder import Encoder
-from failuretwin.decision.learned.estimator import LearnedDiagnoser
-from failuretwin.decision.learned.recipe import Recipe
-from failuretwin.decision.learned.robust_features import expectation_of
-from failuretwin.decision.learned.signals import signals_of
-from failuretwin.decision.learned.stream import CHUNK_RUNS, Stream
-from failuretwin.decision.learned.temperature import best_temperature, probabilities
-from failuretwin.decision.learned.training import Standard
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.decision.learned import networks as stream_module
+from failuretwin.decision.learned.data import Recipe
+from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
+from failuretwin.decision.learned.features import Encoder, expectation_of, signals_of
+from failuretwin.decision.learned.networks import CHUNK_RUNS, Standard, Stream
+from failuretwin.decision.learned.posteriors import best_temperature, probabilities
 
 
 @parametrize_with_checks([LearnedDiagnoser(iterations=60, learning_rate=5e-3, random_state=0)])

@@ -12,16 +12,12 @@ import torch
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.decision.learned.blend import Weights
-from failuretwin.decision.learned.encoder import Encoder
-from failuretwin.decision.learned.estimator import LearnedDiagnoser
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
+from failuretwin.decision.learned.export import export_numpy, export_onnx
+from failuretwin.decision.learned.features import Encoder, expectation_of, signals_of
 from failuretwin.decision.learned.networks import NETWORKS
-from failuretwin.decision.learned.numpy_export import export_numpy
-from failuretwin.decision.learned.onnx_export import export_onnx
-from failuretwin.decision.learned.robust_features import expectation_of
-from failuretwin.decision.learned.signals import signals_of
+from failuretwin.decision.learned.posteriors import Weights
 from failuretwin.decision.learned.storage import load_network, save_network
 
 ALL = pytest.mark.parametrize("network", list(NETWORKS))

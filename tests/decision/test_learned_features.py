@@ -7,18 +7,17 @@ import pytest
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.decision.learned.encoder import Encoder
-from failuretwin.decision.learned.robust_features import (
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.decision.learned.features import (
     DISTANCE_M,
     PER_MOTOR,
     TURN_RAD,
+    Encoder,
     expectation_of,
     joint_frames,
+    signals_of,
 )
-from failuretwin.decision.learned.signals import signals_of
-from failuretwin.digital_model.imperfections import Imperfections, Readings
+from failuretwin.digital_model.nonidealities import Imperfections, Readings
 from failuretwin.digital_model.settling import Settling
 
 SAGGING = Imperfections(

@@ -5,13 +5,14 @@ import pytest
 import torch
 
 from failuretwin.core.errors import InputError
-from failuretwin.decision.learned.encoder import Encoder
-from failuretwin.decision.learned.networks import NETWORKS, Shape, build_network
-from failuretwin.decision.learned.recipe import VARIANTS, Recipe, widened
-from failuretwin.decision.learned.robust_features import expectation_of
-from failuretwin.decision.learned.training import (
+from failuretwin.decision.learned.data import VARIANTS, Recipe, widened
+from failuretwin.decision.learned.features import Encoder, expectation_of
+from failuretwin.decision.learned.networks import (
+    NETWORKS,
     Pace,
+    Shape,
     Standard,
+    build_network,
     scores_of,
     shuffled_batches,
     training,
@@ -143,7 +144,7 @@ def test_small_errors_come_most_often():
 
 
 def test_widened_robots_differ_more(armpi):
-    from failuretwin.digital_model.imperfections import load_imperfections
+    from failuretwin.digital_model.nonidealities import load_imperfections
 
     known = load_imperfections("armpi_fpv", armpi)
     wide = widened(known, 3.0)

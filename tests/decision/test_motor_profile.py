@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from failuretwin.connection.healthy import PATH_NOISE_M, HealthyModel
-from failuretwin.connection.lost_commands import OUTLIER_RATE
-from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision.evidence.scene import Scene
-from failuretwin.digital_model.imperfections import Imperfections, LostCommand
+from failuretwin.digital_model.nonidealities import Imperfections, LostCommand
 from failuretwin.digital_model.settling import Settling
+from failuretwin.inference.command_loss import OUTLIER_RATE
+from failuretwin.inference.evidence import settled_evidence
+from failuretwin.inference.healthy_model import PATH_NOISE_M, HealthyModel
+from failuretwin.inference.run_likelihood import Scene
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 SCATTER = np.array([0.005, 0.006, 0.005, 0.004])

@@ -9,15 +9,15 @@ import pytest
 from scipy import integrate, stats
 from small_arms import GANTRY, small_twin
 
-from failuretwin.connection.healthy import HealthyModel
 from failuretwin.core.movements import Movements
-from failuretwin.data_knowledge.settled_evidence import SettledEvidence, settled_evidence
-from failuretwin.decision.evidence.scene import Scene
-from failuretwin.decision.evidence.two_angles import two_angles
-from failuretwin.decision.hypotheses.laws.off_anyhow import weigh_off_anyhow
-from failuretwin.decision.hypotheses.laws.two_amounts import Belief
-from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, Imperfections
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfections
 from failuretwin.digital_model.settling import Settling
+from failuretwin.inference.evidence import SettledEvidence, settled_evidence
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.run_likelihood import Scene
+from failuretwin.inference.two_joint_likelihood import two_angles
+from failuretwin.inference.unknown import weigh_off_anyhow
+from failuretwin.inference.unmodelled_offsets import Belief
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 SCATTER = np.array([0.005, 0.006, 0.005, 0.004])

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
-from failuretwin.decision.hypotheses.onsets import OnsetPrior, Stretches, at_movement_starts
-from failuretwin.decision.hypotheses.priors import Priors
+from failuretwin.inference.onset import OnsetPrior, Stretches, at_movement_starts
+from failuretwin.inference.priors import Priors
 
 lengths = st.lists(st.floats(0.0, 5.0), min_size=1, max_size=8)
 earlies = st.floats(0.0, 1.0)

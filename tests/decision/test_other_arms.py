@@ -9,15 +9,9 @@ import pytest
 from small_arms import GANTRY, SCARA, small_twin
 
 from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
-from failuretwin.connection.healthy import HealthyModel
 from failuretwin.core.hypothesis import UNKNOWN, paper_hypotheses, single_faults
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision import bayes
-from failuretwin.decision.evidence.scene import Scene
-from failuretwin.decision.hypotheses.weighing import WEIGHABLE
-from failuretwin.digital_model.imperfections import (
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.nonidealities import (
     NO_IMPERFECTIONS,
     Readings,
     default_imperfections,
@@ -25,6 +19,11 @@ from failuretwin.digital_model.imperfections import (
 )
 from failuretwin.failure_behavior.modes import MODES, SteadyStateError
 from failuretwin.failure_behavior.random_movements import RandomMovements
+from failuretwin.inference import diagnoser as bayes
+from failuretwin.inference.evidence import settled_evidence
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.posterior import WEIGHABLE
+from failuretwin.inference.run_likelihood import Scene
 
 KINDS = {
     "none": lambda robot: NO_IMPERFECTIONS,

@@ -5,14 +5,13 @@ import pytest
 
 from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision.evidence.scene import Scene
-from failuretwin.decision.hypotheses.onsets import OnsetPrior
-from failuretwin.decision.hypotheses.priors import Priors
-from failuretwin.decision.hypotheses.weighing import weigh_hypothesis
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.inference.evidence import settled_evidence
+from failuretwin.inference.onset import OnsetPrior
+from failuretwin.inference.posterior import weigh_hypothesis
+from failuretwin.inference.priors import Priors
+from failuretwin.inference.run_likelihood import Scene
 
 PAIRS = tuple(
     Hypothesis.parse(text)
@@ -76,10 +75,10 @@ def test_a_single_fault_is_not_taken_for_two(twin, imperfect, found):
 @pytest.mark.parametrize("one", ["stuck", "steady_state_error", "encoder_scale"])
 def test_a_second_fault_that_cannot_show_changes_nothing(twin, imperfect, monkeypatch, one, other):
     """A fault of motor 4 whose only size is nothing leaves what is said of a fault of motor 1."""
-    from failuretwin.core.quadrature import log_of
-    from failuretwin.decision.hypotheses import weighing
-    from failuretwin.decision.hypotheses.law import Law
-    from failuretwin.decision.hypotheses.onsets import at_once
+    from failuretwin.core.numerics import log_of
+    from failuretwin.inference import posterior as weighing
+    from failuretwin.inference.marginal import Law
+    from failuretwin.inference.onset import at_once
 
     def nothing(scene, motor, priors):
         stretches = at_once(scene.evidence)

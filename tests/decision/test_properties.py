@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from failuretwin import BayesDiagnoser, DigitalTwin
 from failuretwin.core.hypothesis import paper_hypotheses, single_faults
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.digital_model.imperfections import default_imperfections
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.nonidealities import default_imperfections
 
 MODES = ("stuck", "steady_state_error", "encoder_bias", "lost_commands")
 

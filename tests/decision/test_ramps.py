@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from failuretwin.connection.healthy import HealthyModel
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
-from failuretwin.data_knowledge.moving_evidence import moving_evidence
-from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision.evidence.ramps import (
+from failuretwin.digital_model.nonidealities import Imperfections, Readings, Timing
+from failuretwin.digital_model.settling import Settling
+from failuretwin.inference.evidence import moving_evidence, settled_evidence
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.transient_likelihood import (
     DOF,
     GLITCH_RATE,
     ROUGHNESS_M,
@@ -18,8 +19,6 @@ from failuretwin.decision.evidence.ramps import (
     RampModel,
     Ramps,
 )
-from failuretwin.digital_model.imperfections import Imperfections, Readings, Timing
-from failuretwin.digital_model.settling import Settling
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 SCATTER = np.array([0.005, 0.006, 0.005, 0.004])

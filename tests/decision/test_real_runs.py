@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from failuretwin import BayesDiagnoser, ReadOptions, read_runs
-from failuretwin.decision.hypotheses.priors import priors_of
+from failuretwin.inference.priors import priors_of
 
 BOTH = pytest.mark.parametrize("how", ["measured", "published"])
 

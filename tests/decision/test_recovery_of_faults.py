@@ -11,11 +11,10 @@ from scipy import stats
 
 from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.knowledge import magnitude_range
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.digital_model.imperfections import Imperfections, load_imperfections
-from failuretwin.failure_behavior.course import STEP
+from failuretwin.data_knowledge.failure_modes import magnitude_range
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.nonidealities import Imperfections, load_imperfections
+from failuretwin.failure_behavior.fault import STEP
 from failuretwin.failure_behavior.modes import MODES
 
 RUNS = 12

@@ -5,16 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from failuretwin.connection.healthy import HealthyModel
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.noise_free import without_chance
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.decision.hypotheses.priors import Priors
-from failuretwin.decision.telling_apart.separation import Judge, separation, truth_and_faults
-from failuretwin.digital_model.imperfections import default_imperfections
+from failuretwin.data_knowledge.generate import Plan, simulate, without_chance
+from failuretwin.digital_model.nonidealities import default_imperfections
 from failuretwin.failure_behavior.modes import MODES
+from failuretwin.inference.expected_bayes_factors import Judge, separation, truth_and_faults
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.priors import Priors
 
 SETTLED = ("stuck", "encoder_bias", "encoder_scale", "backlash", "torque_loss", "drift")
 """Modes whose members settle exactly somewhere, that is, with nothing drawn for each movement."""

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from failuretwin.decision.hypotheses.laws.nodes import size_nodes
+from failuretwin.inference.fault_models import size_nodes
 
 LOW, HIGH = 0.02, 0.85
 pointed = arrays(np.float64, (2, 3), elements=st.floats(-2, 2))

@@ -13,16 +13,15 @@ from failuretwin.core.hypothesis import (
     paper_hypotheses,
     single_faults,
 )
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.data_knowledge.settled_evidence import settled_evidence
-from failuretwin.decision.evidence.scene import Scene
-from failuretwin.decision.hypotheses import weighing
-from failuretwin.decision.hypotheses.laws.unknown import LEFT_OUT, weigh_unknown
-from failuretwin.decision.hypotheses.weighing import weigh_all
-from failuretwin.decision.hypotheses.weight import Weight
-from failuretwin.decision.telling_apart.separation import separation
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.inference import posterior as weighing
+from failuretwin.inference.evidence import settled_evidence
+from failuretwin.inference.expected_bayes_factors import separation
+from failuretwin.inference.marginal import Weight
+from failuretwin.inference.posterior import weigh_all
+from failuretwin.inference.run_likelihood import Scene
+from failuretwin.inference.unknown import LEFT_OUT, weigh_unknown
 
 TWO_AT_ONCE = (
     Hypothesis.parse("motor_1:steady_state_error+motor_3:steady_state_error"),
@@ -121,7 +120,7 @@ def test_unknown_counts_its_best_explanation_alone(diagnoser, imperfect):
 
 
 def test_without_evidence_unknown_is_as_rare_as_it_was(diagnoser, imperfect):
-    from failuretwin.decision.hypotheses.weighing import log_prior
+    from failuretwin.inference.posterior import log_prior
 
     blind = imperfect.isel(run=[0])
     blind = blind.assign(measured=np.nan * blind["measured"])

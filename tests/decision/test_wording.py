@@ -3,10 +3,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from failuretwin.core.diagnosis import Diagnosis, MovementEvidence
-from failuretwin.core.hypothesis import HEALTHY, MAGNITUDE_UNITS, UNKNOWN, Fault, Hypothesis
-from failuretwin.decision.hypotheses.weighing import WEIGHABLE
-from failuretwin.decision.wording import (
+from failuretwin.core.hypothesis import (
+    HEALTHY,
+    MAGNITUDE_UNITS,
+    UNKNOWN,
+    Diagnosis,
+    Fault,
+    Hypothesis,
+    MovementEvidence,
+)
+from failuretwin.inference.explanation import (
     SURE,
     explanation,
     percent,
@@ -14,6 +20,7 @@ from failuretwin.decision.wording import (
     size_words,
     verdict,
 )
+from failuretwin.inference.posterior import WEIGHABLE
 
 SIZED = {
     "stuck": (np.deg2rad(-12.3), "motor 3 stuck at -12 deg since 2.5 s, 98 % sure"),

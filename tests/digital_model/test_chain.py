@@ -8,10 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from failuretwin.core.errors import InputError
-from failuretwin.digital_model.chain import SerialChain, rotation_to_z
+from failuretwin.digital_model.kinematics import CHUNK, SerialChain, rotation_to_z
 from failuretwin.digital_model.robot import bundled_folder
 from failuretwin.digital_model.urdf import read_urdf
-from failuretwin.digital_model.vectors import CHUNK
 
 SAME_PLACE_M = 1e-9
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from failuretwin.digital_model.holding import hold
+from failuretwin.digital_model.settling import hold
 
 STEP = 0.01
 LIMIT = np.array([1.5, 4.0])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from failuretwin.core.errors import InputError
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.digital_model.nonidealities import load_imperfections
 
 HEAD = 'name = "own"\nsource = "test"\n'
 NONSENSE = {

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from failuretwin.digital_model.limited_servo import respond_limited
-from failuretwin.digital_model.servo import ServoLoop, respond
+from failuretwin.digital_model.servo import ServoLoop, respond, respond_limited
 
 LOOP = ServoLoop(P=0.25, I=30.0, filter_s=0.011)
 STEP_S = 0.002

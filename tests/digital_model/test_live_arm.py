@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from failuretwin.digital_model.engine import Drive
-from failuretwin.digital_model.imperfections import Schedule
-from failuretwin.digital_model.physics.engine import PhysicsEngine
-from failuretwin.digital_model.physics.live_arm import LiveArm
+from failuretwin.digital_model.nonidealities import Schedule
+from failuretwin.digital_model.physics.engine import LiveArm, PhysicsEngine
+from failuretwin.digital_model.twin import Drive
 from failuretwin.failure_behavior.random_movements import RandomMovements
 
 pytest.importorskip("mujoco")

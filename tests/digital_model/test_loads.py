@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from failuretwin import load_robot
-from failuretwin.digital_model.loads import GRAVITY, loads_of
+from failuretwin.digital_model.gravity import GRAVITY, loads_of
 from failuretwin.digital_model.robot import bundled_robots
-from failuretwin.digital_model.urdf import read_root, read_urdf
-from failuretwin.digital_model.urdf_links import read_links
+from failuretwin.digital_model.urdf import read_links, read_root, read_urdf
 
 SLIDER = """<robot name="slider">
   <link name="base"/>

@@ -12,14 +12,17 @@ from hypothesis.extra.numpy import arrays
 
 from failuretwin import load_robot
 from failuretwin.core.errors import InputError
-from failuretwin.digital_model.engine import Drive
-from failuretwin.digital_model.physics.arm import GRAVITY_M_S2, TOOL, arm_spec
-from failuretwin.digital_model.physics.derived import SAG_RAD, default_parameters
-from failuretwin.digital_model.physics.engine import PhysicsEngine
-from failuretwin.digital_model.physics.model import build_model
-from failuretwin.digital_model.physics.parameters import load_parameters
-from failuretwin.digital_model.physics.setpoint import filtered, limit_speed, refine
+from failuretwin.digital_model.physics.batch import filtered, limit_speed, refine
+from failuretwin.digital_model.physics.engine import SAG_RAD, PhysicsEngine, default_parameters
+from failuretwin.digital_model.physics.model import (
+    GRAVITY_M_S2,
+    TOOL,
+    arm_spec,
+    build_model,
+    load_parameters,
+)
 from failuretwin.digital_model.robot import bundled_robots
+from failuretwin.digital_model.twin import Drive
 
 mujoco = pytest.importorskip("mujoco")
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.digital_model.nonidealities import load_imperfections
 from failuretwin.digital_model.settling import Settling
 
 RAD_PER_COUNT = np.deg2rad(0.24)

@@ -4,11 +4,16 @@ import numpy as np
 import pytest
 
 from failuretwin.core.errors import InputError
-from failuretwin.digital_model.mobility import mobility
-from failuretwin.digital_model.profile_template import movement_range, profile_text, speed_limit
-from failuretwin.digital_model.robot import bundled_folder, load_robot
+from failuretwin.digital_model.robot import (
+    bundled_folder,
+    load_robot,
+    movement_range,
+    profile_text,
+    speed_limit,
+)
 from failuretwin.digital_model.urdf import read_urdf
 from failuretwin.digital_model.urdf_check import check_urdf
+from failuretwin.digital_model.urdf_findings import mobility
 
 
 def link(name, mass="0.5", moment="1e-4", more=""):

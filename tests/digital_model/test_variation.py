@@ -7,10 +7,8 @@ import pytest
 from scipy import stats
 
 from failuretwin.core.errors import InputError
-from failuretwin.digital_model.disturbances import draw_disturbances, stack
-from failuretwin.digital_model.imperfect import lagged
-from failuretwin.digital_model.imperfections import Variation, load_imperfections
-from failuretwin.digital_model.variation import vary
+from failuretwin.digital_model.disturbances import draw_disturbances, lagged, stack
+from failuretwin.digital_model.nonidealities import Variation, load_imperfections, vary
 
 SURE = 1e-3
 RUNS = 2000

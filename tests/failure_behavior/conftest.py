@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from failuretwin.core.hypothesis import MAGNITUDE_UNITS, Fault, Hypothesis
-from failuretwin.data_knowledge.generation import simulate_runs
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, Imperfections
+from failuretwin.data_knowledge.generate import Plan, simulate_runs
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfections
 from failuretwin.digital_model.settling import Settling
 from failuretwin.failure_behavior.modes import MODES
 from failuretwin.failure_behavior.random_movements import RandomMovements

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.integrate import cumulative_trapezoid
 
-from failuretwin.failure_behavior.course import Course, draw_episodes, exposures, severities
+from failuretwin.failure_behavior.fault import Course, draw_episodes, exposures, severities
 
 TIME = np.arange(1000) * 0.01
 EPISODES = ((2.0, 3.0), (4.5, 5.25), (9.0, 12.0))

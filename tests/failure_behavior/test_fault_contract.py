@@ -10,10 +10,9 @@ import pytest
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import HEALTHY, MAGNITUDE_UNITS
-from failuretwin.data_knowledge.generation import simulate_runs
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS
-from failuretwin.failure_behavior.course import PROFILES
+from failuretwin.data_knowledge.generate import Plan, simulate_runs
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
+from failuretwin.failure_behavior.fault import PROFILES
 from failuretwin.failure_behavior.modes import MODES, Drift
 
 TIME = np.arange(1000) * 0.01

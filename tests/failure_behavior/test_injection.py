@@ -7,11 +7,9 @@ import pytest
 
 from failuretwin.core.hypothesis import Fault, Hypothesis
 from failuretwin.core.movements import Movements
-from failuretwin.data_knowledge.generation import simulate_runs
-from failuretwin.data_knowledge.plan import Plan
-from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, load_imperfections
-from failuretwin.failure_behavior.course import Course
-from failuretwin.failure_behavior.fault_value import FaultValue
+from failuretwin.data_knowledge.generate import Plan, simulate_runs
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, load_imperfections
+from failuretwin.failure_behavior.fault import Course, FaultValue
 from failuretwin.failure_behavior.injection import Injection
 from failuretwin.failure_behavior.modes import MODES, SteadyStateError, Stuck
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from failuretwin.failure_behavior.modes import MODES
 
 ENDS = np.arange(200, 1001, 200) - 1

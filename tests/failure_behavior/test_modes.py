@@ -10,9 +10,9 @@ from scipy import stats
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Fault
-from failuretwin.digital_model.holding import hold
-from failuretwin.failure_behavior.course import Course
-from failuretwin.failure_behavior.fault_value import FaultGroup, FaultValue
+from failuretwin.digital_model.settling import hold
+from failuretwin.failure_behavior.fault import Course, FaultGroup, FaultValue
+from failuretwin.failure_behavior.mode import MotorOrders
 from failuretwin.failure_behavior.modes import (
     MODES,
     Backlash,
@@ -23,7 +23,6 @@ from failuretwin.failure_behavior.modes import (
     SteadyStateError,
     Stuck,
 )
-from failuretwin.failure_behavior.modes.base import MotorOrders
 
 COUNT = np.deg2rad(0.24)
 FREEZE = 49

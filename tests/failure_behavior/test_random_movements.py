@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from failuretwin.digital_model.imperfections import Schedule
+from failuretwin.digital_model.nonidealities import Schedule
 from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
 
 RANGE_DEG = np.array([80.0, 50.0, 50.0, 50.0])

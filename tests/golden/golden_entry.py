@@ -9,24 +9,22 @@ from unittest import mock
 import numpy as np
 
 import failuretwin as ft
-from failuretwin.connection.calibration.learn import calibrate
+from failuretwin.connection.calibration.calibrate import calibrate
 from failuretwin.connection.calibration.observations import observe
-from failuretwin.connection.run_evidence import run_evidence
-from failuretwin.connection.tracker import Tracker
+from failuretwin.connection.wear import run_evidence
+from failuretwin.connection.wear_tracker import Tracker
 from failuretwin.core.hypothesis import parse_hypotheses
-from failuretwin.data_knowledge.log_quality import log_quality, without_spoilt
-from failuretwin.data_knowledge.moving_evidence import moving_evidence
-from failuretwin.data_knowledge.settled_evidence import settled_evidence
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
-from failuretwin.decision import bayes, judgement
-from failuretwin.decision.hypotheses.priors import MONITORING, priors_of
-from failuretwin.decision.learned.paper_features import augmented_features, original_features
-from failuretwin.decision.learned.robust_features import RobustFeatures, expectation_of
-from failuretwin.decision.learned.signals import signals_of
+from failuretwin.decision.learned.features import (
+    RobustFeatures,
+    augmented_features,
+    expectation_of,
+    original_features,
+    signals_of,
+)
+from failuretwin.decision.streaming.diagnoser import monitor
 from failuretwin.decision.streaming.fleet import StreamingFleet
-from failuretwin.decision.streaming.streaming import monitor
-from failuretwin.decision.telling_apart.separation import separation
-from failuretwin.digital_model.imperfections import (
+from failuretwin.digital_model.nonidealities import (
     LostCommand,
     Readings,
     default_imperfections,
@@ -34,6 +32,12 @@ from failuretwin.digital_model.imperfections import (
     load_imperfections,
 )
 from failuretwin.failure_behavior.modes import MODES
+from failuretwin.inference import diagnoser as bayes
+from failuretwin.inference import posterior as judgement
+from failuretwin.inference.evidence import moving_evidence, settled_evidence
+from failuretwin.inference.expected_bayes_factors import separation
+from failuretwin.inference.log_quality import log_quality, without_spoilt
+from failuretwin.inference.priors import MONITORING, priors_of
 
 __all__ = [
     "MODES",

@@ -14,15 +14,12 @@ import click
 
 from failuretwin import __version__
 from failuretwin.app.commands.calibrate import calibrate
+from failuretwin.app.commands.data import import_, simulate
 from failuretwin.app.commands.diagnose import diagnose
-from failuretwin.app.commands.emulate import emulate
 from failuretwin.app.commands.evaluate import evaluate
-from failuretwin.app.commands.import_ import import_
+from failuretwin.app.commands.live import emulate, watch
 from failuretwin.app.commands.robot import robot
-from failuretwin.app.commands.simulate import simulate
-from failuretwin.app.commands.study import study
-from failuretwin.app.commands.train import train
-from failuretwin.app.commands.watch import watch
+from failuretwin.app.commands.train import study, train
 from failuretwin.core.errors import FailureTwinError
 
 

@@ -3,28 +3,36 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import click
 
 from failuretwin.app.commands.options import LogOptions
+from failuretwin.connection.calibration.result import Calibration, LeftOut, with_loops
+from failuretwin.connection.calibration.step_parameters import StepFit, fit_steps
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.bags.reading import BagTopics
+from failuretwin.core.hypothesis import Hypothesis, parse_hypotheses
+from failuretwin.data_knowledge.bags.read import BagTopics
 from failuretwin.data_knowledge.column_guess import column_map_text, guess_columns
-from failuretwin.data_knowledge.column_map import read_column_map
-from failuretwin.data_knowledge.matlab_files import RECOVERY_ERROR, RECOVERY_WORST
-from failuretwin.data_knowledge.reading import ReadOptions, read_runs
-from failuretwin.data_knowledge.session_runs import As
+from failuretwin.data_knowledge.csv_log import read_column_map
+from failuretwin.data_knowledge.matlab import RECOVERY_ERROR, RECOVERY_WORST, find_matlab_files
+from failuretwin.data_knowledge.raw_sessions import SESSION_FILES, As
+from failuretwin.data_knowledge.read import ReadOptions, read_runs
+from failuretwin.data_knowledge.step_tests import find_step_tests, read_step_test
 from failuretwin.data_knowledge.store import replacing
-from failuretwin.digital_model.imperfections import GENERIC_NAME
+from failuretwin.decision.learned.diagnoser import Diagnoser, HybridDiagnoser
+from failuretwin.digital_model.nonidealities import GENERIC_NAME
 from failuretwin.digital_model.robot import Robot
+from failuretwin.inference.diagnoser import BayesDiagnoser
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
 
 TOLD_ERROR_M = 1e-6
 """Error of recovered commands that the user is told of [m]; exact ones are below 1e-9."""
@@ -103,4 +111,203 @@ def _with_map(
     raise InputError(
         f"{path} did not exist. The guess above has been written there and nothing was read: check "
         "every line, correct it, and run the same command again."
+    )
+
+
+# What commands need to know of the extra `learn`.
+
+
+def check_learning() -> None:
+    """Raise InputError, saying how to install them, if the learning libraries are missing."""
+    try:
+        import sklearn
+        import torch
+    except ImportError as error:
+        raise InputError(
+            f"networks need PyTorch and scikit-learn ({error}). Install them: "
+            "pip install 'failuretwin[learn]'."
+        ) from error
+    del sklearn, torch
+
+
+# Which diagnoser the user asks for.
+
+BAYES = "bayes"
+"""Name of the method that needs no file."""
+BLEND = f"{BAYES}+"
+"""What stands before the file of a network that is blended with it."""
+
+
+def told_hypotheses(text: str | None, robot: Robot) -> tuple[Hypothesis, ...] | None:
+    """Return the hypotheses that the user names; None where none are named.
+
+    Args:
+        text: Hypotheses in their text form, separated by commas.
+        robot: The robot, for the names of its motors.
+
+    Raises:
+        InputError: If one cannot be read, or there is only one, which would always be certain.
+    """
+    if text is None:
+        return None
+    hypotheses = parse_hypotheses(text.split(","), robot.motor_names)
+    if len(hypotheses) < 2:
+        raise InputError(
+            f"--hypotheses names only {hypotheses[0]}, so every run would be that for certain. "
+            "Expected two at least, such as healthy,motor_1:stuck."
+        )
+    return hypotheses
+
+
+def chosen_diagnoser(
+    method: str, bayes: BayesDiagnoser, settings: Mapping[str, object]
+) -> Diagnoser:
+    """Return the diagnoser that the user names.
+
+    Args:
+        method: ``bayes``, the file of a network, or ``bayes+`` and that file.
+        bayes: The Bayesian diagnoser.
+        settings: Options by name that belong to it alone; None where not given.
+
+    Raises:
+        InputError: If one of those is given with a network, the file is no network for this robot
+            or was never fitted to be blended, or the extra `learn` is missing.
+    """
+    if method == BAYES:
+        return bayes
+    network = _network(Path(method.removeprefix(BLEND)), bayes.twin.robot, settings)
+    if not method.startswith(BLEND):
+        return network
+    if network.weights_ is None:
+        raise InputError(
+            f"{method.removeprefix(BLEND)}: how it weighs beside Bayes was never fitted. Train it "
+            "with `failuretwin train`, or use it alone."
+        )
+    return HybridDiagnoser(bayes, network, network.weights_)
+
+
+def _network(path: Path, robot: Robot, settings: Mapping[str, object]) -> LearnedDiagnoser:
+    if not path.exists():
+        raise InputError(
+            f"--method {path}: is neither 'bayes' nor a file that exists. Train a network with "
+            f"`failuretwin train --out {path.with_suffix('.npz')}`."
+        )
+    given = [name for name, value in settings.items() if value is not None]
+    if given:
+        raise InputError(
+            f"{', '.join(given)}: a network has learned what it knows, and cannot be told more. "
+            "Leave that out, or use --method bayes."
+        )
+    check_learning()
+    from failuretwin.decision.learned.storage import load_network
+
+    return load_network(path, robot)
+
+
+def expected_name(diagnoser: Diagnoser, bayes: BayesDiagnoser) -> str:
+    """Return the name of the healthy behaviour that a diagnoser expects.
+
+    Args:
+        diagnoser: As `chosen_diagnoser` gave it.
+        bayes: The Bayesian diagnoser, which is it or a part of it unless it is a network.
+    """
+    encoder = getattr(diagnoser, "encoder", None)
+    if encoder is None:
+        return bayes.healthy_model.imperfections.name
+    return encoder.expected.name if encoder.expected else "none"
+
+
+# Step tests among the logs of a calibration: sorted out, fitted, and joined to the result.
+
+
+@dataclass(frozen=True)
+class LearnedLoops:
+    """What step tests say of a robot.
+
+    Attributes:
+        robot: The robot with the loops found; as it was unless every motor was tested.
+        fits: What was learned of each motor.
+        left_out: Steps that did not count.
+    """
+
+    robot: Robot
+    fits: tuple[StepFit, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
+
+
+def split_step_tests(logs: Sequence[Path], columns: Path | None) -> tuple[list[Path], list[Path]]:
+    """Return step tests, as files, and all other logs.
+
+    A folder that holds both kinds counts as both.
+
+    Args:
+        logs: Files and folders.
+        columns: Column map, by which other CSV files in a folder are logs; None: they are not.
+
+    Raises:
+        InputError: If there are step tests only.
+    """
+    tests, others = list[Path](), list[Path]()
+    for log in logs:
+        found = find_step_tests(log)
+        tests += found
+        if not found or (log.is_dir() and _holds_more(log, found, columns)):
+            others.append(log)
+    if not others:
+        raise InputError(
+            f"{len(tests)} step tests and no other log. Step tests say how fast a motor follows, "
+            "but each rests at two or three places only; where motors settle takes logs of the arm "
+            "moving about. Give a session of the healthy robot beside them."
+        )
+    return list(dict.fromkeys(tests)), others
+
+
+def _holds_more(folder: Path, tests: list[Path], columns: Path | None) -> bool:
+    if any(True for name in SESSION_FILES for _ in folder.rglob(name)):
+        return True
+    if columns is not None and len(list(folder.rglob("*.csv"))) > len(tests):
+        return True
+    return bool(find_matlab_files(folder))
+
+
+def learn_loops(tests: Sequence[Path], robot: Robot) -> LearnedLoops:
+    """Fit servo loops to step tests.
+
+    Raises:
+        InputError: If a file cannot be read, or there are step tests but none can be used.
+    """
+    if not tests:
+        return LearnedLoops(robot)
+    steps = [step for test in tests for step in read_step_test(test, robot)]
+    fits, left_out = fit_steps(steps, robot)
+    if not fits:
+        told = "; ".join(f"{out.run}: step {out.movement} {out.reason}" for out in left_out[:3])
+        raise InputError(
+            f"none of {len(steps)} steps can be used ({told}). Give step tests of a healthy motor "
+            "in files named after its servo, such as test_motor_6.csv, or leave them out."
+        )
+    loops = [fit.loop for fit in fits] if len(fits) == len(robot.motors) else []
+    return LearnedLoops(with_loops(robot, loops), fits, left_out)
+
+
+def with_step_tests(found: Calibration, steps: LearnedLoops) -> Calibration:
+    """Return a calibration with what step tests say.
+
+    Loops join it only if every motor has one: delay and lag, which are those of the whole robot,
+    are on top of the loops and cannot be on top of two kinds.
+    """
+    if not steps.fits:
+        return found
+    counts = ", ".join(f"{fit.steps} of {fit.motor}" for fit in steps.fits)
+    tested = [fit.motor for fit in steps.fits]
+    missing = [name for name in steps.robot.motor_names if name not in tested]
+    use = "delay, lag and ramp shortening are what is left on top of them"
+    if missing:
+        use = f"not used by the twin, since {', '.join(missing)} had no step test"
+    return replace(
+        found,
+        parameters=(*found.parameters, *(p for fit in steps.fits for p in fit.parameters)),
+        loops=() if missing else tuple(fit.loop for fit in steps.fits),
+        left_out=(*found.left_out, *steps.left_out),
+        remarks=(*found.remarks, f"servo loops from step tests ({counts}): {use}"),
     )

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import base64
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from failuretwin.core.diagnosis import Diagnosis
+from failuretwin import __version__
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import AXES, unique_names
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.knowledge import plain_name
+from failuretwin.data_knowledge.failure_modes import plain_name
+from failuretwin.data_knowledge.store import filling
+from failuretwin.decision.evaluation import Evaluation
+from failuretwin.decision.metrics import Reliability, Share, judged_truth
+from failuretwin.decision.results import as_unknown_line, score_line
 from failuretwin.digital_model.twin import DigitalTwin
 
 if TYPE_CHECKING:
     import xarray as xr
+    from jinja2 import Environment
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -171,3 +178,133 @@ def _plain(hypothesis: str) -> str:
 def clean(panel: Axes) -> None:
     """Take away the lines of a panel that frame nothing."""
     panel.spines[["top", "right"]].set_visible(False)
+
+
+# One self-contained HTML page for the runs of a folder. Needs the extra `plots`.
+
+
+def write_page(
+    diagnoses: Sequence[Diagnosis], pictures: Sequence[Path], robot: str, path: Path
+) -> None:
+    """Write the page; pictures are part of it.
+
+    Args:
+        diagnoses: Diagnoses of the runs.
+        pictures: PNG file of each run, in the same order.
+        robot: Name of the robot.
+        path: HTML file to write.
+
+    Raises:
+        InputError: If jinja2 is missing.
+    """
+    template = (files("failuretwin.app") / "page.html.j2").read_text(encoding="utf-8")
+    page = environment().from_string(template)
+    records = [d.to_record() for d in diagnoses]
+    text = page.render(
+        runs=[_entry(d, picture) for d, picture in zip(diagnoses, pictures, strict=True)],
+        robot=robot,
+        method=diagnoses[0].method,
+        protocol=diagnoses[0].protocol,
+        version=__version__,
+        known=any(d.truth is not None for d in diagnoses),
+        score=score_line(records),
+        as_unknown=as_unknown_line(records),
+    )
+    path.write_text(text, encoding="utf-8")
+
+
+def environment() -> Environment:
+    """Return what renders the templates of pages; text in them is escaped.
+
+    Raises:
+        InputError: If jinja2 is missing.
+    """
+    try:
+        from jinja2 import Environment, StrictUndefined
+    except ImportError as error:
+        raise InputError(
+            f"pages need jinja2 ({error}). Install it: pip install 'failuretwin[plots]'."
+        ) from error
+    return Environment(autoescape=True, undefined=StrictUndefined)
+
+
+def _entry(diagnosis: Diagnosis, picture: Path) -> dict[str, Any]:
+    truth = diagnosis.truth
+    return {
+        "name": diagnosis.run,
+        "verdict": diagnosis.verdict,
+        "truth": "" if truth is None else plain_name(Hypothesis.parse(truth)),
+        "wrong": truth is not None
+        and judged_truth(truth, diagnosis.posterior) != diagnosis.diagnosis,
+        "explanation": diagnosis.explanation,
+        "quality": diagnosis.quality,
+        "picture": base64.b64encode(picture.read_bytes()).decode("ascii"),
+    }
+
+
+# Picture of the reliability diagram. Needs the extra `plots`.
+
+NAME = "reliability.png"
+"""Name of the picture in its folder."""
+
+
+def write_reliability(evaluation: Evaluation, folder: Path) -> None:
+    """Write the picture into `folder`.
+
+    Raises:
+        InputError: If no run got a verdict, or matplotlib is missing.
+    """
+    if evaluation.calibration is None:
+        raise InputError("no run got a verdict, so there is no reliability to draw.")
+    title = f"{evaluation.scores.runs} runs, protocol {evaluation.protocol}"
+    figure = reliability_figure(evaluation.calibration.equal, title)
+    with filling(folder) as partial:
+        figure.savefig(partial / NAME, dpi=130)
+
+
+def reliability_figure(bins: Reliability, title: str) -> Figure:
+    """Return how often verdicts are right by how sure they are, and how many there are.
+
+    Args:
+        bins: The reliability diagram.
+        title: What it is of.
+
+    Raises:
+        InputError: If matplotlib is missing.
+    """
+    figure = figure_class()(figsize=(5.6, 6.4), layout="constrained")
+    grid = figure.add_gridspec(2, 1, height_ratios=[4.0, 1.0])
+    upper = figure.add_subplot(grid[0])
+    _plot_shares(upper, bins)
+    lower = figure.add_subplot(grid[1], sharex=upper)
+    lower.bar(bins.edges[:-1], bins.count, np.diff(bins.edges), align="edge", color=GREY, ec="w")
+    lower.set_xlabel("stated probability of the verdict")
+    lower.set_ylabel("runs")
+    for panel in (upper, lower):
+        panel.spines[["top", "right"]].set_visible(False)
+    figure.suptitle(title, fontsize=11)
+    return figure
+
+
+def _plot_shares(panel: Axes, bins: Reliability) -> None:
+    filled = np.flatnonzero(bins.count)
+    shares = [Share(int(bins.right[i]), int(bins.count[i])) for i in filled]
+    value = np.array([share.value for share in shares])
+    low, high = np.array([share.interval for share in shares]).T
+    panel.plot([0.0, 1.0], [0.0, 1.0], color=GREY, lw=1.2, ls="--", label="means what it says")
+    panel.errorbar(
+        bins.confidence[filled],
+        value,
+        yerr=np.maximum([value - low, high - value], 0.0),  # rounding, at shares of 0 and 1
+        color=BLUE,
+        marker="o",
+        ms=5,
+        lw=1.2,
+        capsize=3,
+        label="share right, 95 % interval",
+    )
+    panel.set_xlim(0.0, 1.02)
+    panel.set_ylim(-0.02, 1.02)
+    panel.set_ylabel("share of verdicts that are right")
+    panel.tick_params(labelbottom=False)
+    panel.legend(loc="upper left", fontsize=8, frameon=False)

@@ -5,15 +5,129 @@ Wear is one vector for a robot: the bias of every motor [rad], then its complian
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.connection.run_evidence import LEAST_SCATTER_RAD, RunEvidence
-from failuretwin.core.types import FloatArray
-from failuretwin.digital_model.imperfections import Variation
+from failuretwin.connection.calibration.observations import Observations, stayed
+from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.digital_model.nonidealities import Variation
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, largest_load
+from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.healthy_model import PATH_NOISE_M
+
+# What one run says of the wear of the motors: a linear model with unit scatter.
+
+DECIMALS = 6
+"""Errors and designs are rounded to this many decimals of the scatter: short in a file, and a run
+read back from it is the run that was written."""
+LEAST_SCATTER_RAD = 1e-5
+"""Scatter assumed of motors that are said to have none [rad]; no reading is as fine."""
+KEY_DIGITS = 16
+
+
+@dataclass(frozen=True)
+class RunEvidence:
+    """Settled errors of one run as a linear model: error = design @ wear + unit scatter.
+
+    Wear is the bias of every motor, then its compliance. A group is what scatters together as one
+    Student t: the three axes of a tool position, or the reading of one motor.
+
+    Attributes:
+        run: Name of the run.
+        key: Fingerprint of its settled movements; a run given twice is known by it.
+        error: Settled minus commanded, friction taken off, in scatters, (group, axis).
+        design: Its slope by wear, (group, axis, 2 motor) [1/rad, then N m/rad].
+    """
+
+    run: str
+    key: str
+    error: FloatArray
+    design: FloatArray
+
+
+def run_evidence(
+    observations: Observations, robot: Robot, settling: Settling, runs: Sequence[int]
+) -> list[RunEvidence]:
+    """Return what runs say; nothing of movements whose command did not arrive.
+
+    Args:
+        observations: Settled movements; by the motors' readings where they have them, else by the
+            tool.
+        robot: The robot.
+        settling: Where motors settle as far as is known: the model is made linear there.
+        runs: Indices of the wanted runs.
+    """
+    wanted = observations[np.isin(observations.run, np.asarray(runs))]
+    expected = wanted.target + settling.offset(robot, wanted.target, wanted.direction)
+    lost = stayed(wanted, robot, expected)
+    if wanted.position is None:
+        error, design = _by_tool(wanted, robot, settling, expected)
+        kept = np.asarray(~lost.any(axis=1, keepdims=True))
+    else:
+        error, design = _by_readings(wanted, wanted.position, robot, settling)
+        kept = ~lost
+    return [_of_run(wanted, error, design, kept, run) for run in runs]
+
+
+def _by_tool(
+    seen: Observations, robot: Robot, settling: Settling, expected: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return white errors (movement, 1, axis) and designs (movement, 1, axis, 2 motor)."""
+    point, jacobian = DigitalTwin(robot).path_and_jacobian(expected)
+    short = np.asarray(settling.friction) * seen.direction
+    away = expected - seen.target + short
+    error = seen.point - point + np.einsum("iak,ik->ia", jacobian, away)
+    torque = robot.sense * robot.loads.torque(expected * robot.sense, settling.payload)
+    design = np.concatenate([jacobian, jacobian * torque[:, None]], axis=2)
+    scaled = jacobian * np.asarray(settling.scatter)
+    spread = np.einsum("iak,ibk->iab", scaled, scaled) + PATH_NOISE_M**2 * np.eye(3)
+    root = np.linalg.cholesky(spread)
+    white = np.linalg.solve(root, np.concatenate([error[..., None], design], axis=2))
+    return white[:, None, :, 0], white[:, None, :, 1:]
+
+
+def _by_readings(
+    seen: Observations, position: FloatArray, robot: Robot, settling: Settling
+) -> tuple[FloatArray, FloatArray]:
+    """Return white errors (movement, motor, 1) and designs (movement, motor, 1, 2 motor)."""
+    count = 0.0
+    if robot.profile.servo_units is not None:
+        count = abs(robot.servo_units.rad_per_count) / np.sqrt(12.0)
+    scale = np.sqrt(np.asarray(settling.scatter) ** 2 + count**2)
+    scale = np.maximum(scale, LEAST_SCATTER_RAD)
+    torque = robot.sense * robot.loads.torque(position * robot.sense, settling.payload)
+    error = position - seen.target + np.asarray(settling.friction) * seen.direction
+    unit = np.eye(position.shape[1])
+    design = np.concatenate(
+        [np.broadcast_to(unit, (len(seen), *unit.shape)), unit * torque[:, :, None]], axis=2
+    )
+    return (error / scale)[..., None], (design / scale[:, None])[:, :, None]
+
+
+def _of_run(
+    seen: Observations, error: FloatArray, design: FloatArray, kept: BoolArray, run: int
+) -> RunEvidence:
+    inside = seen.run == run
+    chosen = inside[:, None] & kept
+    return RunEvidence(
+        run=seen.runs[run],
+        key=_key(seen[inside], seen.runs[run]),
+        error=np.round(error[chosen], DECIMALS),
+        design=np.round(design[chosen], DECIMALS),
+    )
+
+
+def _key(seen: Observations, name: str) -> str:
+    """Return the fingerprint of the movements of one run."""
+    digest = hashlib.sha256(name.encode())
+    for values in (seen.target, seen.point):
+        digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()[:KEY_DIGITS]
+
 
 START = 1.0
 """Standard deviation of bias and largest sag of a robot whose calibration states no doubt, in
@@ -162,3 +276,90 @@ def information(axes: int, dof: float) -> float:
     Lange, Little & Taylor, JASA 84 (1989) 881: (dof + axes) / (dof + axes + 2).
     """
     return 1.0 if np.isinf(dof) else (dof + axes) / (dof + axes + 2.0)
+
+
+# Have the latest runs changed as no wear does? Too fast, or too far from the calibration.
+
+FREE = 30.0
+"""How far a sudden change may go, a standard deviation in scatters: as good as anywhere."""
+CHANCE = 4.0
+"""The latest runs may lie this many standard deviations off by chance."""
+FEWEST = 5
+"""Runs below which nothing is said of a sudden change."""
+
+
+def unlike_wear(
+    window: Sequence[RunEvidence],
+    references: Sequence[WearState],
+    start: WearState,
+    unit: FloatArray,
+    limits: WearLimits,
+    dof: float,
+) -> tuple[int, bool] | None:
+    """Return what has changed more than wear can make it; None: nothing.
+
+    The runs are compared with the tracked state and with what it was a horizon ago: a fault that
+    grows slowly drags the state along before it shows.
+
+    Args:
+        window: The latest runs, none of them learned yet.
+        references: The tracked state, then earlier ones.
+        start: Wear of the calibration.
+        unit: Wear that moves a motor by its scatter, (2 motor,).
+        limits: How fast and how far wear may go.
+        dof: Degrees of freedom of the scatter.
+
+    Returns:
+        The entry of the wear that stands out, and whether it changes too fast, rather than lies
+        too far from the calibration.
+    """
+    runs = [run for run in window if run.error.size]
+    if len(runs) < FEWEST:
+        return None
+    change = sudden_change(references[0], runs, unit, dof)
+    now = references[0].mean + change.mean
+
+    def off(known: WearState, most: float) -> FloatArray:
+        """Return by how much each entry lies off beyond `most` and chance."""
+        chance = CHANCE * np.hypot(change.deviation, known.deviation)
+        return np.abs(now - known.mean) - most * unit - chance
+
+    fast = np.max([off(known, limits.reach) for known in references], axis=0)
+    excess = np.maximum(fast, off(start, limits.limit))
+    over = np.divide(excess, unit, out=np.zeros_like(unit), where=unit > 0.0)
+    worst = int(np.argmax(over))
+    return (worst, bool(fast[worst] > 0.0)) if over[worst] > 0.0 else None
+
+
+def sudden_change(
+    state: WearState, window: Sequence[RunEvidence], unit: FloatArray, dof: float
+) -> WearState:
+    """Return how far runs lie off a state if their wear is one and the same, whatever it is.
+
+    Args:
+        state: Tracked state; taken as it is.
+        window: The runs.
+        unit: Wear that moves a motor by its scatter, (2 motor,).
+        dof: Degrees of freedom of the scatter.
+
+    Returns:
+        Difference to `state`, with the covariance that the scatter of the runs gives it.
+    """
+    free = FREE * unit
+    full = [run for run in window if run.error.size]
+    if not full:
+        return WearState(np.zeros_like(free), np.diag(free**2))
+    error, design = (
+        np.concatenate([r.error for r in full]),
+        np.concatenate([r.design for r in full]),
+    )
+    axes = error.shape[1]
+    design = design.reshape(error.size, -1)
+    off, scaled = error.reshape(-1) - design @ state.mean, design * free
+    change = np.zeros_like(free)
+    for _ in range(ROUNDS):
+        weight = weights((off - scaled @ change).reshape(-1, axes), dof)[:, None]
+        known = (scaled * weight).T @ scaled + np.eye(len(free))
+        change = as_floats(np.linalg.solve(known, (scaled * weight).T @ off))
+    known = information(axes, dof) * scaled.T @ scaled + np.eye(len(free))
+    return WearState(change * free, np.linalg.inv(known) * np.outer(free, free))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.column_map import SERVO, load_csv
+from failuretwin.data_knowledge.csv_log import SERVO, load_csv
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
+import fcntl
 import os
 import shutil
+import socket
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -12,11 +15,52 @@ from typing import TYPE_CHECKING
 
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.runs import check_runs
-from failuretwin.data_knowledge.swap import take_place
 
 if TYPE_CHECKING:
     import xarray as xr
     from zarr.core.buffer import Buffer
+
+# Put something new where something old stands, in one step where the system can.
+
+AT_FDCWD = -100
+RENAME_EXCHANGE = 2
+
+
+def take_place(new: Path, path: Path) -> None:
+    """Put `new` where `path` is; a folder there is kept until the new one stands.
+
+    Raises:
+        OSError: If that cannot be done; `path` is as before.
+    """
+    if not path.is_dir():
+        new.replace(path)
+        return
+    if exchange(new, path):
+        shutil.rmtree(new)
+        return
+    old = path.with_name(f".{path.name}.{os.getpid()}.old")
+    path.replace(old)
+    try:
+        new.replace(path)
+    except OSError:
+        old.replace(path)
+        raise
+    shutil.rmtree(old)
+
+
+def exchange(one: Path, other: Path) -> bool:
+    """Let two paths change places in one step; return False where the system cannot.
+
+    Without it a process that is killed between two renames would leave no folder at all.
+    """
+    try:
+        rename = ctypes.CDLL(None).renameat2
+    except (AttributeError, OSError):
+        return False
+    names = (os.fsencode(one), os.fsencode(other))
+    done: int = rename(AT_FDCWD, names[0], AT_FDCWD, names[1], RENAME_EXCHANGE)
+    return done == 0
+
 
 SUFFIXES = (".nc", ".zarr")
 
@@ -182,3 +226,62 @@ def reason(error: BaseException) -> str:
 def one_line(text: str) -> str:
     """Return the text of another library's error on one line, without its inner details."""
     return " ".join(text.partition("(")[0].split())
+
+
+# One writer at a time: a lock that ends with the process that holds it.
+
+
+@contextmanager
+def sole_writer(path: Path) -> Iterator[None]:
+    """Hold the lock `.NAME.lock` beside `path`; nobody else can write `path` meanwhile.
+
+    The system lets go of the lock when its process dies, however that happens, so the file of a
+    dead process holds nobody back.
+
+    Raises:
+        OutputError: If another process holds it, or if it cannot be made.
+    """
+    file = path.with_name(f".{path.name}.lock")
+    handle = _locked(file, path)
+    try:
+        yield
+    finally:
+        file.unlink(missing_ok=True)  # before letting go: nobody can lock a file that has no name
+        os.close(handle)
+
+
+def _locked(file: Path, path: Path) -> int:
+    while True:
+        try:
+            handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise OutputError(f"{path}: lock {file} cannot be made ({error.strerror}).") from error
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            holder = os.read(handle, 200).decode(errors="replace")
+            os.close(handle)
+            raise OutputError(
+                f"{path}: {holder or 'another process'} is writing it. Wait until it is done, or "
+                "choose another name."
+            ) from error
+        if _still_there(file, handle):
+            _write_holder(handle)
+            return handle
+        os.close(handle)  # the one before us removed it just as we came
+
+
+def _still_there(file: Path, handle: int) -> bool:
+    try:
+        return os.path.samestat(file.stat(), os.fstat(handle))
+    except FileNotFoundError:
+        return False
+
+
+def _write_holder(handle: int) -> None:
+    """Say who holds the lock; on a full disk it goes without a name."""
+    try:
+        os.truncate(handle, 0)
+        os.write(handle, f"process {os.getpid()} on {socket.gethostname()}".encode())
+    except OSError:
+        pass

@@ -7,15 +7,16 @@ what follows from it is deterministic and works on many runs at once.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from failuretwin.core.movements import Movements
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.digital_model.imperfections import Imperfections, Readings
+from failuretwin.digital_model.nonidealities import Imperfections, Readings, vary
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling
-from failuretwin.digital_model.variation import vary
+from failuretwin.digital_model.twin import DigitalTwin
 
 
 @dataclass(frozen=True)
@@ -149,3 +150,163 @@ def _draw_readings(
         rng.normal(0.0, readings.noise_m, (count, 3)) if readings.noise_m else np.zeros((count, 3))
     )
     return np.maximum.accumulate(times), glitch, noise
+
+
+# The motions of the imperfect healthy robot, for many runs at once; all chance is drawn before.
+
+
+def delay_commands(movements: Movements, late: FloatArray) -> Movements:
+    """Return the movements as commanded when each late start also delays all that follow.
+
+    A stalled bus holds up the sender: the command keeps its early stamp, the next one is sent a
+    full period after the late start.
+
+    Args:
+        movements: The undisturbed schedule.
+        late: Late start of each movement, (run, movement) [s].
+    """
+    before = np.cumsum(late, axis=1) - late
+    return replace(movements, start=movements.start + before)
+
+
+def actual_movements(movements: Movements, chance: Disturbances) -> Movements:
+    """Return the movements that the motors really make, without gravity sag.
+
+    Args:
+        movements: As commanded (after any fault that alters targets).
+        chance: Disturbances of the same runs.
+
+    Returns:
+        Movements with lost commands, bias, friction and scatter in their targets, and with late
+        starts, delay and early ramp ends in their times.
+    """
+    here = movements.initial + chance.bias + chance.scatter[:, 0]
+    initial = here
+    target = np.empty_like(movements.target)
+    commanded = movements.initial
+    for m in range(target.shape[1]):
+        wanted = movements.target[:, m]
+        short = chance.friction * np.sign(wanted - commanded)
+        settled = wanted + chance.bias - short + chance.scatter[:, 1 + m]
+        target[:, m] = np.where(chance.lost[:, m], here, settled)
+        commanded = np.where(chance.lost[:, m], commanded, wanted)
+        here = target[:, m]
+    return Movements(
+        initial=initial,
+        target=target,
+        ramp_duration=movements.ramp_duration * (1.0 - chance.shortening[:, None, None]),
+        start=movements.start + chance.late + chance.delay[:, None],
+    )
+
+
+def lagged(reference: FloatArray, time: FloatArray, lag: FloatArray) -> FloatArray:
+    """Return references behind a first-order lag, exact for lines between samples.
+
+    Args:
+        reference: (run, time, motor) [rad], at rest at its first value.
+        time: Uniform grid, (time,) [s].
+        lag: Time constant of each run, (run,) [s]; 0 leaves a run as it is.
+    """
+    from scipy.signal import lfilter
+
+    if not lag.any():
+        return reference
+    out = reference.copy()
+    step = time[1] - time[0]
+    for run in np.flatnonzero(lag):
+        kept = np.exp(-step / lag[run])
+        mean = lag[run] / step * (1.0 - kept)
+        moved = reference[run] - reference[run, :1]
+        out[run] = reference[run, :1] + lfilter(
+            [1.0 - mean, mean - kept], [1.0, -kept], moved, axis=0
+        )
+    return out
+
+
+# The sensors: from the true angles of many runs to readings of motors and of the tool's path.
+
+
+def sense(
+    twin: DigitalTwin,
+    readings: Readings | None,
+    position: FloatArray,
+    time: FloatArray,
+    movement_start: FloatArray,
+    chance: Disturbances,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the tool path and the motors' angles as the sensors report them.
+
+    Args:
+        twin: Kinematics of the robot.
+        readings: The sensor; None: perfect, one sample at every grid time.
+        position: True angles, (run, time, motor) [rad].
+        time: Uniform grid, (time,) [s].
+        movement_start: Starts as commanded, (run, movement) [s]; gaps hang on them.
+        chance: Disturbances of the same runs.
+
+    Returns:
+        Tool path (run, time, axis) [m] and angles (run, time, motor) [rad], NaN where there is no
+        sample.
+    """
+    if readings is None:
+        return twin.path(position), position
+    read = _at_times(position, time, chance.reading_time)
+    if readings.whole_counts:
+        units = twin.robot.servo_units
+        read = units.to_rad(np.round(units.to_counts(read)))
+    missing = _in_gap(chance, movement_start)
+    if readings.drawn_out:
+        return _draw_out(twin, read, chance, missing, time)
+    spoilt = np.isfinite(chance.glitch)
+    unseen = missing | spoilt.any(axis=-1)
+    points = np.where(unseen[..., None], np.nan, twin.path(read) + chance.noise)
+    angles = np.where(missing[..., None] | spoilt, np.nan, read)
+    nearest = np.rint(chance.reading_time / (time[1] - time[0])).astype(np.int64)
+    inside = nearest < len(time)
+    run = np.broadcast_to(np.arange(len(position))[:, None], nearest.shape)
+    measured = np.full((*position.shape[:2], 3), np.nan)
+    measured[run[inside], nearest[inside]] = points[inside]
+    angle = np.full(position.shape, np.nan)
+    angle[run[inside], nearest[inside]] = angles[inside]
+    return measured, angle
+
+
+def _at_times(position: FloatArray, time: FloatArray, at: FloatArray) -> FloatArray:
+    """Return `position` (run, time, motor) linearly interpolated at `at` (run, reading)."""
+    place = np.clip(at / (time[1] - time[0]), 0.0, len(time) - 1.0)
+    low = np.minimum(place.astype(np.int64), len(time) - 2)
+    share = (place - low)[..., None]
+    run = np.arange(len(position))[:, None]
+    return position[run, low] * (1.0 - share) + position[run, low + 1] * share
+
+
+def _in_gap(chance: Disturbances, start: FloatArray) -> BoolArray:
+    """Return which readings the stalled bus swallows, (run, reading)."""
+    stalled = np.concatenate([chance.late[:, 1:] > 0.0, chance.stalled[:, None]], axis=1)
+    begin = start + chance.gap_start
+    end = np.full_like(start, np.inf)
+    end[:, :-1] = start[:, 1:] + chance.late[:, 1:]
+    at = chance.reading_time[:, :, None]
+    inside = (at > begin[:, None]) & (at < end[:, None]) & stalled[:, None]
+    return np.asarray(inside.any(axis=-1))
+
+
+def _draw_out(
+    twin: DigitalTwin,
+    read: FloatArray,
+    chance: Disturbances,
+    missing: BoolArray,
+    time: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return path and angles drawn out to the grid by straight lines, as published."""
+    units = twin.robot.servo_units
+    counts = np.where(np.isfinite(chance.glitch), chance.glitch, units.to_counts(read))
+    filled = np.empty((len(read), len(time), read.shape[-1]))
+    for run in range(len(read)):
+        kept = ~missing[run]
+        for motor in range(read.shape[-1]):
+            filled[run, :, motor] = np.interp(
+                time, chance.reading_time[run, kept], counts[run, kept, motor]
+            )
+    angle = units.to_rad(filled)
+    return twin.path(angle), angle

@@ -69,3 +69,72 @@ def respond(loops: Sequence[ServoLoop], command: FloatArray, step: float) -> Flo
         start = command[..., :1, motor]
         response[..., motor, :] = start + lfilter(b, a, command[..., motor] - start)
     return np.swapaxes(response, -1, -2)
+
+
+# The servo loop of a motor that can turn no faster than its speed limit.
+
+
+def respond_limited(
+    gains: FloatArray, limit: FloatArray, reference: FloatArray, step: float
+) -> FloatArray:
+    """Return the angles of motors that start at rest at their first reference.
+
+    Both regimes, free and at the limit, are solved exactly for references that are linear between
+    samples; which of them holds is decided at the beginning of every sample.
+
+    Args:
+        gains: P [-], I [1/s] and filter time constant [s] of each variant, (variant, 3).
+        limit: Speed limit of each variant, (variant,) [rad/s].
+        reference: What the motor is told, (variant, test, time) [rad].
+        step: Time step [s].
+
+    Returns:
+        Angles at the same instants, (variant, test, time) [rad].
+    """
+    free, held = _transitions(gains, step)
+    begin = reference[..., :1]
+    drive = _drive(reference - begin, free, step)
+    most = limit[:, None]
+    response = np.zeros((reference.shape[-1], *reference.shape[:2]))
+    x = np.zeros((*reference.shape[:2], 3))
+    for i, driven in enumerate(drive):
+        ahead = x @ free[:, :3] + driven
+        speed = ahead[..., 3]
+        too_fast = np.abs(speed) > most
+        if too_fast.any():
+            capped = np.clip(speed, -most, most)[..., None] * held[:, 3:]
+            x = np.where(too_fast[..., None], x @ held[:, :3] + capped, ahead[..., :3])
+        else:
+            x = ahead[..., :3]
+        response[i + 1] = x[..., 2]
+    return begin + np.moveaxis(response, 0, -1)
+
+
+def _drive(reference: FloatArray, free: FloatArray, step: float) -> FloatArray:
+    """Return what the reference adds in every time step, (time - 1, variant, test, 4)."""
+    slope = np.diff(reference, axis=-1) / step
+    told = np.stack([reference[..., :-1], slope], axis=-1)
+    return np.ascontiguousarray(np.moveaxis(told @ free[:, None, 3:], 2, 0))
+
+
+def _transitions(gains: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
+    """Return the matrices that carry the state (u, filtered u, angle) over one time step.
+
+    Both act from the right. The first, (variant, 5, 4), takes state, reference and its slope to the
+    next state and to the speed u' that the controller asks for now; the second, (variant, 4, 3),
+    takes state and capped speed to the next state.
+    """
+    from scipy.linalg import expm
+
+    P, I, rate = gains[:, 0], gains[:, 1], 1.0 / gains[:, 2]  # noqa: E741 - integral gain
+    asked = np.stack([0.0 * P, -P * rate, P * rate - I, I, P], axis=1)
+    free = np.zeros((len(gains), 5, 5))
+    free[:, 0] = asked
+    free[:, 1, 0] = free[:, 2, 1] = rate
+    free[:, 1, 1] = free[:, 2, 2] = -rate
+    free[:, 3, 4] = 1.0
+    held = np.zeros((len(gains), 4, 4))
+    held[:, 1:3, :3] = free[:, 1:3, :3]
+    held[:, 0, 3] = 1.0
+    ahead, capped = (np.swapaxes(np.asarray(expm(step * m)), 1, 2) for m in (free, held))
+    return np.concatenate([ahead[..., :3], asked[..., None]], axis=2), capped[..., :3]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection
+from collections import Counter
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -13,7 +14,7 @@ import numpy as np
 
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.types import FloatArray
-from failuretwin.digital_model.chain import Joint, SerialChain, rotation_to_z
+from failuretwin.digital_model.kinematics import Joint, SerialChain, rotation_to_z
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 HELD_TYPES = ("fixed", "floating", "planar")
@@ -255,3 +256,141 @@ def transform(xyz: tuple[float, float, float], rpy: tuple[float, float, float]) 
     ]
     T[:3, 3] = xyz
     return T
+
+
+# What the links of a URDF carry beside the joints: masses and meshes.
+
+MOMENTS = ("ixx", "iyy", "izz")
+
+
+@dataclass(frozen=True)
+class LinkFacts:
+    """What a file says of one link.
+
+    Attributes:
+        name: Name of the link.
+        mass: Its mass [kg]; None where the file states none that can be read.
+        centre: Centre of the mass in the link's frame [m]; the frame's origin where none is stated.
+        has_inertia: Whether all three moments of inertia are stated and above zero.
+        meshes: Mesh files as the file names them.
+    """
+
+    name: str
+    mass: float | None
+    centre: tuple[float, float, float]
+    has_inertia: bool
+    meshes: tuple[str, ...]
+
+
+def read_links(root: ElementTree.Element) -> dict[str, LinkFacts]:
+    """Return the links below the <robot> element `root` by their names."""
+    facts = (_read_link(link) for link in root.findall("link"))
+    return {fact.name: fact for fact in facts}
+
+
+def _read_link(link: ElementTree.Element) -> LinkFacts:
+    inertia = link.find("inertial/inertia")
+    moments = [_number_or_none(inertia, key) for key in MOMENTS]
+    return LinkFacts(
+        name=link.get("name", ""),
+        mass=_number_or_none(link.find("inertial/mass"), "value"),
+        centre=_centre(link.find("inertial/origin")),
+        has_inertia=all(moment is not None and moment > 0.0 for moment in moments),
+        meshes=tuple(mesh.get("filename", "") for mesh in link.iter("mesh")),
+    )
+
+
+def _centre(origin: ElementTree.Element | None) -> tuple[float, float, float]:
+    text = "0 0 0" if origin is None else origin.get("xyz", "0 0 0")
+    try:
+        x, y, z = (float(part) for part in text.split())
+    except ValueError:
+        return 0.0, 0.0, 0.0
+    return x, y, z
+
+
+def _number_or_none(element: ElementTree.Element | None, key: str) -> float | None:
+    try:
+        value = float("nan" if element is None else element.get(key, "nan"))
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+# How the links of a URDF hang together: roots, leaves and the way to the tool.
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """A link at the end of a branch, which may be the tool.
+
+    Attributes:
+        link: Its name.
+        moving: Joints between base and link that a motor can move.
+        length: Length of the way along the joint frames [m].
+    """
+
+    link: str
+    moving: int
+    length: float
+
+
+def is_motor_joint(joint: UrdfJoint) -> bool:
+    """Return whether a motor of its own can move `joint`."""
+    return joint.type in MOVING_TYPES and joint.mimic is None
+
+
+def roots(urdf: Urdf) -> list[str]:
+    """Return the links that hang from no other."""
+    children = {joint.child for joint in urdf.joints}
+    return [link for link in dict.fromkeys(urdf.links) if link not in children]
+
+
+def twice_carried(urdf: Urdf) -> list[str]:
+    """Return the links that are the child of several joints, which closes a loop."""
+    counts = Counter(joint.child for joint in urdf.joints)
+    return [link for link, count in counts.items() if count > 1]
+
+
+def leaves(urdf: Urdf, base: str) -> list[Leaf]:
+    """Return the ends of all branches above `base`, the best candidate for the tool first.
+
+    That is the one with the most motors on the way to it and, among equals, the longest way.
+    """
+    by_parent: dict[str, list[UrdfJoint]] = {}
+    for joint in urdf.joints:
+        by_parent.setdefault(joint.parent, []).append(joint)
+    found, open_ways, seen = [], [(Leaf(base, 0, 0.0))], set()
+    while open_ways:
+        leaf = open_ways.pop()
+        if leaf.link in seen:
+            continue
+        seen.add(leaf.link)
+        joints = by_parent.get(leaf.link, [])
+        open_ways += [_step(leaf, joint) for joint in joints]
+        if not joints and leaf.link in urdf.links:
+            found.append(leaf)
+    return sorted(found, key=lambda leaf: (-leaf.moving, -round(leaf.length, 9), leaf.link))
+
+
+def _step(leaf: Leaf, joint: UrdfJoint) -> Leaf:
+    length = float(np.linalg.norm(joint.T_pc[:3, 3]))
+    return Leaf(joint.child, leaf.moving + is_motor_joint(joint), leaf.length + length)
+
+
+def rigid_body(urdf: Urdf, link: str) -> list[str]:
+    """Return `link` and all links that fixed joints hold to it further out."""
+    body = [link]
+    for name in body:
+        fixed = (j for j in urdf.joints if j.parent == name and j.type == "fixed")
+        body += [joint.child for joint in fixed if joint.child not in body]
+    return body
+
+
+def links_beyond(urdf: Urdf, joints: Sequence[UrdfJoint]) -> list[str]:
+    """Return all links that the first motor of `joints` carries."""
+    first = next((joint for joint in joints if is_motor_joint(joint)), None)
+    carried = [] if first is None else [first.child]
+    for name in carried:
+        carried += [j.child for j in urdf.joints if j.parent == name and j.child not in carried]
+    return carried

@@ -9,16 +9,19 @@ from xml.etree import ElementTree
 
 from failuretwin.core.errors import InputError
 from failuretwin.digital_model import urdf_findings as look
-from failuretwin.digital_model.mobility import Mobility, mobility
-from failuretwin.digital_model.urdf import Urdf, UrdfJoint, read_root, read_urdf
-from failuretwin.digital_model.urdf_findings import Finding, Severity
-from failuretwin.digital_model.urdf_links import LinkFacts, read_links
-from failuretwin.digital_model.urdf_tree import (
+from failuretwin.digital_model.urdf import (
+    LinkFacts,
+    Urdf,
+    UrdfJoint,
     is_motor_joint,
     leaves,
     links_beyond,
+    read_links,
+    read_root,
+    read_urdf,
     roots,
 )
+from failuretwin.digital_model.urdf_findings import Finding, Mobility, Severity, mobility
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray
-from failuretwin.digital_model.imperfections import Schedule
+from failuretwin.digital_model.nonidealities import Schedule
 from failuretwin.digital_model.robot import Robot
 
 SPEED_CAP_RAD_S = np.deg2rad(272.0)

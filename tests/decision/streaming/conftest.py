@@ -5,8 +5,8 @@ import pytest
 
 from failuretwin import BayesDiagnoser, Plan
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge.generation import simulate
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.data_knowledge.generate import simulate
+from failuretwin.digital_model.nonidealities import load_imperfections
 
 
 @pytest.fixture(scope="session")

@@ -6,15 +6,19 @@ import numpy as np
 import pytest
 
 from failuretwin import BayesDiagnoser, DigitalTwin, Plan, load_robot
-from failuretwin.connection.links.values import OK, STALE
+from failuretwin.connection.links.base import OK, STALE
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Movements
-from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.generate import simulate
+from failuretwin.decision.streaming.diagnoser import (
+    StreamingDiagnoser,
+    load_fleet,
+    monitor,
+    save_fleet,
+)
 from failuretwin.decision.streaming.fleet import StreamingFleet
-from failuretwin.decision.streaming.saved import load_fleet, save_fleet
-from failuretwin.decision.streaming.streaming import StreamingDiagnoser, monitor
-from failuretwin.digital_model.imperfections import NO_IMPERFECTIONS, load_imperfections
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, load_imperfections
 
 PERIOD_S = 2.04
 STEP_S = 0.1

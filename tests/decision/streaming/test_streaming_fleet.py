@@ -8,9 +8,9 @@ import pytest
 from failuretwin import BayesDiagnoser, Plan
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
-from failuretwin.data_knowledge.generation import simulate
+from failuretwin.data_knowledge.generate import simulate
 from failuretwin.decision.streaming.fleet import SILENCE_S, StreamingFleet
-from failuretwin.digital_model.imperfections import load_imperfections
+from failuretwin.digital_model.nonidealities import load_imperfections
 
 
 def posteriors(diagnoses):

@@ -39,14 +39,10 @@ def calibrate(
     folders that hold some) add servo loops and speed limits.
     """
     del seed  # nothing here depends on chance
-    from failuretwin.app.calibrating import learn_robot
     from failuretwin.app.calibration_tables import beats_uncalibrated, print_calibration
-    from failuretwin.app.inputs import read_inputs
-    from failuretwin.app.step_inputs import learn_loops, split_step_tests, with_step_tests
-    from failuretwin.connection.calibration.calibration_file import (
-        check_calibration_file,
-        save_calibration,
-    )
+    from failuretwin.app.inputs import learn_loops, read_inputs, split_step_tests, with_step_tests
+    from failuretwin.connection.calibrating import learn_robot
+    from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
     from failuretwin.digital_model.robot import load_robot
 
     check_calibration_file(out)
@@ -58,7 +54,7 @@ def calibrate(
     found, judged = learn_robot(runs, model, name or out.stem, source, hold_out)
     found = with_step_tests(found, steps)
     if report is not None:
-        from failuretwin.app.calibration_page import write_calibration_page
+        from failuretwin.app.calibration_report import write_calibration_page
         from failuretwin.data_knowledge.store import filling
 
         with filling(report) as folder:

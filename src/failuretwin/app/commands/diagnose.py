@@ -75,23 +75,32 @@ def diagnose(
     downwards), such a file (.mat), a bag (.bag, .mcap), or a CSV file with --columns.
     """
     del seed  # nothing here is drawn by chance
-    from failuretwin.app.ambiguity_lines import ambiguity_lines
-    from failuretwin.app.inputs import read_inputs, tell_mismatch
-    from failuretwin.app.method import chosen_diagnoser, expected_name, told_hypotheses
-    from failuretwin.app.progress import progress_bar
-    from failuretwin.app.results import write_csv, write_json_lines
-    from failuretwin.app.tables import print_diagnoses, print_lines, print_scores
-    from failuretwin.app.tracking import (
+    from failuretwin.app.inputs import (
+        chosen_diagnoser,
+        expected_name,
+        read_inputs,
+        tell_mismatch,
+        told_hypotheses,
+    )
+    from failuretwin.app.tables import (
+        ambiguity_lines,
+        print_diagnoses,
+        print_lines,
+        print_scores,
+        progress_bar,
+    )
+    from failuretwin.connection.tracking import (
         diagnose_tracked,
         keep_history,
         open_history,
         tracking_line,
     )
-    from failuretwin.decision.bayes import BayesDiagnoser
-    from failuretwin.decision.hypotheses.priors import priors_of
-    from failuretwin.digital_model.imperfections import load_imperfections
+    from failuretwin.decision.results import write_csv, write_json_lines
+    from failuretwin.digital_model.nonidealities import load_imperfections
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.twin import DigitalTwin
+    from failuretwin.inference.diagnoser import BayesDiagnoser
+    from failuretwin.inference.priors import priors_of
 
     model = load_robot(robot)
     twin = DigitalTwin(model)
@@ -123,8 +132,7 @@ def diagnose(
     if csv_file is not None:
         write_csv(records, csv_file)
     if plot is not None:
-        from failuretwin.app.page import write_page
-        from failuretwin.app.plots import plot_runs
+        from failuretwin.app.plots import plot_runs, write_page
         from failuretwin.data_knowledge.store import filling
 
         with filling(plot) as folder:

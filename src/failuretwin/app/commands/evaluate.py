@@ -45,15 +45,18 @@ def evaluate(
     """Score the results of `diagnose --json` against the truth."""
     import numpy as np
 
-    from failuretwin.app.comparison import Results, compare_results
-    from failuretwin.app.evaluation import evaluate_records
-    from failuretwin.app.evaluation_tables import print_comparison, print_evaluation
-    from failuretwin.app.latex import write_latex
-    from failuretwin.app.reliability_plot import write_reliability
-    from failuretwin.app.results import read_json_lines
+    from failuretwin.app.evaluation_tables import print_comparison, print_evaluation, write_latex
+    from failuretwin.app.plots import write_reliability
     from failuretwin.app.tables import print_scores
-    from failuretwin.app.truth import read_truths, with_truth
     from failuretwin.core.errors import InputError
+    from failuretwin.decision.evaluation import (
+        Results,
+        compare_results,
+        evaluate_records,
+        read_truths,
+        with_truth,
+    )
+    from failuretwin.decision.results import read_json_lines
 
     truths = {} if truth is None else read_truths(truth, robot, published_labels)
     if published_labels and truth is None:

@@ -36,7 +36,7 @@ def robot() -> None:
 @link_options
 def check(urdf: Path, base: str | None, tool: str | None) -> None:
     """Say whether a URDF can be used, which motors move the tool, and what is missing."""
-    from failuretwin.app.robot_report import print_report
+    from failuretwin.app.tables import print_report
     from failuretwin.digital_model.urdf_check import check_urdf
 
     report = check_urdf(urdf, base, tool)
@@ -52,8 +52,7 @@ def init(urdf: Path, out: Path, base: str | None, tool: str | None) -> None:
     """Write a commented profile for the robot of a URDF, ready for --robot PROFILE."""
     from failuretwin.core.errors import InputError
     from failuretwin.data_knowledge.store import replacing
-    from failuretwin.digital_model.profile_template import profile_text
-    from failuretwin.digital_model.robot import load_robot
+    from failuretwin.digital_model.robot import load_robot, profile_text
     from failuretwin.digital_model.urdf_check import check_urdf
 
     if out.suffix != ".toml":

@@ -4,31 +4,230 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from failuretwin import __version__
-from failuretwin.app.calibration_plots import png
-from failuretwin.app.page import environment
-from failuretwin.app.study.data import Exam, class_names
-from failuretwin.app.study.figures import confusion_figure, path_figure, training_figure
-from failuretwin.app.study.plan import FEATURES, PRINTED_RATE, REPRODUCING_RATE, StudyPlan
-from failuretwin.app.study.published import RATIOS, TABLE_2, TABLE_3, Spread
-from failuretwin.app.study.results import (
-    SETS,
-    accuracies,
-    class_ratios,
-    mean_confusion,
-    of_kind,
+from failuretwin.app.calibration_report import png
+from failuretwin.app.plots import BLUE, GREY, MM_PER_M, RED, clean, environment, figure_class
+from failuretwin.app.study.trainings import (
+    FEATURES,
+    PRINTED_RATE,
+    REPRODUCING_RATE,
+    Exam,
+    StudyPlan,
+    Training,
+    class_names,
 )
-from failuretwin.app.study.trainings import Training
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.data_knowledge.knowledge import plain_name
+from failuretwin.core.runs import AXES
+from failuretwin.core.types import FloatArray, IntArray, as_floats
+from failuretwin.data_knowledge.failure_modes import plain_name
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.figure import Figure
+
+# What the paper reports, to stand beside our figures (arXiv 2411.01360, tables II and III).
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean and standard deviation over repetitions; NaN where there is none."""
+
+    mean: float
+    deviation: float
+
+
+NONE = Spread(math.nan, math.nan)
+
+TABLE_2 = {
+    "training": Spread(0.9812, 0.0171),
+    "validation": Spread(0.9244, 0.0041),
+    "test": Spread(0.6156, 0.0559),
+}
+"""Accuracy after 5050 iterations with augmented features."""
+
+RATIOS = ("precision", "recall", "F1")
+"""Columns of Table III."""
+
+TABLE_3 = {
+    "healthy": (NONE, Spread(0.0, 0.0), NONE),
+    "motor_1:steady_state_error": (Spread(1.00, 0.00), Spread(0.52, 0.13), Spread(0.68, 0.11)),
+    "motor_1:stuck": (Spread(0.96, 0.06), Spread(0.84, 0.05), Spread(0.89, 0.04)),
+    "motor_2:steady_state_error": (Spread(0.49, 0.10), Spread(0.70, 0.10), Spread(0.58, 0.10)),
+    "motor_2:stuck": (Spread(0.75, 0.10), Spread(0.92, 0.04), Spread(0.82, 0.06)),
+    "motor_3:steady_state_error": (Spread(0.64, 0.08), Spread(0.70, 0.16), Spread(0.66, 0.08)),
+    "motor_3:stuck": (Spread(0.64, 0.16), Spread(0.72, 0.11), Spread(0.67, 0.11)),
+    "motor_4:steady_state_error": (Spread(0.39, 0.06), Spread(0.68, 0.11), Spread(0.50, 0.07)),
+    "motor_4:stuck": (Spread(0.49, 0.11), Spread(0.46, 0.15), Spread(0.47, 0.13)),
+}
+"""Precision, recall and F1 of each class on 90 real runs, in the order of the paper's rows."""
+
+# From the results of the trainings to the numbers of the paper's tables.
+
+SETS = ("training", "validation", "test")
+"""What accuracies are taken on."""
+
+
+def of_kind(trainings: Sequence[Training], features: str, learning_rate: float) -> list[Training]:
+    """Return the repetitions of one kind of training."""
+    return [
+        training
+        for training in trainings
+        if (training.job.features, training.job.learning_rate) == (features, learning_rate)
+    ]
+
+
+def spread_of(values: Sequence[float] | FloatArray) -> Spread:
+    """Return mean and sample standard deviation; NaN if any value is NaN, as in the paper."""
+    array = np.asarray(values, dtype=np.float64)
+    deviation = float(array.std(ddof=1)) if len(array) > 1 else math.nan
+    return Spread(float(array.mean()), deviation)
+
+
+def accuracies(repeats: Sequence[Training], name: str) -> list[Spread]:
+    """Return the accuracy on one of `SETS` at each checkpoint."""
+    rows = [[getattr(point, name) for point in training.checkpoints] for training in repeats]
+    return [spread_of(column) for column in np.array(rows).T]
+
+
+def class_ratios(repeats: Sequence[Training]) -> list[tuple[Spread, Spread, Spread]]:
+    """Return precision, recall and F1 of each class on the test set.
+
+    Precision and F1 are NaN in a repetition that never names the class, as in the paper.
+    """
+    ratios = np.array([_ratios(np.array(training.confusion)) for training in repeats])
+    return [
+        (spread_of(rows[:, 0]), spread_of(rows[:, 1]), spread_of(rows[:, 2]))
+        for rows in np.moveaxis(ratios, 1, 0)
+    ]
+
+
+def _ratios(confusion: IntArray) -> FloatArray:
+    """Return (class, 3) ratios of one confusion matrix (truth, diagnosis)."""
+    hits = np.diag(confusion).astype(np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        precision = hits / confusion.sum(axis=0)
+        recall = hits / confusion.sum(axis=1)
+        f1 = 2.0 * hits / (confusion.sum(axis=0) + confusion.sum(axis=1))
+    f1[np.isnan(precision)] = np.nan
+    return np.stack([precision, recall, f1], axis=1)
+
+
+def mean_confusion(repeats: Sequence[Training]) -> FloatArray:
+    """Return the share of each truth that got each diagnosis on the test set, (truth, diagnosis).
+
+    NaN in the row of a class that the test set lacks.
+    """
+    total = np.sum([training.confusion for training in repeats], axis=0).astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        return total / total.sum(axis=1, keepdims=True)
+
+
+# Pictures of the study. Need the extra `plots`.
+
+COLOURS = {"training": GREY, "validation": BLUE, "test": RED}
+
+
+def training_figure(
+    trainings: Sequence[Training], learning_rate: float, published: Mapping[str, float]
+) -> Figure:
+    """Return accuracy by iterations, a panel for each feature set, with error bars of one sd.
+
+    Args:
+        trainings: All results.
+        learning_rate: Which of them to show.
+        published: Published accuracies by set, drawn as lines in the panel of augmented features.
+    """
+    figure = figure_class()(figsize=(11.0, 4.2), layout="constrained")
+    panels = figure.subplots(1, len(FEATURES), sharey=True)
+    for panel, features in zip(panels, FEATURES, strict=True):
+        repeats = of_kind(trainings, features, learning_rate)
+        iterations = [point.iteration for point in repeats[0].checkpoints]
+        for name in SETS:
+            rows = accuracies(repeats, name)
+            panel.errorbar(
+                iterations,
+                [100.0 * row.mean for row in rows],
+                yerr=np.nan_to_num([100.0 * row.deviation for row in rows]),
+                color=COLOURS[name],
+                marker="o",
+                ms=4,
+                capsize=3,
+                label=name,
+            )
+            if features == "augmented":
+                panel.axhline(100.0 * published[name], color=COLOURS[name], lw=0.8, ls=":")
+        panel.set_title(f"{features} features", fontsize=10)
+        panel.set_xlabel("iterations")
+        panel.set_ylim(0.0, 102.0)
+        clean(panel)
+    panels[0].set_ylabel("right [%]")
+    panels[0].legend(loc="lower right", fontsize=8, frameon=False)
+    return figure
+
+
+def path_figure(runs: xr.Dataset, run: int, twin: DigitalTwin) -> Figure:
+    """Return the simulated and the measured path of a run, and what lies between them.
+
+    Args:
+        runs: The test set.
+        run: Number of the run in it.
+        twin: The published twin.
+    """
+    time = as_floats(runs["time"].values)
+    measured = as_floats(runs["measured"].values[run])
+    simulated = twin.path(twin.respond(as_floats(runs["command"].values[run]), time))
+    seen = np.isfinite(measured).all(axis=1)
+    figure = figure_class()(figsize=(11.0, 5.4), layout="constrained")
+    panels = figure.subplots(2, len(AXES), sharex=True)
+    for column, axis in enumerate(AXES):
+        upper, lower = panels[:, column]
+        upper.plot(time, MM_PER_M * simulated[:, column], color=GREY, lw=2.0, label="simulated")
+        upper.plot(time[seen], MM_PER_M * measured[seen, column], color=BLUE, label="measured")
+        upper.set_title(f"{axis} [mm]", fontsize=10)
+        residual = MM_PER_M * (measured - simulated)[seen, column]
+        lower.plot(time[seen], residual, color=RED)
+        lower.set_xlabel("time [s]")
+        clean(upper)
+        clean(lower)
+    panels[0, 0].legend(fontsize=8, frameon=False)
+    panels[1, 0].set_ylabel("residual [mm]")
+    return figure
+
+
+def confusion_figure(shares: Mapping[str, FloatArray], classes: Sequence[str]) -> Figure:
+    """Return confusion matrices side by side.
+
+    Args:
+        shares: Share of each truth that got each diagnosis, by title, (truth, diagnosis).
+        classes: Names of the classes.
+    """
+    figure = figure_class()(figsize=(6.0 * len(shares), 5.6), layout="constrained")
+    panels = figure.subplots(1, len(shares), sharey=True, squeeze=False)[0]
+    for panel, (title, share) in zip(panels, shares.items(), strict=True):
+        panel.imshow(np.nan_to_num(share), vmin=0.0, vmax=1.0, cmap="Blues")
+        for truth, said in np.argwhere(np.nan_to_num(share) > 0.0):
+            value = share[truth, said]
+            colour = "white" if value > 0.6 else "black"
+            text = f"{100.0 * value:.0f}"
+            panel.text(said, truth, text, ha="center", va="center", fontsize=7, color=colour)
+        panel.set_xticks(range(len(classes)), classes, rotation=60, ha="right", fontsize=7)
+        panel.set_yticks(range(len(classes)), classes, fontsize=7)
+        panel.set_xlabel("diagnosis")
+        panel.set_title(title, fontsize=10)
+    panels[0].set_ylabel("truth")
+    return figure
+
 
 RATES = (REPRODUCING_RATE, PRINTED_RATE)
 

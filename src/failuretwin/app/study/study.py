@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from failuretwin import __version__
-from failuretwin.app.study.data import Exam, class_names, make_arrays
 from failuretwin.app.study.page import write_study_page
-from failuretwin.app.study.plan import StudyPlan
-from failuretwin.app.study.trainings import run_all
+from failuretwin.app.study.trainings import Exam, StudyPlan, class_names, make_arrays, run_all
+from failuretwin.core.config import fingerprint
 from failuretwin.core.errors import InputError, OutputError
-from failuretwin.core.fingerprint import fingerprint
 from failuretwin.data_knowledge.store import reason, replacing
 from failuretwin.digital_model.robot import Robot
 

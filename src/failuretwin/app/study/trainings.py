@@ -6,20 +6,202 @@ import json
 import multiprocessing
 import signal
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from failuretwin.app.study.data import load_arrays
-from failuretwin.app.study.plan import BATCH_RUNS, VALIDATION_SHARE, Job, StudyPlan
-from failuretwin.core.errors import FailureTwinError
+from failuretwin.core.errors import FailureTwinError, InputError
+from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import IntArray
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.data_knowledge.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import replacing
+from failuretwin.decision.learned.features import Encoder, Floats, signals_of
+from failuretwin.digital_model.robot import Robot
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# What the study does, to the letter of the paper; and a small version of it.
+
+FEATURES = ("original", "augmented")
+"""The paper's two feature sets."""
+PRINTED_RATE, REPRODUCING_RATE = 1e-4, 1e-3
+"""Learning rate as printed in the paper, and the reading that reproduces its Table II."""
+BATCH_RUNS = 32
+VALIDATION_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training.
+
+    Attributes:
+        features: Feature set.
+        learning_rate: Of Adam.
+        repeat: Number of the repetition, from 0: of the split and the random weights.
+    """
+
+    features: str
+    learning_rate: float
+    repeat: int
+
+    @property
+    def name(self) -> str:
+        """Name of its result file, without suffix."""
+        return f"{self.features}-{self.learning_rate:g}-{self.repeat}"
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """Sizes of the study; the defaults are the paper's.
+
+    Attributes:
+        seed: Seed of all chance.
+        runs_per_class: Simulated runs of each of the nine classes.
+        checkpoints: Iterations after which accuracies are taken, all of one training. The paper
+            calls them epochs; its figures fit iterations, of which an epoch has 101.
+        repeats: Repetitions of each training.
+        stand_in_runs: Runs of each class by the physics engine where no real test set is given.
+    """
+
+    seed: int = 0
+    runs_per_class: int = 400
+    checkpoints: tuple[int, ...] = (1010, 2020, 3030, 4040, 5050)
+    repeats: int = 5
+    stand_in_runs: int = 100
+
+    def jobs(self) -> Iterator[Job]:
+        """Give every training, those that tell most first."""
+        for repeat in range(self.repeats):
+            for rate in (REPRODUCING_RATE, PRINTED_RATE):
+                for features in reversed(FEATURES):
+                    yield Job(features, rate, repeat)
+
+    @property
+    def iterations(self) -> int:
+        """Iterations of one training."""
+        return self.checkpoints[-1]
+
+
+def quick_plan(seed: int) -> StudyPlan:
+    """Return a study of about two minutes: all of its parts, figures that mean little."""
+    return StudyPlan(seed, 60, (50, 100, 150, 200, 250), 2, 20)
+
+
+# The study's runs as features: simulated by the published twin, and a test set beside them.
+
+
+@dataclass(frozen=True)
+class Exam:
+    """Runs that networks are tested on.
+
+    Attributes:
+        runs: The run set.
+        real: Whether they come from a log, not from the physics engine.
+        source: What they are, in words.
+    """
+
+    runs: xr.Dataset
+    real: bool
+    source: str
+
+
+@dataclass(frozen=True)
+class Arrays:
+    """Features and classes of the simulated runs and of the test set, by feature set.
+
+    Attributes:
+        simulated: (run, point, channel).
+        simulated_class: (run,).
+        test: (run, point, channel).
+        test_class: (run,).
+    """
+
+    simulated: Floats
+    simulated_class: IntArray
+    test: Floats
+    test_class: IntArray
+
+
+def class_names(robot: Robot) -> list[str]:
+    """Return the paper's classes in the order of its labels."""
+    return [str(hypothesis) for hypothesis in paper_hypotheses(robot.motor_names)]
+
+
+def real_test_set(path: Path, robot: Robot, published_labels: bool) -> Exam:
+    """Read a test set as the authors processed theirs: readings drawn out by straight lines.
+
+    Raises:
+        InputError: If it cannot be read or its truth is not known or not one of the classes.
+    """
+    runs = read_runs(path, robot, ReadOptions("published", published_labels))
+    check_motors(runs, robot.name, robot.motor_names)
+    truth = truth_of(runs)
+    if truth is None:
+        raise InputError(
+            f"{path}: the truth of its runs is not known, so nothing can be tested on them. Give a "
+            "run set with `fault`, or raw sessions whose folders end in _label_K with "
+            "--published-labels."
+        )
+    strange = sorted(set(truth) - set(class_names(robot)))
+    if strange:
+        raise InputError(
+            f"{path}: runs of {', '.join(strange)} are no class of the study. Expected "
+            f"{', '.join(class_names(robot))}."
+        )
+    return Exam(runs, real=True, source=f"{runs.sizes['run']} runs of {path}")
+
+
+def stand_in_test_set(plan: StudyPlan, robot: Robot) -> Exam:
+    """Simulate a test set with the physics engine, for want of a real one."""
+    hypotheses = paper_hypotheses(robot.motor_names)
+    count = plan.stand_in_runs
+    runs = simulate(Plan(robot, hypotheses, count, plan.seed + 1, engine="physics"))
+    return Exam(
+        runs,
+        real=False,
+        source=f"{len(hypotheses) * count} runs of the physics engine, which stands in for a robot",
+    )
+
+
+def make_arrays(plan: StudyPlan, robot: Robot, test: Exam, folder: Path) -> None:
+    """Simulate the training data and write a file of arrays for each feature set into `folder`."""
+    names = class_names(robot)
+    simulated = simulate(
+        Plan(robot, paper_hypotheses(robot.motor_names), plan.runs_per_class, plan.seed)
+    )
+    for features in FEATURES:
+        encoder = Encoder(features, robot)
+        with replacing(_data_file(folder, features)) as partial, partial.open("wb") as file:
+            np.savez(
+                file,
+                simulated=encoder.encode(signals_of(simulated)),
+                simulated_class=_classes(simulated, names),
+                test=encoder.encode(signals_of(test.runs)),
+                test_class=_classes(test.runs, names),
+            )
+
+
+def load_arrays(folder: Path, features: str) -> Arrays:
+    """Return what `make_arrays` wrote."""
+    with np.load(_data_file(folder, features), allow_pickle=False) as stored:
+        return Arrays(**stored)
+
+
+def _data_file(folder: Path, features: str) -> Path:
+    return folder / f"{features}.npz"
+
+
+def _classes(runs: xr.Dataset, names: list[str]) -> IntArray:
+    return np.array([names.index(fault) for fault in truth_of(runs) or []], dtype=np.int64)
+
 
 LOOK_S = 0.5
 """Time between two looks at how far the trainings are [s]."""
@@ -85,7 +267,7 @@ def processes(jobs: int) -> int:
 
     if torch.cuda.is_available():
         return 1
-    from failuretwin.decision.learned.stream import cores
+    from failuretwin.decision.learned.networks import cores
 
     return min(jobs, cores())
 
@@ -147,10 +329,11 @@ def train(plan: StudyPlan, folder: Path, classes: int, job: Job) -> None:
     """Do one training and write its result into `folder`."""
     import torch
 
-    from failuretwin.decision.learned.networks import Shape, build_network
-    from failuretwin.decision.learned.training import (
+    from failuretwin.decision.learned.networks import (
         Pace,
+        Shape,
         Standard,
+        build_network,
         scores_of,
         shuffled_batches,
         training,

@@ -6,11 +6,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import gammaln, stdtr
 
+from failuretwin.core.numerics import log_student
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
-from failuretwin.data_knowledge.settled_evidence import SettledEvidence, settled_evidence
 from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.settling import largest_load
 from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.evidence import SettledEvidence, settled_evidence
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -185,3 +188,132 @@ def stayed(observations: Observations, robot: Robot, expected: FloatArray) -> Bo
     best = np.argmin(away, axis=0)
     clear = (away[0] > FAR_OFF_M) & (away.min(axis=0) < 0.5 * away[0])
     return np.stack(sets)[np.where(clear, best, 0)] & travel
+
+
+# How probable settled errors are: a linear model with the scatter of a Student t.
+
+ROUNDING = float(1.0 / np.sqrt(12.0))
+"""Standard deviation of what whole numbers round off."""
+LEAST_DOF = 1.0
+"""Degrees of freedom below which tails grow no heavier: where every error is far smaller than what
+counts round off, ever heavier tails would fit ever better."""
+
+
+@dataclass(frozen=True)
+class SettledErrors:
+    """Settled errors as a linear model of bias, compliance and friction, with scatter.
+
+    Attributes:
+        error: Settled minus commanded: angles (movement, motor) [rad] or tool (movement, axis) [m].
+        design: Factor of bias, compliance and friction, (3, movement, motor).
+        jacobian: Tool position by angle, (movement, axis, motor); None where angles were read.
+        count: Step that motors are read in [rad]; 0: read as they are.
+        arrived: How probable it is that each command arrived, (movement, motor): a reading counts
+            by so much.
+    """
+
+    error: FloatArray
+    design: FloatArray
+    jacobian: FloatArray | None
+    count: float
+    arrived: FloatArray
+
+    def log_likelihood(self, parameters: FloatArray) -> float:
+        """Return the log likelihood of parameters as in `SettledFit.mode`.
+
+        With the tool path alone, the logarithm of the tool sensor's noise [m] comes after them.
+        """
+        motors = self.design.shape[2]
+        grouped = parameters[: 4 * motors].reshape(4, -1)
+        linear, log_scatter = grouped[:3], grouped[3]
+        dof = max(float(np.exp(parameters[4 * motors])), LEAST_DOF)
+        expected = np.einsum("pik,pk->ik", self.design, linear)
+        scatter = np.exp(log_scatter)
+        if self.jacobian is None:
+            density = log_rounded_student(self.error - expected, scatter, self.count, dof)
+            return float(np.sum(density * self.arrived))
+        scale = np.hypot(scatter, self.count * ROUNDING)
+        moved = np.einsum("iak,ik->ia", self.jacobian, expected)
+        noise = float(np.exp(2.0 * parameters[-1]))
+        return float(np.sum(log_student(self.error - moved, self.jacobian * scale, noise, dof)))
+
+
+def log_rounded_student(
+    error: FloatArray, scale: FloatArray, count: float, dof: float
+) -> FloatArray:
+    """Return log densities of Student t errors that are read in whole counts.
+
+    A reading stands for all angles within half a count, so its probability is that of all of them
+    together. To widen the scale by the variance of rounding instead makes tails look lighter and
+    scatter smaller than they are.
+
+    Args:
+        error: Deviations, (..., motor) [rad].
+        scale: Scale of each motor, (motor,) [rad].
+        count: Step of the readings [rad]; 0: none.
+        dof: Degrees of freedom.
+
+    Returns:
+        Per rad, (..., motor).
+    """
+    away, half = np.abs(error), 0.5 * count
+    if count == 0.0:
+        constant = gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * np.log(dof * np.pi)
+        density = constant - np.log(scale) - 0.5 * (dof + 1) * np.log1p((away / scale) ** 2 / dof)
+        return np.asarray(density)
+    share = stdtr(dof, (half - away) / scale) - stdtr(dof, (-half - away) / scale)
+    return np.log(np.maximum(share, np.finfo(float).tiny) / count)
+
+
+def count_of(robot: Robot) -> float:
+    """Return the step that the motors are read in [rad]; 0 without servo units."""
+    if robot.profile.servo_units is None:
+        return 0.0
+    return float(abs(robot.servo_units.rad_per_count))
+
+
+def rounding(robot: Robot) -> float:
+    """Return the standard deviation of what whole servo counts round off [rad]."""
+    return count_of(robot) * ROUNDING
+
+
+# What is believed of a robot's settling before its logs are seen.
+
+OFFSET_PRIOR_RAD = 0.03
+"""Prior standard deviation of bias, friction and the largest sag [rad]: about 2 degrees."""
+SCATTER_PRIOR_RAD, SCATTER_PRIOR_SPREAD = 0.007, 1.0
+"""Prior median of the scatter [rad] and standard deviation of its logarithm."""
+DOF_PRIOR, DOF_PRIOR_SPREAD = 5.0, 0.7
+"""Prior median of the degrees of freedom and standard deviation of their logarithm."""
+TOOL_NOISE_PRIOR_M, TOOL_NOISE_PRIOR_SPREAD = 0.0005, 1.0
+"""Prior median of a tool sensor's own noise [m] and standard deviation of its logarithm."""
+
+
+@dataclass(frozen=True)
+class SettlingPrior:
+    """Independent normal priors: mean and standard deviation of each parameter."""
+
+    mean: FloatArray
+    deviation: FloatArray
+
+    @classmethod
+    def of(cls, robot: Robot, payload: float, of_motors: bool) -> SettlingPrior:
+        """Return priors that know how large a load the motors of the robot carry."""
+        motors = len(robot.motors)
+        load = np.maximum(largest_load(robot, payload), 1e-6)
+        offset = np.full(motors, OFFSET_PRIOR_RAD)
+        mean = np.zeros(4 * motors + 1)
+        mean[3 * motors : -1], mean[-1] = np.log(SCATTER_PRIOR_RAD), np.log(DOF_PRIOR)
+        compliance = np.where(load > 1e-6, OFFSET_PRIOR_RAD / load, 1e-9)
+        spread = np.full(motors, SCATTER_PRIOR_SPREAD)
+        deviation = np.concatenate([offset, compliance, offset, spread, [DOF_PRIOR_SPREAD]])
+        if of_motors:
+            return cls(mean, deviation)
+        return cls(
+            np.append(mean, np.log(TOOL_NOISE_PRIOR_M)),
+            np.append(deviation, TOOL_NOISE_PRIOR_SPREAD),
+        )
+
+    def log_density(self, parameters: FloatArray) -> float:
+        """Return the log density of parameters, but for a constant."""
+        return -0.5 * float(np.sum(((parameters - self.mean) / self.deviation) ** 2))

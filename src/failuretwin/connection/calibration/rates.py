@@ -10,7 +10,7 @@ from scipy.stats import beta, binom
 
 from failuretwin.connection.calibration.observations import TRAVEL_RAD, Observations
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.digital_model.imperfections import LostCommand, Range
+from failuretwin.digital_model.nonidealities import LostCommand, Range
 
 LEVEL = (0.025, 0.975)
 PRIOR_MOVEMENTS = 2.0

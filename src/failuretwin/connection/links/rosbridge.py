@@ -7,15 +7,16 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any, Self
 
-from failuretwin.connection.links.bulletin import Bulletin
-from failuretwin.connection.links.event_queue import EventQueue
-from failuretwin.connection.links.inbox import Inbox
-from failuretwin.connection.links.ros_topics import RosTopics, kind_of_type
-from failuretwin.connection.links.ros_writer import DIAGNOSTICS_TYPE
-from failuretwin.connection.links.values import Answer, Event, Item, LinkCounts
+from failuretwin.connection.links.base import Answer, Event, EventQueue, Item, LinkCounts
+from failuretwin.connection.links.ros_messages import (
+    DIAGNOSTICS_TYPE,
+    Bulletin,
+    RosTopics,
+    kind_of_type,
+)
+from failuretwin.connection.links.ros_reading import Inbox
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.bags.messages import Kind
-from failuretwin.data_knowledge.bags.topics import Role
+from failuretwin.data_knowledge.bags.messages import Kind, Role
 from failuretwin.digital_model.robot import Robot
 
 CONNECT_S = 5.0

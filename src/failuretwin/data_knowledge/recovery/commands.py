@@ -14,10 +14,9 @@ import numpy as np
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.recovery.approximate import fit_run
+from failuretwin.data_knowledge.recovery.exact import NoWholeUnitsError, solve_run
+from failuretwin.data_knowledge.recovery.fit import PathPart, fit_run
 from failuretwin.data_knowledge.recovery.inverse_kinematics import PlaneArm, plane_arm
-from failuretwin.data_knowledge.recovery.ramp_fit import PathPart
-from failuretwin.data_knowledge.recovery.whole_units import NoWholeUnitsError, solve_run
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 

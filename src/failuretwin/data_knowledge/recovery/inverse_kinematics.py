@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.core.units import ServoUnits
+from failuretwin.core.types import BoolArray, FloatArray, ServoUnits
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 

@@ -17,16 +17,13 @@ import numpy as np
 import torch
 
 from failuretwin import __version__
-from failuretwin.core.config import from_table
+from failuretwin.core.config import fingerprint, from_table
 from failuretwin.core.errors import InputError
-from failuretwin.core.fingerprint import fingerprint
 from failuretwin.data_knowledge.store import reason, replacing
-from failuretwin.decision.learned.blend import Weights
-from failuretwin.decision.learned.encoder import Encoder
-from failuretwin.decision.learned.estimator import LearnedDiagnoser, network_shape
-from failuretwin.decision.learned.networks import build_network
-from failuretwin.decision.learned.robust_features import Expectation
-from failuretwin.decision.learned.training import Standard
+from failuretwin.decision.learned.diagnoser import LearnedDiagnoser, network_shape
+from failuretwin.decision.learned.features import Encoder, Expectation
+from failuretwin.decision.learned.networks import Standard, build_network
+from failuretwin.decision.learned.posteriors import Weights
 from failuretwin.digital_model.robot import Robot
 
 FORMAT = 1

@@ -5,27 +5,39 @@ One module for each question: right or wrong (`classes`), false alarms (`alarms`
 (`reliability`, `ranks`, `coverage`), and which of two methods is better (`paired`).
 """
 
-from failuretwin.decision.metrics.alarms import Alarms, count_alarms
-from failuretwin.decision.metrics.classes import (
+from failuretwin.decision.metrics.classification import (
     NO_VERDICT,
+    Alarms,
     ClassScore,
+    LogScoreGain,
+    McNemar,
     Scores,
+    count_alarms,
     judged_truth,
+    log_score_gain,
+    mcnemar,
     score,
 )
-from failuretwin.decision.metrics.coverage import Coverage, IntervalCase, coverage_by_mode
 from failuretwin.decision.metrics.delay import Delays, alarm_threshold, delays_after_onset
-from failuretwin.decision.metrics.paired import LogScoreGain, McNemar, log_score_gain, mcnemar
-from failuretwin.decision.metrics.proper import LogScore, brier_score, log_score
-from failuretwin.decision.metrics.ranks import EcdfBand, RankCheck, check_ranks, rank_of_truth
-from failuretwin.decision.metrics.reliability import (
+from failuretwin.decision.metrics.probability import (
+    Coverage,
+    EcdfBand,
+    IntervalCase,
+    LogScore,
+    RankCheck,
     Reliability,
+    Share,
     adaptive_edges,
+    brier_score,
     calibrated_error,
+    check_ranks,
+    coverage_by_mode,
     equal_edges,
+    log_score,
+    rank_of_truth,
     reliability,
+    wilson_interval,
 )
-from failuretwin.decision.metrics.shares import Share, wilson_interval
 
 __all__ = [
     "NO_VERDICT",

@@ -8,7 +8,7 @@ import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.decision.metrics.shares import Share
+from failuretwin.decision.metrics.probability import Share
 
 ISOLATED = 0.5
 """A fault is isolated once it holds more than this share of the probability of any fault."""

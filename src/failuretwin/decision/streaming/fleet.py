@@ -14,19 +14,17 @@ from numbers import Real
 import numpy as np
 from numpy.typing import ArrayLike
 
-from failuretwin.core.diagnosis import Diagnosis
 from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
-from failuretwin.data_knowledge.log_quality import LogQuality
-from failuretwin.data_knowledge.settled_evidence import SETTLING_S
-from failuretwin.decision.bayes import BayesDiagnoser
-from failuretwin.decision.evidence.scene import Scene
-from failuretwin.decision.hypotheses.weighing import log_prior, shows_on_way
-from failuretwin.decision.judgement import Judgement, Place, judge
-from failuretwin.decision.streaming.following import Following, Starts
-from failuretwin.decision.streaming.samples import KEEP_S
-from failuretwin.decision.streaming.state import Arrays, arrays_of, put_arrays
-from failuretwin.decision.streaming.stillness import Stillness
+from failuretwin.decision.streaming.samples import KEEP_S, Stillness
+from failuretwin.decision.streaming.tracking import Following, Starts
+from failuretwin.decision.streaming.window import Arrays, arrays_of, put_arrays
+from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.evidence import SETTLING_S
+from failuretwin.inference.log_quality import LogQuality
+from failuretwin.inference.posterior import Judgement, Place, judge, log_prior, shows_on_way
+from failuretwin.inference.run_likelihood import Scene
 
 MOVEMENTS = 5
 """Movements that are remembered, the present one included: as many as a run of the paper has."""

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.inference.log_quality import (
+    FROZEN_S,
+    FROZEN_TRAVEL_RAD,
+    NEAR_ZERO_M,
+    NEARLY_STILL_M,
+    NEARLY_STILL_S,
+    STILL_M,
+)
 
 KEEP_S = 30.0
 """How long samples are kept [s]; movements that take longer are not found."""
@@ -91,3 +101,102 @@ def _fill(old: FloatArray, new: FloatArray) -> None:
     """Replace the values of robots (robot, ...) of which something new is known, in place."""
     known = np.isfinite(new).all(axis=-1)
     old[known] = new[known]
+
+
+# Tools that stand still though motors are told to move: a dead sensor, or a dead arm.
+
+
+@dataclass
+class _Watch:
+    """Since when values have not moved, and how far motors were told to travel meanwhile.
+
+    Attributes:
+        value: Where they stood then, (robot, value).
+        since_s: (robot, value) [s].
+        low: Least references since then, (robot, value, motor) [rad].
+        high: Greatest ones.
+    """
+
+    value: FloatArray
+    since_s: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+    @classmethod
+    def empty(cls, robots: int, values: int, motors: int) -> _Watch:
+        none = np.full((robots, values), np.nan)
+        travel = np.full((robots, values, motors), np.nan)
+        return cls(none.copy(), none.copy(), travel.copy(), travel.copy())
+
+    def begin(self, anew: BoolArray, time: float, value: FloatArray, command: FloatArray) -> None:
+        """Begin anew with some of the values (robot, value)."""
+        self.value[anew], self.since_s[anew] = value[anew], time
+        reference = np.broadcast_to(command[:, None], self.low.shape)
+        self.low[anew], self.high[anew] = reference[anew], reference[anew]
+
+    def follow(self, command: FloatArray) -> None:
+        """Take references, (robot, motor) [rad]; NaN where not known."""
+        np.fmin(self.low, command[:, None], out=self.low)
+        np.fmax(self.high, command[:, None], out=self.high)
+
+    def still_for(self, time: float, least_s: float) -> BoolArray:
+        """Return which stand still though two motors at least should move, (robot, value)."""
+        with np.errstate(invalid="ignore"):
+            travel = np.sort(self.high - self.low, axis=-1)[..., -2:].min(axis=-1)
+            return (time - self.since_s >= least_s) & (travel > FROZEN_TRAVEL_RAD)
+
+
+@dataclass
+class Stillness:
+    """Watches the tools of many robots, by the same rules as `log_quality`.
+
+    Attributes:
+        channels: Coordinates that report the very same number, by axis.
+        tools: Tools that stay near one place.
+        place: That place, (robot, axis) [m].
+    """
+
+    channels: _Watch
+    tools: _Watch
+    place: FloatArray
+
+    @classmethod
+    def unknown(cls, robots: int, motors: int) -> Stillness:
+        """Return a watch over tools that were never seen."""
+        tools = _Watch.empty(robots, 1, motors)
+        return cls(_Watch.empty(robots, 3, motors), tools, np.full((robots, 3), np.nan))
+
+    def since_s(self, robot: int) -> float:
+        """Return since when the tool of a robot has stood where it stands [s]."""
+        return float(min(self.tools.since_s[robot, 0], self.channels.since_s[robot].max()))
+
+    def see(
+        self, time: float, read: BoolArray, points: FloatArray, command: FloatArray
+    ) -> tuple[BoolArray, BoolArray]:
+        """Take readings and say what is dead.
+
+        Args:
+            time: When they were taken [s].
+            read: Robots that were read, (robot,).
+            points: Tool positions of all, (robot, axis) [m].
+            command: References of all, as far as known, (robot, motor) [rad].
+
+        Returns:
+            Tools among those read that stand still, (robot,), and channels that do alone,
+            (robot, axis).
+        """
+        with np.errstate(invalid="ignore"):
+            same = np.abs(points - self.channels.value) <= STILL_M
+            near = np.abs(points - self.place).max(axis=1) <= NEARLY_STILL_M
+        self.channels.begin(read[:, None] & ~same, time, points, command)
+        away = read & ~near
+        self.place[away] = points[away]
+        self.tools.begin(away[:, None], time, points[:, :1], command)
+        for watch in (self.channels, self.tools):
+            watch.follow(command)
+        frozen = self.channels.still_for(time, FROZEN_S)
+        frozen &= read[:, None]
+        still = self.tools.still_for(time, NEARLY_STILL_S)[:, 0] & read | frozen.all(axis=1)
+        # One at zero may be held there by a stuck motor; see `log_quality`.
+        alone = frozen & ~still[:, None] & (np.abs(self.channels.value) > NEAR_ZERO_M)
+        return still, alone

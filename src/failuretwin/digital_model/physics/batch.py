@@ -10,13 +10,122 @@ import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.digital_model.engine import Drive
-from failuretwin.digital_model.physics.extra import load_mujoco
-from failuretwin.digital_model.physics.model import PhysicsModel, build_model
-from failuretwin.digital_model.physics.parameters import PhysicsParameters
-from failuretwin.digital_model.physics.setpoint import filtered, limit_speed, refine
-from failuretwin.digital_model.physics.statics import rest_state
+from failuretwin.digital_model.physics.model import (
+    PhysicsModel,
+    PhysicsParameters,
+    build_model,
+    load_mujoco,
+)
 from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.twin import Drive
+
+# The servos' set-points: references within the speed limit, filtered, at the fine step.
+
+
+def limit_speed(reference: FloatArray, step: float, speed: FloatArray) -> FloatArray:
+    """Return references that chase the given ones no faster than each motor can.
+
+    Args:
+        reference: (run, time, motor) [rad].
+        step: Time between samples [s].
+        speed: Largest speed of each motor, (motor,) [rad/s].
+    """
+    largest = speed * step * (1.0 + 1e-9)  # a ramp at exactly this speed is left as it is
+    limited = reference.copy()
+    # Only runs that ask for more are touched, so that none depends on the others by rounding.
+    fast = (np.abs(np.diff(reference, axis=1)) > largest).any(axis=(1, 2))
+    for i in range(1, reference.shape[1]):
+        change = np.clip(reference[fast, i] - limited[fast, i - 1], -largest, largest)
+        limited[fast, i] = limited[fast, i - 1] + change
+    return limited
+
+
+def refine(samples: FloatArray, substeps: int) -> FloatArray:
+    """Return `samples` (run, time, motor) with straight lines between, `substeps` times finer.
+
+    The result has (time - 1) * substeps + 1 instants.
+    """
+    share = (np.arange(substeps) / substeps)[:, None]
+    low, high = samples[:, :-1, None], samples[:, 1:, None]
+    fine = low + share * (high - low)
+    fine = fine.reshape(len(samples), -1, samples.shape[-1])
+    return np.concatenate([fine, samples[:, -1:]], axis=1)
+
+
+def filtered(
+    reference: FloatArray, before: FloatArray, step: float, filter_s: FloatArray
+) -> FloatArray:
+    """Return references after each motor's first-order filter; exact for straight lines.
+
+    Args:
+        reference: (run, time, motor) [rad].
+        before: What the filter has put out at the first instant, (run, motor) [rad].
+        step: Time between instants [s].
+        filter_s: Time constants, (motor,) [s].
+
+    Returns:
+        (run, time, motor) [rad], beginning with `before`.
+    """
+    from scipy.signal import lfilter
+
+    out = np.empty_like(reference)
+    out[:, 0] = before
+    for k, tau in enumerate(filter_s):
+        kept = np.exp(-step / tau)
+        new = 1.0 - (1.0 - kept) * tau / step
+        old = (1.0 - kept) * tau / step - kept
+        memory = old * reference[:, :1, k] + kept * before[:, k, None]
+        out[:, 1:, k], _ = lfilter([new, old], [1.0, -kept], reference[:, 1:, k], axis=1, zi=memory)
+    return out
+
+
+# Where the arm rests: servo and flex balance the weight, the gears' friction is relaxed.
+
+ITERATIONS = 200
+AT_REST_RAD = 1e-13
+
+
+def rest_state(
+    model: PhysicsModel,
+    data: Any,
+    parameters: PhysicsParameters,
+    setpoint: FloatArray,
+    strength: FloatArray,
+) -> FloatArray:
+    """Return the full physics state of the arm at rest.
+
+    Args:
+        model: The model of the run.
+        data: A `mujoco.MjData` of it, overwritten.
+        parameters: The motors.
+        setpoint: Set-points in the physical sense, (motor,) [rad].
+        strength: Share of its stiffness that each servo has, (motor,).
+
+    Returns:
+        (state,), as `mujoco.rollout` takes it.
+    """
+    mujoco = load_mujoco()
+    give_drive = 1.0 / (strength * np.array([motor.stiffness for motor in parameters.motors]))
+    give_flex = 1.0 / np.array([motor.flex_stiffness for motor in parameters.motors])
+    mujoco.mj_resetData(model.compiled, data)
+    load, before, share = np.zeros_like(setpoint), np.zeros_like(setpoint), 1.0
+    for _ in range(ITERATIONS):
+        data.qpos[model.drive] = setpoint - give_drive * load
+        data.qpos[model.flex] = -give_flex * load
+        mujoco.mj_forward(model.compiled, data)
+        change = data.qfrc_bias[model.drive] - load
+        if np.abs(change * (give_drive + give_flex)).max() < AT_REST_RAD:
+            break
+        # Soft servos give way so far that the load swings to and fro: smaller steps converge.
+        share *= 0.5 if change @ before < -0.5 * before @ before else 1.0
+        load, before = load + share * change, change
+    sticks = model.friction >= 0
+    data.plastic[model.friction[sticks]] = data.qpos[model.drive[sticks]]
+    full = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    state = np.empty(mujoco.mj_stateSize(model.compiled, full))
+    mujoco.mj_getState(model.compiled, data, state, full)
+    return state
+
 
 SAMPLES_AT_ONCE = 250
 """Bounds what is in memory: states and controls of 64 runs at two steps each take about 10 MB."""

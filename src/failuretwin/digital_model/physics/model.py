@@ -15,15 +15,214 @@ brake is part of the gear and not limited. Friction of the gear is a spring that
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, fields
 from typing import Any
+from xml.etree import ElementTree
 
+import numpy as np
+
+from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
-from failuretwin.core.types import IntArray
-from failuretwin.digital_model.physics.arm import arm_spec
-from failuretwin.digital_model.physics.extra import load_mujoco
-from failuretwin.digital_model.physics.parameters import MotorPhysics, PhysicsParameters
+from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.urdf import Urdf, read_root, read_urdf
+
+# What the physics engine needs to know of motors and gears, and where it is written down.
+
+MAY_BE_ZERO = ("derivative", "damping", "friction", "flex_damping")
+MAY_BE_INFINITE = ("torque_limit",)
+
+
+@dataclass(frozen=True)
+class MotorPhysics:
+    """A motor with its servo and its gear. For a sliding joint read N for N m and m for rad.
+
+    Servo: torque = stiffness * (s - q) + derivative * (s' - q'), within the torque limit, with q
+    the angle of the drive and s the reference after a first-order filter. The motor's largest speed
+    is a fact of the robot's profile.
+
+    Attributes:
+        name: Name of the motor.
+        stiffness: Proportional gain of the servo [N m/rad].
+        derivative: Gain of the servo on the error's speed [N m s/rad].
+        filter_s: Time constant of the set-point filter [s].
+        damping: Back-EMF and viscous friction of the drive [N m s/rad]; the motor can turn no
+            faster than torque_limit / damping.
+        armature: Inertia of the rotor as seen behind the gear [kg m2].
+        friction: Coulomb friction of the gear [N m]; the drive comes to rest up to friction /
+            stiffness away from its set-point, which is all the dead band there is.
+        friction_yield: How far teeth and grease give before the gear slips [rad].
+        torque_limit: Stall torque [N m].
+        flex_stiffness: Stiffness of the gear's output side [N m/rad].
+        flex_damping: Damping of the output side [N m s/rad].
+        flex_inertia: Inertia that takes part in the flexing alone, such as the gear's last stage
+            [kg m2]; it bounds how fast the flex of a light link can ring.
+    """
+
+    name: str
+    stiffness: float
+    derivative: float
+    filter_s: float
+    damping: float
+    armature: float
+    friction: float
+    friction_yield: float
+    torque_limit: float
+    flex_stiffness: float
+    flex_damping: float
+    flex_inertia: float
+
+    def __post_init__(self) -> None:
+        for field in fields(self)[1:]:
+            value = getattr(self, field.name)
+            fits = value >= 0.0 if field.name in MAY_BE_ZERO else value > 0.0
+            if not fits or (math.isinf(value) and field.name not in MAY_BE_INFINITE):
+                raise InputError(
+                    f"motor {self.name!r}: {field.name} is {value}, expected a finite number "
+                    f"{'of zero or more' if field.name in MAY_BE_ZERO else 'above zero'}."
+                )
+
+    @property
+    def compliance(self) -> float:
+        """How far the output side gives way under load at rest [rad/(N m)]."""
+        return 1.0 / self.stiffness + 1.0 / self.flex_stiffness
+
+
+@dataclass(frozen=True)
+class PhysicsParameters:
+    """The motors of one robot.
+
+    Attributes:
+        source: Where the figures come from.
+        motors: One entry for each motor of the robot, in chain order.
+    """
+
+    source: str
+    motors: tuple[MotorPhysics, ...]
+
+    def check_fit(self, robot: Robot) -> None:
+        """Raise an error unless the motors are those of `robot`.
+
+        Raises:
+            InputError: If names or their order differ.
+        """
+        names = [motor.name for motor in self.motors]
+        if names != robot.motor_names:
+            raise InputError(
+                f"physics parameters are for motors {', '.join(names)}; {robot.name!r} has "
+                f"{', '.join(robot.motor_names)}. List exactly these, in this order."
+            )
+
+
+def load_parameters(robot: Robot) -> PhysicsParameters | None:
+    """Return the parameters in the file that the robot's profile names; None if it names none.
+
+    Raises:
+        InputError: If the file cannot be used or does not fit the robot.
+    """
+    path = robot.physics_file
+    if path is None:
+        return None
+    parameters = from_table(PhysicsParameters, read_toml(path), str(path))
+    parameters.check_fit(robot)
+    return parameters
+
+
+# MuJoCo, an optional package that is loaded only where it is used.
+
+
+def load_mujoco() -> Any:
+    """Return the module `mujoco`.
+
+    Raises:
+        InputError: If it is not installed.
+    """
+    try:
+        import mujoco
+        import mujoco.rollout
+    except ImportError as error:
+        raise InputError(
+            f"the physics engine needs mujoco ({error}). Install it: "
+            "pip install 'failuretwin[physics]'."
+        ) from error
+    return mujoco
+
+
+# A URDF as a rigid arm in MuJoCo: only the motors' joints move, nothing collides.
+
+GRAVITY_M_S2 = 9.81
+TOOL = "tool point"
+"""Name of the site at the tool point."""
+
+JOINT_PARTS = ("parent", "child", "origin", "axis")
+"""What is taken over of a joint; limits, friction and mimicry are not."""
+NEXT_TO_NOTHING = 1e-9
+"""Mass [kg] and moment of inertia [kg m2] of links for which the URDF states none."""
+
+
+def arm_spec(robot: Robot, payload: float = 0.0) -> Any:
+    """Return the robot as a `mujoco.MjSpec` that can still be changed.
+
+    Joints turn in the physical sense and keep their URDF names; those without a motor are held at
+    zero. Gravity points down the z axis of the base frame.
+
+    Args:
+        robot: The robot.
+        payload: Mass of a point at the tool point [kg].
+
+    Raises:
+        InputError: If mujoco is missing or cannot use the URDF.
+    """
+    mujoco = load_mujoco()
+    path = robot.urdf_file
+    root = read_root(path)
+    _strip(root, {motor.joint for motor in robot.motors})
+    try:
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+    except ValueError as error:
+        raise InputError(f"{path}: MuJoCo cannot use it ({error}).") from error
+    spec.compiler.fusestatic = True
+    spec.compiler.balanceinertia = True
+    spec.compiler.boundmass = spec.compiler.boundinertia = NEXT_TO_NOTHING
+    spec.option.gravity = -GRAVITY_M_S2 * _up(read_urdf(path), robot.profile.base_link)
+    spec.option.disableflags |= (
+        mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
+    )
+    tool = spec.body(robot.profile.tool_link)
+    tool.add_site(name=TOOL)
+    if payload > 0.0:
+        point = tool.add_body(name="payload", mass=payload, explicitinertial=True)
+        point.inertia = np.full(3, NEXT_TO_NOTHING)
+    return spec
+
+
+def _strip(root: ElementTree.Element, moving: set[str]) -> None:
+    """Leave links with their masses and joints, of which only `moving` move."""
+    for element in list(root):
+        keep = {"link": ("inertial",), "joint": JOINT_PARTS}.get(element.tag)
+        if keep is None:
+            root.remove(element)
+            continue
+        if element.tag == "joint" and element.get("name") not in moving:
+            element.set("type", "fixed")
+        for part in list(element):
+            useless = part.tag == "axis" and element.get("type") == "fixed"
+            if part.tag not in keep or useless:
+                element.remove(part)
+
+
+def _up(urdf: Urdf, base_link: str) -> FloatArray:
+    """Return the z axis of the base frame in the frame of the URDF's root, (3,)."""
+    parent = {joint.child: joint.parent for joint in urdf.joints}
+    root = base_link
+    while root in parent:
+        root = parent[root]
+    T_rb = np.eye(4)
+    for joint in urdf.path(root, base_link):
+        T_rb = T_rb @ joint.T_pc
+    return T_rb[:3, 2]
+
 
 BRAKE_S = 2e4
 """Brake torque [N m] at 1 rad/s per N m/rad of servo stiffness [s]. A load under which the servo

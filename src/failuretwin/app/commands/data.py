@@ -1,0 +1,153 @@
+"""`failuretwin import`: logs into a run set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from failuretwin.app.commands.options import PATH, LogOptions, common_options, reading_options
+
+
+@click.command("import")
+@click.argument("sources", nargs=-1, required=True, type=PATH, metavar="SRC...")
+@click.option(
+    "--out",
+    required=True,
+    type=PATH,
+    help="What to write: a run set (.nc, .zarr), a published layout (.mat: one file of cells, no "
+    "ending for a folder of pairs), or .csv.",
+)
+@reading_options
+@common_options
+def import_(
+    sources: tuple[Path, ...],
+    out: Path,
+    reading: LogOptions,
+    robot: str,
+    seed: int,
+) -> None:
+    """Read logs and write them as one run set.
+
+    SRC is a run set (.nc, .zarr), a folder with raw sessions or published MATLAB files (searched
+    downwards), such a file (.mat), a bag (.bag, .mcap), or a CSV file with --columns.
+    """
+    del seed  # nothing here is drawn by chance
+    from failuretwin.app.inputs import read_inputs
+    from failuretwin.core.errors import InputError
+    from failuretwin.data_knowledge.matlab import check_export_suffix, export_runs
+    from failuretwin.digital_model.robot import load_robot
+    from failuretwin.digital_model.twin import DigitalTwin
+
+    check_export_suffix(out)
+    if out.resolve() in [source.resolve() for source in sources]:
+        raise InputError(f"{out}: is what is to be read. Give another name to write to.")
+    model = load_robot(robot)
+    runs = read_inputs(sources, model, reading)
+    export_runs(runs, out, DigitalTwin(model))
+    click.echo(f"{runs.sizes['run']} runs written to {out}")
+
+
+# `failuretwin simulate`: runs made by the twin.
+
+
+@click.command()
+@click.option("--out", required=True, type=PATH, help="Run set to write (.nc or .zarr).")
+@click.option(
+    "--runs-per-class",
+    type=click.IntRange(min=1),
+    default=400,
+    show_default=True,
+    help="Runs of each hypothesis; the paper has 400.",
+)
+@click.option(
+    "--hypotheses",
+    metavar="H,...",
+    help="What to simulate, such as healthy,motor_2:stuck. Default: the paper's nine classes.",
+)
+@click.option(
+    "--imperfections",
+    default="none",
+    show_default=True,
+    metavar="none|NAME|FILE",
+    help="What the robot does that its twin does not: nothing, what is known of the robot of that "
+    "name, or a TOML file.",
+)
+@click.option(
+    "--engine",
+    type=click.Choice(["servo", "physics"]),
+    default="servo",
+    show_default=True,
+    help="What moves the robot: the published servo loops, or rigid-body physics (MuJoCo) with "
+    "gears that stick and joints that flex.",
+)
+@click.option(
+    "--faults",
+    type=PATH,
+    metavar="FILE",
+    help="How large faults are, when they begin and how they grow: a TOML file with a table for "
+    "each mode, such as [drift]. Default: the paper's stuck and steady_state_error; the other "
+    "modes as assumed in docs/fault_modes.md.",
+)
+@click.option(
+    "--workers",
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    help="Processes on this machine to spread the work over; the runs do not depend on it.",
+)
+@click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="Dask scheduler whose workers do the work instead, such as tcp://host:8786. They must "
+    "share the folder of --out.",
+)
+@common_options
+def simulate(
+    out: Path,
+    runs_per_class: int,
+    hypotheses: str | None,
+    imperfections: str,
+    engine: str,
+    faults: Path | None,
+    workers: int,
+    scheduler: str | None,
+    robot: str,
+    seed: int,
+) -> None:
+    """Make labelled runs with the digital twin and write them as a run set.
+
+    To .zarr any number of runs can be written; if that is interrupted, the same command goes on
+    with what is missing. Up to a few thousand can be written to .nc.
+    """
+    from failuretwin.app.tables import progress_bar
+    from failuretwin.connection.calibration.result import robot_as_calibrated
+    from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
+    from failuretwin.data_knowledge.generate import Plan
+    from failuretwin.data_knowledge.resumable import produce
+    from failuretwin.data_knowledge.store import check_destination
+    from failuretwin.data_knowledge.workers import Workforce
+    from failuretwin.digital_model.nonidealities import load_imperfections
+    from failuretwin.digital_model.robot import load_robot
+    from failuretwin.failure_behavior.modes import MODES, load_modes
+
+    check_destination(out)
+    model = robot_as_calibrated(load_robot(robot), imperfections)
+    names = model.motor_names
+    plan = Plan(
+        robot=model,
+        hypotheses=(
+            parse_hypotheses(hypotheses.split(","), names)
+            if hypotheses is not None
+            else paper_hypotheses(names)
+        ),
+        runs_per_class=runs_per_class,
+        seed=seed,
+        imperfections=load_imperfections(imperfections, model),
+        engine=engine,
+        modes=MODES if faults is None else load_modes(faults),
+    )
+    workforce = Workforce(workers, scheduler)
+    with progress_bar("simulating", plan.size) as advance:
+        produce(plan, out, workforce, advance, tell=lambda text: click.echo(text, err=True))
+    click.echo(f"{plan.size} runs written to {out}")

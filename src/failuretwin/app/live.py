@@ -1,0 +1,367 @@
+"""From what stands on the command line to sources and sinks."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Sequence
+from contextlib import ExitStack, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import click
+import numpy as np
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from failuretwin.app.shadow import SILENCE_S, Change, Changes, Moment, Shadow
+from failuretwin.connection.links.base import LinkCounts, Pace, Sink, Source
+from failuretwin.connection.links.diagnostics import (
+    LEVEL_ERROR,
+    LEVEL_NAMES,
+    LEVEL_OK,
+    LEVEL_STALE,
+    LEVEL_WARN,
+    statuses,
+)
+from failuretwin.connection.links.ros_messages import RosTopics, load_topics
+from failuretwin.core.errors import InputError
+from failuretwin.data_knowledge.bags.messages import BagTopics
+from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.robot import Robot
+from failuretwin.failure_behavior.injection import ScheduledFault
+
+EMULATED, ROS1, ROSBRIDGE = "emulated", "ros1", "rosbridge"
+ROSBRIDGE_PORT = 9090
+"""Where rosbridge servers listen unless told otherwise."""
+SOURCES = f"{EMULATED}, {ROS1}, {ROSBRIDGE}://HOST[:PORT], or a log (raw session, bag, .mcap)"
+
+
+@dataclass(frozen=True)
+class EmulationOptions:
+    """What the command line says of an emulated robot.
+
+    Attributes:
+        faults: Faults in text form, such as ``motor_3:stuck@40-80``.
+        imperfections: Name or file; None: those of the robot's profile, if any.
+        duration_s: How long it works [s]; infinity: until it is interrupted.
+        seed: Seed of all chance.
+    """
+
+    faults: Sequence[str] = ()
+    imperfections: str | None = None
+    duration_s: float = math.inf
+    seed: int = 0
+
+
+def emulated_robot(
+    robot: Robot, options: EmulationOptions, pace: Pace, zero_s: float = 0.0
+) -> Source:
+    """Return an emulated robot as a source.
+
+    Args:
+        robot: The robot.
+        options: What the command line says of it.
+        pace: How fast its time passes.
+        zero_s: What its clock says at the start [s].
+    """
+    from failuretwin.connection.emulated_arm import Emulation, emulated
+
+    own = "none" if robot.imperfections_file is None else robot.name
+    emulation = Emulation(
+        robot=robot,
+        imperfections=load_imperfections(options.imperfections or own, robot),
+        schedule=tuple(ScheduledFault.parse(text, robot.motor_names) for text in options.faults),
+        seed=options.seed,
+    )
+    return emulated(emulation, pace, options.duration_s, zero_s)
+
+
+def topics_of(path: Path | None) -> RosTopics:
+    """Return the topics in a file; without one, those of the data set's authors."""
+    return RosTopics() if path is None else load_topics(path)
+
+
+@dataclass(frozen=True)
+class Connections:
+    """A robot to be watched, and where its diagnosis is published.
+
+    Attributes:
+        source: The robot.
+        sinks: Its network, where it has one.
+    """
+
+    source: Source
+    sinks: tuple[Sink, ...] = ()
+
+
+def connect(
+    text: str,
+    robot: Robot,
+    topics: RosTopics,
+    emulation: EmulationOptions,
+    pace: Pace,
+    stack: ExitStack,
+) -> Connections:
+    """Return what a SOURCE on the command line stands for.
+
+    Args:
+        text: One of `SOURCES`.
+        robot: The robot.
+        topics: Its topics on a network.
+        emulation: What an emulated robot is like.
+        pace: How fast time passes in logs and emulation.
+        stack: Closes everything in the end.
+
+    Raises:
+        InputError: If it does not exist, cannot be reached, is none of these, or is told what only
+            an emulated robot does.
+    """
+    if text == EMULATED:
+        return Connections(stack.enter_context(emulated_robot(robot, emulation, pace)))
+    if emulation.faults or emulation.imperfections:
+        raise InputError(
+            f"--fault and --imperfections are of an emulated robot, but the source is {text!r}. "
+            f"Leave them out, or watch {EMULATED!r}."
+        )
+    if text == ROS1:
+        return _ros1(robot, topics, stack)
+    if text.startswith(f"{ROSBRIDGE}://"):
+        return _rosbridge(text, robot, topics, stack)
+    from failuretwin.connection.links.recording import replay
+
+    path = Path(text)
+    if not path.exists():
+        raise InputError(f"source {text!r} does not exist. Expected {SOURCES}.")
+    named = None if topics == RosTopics() else _bag_topics(topics)
+    return Connections(stack.enter_context(replay(path, robot, pace, named)))
+
+
+def _bag_topics(topics: RosTopics) -> BagTopics:
+    """Return the topics of a network as those of a recording of it."""
+    return BagTopics(topics.command, topics.tool or None, topics.position or None)
+
+
+def _ros1(robot: Robot, topics: RosTopics, stack: ExitStack) -> Connections:
+    from failuretwin.connection.links.ros1 import Ros1Diagnostics, Ros1Source
+
+    source = stack.enter_context(Ros1Source(robot, topics))
+    return Connections(source, (stack.enter_context(Ros1Diagnostics(robot, topics)),))
+
+
+def _rosbridge(text: str, robot: Robot, topics: RosTopics, stack: ExitStack) -> Connections:
+    from failuretwin.connection.links import rosbridge
+
+    try:
+        address = urlsplit(text)
+        host, port = address.hostname, address.port or ROSBRIDGE_PORT
+    except ValueError:
+        host, port = None, 0
+    if not host:
+        raise InputError(f"{text!r} is no address. Expected {ROSBRIDGE}://HOST[:PORT].")
+    ros = rosbridge.connect(host, port)
+    stack.callback(rosbridge.disconnect, ros)
+    source = stack.enter_context(rosbridge.RosbridgeSource(robot, topics, ros))
+    sink = stack.enter_context(rosbridge.RosbridgeDiagnostics(robot, topics, ros))
+    return Connections(source, (sink,))
+
+
+# The live view on a terminal: motors, residual, posterior over time, what changed.
+
+STYLES = {
+    LEVEL_OK: "green",
+    LEVEL_WARN: "yellow",
+    LEVEL_ERROR: "bold red",
+    LEVEL_STALE: "magenta",
+}
+BLOCKS = " ▁▂▃▄▅▆▇█"
+COLUMNS = 60
+"""Width of the posterior over time."""
+COLUMN_S = 1.0
+"""Time of the stream that one column stands for [s]."""
+RESIDUAL_MM = 50.0
+"""Residual that fills its bar [mm]."""
+BAR = 20
+SHOWN_HYPOTHESES = 6
+SHOWN_CHANGES = 8
+
+
+class View:
+    """Draws what the shadow knows.
+
+    Args:
+        motors: Names of the robot's motors in chain order.
+        source: What the robot is called.
+    """
+
+    def __init__(self, motors: Sequence[str], source: str) -> None:
+        self._motors = motors
+        self._source = source
+        self._history: deque[dict[str, float]] = deque(maxlen=COLUMNS)
+        self._next_s = -np.inf
+
+    def remember(self, moment: Moment) -> None:
+        """Take a moment into the posterior over time; time without any is a gap."""
+        now_s = moment.stream_time
+        if now_s < self._next_s:
+            return
+        if np.isfinite(self._next_s):
+            missing = int((now_s - self._next_s) / COLUMN_S)
+            self._history.extend([{}] * min(missing, COLUMNS))
+        self._next_s = now_s + COLUMN_S
+        diagnosis, stale = moment.answer.diagnosis, moment.answer.state != "OK"
+        known = diagnosis is not None and not stale
+        self._history.append(dict(diagnosis.posterior) if known and diagnosis else {})
+
+    def draw(self, moment: Moment, counts: LinkCounts, changes: Sequence[Change]) -> RenderableType:
+        """Return the view of a moment.
+
+        Args:
+            moment: What the shadow knows.
+            counts: What the link has seen.
+            changes: What has changed so far, the newest last.
+        """
+        lines = [Text(str(change)) for change in list(changes)[-SHOWN_CHANGES:]]
+        return Group(
+            self._head(moment, counts),
+            self._motor_table(moment),
+            Panel(self._posterior(), title=f"posterior, last {COLUMNS} s", title_align="left"),
+            Panel(Group(*lines), title="what changed", title_align="left"),
+        )
+
+    def _head(self, moment: Moment, counts: LinkCounts) -> Text:
+        arm = statuses(moment.answer, self._motors)[0]
+        head = Text(f"{LEVEL_NAMES[arm.level]:6s}", STYLES[arm.level])
+        head.append(f" {arm.message}\n", "default")
+        off = float(np.linalg.norm(moment.residual)) * 1000.0
+        share = 0.0 if np.isnan(off) else min(1.0, off / RESIDUAL_MM)
+        said = "no reading" if np.isnan(off) else f"{off:5.1f} mm off the reference"
+        head.append(
+            f"{self._source}  {moment.stream_time:.1f} s  {counts.received} events, "
+            f"{counts.garbage} garbage, {counts.dropped} dropped, {counts.reconnects} reconnects, "
+            f"{1000 * moment.seconds:.1f} ms a sample\n",
+            "dim",
+        )
+        head.append(f"tool   {_bar(share)} {said}", "default")
+        return head
+
+    def _motor_table(self, moment: Moment) -> Table:
+        table = Table(box=None, pad_edge=False)
+        for name in ("motor", "state", "faulty", "", "how"):
+            table.add_column(name)
+        for status in statuses(moment.answer, self._motors)[1:]:
+            probability = float(status.values.get("probability", 0.0))
+            table.add_row(
+                status.name,
+                Text(LEVEL_NAMES[status.level], STYLES[status.level]),
+                f"{100 * probability:5.1f} %" if status.values else "",
+                _bar(probability),
+                status.message,
+            )
+        return table
+
+    def _posterior(self) -> Table:
+        """Return the posterior over time, a row for each hypothesis that ever mattered."""
+        weight: dict[str, float] = {}
+        for column in self._history:
+            for name, probability in column.items():
+                weight[name] = weight.get(name, 0.0) + probability
+        ranked = sorted(weight, key=lambda name: -weight[name])[:SHOWN_HYPOTHESES]
+        table = Table(box=None, show_header=False, pad_edge=False)
+        for name in ranked:
+            blocks = "".join(_block(column.get(name)) for column in self._history)
+            last = self._history[-1].get(name)
+            table.add_row(name, blocks, "" if last is None else f"{100 * last:5.1f} %")
+        return table
+
+
+def _bar(share: float) -> str:
+    full = round(BAR * share)
+    return "█" * full + "·" * (BAR - full)
+
+
+def _block(probability: float | None) -> str:
+    if probability is None:
+        return "?"
+    return BLOCKS[round(probability * (len(BLOCKS) - 1))]
+
+
+# Watching until the source ends or the user has seen enough.
+
+REFRESH_S = 0.25
+"""Time between two drawings [s]."""
+POLL_S = 0.1
+"""Longest wait for an event [s]."""
+LATE_S = 0.3
+"""A command that comes later than this spoils the diagnosis, and the user is told [s]."""
+
+
+def watch_until_end(
+    shadow: Shadow,
+    source: Source,
+    sinks: Sequence[Sink],
+    motors: list[str],
+    console: Console,
+    until_s: float,
+) -> Changes:
+    """Watch a robot; on a terminal with a live view, else with a line for each change.
+
+    Args:
+        shadow: The shadow of the robot.
+        source: The robot.
+        sinks: Where the shadow tells what it knows.
+        motors: Names of the robot's motors in chain order.
+        console: Where to draw.
+        until_s: When to stop, by our own monotonic clock [s].
+
+    Returns:
+        All that has changed.
+    """
+    changes, view = Changes(motors), View(motors, source.name)
+    live = Live(console=console, auto_refresh=False) if console.is_terminal else nullcontext()
+    begun_s, drawn_s = time.monotonic(), 0.0
+    with live as shown:
+        going = True
+        while going:
+            going = shadow.step(POLL_S) and time.monotonic() < until_s
+            troubles = _troubles(shadow, source, sinks, time.monotonic() - begun_s)
+            found = changes.notice(shadow.moment, source.counts, shadow.clock_jumps, troubles)
+            if shown is None:
+                _print(found)
+                continue
+            view.remember(shadow.moment)
+            if not going or time.monotonic() >= drawn_s + REFRESH_S:
+                drawn_s = time.monotonic()
+                picture = view.draw(shadow.moment, source.counts, changes.lines)
+                shown.update(picture, refresh=True)
+    return changes
+
+
+def _troubles(
+    shadow: Shadow, source: Source, sinks: Sequence[Sink], since_s: float
+) -> tuple[str, ...]:
+    """Return what keeps the diagnosis from being made or told.
+
+    Args:
+        shadow: The shadow of the robot.
+        source: The robot.
+        sinks: Where the shadow tells what it knows.
+        since_s: For how long the robot has been listened to [s].
+    """
+    found = [sink.trouble for sink in sinks if sink.trouble]
+    if source.counts.received == 0 and since_s > SILENCE_S:
+        found.append(f"nothing comes from {source.name}")
+    if shadow.late_s >= LATE_S:
+        wait = math.ceil(2.0 * shadow.late_s) / 2.0
+        found.append(f"commands come late: put commands_late_s = {wait} into the --topics file")
+    return tuple(found)
+
+
+def _print(found: Sequence[Change]) -> None:
+    for change in found:
+        click.echo(str(change))

@@ -1,1 +1,0 @@
-"""The live shadow: a robot is listened to, diagnosed at every sample, and shown."""

@@ -1,0 +1,299 @@
+"""The digital shadow: from the events of a link to answers, whatever happens to the link."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from failuretwin.connection.links.base import (
+    OK,
+    STALE,
+    Answer,
+    CommandSent,
+    Event,
+    LinkCounts,
+    Reading,
+    Sink,
+    Source,
+    StreamClock,
+)
+from failuretwin.connection.links.diagnostics import SURE, statuses
+from failuretwin.connection.links.live_commands import LiveReference, Sequencer
+from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.types import FloatArray
+from failuretwin.digital_model.twin import DigitalTwin
+
+SILENCE_S = 5.0
+"""Without a reading for so long on our own clock, the answer is stale [s]."""
+TICK_S = 0.5
+"""Time without an event after which the diagnoser is told that time goes on [s]."""
+
+
+class Believed(Protocol):
+    """What a streaming diagnoser answers."""
+
+    @property
+    def time(self) -> float:
+        """Time of the stream [s]."""
+        ...
+
+    @property
+    def state(self) -> str:
+        """``OK`` or ``STALE``."""
+        ...
+
+    @property
+    def diagnosis(self) -> Diagnosis | None:
+        """The diagnosis; None where there is none yet."""
+        ...
+
+
+class Diagnoser(Protocol):
+    """A streaming diagnoser."""
+
+    def update(
+        self,
+        time: float,
+        command: Mapping[str, float] | ArrayLike | None,
+        measured: ArrayLike | None,
+    ) -> Believed:
+        """Take what is known at a time of the stream and return what is believed then."""
+        ...
+
+    def conclude(self) -> Believed:
+        """Return what is believed when all that has come counts."""
+        ...
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What the shadow knows at one time.
+
+    Attributes:
+        answer: What is believed, by the robot's clock.
+        stream_time: Time since the first event, without leaps [s].
+        residual: Tool position minus where the reference puts it, (axis,) [m]; NaN if not known.
+        seconds: Time that the last sample took from our hands to its answer [s].
+    """
+
+    answer: Answer
+    stream_time: float
+    residual: FloatArray
+    seconds: float
+
+
+class Shadow:
+    """Feeds a diagnoser from a source and tells sinks what was seen and what is believed.
+
+    Args:
+        source: The robot.
+        diagnoser: The streaming diagnoser.
+        twin: Kinematics of the robot.
+        sinks: Where events and answers go.
+        commands_late_s: How much later than their stamps commands may arrive [s].
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        diagnoser: Diagnoser,
+        twin: DigitalTwin,
+        sinks: Sequence[Sink] = (),
+        commands_late_s: float = 0.0,
+    ) -> None:
+        self._source = source
+        self._diagnoser = diagnoser
+        self._twin = twin
+        self._sinks = sinks
+        self._clock = StreamClock()
+        self._sequencer = Sequencer(commands_late_s)
+        self._reference = LiveReference()
+        self._read_s = -np.inf
+        self._fed_s = time.monotonic()
+        self._newest = 0.0
+        self.moment = Moment(
+            Answer(self._clock.stamp(0.0), STALE, None), 0.0, np.full(3, np.nan), 0.0
+        )
+
+    @property
+    def clock_jumps(self) -> int:
+        """How often the robot's clock was set while it ran."""
+        return self._clock.jumps
+
+    @property
+    def late_s(self) -> float:
+        """The longest time by which a command came too late to be followed in time [s]."""
+        return self._reference.late_s
+
+    def step(self, timeout_s: float) -> bool:
+        """Take one event, or see that time goes on, and return whether there may be more.
+
+        Args:
+            timeout_s: Longest wait for an event [s].
+        """
+        event = self._source.poll(min(timeout_s, TICK_S))
+        if event is not None:
+            self._take(event)
+        elif self._source.ended:
+            self._feed_all(np.inf)
+            self._say(self._diagnoser.conclude(), self.moment.residual)
+            return False
+        elif time.monotonic() - self._fed_s >= TICK_S:
+            self._tick()
+        return True
+
+    def _take(self, event: Event) -> None:
+        now_s = time.monotonic()
+        for sink in self._sinks:
+            sink.put(event)
+        at = self._clock.place(event.time, now_s)
+        self._newest = max(self._newest, at)
+        self._sequencer.add(replace(event, time=at))
+        self._feed_all(self._newest)
+        self.moment = replace(self.moment, seconds=time.monotonic() - now_s)
+
+    def _tick(self) -> None:
+        """Tell the diagnoser that time goes on without data."""
+        now_s = time.monotonic()
+        self._fed_s = now_s
+        at = self._clock.at(now_s)
+        self._feed_all(at)
+        self._say(self._diagnoser.update(at, None, None), self.moment.residual)
+
+    def _feed_all(self, until: float) -> None:
+        for event in self._sequencer.ready(until):
+            if isinstance(event, CommandSent):
+                self._reference.add(event)
+            else:
+                self._feed(event)
+
+    def _feed(self, reading: Reading) -> None:
+        self._fed_s = time.monotonic()
+        if reading.position is not None and np.isfinite(reading.position).all():
+            self._reference.start_at(reading.position)
+        seen = reading.tool if np.isfinite(reading.tool).all() else None
+        command = None
+        for at, angles in self._reference.corners_to(reading.time):
+            if at < reading.time:
+                self._diagnoser.update(at, angles, None)
+            else:
+                command = angles
+        residual = self.moment.residual
+        if seen is not None:
+            self._read_s = self._fed_s
+            expected = np.full(3, np.nan) if command is None else self._twin.path(command)
+            residual = seen - expected
+        self._say(self._diagnoser.update(reading.time, command, seen), residual)
+
+    def _say(self, believed: Believed, residual: FloatArray) -> None:
+        silent = time.monotonic() - self._read_s > SILENCE_S
+        state = STALE if silent or believed.state != OK else OK
+        answer = Answer(self._clock.stamp(believed.time), state, believed.diagnosis)
+        self.moment = Moment(answer, believed.time, residual, self.moment.seconds)
+        for sink in self._sinks:
+            sink.put(answer)
+
+
+# What changes, in words: faults found, repairs noticed, silence, trouble with the link.
+
+KEPT = 1000
+"""Changes that are remembered; the recording holds all of them."""
+GARBAGE_EVERY_S = 10.0
+"""Time between two reports of messages that make no sense [s]."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """Something that changed.
+
+    Attributes:
+        stream_time: When [s].
+        text: What, in words.
+    """
+
+    stream_time: float
+    text: str
+
+    def __str__(self) -> str:
+        """Return it as a line."""
+        return f"{self.stream_time:8.1f} s  {self.text}"
+
+
+class Changes:
+    """Notices changes from moment to moment.
+
+    Args:
+        motors: Names of the robot's motors in chain order.
+    """
+
+    def __init__(self, motors: list[str]) -> None:
+        self.lines: deque[Change] = deque(maxlen=KEPT)
+        self._motors = motors
+        self._alarm = ""
+        self._state = ""
+        self._troubles: tuple[str, ...] = ()
+        self._counts = LinkCounts()
+        self._jumps = 0
+        self._garbage_at = -GARBAGE_EVERY_S
+
+    def notice(
+        self, moment: Moment, counts: LinkCounts, jumps: int, troubles: tuple[str, ...]
+    ) -> list[Change]:
+        """Return what has changed since the last call.
+
+        Args:
+            moment: What the shadow knows.
+            counts: What the link has seen.
+            jumps: How often the robot's clock was set.
+            troubles: What keeps sinks from working.
+        """
+        texts = self._link(moment.stream_time, counts, jumps, troubles)
+        texts += self._silence(moment)
+        texts += self._diagnosis(moment)
+        found = [Change(moment.stream_time, text) for text in texts]
+        self.lines.extend(found)
+        return found
+
+    def _silence(self, moment: Moment) -> list[str]:
+        before, self._state = self._state, moment.answer.state
+        if not before or before == self._state:
+            return []
+        return ["no data any more" if self._state == STALE else "data are coming"]
+
+    def _diagnosis(self, moment: Moment) -> list[str]:
+        answer = moment.answer
+        if answer.state == STALE or answer.diagnosis is None or answer.diagnosis.undecided:
+            return []
+        arm = statuses(answer, self._motors)[0]
+        best, before = answer.diagnosis.ranked[0], self._alarm
+        if best == before or answer.diagnosis.posterior[best] < SURE:
+            return []
+        self._alarm = best
+        return [f"healthy again: {arm.message}" if before and best == "healthy" else arm.message]
+
+    def _link(
+        self, at: float, counts: LinkCounts, jumps: int, troubles: tuple[str, ...]
+    ) -> list[str]:
+        before, texts = self._counts, []
+        if counts.reconnects > before.reconnects:
+            texts.append("the link is back")
+        if counts.dropped > before.dropped:
+            texts.append(f"{counts.dropped} events dropped so far: this computer is too slow")
+        if jumps > self._jumps:
+            texts.append("the robot's clock jumped; going on by our own")
+        garbage = before.garbage
+        if counts.garbage > garbage and at >= self._garbage_at + GARBAGE_EVERY_S:
+            self._garbage_at = at
+            garbage = counts.garbage
+            texts.append(f"{garbage} messages made no sense so far: {counts.last_garbage}")
+        texts += [trouble for trouble in troubles if trouble not in self._troubles]
+        texts += [f"over: {old}" for old in self._troubles if old not in troubles]
+        self._counts = LinkCounts(counts.received, garbage, counts.dropped, counts.reconnects)
+        self._jumps, self._troubles = jumps, troubles
+        return texts

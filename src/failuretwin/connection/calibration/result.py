@@ -1,0 +1,283 @@
+"""The result of a calibration: imperfections with error bars and where they come from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from failuretwin import __version__
+from failuretwin.core.config import from_table, read_toml
+from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.data_knowledge.store import check_writable, replacing
+from failuretwin.digital_model.nonidealities import (
+    CALIBRATION_TABLE,
+    Imperfections,
+    load_imperfections,
+)
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.servo import ServoLoop
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One figure learned from the logs.
+
+    Attributes:
+        name: What it is, such as ``compliance``.
+        motor: The motor it belongs to; empty for the whole robot.
+        unit: Its unit.
+        value: Best value.
+        low: Lower end of its 95 % interval.
+        high: Upper end.
+        identified: Whether the logs say it; otherwise the interval is mostly that of the prior.
+        note: What keeps the logs from saying it and which movement would, or empty.
+    """
+
+    name: str
+    motor: str
+    unit: str
+    value: float
+    low: float
+    high: float
+    identified: bool = True
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class LoopFit:
+    """Servo loop of a motor as its step tests speak for it.
+
+    Attributes:
+        motor: Its name.
+        P: Proportional gain [-].
+        I: Integral gain [1/s].
+        filter_s: Time constant of the input filter [s].
+        speed_limit: Largest speed [rad/s].
+    """
+
+    motor: str
+    P: float
+    I: float  # noqa: E741 - the field's name for an integral gain
+    filter_s: float
+    speed_limit: float
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A movement that did not count, because it does not look like one of a healthy motor.
+
+    Attributes:
+        run: Name of the run.
+        movement: Number of the movement in it, from 1; 0 for the whole run.
+        motor: The motor that stands out; empty where none does by itself.
+        reason: What it did.
+    """
+
+    run: str
+    movement: int
+    motor: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """How well a fit to all other sessions predicts one session.
+
+    Attributes:
+        session: The session left out.
+        movements: Its settled movements.
+        before: Robust size of the settled error of each motor without calibration, 1.48 times its
+            median size [rad]; of the three axes of the tool [m] where the log has no readings.
+        after: The same about what the fit to the others predicts.
+        gain: Mean log density of a movement under the fit, minus that with the generic figures of
+            an uncalibrated robot [nats].
+        gain_error: Standard error of `gain`.
+    """
+
+    session: str
+    movements: int
+    before: tuple[float, ...]
+    after: tuple[float, ...]
+    gain: float
+    gain_error: float
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What healthy logs teach of a robot.
+
+    Attributes:
+        imperfections: The twin's imperfections, with the doubt about them as variation.
+        parameters: Every figure with its 95 % interval.
+        sessions: Names of the sessions it was fitted to.
+        runs: Number of runs.
+        movements: Number of settled movements that count.
+        used_readings: Whether the motors' own readings were used, or the tool path alone.
+        left_out: What was left out.
+        held_out: How well it predicts sessions that it has not seen.
+        remarks: What else the user should know, in sentences.
+        loops: Servo loops from step tests; motors without any keep those of the profile. Timing is
+            what is left on top of them.
+    """
+
+    imperfections: Imperfections
+    parameters: tuple[Parameter, ...]
+    sessions: tuple[str, ...]
+    runs: int
+    movements: int
+    used_readings: bool
+    left_out: tuple[LeftOut, ...] = ()
+    held_out: tuple[HeldOut, ...] = ()
+    remarks: tuple[str, ...] = ()
+    loops: tuple[LoopFit, ...] = ()
+
+
+# Calibrations as TOML files: the imperfections, which the twin reads, and how they were found.
+
+
+@dataclass(frozen=True)
+class _Record:
+    """The table beside the imperfections: how they were found."""
+
+    robot: str
+    failuretwin_version: str
+    sessions: tuple[str, ...]
+    runs: int
+    movements: int
+    used_readings: bool
+    parameters: tuple[Parameter, ...]
+    left_out: tuple[LeftOut, ...] = ()
+    held_out: tuple[HeldOut, ...] = ()
+    remarks: tuple[str, ...] = ()
+    loops: tuple[LoopFit, ...] = ()
+
+
+def save_calibration(calibration: Calibration, robot: Robot, path: Path) -> None:
+    """Write a calibration; a file of that name is replaced at the end, all at once.
+
+    Raises:
+        OutputError: If it cannot be written; the old file is as before.
+    """
+    import tomli_w
+
+    record = _Record(
+        robot=robot.name,
+        failuretwin_version=__version__,
+        sessions=calibration.sessions,
+        runs=calibration.runs,
+        movements=calibration.movements,
+        used_readings=calibration.used_readings,
+        parameters=calibration.parameters,
+        left_out=calibration.left_out,
+        held_out=calibration.held_out,
+        remarks=calibration.remarks,
+        loops=calibration.loops,
+    )
+    table = {**_plain(calibration.imperfections), CALIBRATION_TABLE: _plain(record)}
+    text = (
+        "# What a healthy robot does that the published twin does not, learned from its logs by\n"
+        "# `failuretwin calibrate`. Angles in rad in the sense of the logs, times in s.\n"
+        f"{tomli_w.dumps(table)}"
+    )
+    with replacing(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+def check_calibration_file(path: Path) -> None:
+    """Raise an error unless a calibration can be written to `path`: worth asking before work."""
+    if path.suffix != ".toml":
+        raise InputError(f"{path}: a calibration ends in .toml.")
+    check_writable(path)
+
+
+def load_calibration(path: Path, robot: Robot) -> Calibration:
+    """Read what `save_calibration` wrote.
+
+    Raises:
+        InputError: If the file is no calibration, or one of another robot.
+    """
+    imperfections = load_imperfections(str(path), robot)
+    table = read_toml(path).get(CALIBRATION_TABLE)
+    if not isinstance(table, dict):
+        raise InputError(
+            f"{path}: holds imperfections without a calibration. Expected a file written by "
+            "`failuretwin calibrate`."
+        )
+    record = from_table(_Record, table, f"{path}: {CALIBRATION_TABLE}")
+    return Calibration(
+        imperfections=imperfections,
+        parameters=record.parameters,
+        sessions=record.sessions,
+        runs=record.runs,
+        movements=record.movements,
+        used_readings=record.used_readings,
+        left_out=record.left_out,
+        held_out=record.held_out,
+        remarks=record.remarks,
+        loops=record.loops,
+    )
+
+
+def _plain(value: Any) -> Any:
+    """Return a dataclass as TOML values: no None, lists for tuples, numbers with few digits."""
+    if is_dataclass(value) and not isinstance(value, type):
+        named = {field.name: getattr(value, field.name) for field in fields(value)}
+        return {name: _plain(item) for name, item in named.items() if item is not None}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):
+        return float(f"{value:.6g}")
+    return value
+
+
+# A robot with the servo loops that its own step tests speak for.
+
+
+def calibrated_robot(robot: Robot, calibration: Calibration) -> Robot:
+    """Return the robot with the loops and speed limits of a calibration; others stay.
+
+    Raises:
+        InputError: If the calibration names a motor that the robot does not have.
+    """
+    return with_loops(robot, calibration.loops)
+
+
+def with_loops(robot: Robot, loops: Sequence[LoopFit]) -> Robot:
+    """Return the robot with other loops and speed limits for some of its motors.
+
+    Raises:
+        InputError: If the robot does not have such a motor.
+    """
+    found = {loop.motor: loop for loop in loops}
+    for name in found:
+        if name not in robot.motor_names:
+            raise unknown_name("motor", name, robot.motor_names)
+    motors = tuple(
+        replace(
+            motor,
+            loop=ServoLoop(fit.P, fit.I, fit.filter_s),
+            speed_limit=fit.speed_limit,
+        )
+        if (fit := found.get(motor.name))
+        else motor
+        for motor in robot.motors
+    )
+    return replace(robot, profile=replace(robot.profile, motors=motors))
+
+
+def robot_as_calibrated(robot: Robot, name_or_path: str) -> Robot:
+    """Return the robot that goes with imperfections, whose timing is on top of their own loops.
+
+    Args:
+        robot: The robot as its profile has it.
+        name_or_path: What `load_imperfections` takes; only calibration files bring loops.
+
+    Raises:
+        InputError: If the file is a calibration that cannot be read or of another robot.
+    """
+    path = Path(name_or_path)
+    if path.suffix != ".toml" or CALIBRATION_TABLE not in read_toml(path):
+        return robot
+    return calibrated_robot(robot, load_calibration(path, robot))

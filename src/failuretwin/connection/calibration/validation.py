@@ -1,0 +1,332 @@
+"""Does the calibration predict logs that it has not seen? Each session left out in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from failuretwin.connection.calibration.observations import Observations, observe, rounding
+from failuretwin.connection.calibration.result import Calibration, HeldOut
+from failuretwin.connection.calibration.settling import (
+    SettledPart,
+    fit_settled_part,
+    fit_settling,
+    sort_movements,
+)
+from failuretwin.core.errors import InputError
+from failuretwin.core.numerics import log_student
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.digital_model.nonidealities import generic_imperfections
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.settling import Settling, largest_load
+from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.healthy_model import PATH_NOISE_M
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+TO_DEVIATION = 1.4826
+"""Median absolute deviation to standard deviation of a normal distribution."""
+
+
+def held_out_sessions(
+    observations: Observations, robot: Robot, payload: float = 0.0
+) -> tuple[HeldOut, ...]:
+    """Return how well the other sessions predict each session; empty with one session alone."""
+    found = []
+    for index in range(len(observations.sessions)):
+        inside = observations.session == index
+        if not inside.any() or inside.all():
+            continue
+        try:
+            others = fit_settled_part(observations[~inside], robot, payload)
+        except InputError:
+            continue  # what is left is too little to learn from
+        found.append(judge(observations[inside], others, robot, observations.sessions[index]))
+    return tuple(entry for entry in found if entry is not None)
+
+
+def judge(
+    observations: Observations, others: SettledPart, robot: Robot, session: str
+) -> HeldOut | None:
+    """Return how well a fit predicts settled movements that it has not seen.
+
+    Movements whose commands did not arrive are left out: there is nothing to predict of them. None
+    if fewer than two are left, for one movement says nothing of scatter.
+
+    Args:
+        observations: Settled movements of one session.
+        others: The fit to other sessions.
+        robot: The robot.
+        session: Name of the session.
+    """
+    settling = others.settling
+    generic = generic_imperfections(robot).settling
+    assert generic is not None
+    plain = settled_errors(observations, robot, None)
+    told = settled_errors(observations, robot, settling)
+    kept = _healthy(plain, observations)
+    gain = _log_density(observations, robot, settling) - _log_density(observations, robot, generic)
+    gain = gain[kept]
+    if len(gain) < 2:
+        return None
+    return HeldOut(
+        session=session,
+        movements=int(kept.sum()),
+        before=tuple(typical_size(plain[kept]).tolist()),
+        after=tuple(typical_size(told[kept]).tolist()),
+        gain=float(gain.mean()),
+        gain_error=float(gain.std(ddof=1) / np.sqrt(len(gain))),
+    )
+
+
+def _healthy(plain: FloatArray, observations: Observations) -> BoolArray:
+    """Return the movements in which everything went near where it was told."""
+    limit = 0.084 if observations.position is not None else 0.03
+    return np.asarray((np.abs(plain) < limit).all(axis=1))
+
+
+def typical_size(errors: FloatArray) -> FloatArray:
+    """Return 1.48 times the median size of the errors in each column.
+
+    It is taken about zero: a shift of the whole session is an error too.
+    """
+    return TO_DEVIATION * np.median(np.abs(errors), axis=0)
+
+
+def settled_errors(
+    observations: Observations, robot: Robot, settling: Settling | None
+) -> FloatArray:
+    """Return settled minus expected: of motors [rad] or of the tool [m], a row a movement.
+
+    Args:
+        observations: Settled movements.
+        robot: The robot.
+        settling: Where its motors settle; None: exactly at their targets.
+    """
+    pose = expected_pose(observations, robot, settling)
+    if observations.position is not None:
+        return observations.position - pose
+    return observations.point - DigitalTwin(robot).path(pose)
+
+
+def expected_pose(
+    observations: Observations, robot: Robot, settling: Settling | None
+) -> FloatArray:
+    """Return the angles at which motors are expected to settle, (movement, motor) [rad]."""
+    if settling is None:
+        return observations.target
+    target, direction = observations.target, observations.direction
+    near = target + settling.offset(robot, target, direction)
+    return target + settling.offset(robot, near, direction)
+
+
+def _log_density(observations: Observations, robot: Robot, settling: Settling) -> FloatArray:
+    """Return the log density of the settled tool position of each movement, (movement,)."""
+    pose = expected_pose(observations, robot, settling)
+    point, jacobian = DigitalTwin(robot).path_and_jacobian(pose)
+    spread = jacobian * np.asarray(settling.scatter)
+    return log_student(observations.point - point, spread, PATH_NOISE_M**2, settling.tail_dof)
+
+
+# Settled errors beside what a calibration expects of them, for a person to look at.
+
+MOST_FOLDS = 10
+"""Sessions are left out in at most this many groups: a fit to each rest takes about a second."""
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Settled errors and what is expected of them, a row a movement.
+
+    A channel is a motor [rad] or, where the log has the tool path alone, an axis of the tool [m].
+
+    Attributes:
+        error: Settled minus commanded, (movement, channel).
+        expected: What the fit expects it to be, (movement, channel).
+        scale: Scale of the Student t distribution of the difference, (movement, channel).
+        counts: Entries whose command arrived and that look healthy, (movement, channel).
+        target: Commanded angles, (movement, motor) [rad].
+        direction: Sign of the commanded travel, (movement, motor).
+        torque: Load torque that each motor meets, in the log's sense, (movement, motor) [N m].
+        of_motors: Whether channels are motors.
+        unseen: Whether each movement is expected by a fit that has not seen its session.
+    """
+
+    error: FloatArray
+    expected: FloatArray
+    scale: FloatArray
+    counts: BoolArray
+    target: FloatArray
+    direction: FloatArray
+    torque: FloatArray
+    of_motors: bool
+    unseen: bool
+
+
+def trusted_runs(found: Calibration, runs: xr.Dataset) -> xr.Dataset:
+    """Return the runs that were not left out as a whole."""
+    out = {entry.run for entry in found.left_out if entry.movement == 0}
+    kept = [i for i, run in enumerate(runs["run"].values) if str(run) not in out]
+    return runs.isel(run=kept)
+
+
+def settling_of(found: Calibration, robot: Robot) -> Settling:
+    """Return where the motors settle by a calibration."""
+    return found.imperfections.settling or Settling.ideal(len(robot.motors))
+
+
+def predict(found: Calibration, runs: xr.Dataset, robot: Robot) -> Predictions:
+    """Return what the calibration expects of the sessions held out.
+
+    Where none were, each session is expected by a fit to the others; with one session alone, by
+    the calibration itself.
+
+    Args:
+        found: The calibration.
+        runs: The runs it was learned from or judged on.
+        robot: The robot.
+    """
+    seen = observe(trusted_runs(found, runs), use_readings=found.used_readings)
+    settling = settling_of(found, robot)
+    learned = np.array([name in found.sessions for name in seen.sessions])[seen.session]
+    if not learned.all():
+        seen = seen[~learned]
+        return _predictions(seen, robot, settling, expected_pose(seen, robot, settling), True)
+    pose = _expected_by_others(seen, robot, settling.payload)
+    unseen = pose is not None
+    if pose is None:
+        pose = expected_pose(seen, robot, settling)
+    return _predictions(seen, robot, settling, pose, unseen)
+
+
+def _expected_by_others(seen: Observations, robot: Robot, payload: float) -> FloatArray | None:
+    """Return the angles expected by fits to other sessions; None where too little is left."""
+    groups = min(len(seen.sessions), MOST_FOLDS)
+    pose = np.empty_like(seen.target)
+    for group in range(groups):
+        inside = seen.session % groups == group
+        try:
+            others = fit_settled_part(seen[~inside], robot, payload)
+        except InputError:
+            return None
+        pose[inside] = expected_pose(seen[inside], robot, others.settling)
+    return pose
+
+
+def _predictions(
+    seen: Observations, robot: Robot, settling: Settling, pose: FloatArray, unseen: bool
+) -> Predictions:
+    lost, odd = sort_movements(seen, robot, settling)
+    twin, scatter = DigitalTwin(robot), np.asarray(settling.scatter)
+    error = settled_errors(seen, robot, None)
+    if seen.position is not None:
+        expected, counts = pose - seen.target, ~lost & ~odd[:, None]
+        scale = np.broadcast_to(np.hypot(scatter, rounding(robot)), error.shape)
+    else:
+        point, jacobian = twin.path_and_jacobian(pose)
+        expected = point - twin.path(seen.target)
+        counts = np.repeat(~lost.any(axis=1, keepdims=True) & ~odd[:, None], 3, axis=1)
+        scale = np.sqrt(jacobian**2 @ scatter**2 + PATH_NOISE_M**2)
+    settled = pose if seen.position is None else seen.position
+    return Predictions(
+        error=error,
+        expected=expected,
+        scale=scale,
+        counts=counts,
+        target=seen.target,
+        direction=seen.direction,
+        torque=robot.sense * robot.loads.torque(settled * robot.sense, settling.payload),
+        of_motors=seen.position is not None,
+        unseen=unseen,
+    )
+
+
+# What the robot might be beside what its profile says: another sense of a motor, a payload.
+
+SURE_NATS = 5.0
+"""Log odds from which one description of the robot is told to be better than another."""
+LEAST_SAG_RAD = 1e-3
+"""Sag below which nothing is said of a payload [rad]: a quarter of a servo count."""
+PAYLOADS_KG = (0.02, 0.1, 0.5, 2.0)
+"""Masses at the tool point that are tried [kg]."""
+
+
+def sense_remarks(part: SettledPart, robot: Robot) -> list[str]:
+    """Return what the logs say of each motor's sense, in sentences.
+
+    A motor that turns the other way sags the other way; where gravity hardly loads it, nothing can
+    be said.
+    """
+    loaded = np.flatnonzero(largest_load(robot, 0.0) > 1e-6).tolist()
+    best, odds = _best_senses(part, robot, loaded)
+    remarks = []
+    for k, motor in enumerate(robot.motors):
+        sense = best.motors[k].sense
+        if k not in odds:
+            told = "cannot be told, gravity does not load it"
+        elif odds[k] <= SURE_NATS:
+            told = f"the logs do not tell ({odds[k]:+.1f} nats for {sense:+.0f})"
+        elif sense == motor.sense:
+            told = f"{sense:+.0f} as in the profile, {odds[k]:.0f} nats better than the other way"
+        else:
+            told = (
+                f"the logs speak for {sense:+.0f} by {odds[k]:.0f} nats, the profile says "
+                f"{motor.sense:+.0f}; check it"
+            )
+        remarks.append(f"sense of {motor.name}: {told}")
+    return remarks
+
+
+def _best_senses(
+    part: SettledPart, robot: Robot, loaded: Sequence[int]
+) -> tuple[Robot, dict[int, float]]:
+    """Return the robot with the senses that fit best, and how much worse each other way is [nats].
+
+    The sense that gains most is turned first: a wrong one bends the loads of the motors before it,
+    and makes theirs look wrong too.
+    """
+    best, posterior = robot, part.fit.log_posterior
+    while True:
+        turned = {k: _refit(part, _with_turned(best, k), part.payload) for k in loaded}
+        k = max(turned, key=lambda motor: turned[motor], default=None)
+        if k is None or turned[k] - posterior <= SURE_NATS:
+            return best, {motor: posterior - other for motor, other in turned.items()}
+        best, posterior = _with_turned(best, k), turned[k]
+
+
+def _with_turned(robot: Robot, index: int) -> Robot:
+    motors = tuple(
+        replace(motor, sense=-motor.sense) if k == index else motor
+        for k, motor in enumerate(robot.motors)
+    )
+    return replace(robot, profile=replace(robot.profile, motors=motors))
+
+
+def best_payload(part: SettledPart, robot: Robot) -> tuple[float, str]:
+    """Return the payload that the logs speak for [kg] and a sentence about it.
+
+    Compliance can take up most of what a payload does, so it is 0 unless the logs are sure.
+    """
+    sag = np.abs(np.asarray(part.settling.compliance) * largest_load(robot, 0.0))
+    if sag.max() < LEAST_SAG_RAD:
+        return 0.0, "payload: the motors do not give way, so none can be told"
+    gain = np.array([_refit(part, robot, kg) for kg in PAYLOADS_KG]) - part.fit.log_posterior
+    best = int(np.argmax(gain))
+    if gain[best] > SURE_NATS:
+        kg = PAYLOADS_KG[best]
+        return kg, f"payload: about {kg:g} kg at the tool point, {gain[best]:.0f} nats over none"
+    return 0.0, (
+        "payload: the logs do not tell one from a softer motor "
+        f"(best {PAYLOADS_KG[best]:g} kg, {gain[best]:+.1f} nats against none); weigh it, or run "
+        "the same movements with and without it"
+    )
+
+
+def _refit(part: SettledPart, robot: Robot, payload: float) -> float:
+    """Return the log posterior of another description on the very same movements."""
+    seen, arrived = part.observations[part.fitted], part.arrived[part.fitted]
+    return fit_settling(seen, robot, arrived, payload).log_posterior

@@ -1,0 +1,262 @@
+"""The physics engine's arm at work without end: random movements, faults that come and go.
+
+A leg is what happens from one command to the next. All chance of the next one is drawn before the
+readings of this one are made, because a bus that stalls swallows readings before it delays a
+command.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import takewhile
+
+import numpy as np
+
+from failuretwin.connection.links.base import CommandSent, Event, Pace, PacedSource, Reading
+from failuretwin.core.errors import InputError
+from failuretwin.core.movements import Movements
+from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.digital_model.disturbances import (
+    Disturbances,
+    actual_movements,
+    draw_disturbances,
+    lagged,
+    sense,
+    stack,
+)
+from failuretwin.digital_model.nonidealities import Imperfections, vary
+from failuretwin.digital_model.physics.engine import LiveArm, PhysicsEngine
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.failure_behavior.fault import FaultValue
+from failuretwin.failure_behavior.injection import Injection, ScheduledFault
+from failuretwin.failure_behavior.mode import FaultMode
+from failuretwin.failure_behavior.modes import MODES
+from failuretwin.failure_behavior.random_movements import RandomMovements
+
+STEP_S = 0.01
+"""Step of the arm's time grid [s]."""
+FIRST_COMMAND_S = 1.0
+"""Time at rest before the first command [s]."""
+MEMORY_S = 6.0
+"""How long lags and play remember what they were told [s]; longer than any movement."""
+NOT_SCHEDULED = "intermittent"
+"""Comes and goes by itself; on a schedule it is a stuck motor that is repaired several times."""
+
+
+@dataclass(frozen=True)
+class Emulation:
+    """What to emulate.
+
+    Attributes:
+        robot: The robot.
+        imperfections: What it does that its twin does not.
+        schedule: Faults that come and go.
+        seed: Seed of all chance.
+        modes: Fault modes with their distributions, by id.
+    """
+
+    robot: Robot
+    imperfections: Imperfections
+    schedule: tuple[ScheduledFault, ...] = ()
+    seed: int = 0
+    modes: Mapping[str, FaultMode] = field(default_factory=lambda: MODES)
+
+    def __post_init__(self) -> None:
+        for scheduled in self.schedule:
+            if scheduled.fault.mode == NOT_SCHEDULED:
+                raise InputError(
+                    f"fault '{scheduled.fault}' comes and goes by itself and cannot be put on a "
+                    "schedule. Give a stuck motor several times instead."
+                )
+
+
+@dataclass(frozen=True)
+class _Leg:
+    """One movement and the time until the next.
+
+    Attributes:
+        time: Grid from where the arm stands to the next command, (time,) [s].
+        movement: The movement as commanded, one of one run.
+        chance: Bad luck of this one run with one movement.
+        late: How late it starts [s].
+        faults: The faults that are there, or were not long ago.
+    """
+
+    time: FloatArray
+    movement: Movements
+    chance: Disturbances
+    late: float
+    faults: Injection
+
+
+class EmulatedArm:
+    """An arm that moves at random for ever; the same seed gives the same life, whatever fails.
+
+    Args:
+        emulation: What to emulate.
+
+    Raises:
+        InputError: If mujoco is missing.
+    """
+
+    def __init__(self, emulation: Emulation) -> None:
+        self._emulation = emulation
+        self._rng, self._rng_of_faults = np.random.default_rng(emulation.seed).spawn(2)
+        imperfections = vary(emulation.imperfections, self._rng)
+        if imperfections.readings is not None:
+            readings = replace(imperfections.readings, drawn_out=False)
+            imperfections = replace(imperfections, readings=readings)
+        self._imperfections = imperfections
+        self._twin = DigitalTwin(emulation.robot)
+        self._self = self._upcoming = self._draw()
+        self._magnitude: dict[ScheduledFault, float] = {}
+        self._index = 0
+        self._start = FIRST_COMMAND_S
+        self._next_reading = 0.0
+        motors = len(emulation.robot.motors)
+        self._commanded = np.zeros(motors)
+        self._told = (self._self.bias + self._self.scatter[0])[None]
+        engine = PhysicsEngine(emulation.robot)
+        self._arm = LiveArm(engine, self._told[0], STEP_S, float(self._self.payload))
+
+    def events(self) -> Iterator[Event]:
+        """Give readings and commands in the order of their times, without end."""
+        while True:
+            leg = self._next_leg()
+            yield from sorted(self._live_through(leg), key=lambda event: event.time)
+
+    def _draw(self) -> Disturbances:
+        """Draw the bad luck of a movement; it is the second of two, as the first is never late."""
+        timing = self._imperfections.timing
+        longest = FIRST_COMMAND_S + self._imperfections.schedule.period_s[1] + timing.late_s[1]
+        return draw_disturbances(self._imperfections, self._emulation.robot, 2, longest, self._rng)
+
+    def _next_leg(self) -> _Leg:
+        drawn, self._upcoming = self._upcoming, self._draw()
+        schedule = self._imperfections.schedule
+        late = float(drawn.late[1])
+        following = self._start + late + float(self._rng.uniform(*schedule.period_s))
+        time = np.arange(self._index, round(following / STEP_S) + 1) * STEP_S
+        movement = RandomMovements(count=1).draw(
+            self._emulation.robot, schedule, self._rng, self._commanded
+        )
+        movement = replace(movement, start=np.array([[self._start]]))
+        self._start = following
+        chance = self._chance_of(drawn, as_floats(time))
+        return _Leg(
+            as_floats(time),
+            movement,
+            chance,
+            late,
+            self._injection(float(time[0]) - MEMORY_S, float(time[-1])),
+        )
+
+    def _chance_of(self, drawn: Disturbances, time: FloatArray) -> Disturbances:
+        """Return the disturbances of one run with one movement, by the leg's own time."""
+        here = self._told[-1] - self._commanded - self._self.bias
+        chance = replace(
+            drawn,
+            bias=self._self.bias,
+            compliance=self._self.compliance,
+            friction=np.zeros_like(self._self.friction),  # the gears have their own
+            delay=self._self.delay,
+            lag=self._self.lag,
+            shortening=self._self.shortening,
+            lost=drawn.lost[1:],
+            scatter=np.stack([here, drawn.scatter[2]]),
+            late=drawn.late[1:],
+            stalled=np.asarray(self._upcoming.late[1] > 0.0),
+            gap_start=drawn.gap_start[1:],
+        )
+        return stack([self._with_readings(chance, time)])
+
+    def _with_readings(self, chance: Disturbances, time: FloatArray) -> Disturbances:
+        """Return the disturbances with the readings of this leg alone, on an even beat."""
+        readings = self._imperfections.readings
+        if readings is None:
+            return chance
+        length = float(time[-1] - time[0])
+        first = self._next_reading - float(time[0])
+        count = max(0, int(np.ceil((length - first) * readings.rate_hz - 1e-9)))
+        self._next_reading += count / readings.rate_hz
+        at = np.clip(first + chance.reading_time[:count], STEP_S, length)
+        return replace(
+            chance, reading_time=at, glitch=chance.glitch[:count], noise=chance.noise[:count]
+        )
+
+    def _injection(self, begin_s: float, end_s: float) -> Injection:
+        """Return the faults that are there at any time between two times [s]."""
+        robot, values = self._emulation.robot, []
+        for scheduled in self._emulation.schedule:
+            if scheduled.overlaps(begin_s, end_s):
+                values.append(self._fault_value(scheduled, end_s))
+        return Injection([values], robot.motor_names, self._emulation.modes)
+
+    def _fault_value(self, scheduled: ScheduledFault, end_s: float) -> FaultValue:
+        fault = scheduled.fault
+        drawn = self._emulation.modes[fault.mode].draw(fault.motor, 1, end_s, self._rng_of_faults)
+        magnitude = self._magnitude.setdefault(scheduled, drawn.magnitude)
+        return replace(drawn, magnitude=magnitude, course=scheduled.course)
+
+    def _live_through(self, leg: _Leg) -> list[Event]:
+        position = self._move(leg)
+        local = leg.time - leg.time[0]
+        # A bus that stalls twice in a row comes back between; else it would be silent for minutes.
+        start = leg.movement.start - leg.time[0] + leg.late
+        readings = self._imperfections.readings
+        measured, angle = sense(self._twin, readings, position[None], local, start, leg.chance)
+        stalled = float(start[0, 0]) if leg.late > 0.0 else 0.0
+        seen = np.isfinite(angle[0]).any(axis=1) & (local > 0.0) & (local >= stalled)
+        events: list[Event] = [
+            Reading(float(leg.time[k]), measured[0, k], angle[0, k]) for k in np.flatnonzero(seen)
+        ]
+        movement = leg.movement
+        command = CommandSent(
+            float(movement.start[0, 0]), movement.target[0, 0], movement.ramp_duration[0, 0]
+        )
+        return [*events, command]
+
+    def _move(self, leg: _Leg) -> FloatArray:
+        """Return the angles on the leg's grid, (time, motor) [rad], and stand at its end."""
+        faulty, lost = leg.faults.on_movements(leg.movement, leg.chance.lost)
+        told = actual_movements(faulty, replace(leg.chance, lost=lost)).reference(leg.time)[0]
+        self._commanded = np.where(lost[0, 0], self._commanded, faulty.target[0, 0])
+        self._index += len(leg.time) - 1
+        self._told = np.concatenate([self._told, told[1:]])[-round(MEMORY_S / STEP_S) :]
+        grid = leg.time[-1] - np.arange(len(self._told))[::-1] * STEP_S
+        followed = lagged(self._told[None], grid, leg.chance.lag)
+        followed = leg.faults.on_reference(followed, as_floats(grid))[0]
+        held: BoolArray | None = leg.faults.held(leg.time)
+        weakness = leg.faults.weakness(leg.time)
+        before = self._arm.angle
+        angles = self._arm.follow(
+            followed[-(len(leg.time) - 1) :],
+            None if held is None else held[0, :-1],
+            None if weakness is None else weakness[0, 1:],
+        )
+        return np.concatenate([before[None], angles])
+
+
+# The emulated robot as a source, in this very process.
+
+
+def emulated(
+    emulation: Emulation, pace: Pace, duration_s: float = math.inf, zero_s: float = 0.0
+) -> PacedSource:
+    """Return an emulated robot as a source.
+
+    Args:
+        emulation: What to emulate.
+        pace: How fast its time passes.
+        duration_s: How long it works [s].
+        zero_s: What its clock says at the start [s].
+
+    Raises:
+        InputError: If mujoco is missing.
+    """
+    events = takewhile(lambda event: event.time <= duration_s, EmulatedArm(emulation).events())
+    stamped = (replace(event, time=event.time + zero_s) for event in events)
+    return PacedSource(f"emulated {emulation.robot.name}", stamped, pace)

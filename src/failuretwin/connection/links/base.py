@@ -1,0 +1,343 @@
+"""What passes along a link: readings and commands one way, answers the other."""
+
+from __future__ import annotations
+
+import time
+import time as wall_clock
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from threading import Condition
+from typing import Protocol, Self
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.types import FloatArray
+
+OK, STALE = "OK", "STALE"
+"""States of an answer: data keep coming, or they have stopped."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What the sensors say at one time.
+
+    Attributes:
+        time: By the robot's clock [s].
+        tool: Tool position in the base frame, (axis,) [m]; NaN where there is none.
+        position: Angles of the motors in the log's sense, (motor,) [rad], NaN where one is
+            missing; None where the robot does not tell. No diagnosis looks at them.
+    """
+
+    time: float
+    tool: FloatArray
+    position: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class CommandSent:
+    """A command: every motor shall ramp to its target, all starting together, and stay there.
+
+    Attributes:
+        time: By the robot's clock [s].
+        target: Where to go, (motor,) [rad].
+        duration: Time to get there, (motor,) [s].
+    """
+
+    time: float
+    target: FloatArray
+    duration: FloatArray
+
+
+Event = Reading | CommandSent
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What is believed at one time.
+
+    Attributes:
+        time: By the robot's clock [s].
+        state: ``OK``, or ``STALE`` where data have stopped; then nothing is known of the present.
+        diagnosis: The diagnosis as it stands, or stood when data stopped; None: there was none yet.
+    """
+
+    time: float
+    state: str
+    diagnosis: Diagnosis | None
+
+
+Item = Reading | CommandSent | Answer
+
+
+@dataclass(frozen=True)
+class LinkCounts:
+    """What a link has seen since it was opened.
+
+    Attributes:
+        received: Readings and commands.
+        garbage: Messages that made no sense and were left out.
+        dropped: Readings and commands given up because they were not fetched in time.
+        reconnects: How often the far side went away and came back.
+        last_garbage: What was wrong with the last message that made no sense.
+    """
+
+    received: int = 0
+    garbage: int = 0
+    dropped: int = 0
+    reconnects: int = 0
+    last_garbage: str = ""
+
+
+class Source(Protocol):
+    """Where readings and commands come from. Used in a ``with`` statement, fetched one by one."""
+
+    @property
+    def name(self) -> str:
+        """What to call it, such as its file or address."""
+        ...
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing can ever come any more; a robot that is silent has not ended."""
+        ...
+
+    @property
+    def counts(self) -> LinkCounts:
+        """What it has seen so far."""
+        ...
+
+    def poll(self, timeout_s: float) -> Event | None:
+        """Return the next event, waiting for it if need be.
+
+        Args:
+            timeout_s: Longest time to wait [s].
+
+        Returns:
+            The event; None if none came in time or the source has ended.
+        """
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+class Sink(Protocol):
+    """Where items go: a recording, a network. Used in a ``with`` statement."""
+
+    @property
+    def name(self) -> str:
+        """What to call it, such as its file or address."""
+        ...
+
+    @property
+    def trouble(self) -> str:
+        """What keeps items from arriving just now; empty if nothing does."""
+        ...
+
+    def put(self, item: Item) -> None:
+        """Take an item. A far side that is gone makes trouble, but no error."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+# The queue between a link's own thread and a consumer that may be slow.
+
+CAPACITY = 1000
+"""Events that wait at most: 100 s of a robot that reads at 10 Hz."""
+
+
+class EventQueue:
+    """Holds a limited number of events and counts those that it had to give up.
+
+    When it is full the oldest reading goes: a lost reading costs little, a lost command would make
+    a healthy robot look faulty.
+
+    Args:
+        capacity: Events that it can hold.
+    """
+
+    def __init__(self, capacity: int = CAPACITY) -> None:
+        self._capacity = capacity
+        self._events: deque[Event] = deque()
+        self._filled = Condition()
+        self.dropped = 0
+        self.received = 0
+
+    def put(self, event: Event) -> None:
+        """Add an event; never waits."""
+        with self._filled:
+            if len(self._events) >= self._capacity:
+                self._drop_one()
+            self._events.append(event)
+            self.received += 1
+            self._filled.notify()
+
+    def get(self, timeout_s: float) -> Event | None:
+        """Return the oldest event, None if none comes within `timeout_s` [s]."""
+        with self._filled:
+            if not self._events:
+                self._filled.wait(timeout_s)
+            return self._events.popleft() if self._events else None
+
+    def __len__(self) -> int:
+        """Return how many events wait."""
+        return len(self._events)
+
+    def _drop_one(self) -> None:
+        readings = (i for i, event in enumerate(self._events) if isinstance(event, Reading))
+        del self._events[next(readings, 0)]
+        self.dropped += 1
+
+
+# Stream time: the robot's stamps, without the leaps of a clock that is set while it runs.
+
+LEAP_S = 60.0
+"""A stamp this far ahead of the newest is a clock that was set, no silence [s]."""
+BACK_S = 5.0
+"""A stamp this far behind the newest is a clock that was set, no message that comes late [s]."""
+
+
+class StreamClock:
+    """Turns stamps into a time that starts at zero and never leaps.
+
+    Where the stamps leap, the time that has passed on our own clock is taken instead.
+    """
+
+    def __init__(self) -> None:
+        self.jumps = 0
+        self._offset: float | None = None
+        self._newest = 0.0
+        self._seen_s = 0.0
+
+    def place(self, stamp: float, now_s: float) -> float:
+        """Return the stream time of an event [s].
+
+        Args:
+            stamp: Its stamp by the robot's clock [s].
+            now_s: Our own monotonic clock [s].
+        """
+        if self._offset is None:
+            self._offset, self._seen_s = -stamp, now_s
+        time = stamp + self._offset
+        if not -BACK_S <= time - self._newest <= LEAP_S:
+            self.jumps += 1
+            time = self.at(now_s)
+            self._offset = time - stamp
+        if time >= self._newest:
+            self._newest, self._seen_s = time, now_s
+        return time
+
+    def at(self, now_s: float) -> float:
+        """Return the stream time [s] at a time of our own clock [s]; 0 until an event comes."""
+        if self._offset is None:
+            return self._newest
+        return self._newest + max(0.0, now_s - self._seen_s)
+
+    def stamp(self, time: float) -> float:
+        """Return what the robot's clock would say at a stream time, both [s].
+
+        Until it has said anything, it is taken to agree with ours.
+        """
+        if self._offset is None:
+            return wall_clock.time()
+        return time - self._offset
+
+
+# The pace at which recorded and emulated time passes.
+
+AS_FAST_AS_POSSIBLE = 0.0
+"""The speed at which nothing is waited for."""
+
+
+@dataclass
+class Pace:
+    """Waits until events are due.
+
+    Attributes:
+        speed: Seconds of the robot's time in each of ours; 0: as fast as possible.
+
+    Raises:
+        InputError: If the speed is negative or not finite.
+    """
+
+    speed: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.speed < float("inf"):
+            raise InputError(
+                f"speed is {self.speed:g}, expected a factor above 0, such as 1 (as recorded) or "
+                "10; 0 means as fast as possible."
+            )
+        self._zero: tuple[float, float] | None = None
+
+    def due(self, event_time: float, timeout_s: float) -> bool:
+        """Wait for an event and return whether it is due by now.
+
+        Args:
+            event_time: When it happens by the robot's clock [s]; the first one is due at once.
+            timeout_s: Longest time to wait [s].
+        """
+        if self.speed == AS_FAST_AS_POSSIBLE:
+            return True
+        now = time.monotonic()
+        if self._zero is None:
+            self._zero = event_time, now
+        first, began = self._zero
+        left = began + (event_time - first) / self.speed - now
+        if left > 0.0:
+            time.sleep(min(left, timeout_s))
+        return left <= timeout_s
+
+
+# Sources whose events are known or made here: replayed logs and the emulated robot.
+
+
+class PacedSource:
+    """Gives events when they are due. Nothing is dropped: a slow consumer gets them later.
+
+    Args:
+        name: What to call it.
+        events: Events in the order of their times.
+        pace: How fast time passes.
+    """
+
+    def __init__(self, name: str, events: Iterator[Event], pace: Pace) -> None:
+        self.name = name
+        self._events = events
+        self._pace = pace
+        self._next: Event | None = None
+        self._ended = False
+        self._received = 0
+
+    @property
+    def ended(self) -> bool:
+        """Whether all events have been given."""
+        return self._ended
+
+    @property
+    def counts(self) -> LinkCounts:
+        """How many events have been given."""
+        return LinkCounts(received=self._received)
+
+    def poll(self, timeout_s: float) -> Event | None:
+        """Return the next event; None if it is not due within `timeout_s` [s] or there is none."""
+        if self._next is None and not self._ended:
+            self._next = next(self._events, None)
+            self._ended = self._next is None
+        event = self._next
+        if event is None or not self._pace.due(event.time, timeout_s):
+            return None
+        self._next = None
+        self._received += 1
+        return event
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing to be closed."""

@@ -1,0 +1,182 @@
+"""Sums and integrals of probabilities in logarithms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import lgamma, log, pi
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from failuretwin.core.types import BoolArray, FloatArray, as_floats
+
+
+@dataclass(frozen=True)
+class Weighted:
+    """A distribution as values with weights, (value,) each; weights need not add up to 1."""
+
+    values: FloatArray
+    weights: FloatArray
+
+    def quantiles(self, levels: tuple[float, ...]) -> FloatArray:
+        """Return quantiles, (level,)."""
+        return weighted_quantiles(self.values, self.weights, levels)
+
+    def draw(self, count: int, rng: np.random.Generator) -> FloatArray:
+        """Return draws, (count,): between the values by straight lines, as quantiles are."""
+        return self.quantiles(tuple(rng.random(count).tolist()))
+
+
+def log_sum(values: FloatArray, axis: int | tuple[int, ...]) -> FloatArray:
+    """Return log(sum(exp(values))) along `axis`; an all -inf slice gives -inf."""
+    top = np.max(values, axis=axis, keepdims=True)
+    safe = np.where(np.isfinite(top), top, 0.0)
+    with np.errstate(divide="ignore"):
+        total = np.log(np.sum(np.exp(values - safe), axis=axis, keepdims=True)) + safe
+    return np.squeeze(total, axis=axis)
+
+
+def log_of(values: ArrayLike) -> FloatArray:
+    """Return the logarithm, -inf for 0 without a warning."""
+    with np.errstate(divide="ignore"):
+        return np.log(as_floats(values))
+
+
+def log_trapezoid_weights(nodes: FloatArray) -> FloatArray:
+    """Return log weights of the trapezoidal rule on sorted `nodes` (..., node), same shape.
+
+    Nodes that coincide get weight 0 between them.
+    """
+    steps = np.diff(nodes, axis=-1)
+    weights = np.zeros_like(nodes)
+    weights[..., :-1] += 0.5 * steps
+    weights[..., 1:] += 0.5 * steps
+    return log_of(weights)
+
+
+def weighted_quantiles(
+    values: FloatArray, weights: FloatArray, levels: tuple[float, ...]
+) -> FloatArray:
+    """Return quantiles of each row of weighted `values`, (..., value) -> (..., level)."""
+    order = np.argsort(values, axis=-1)
+    values = np.take_along_axis(values, order, axis=-1)
+    weights = np.take_along_axis(weights, order, axis=-1)
+    total = np.maximum(weights.sum(axis=-1, keepdims=True), np.finfo(float).tiny)
+    middle = (np.cumsum(weights, axis=-1) - 0.5 * weights) / total
+    flat = middle.reshape(-1, middle.shape[-1]), values.reshape(-1, values.shape[-1])
+    rows = [np.interp(levels, m, v) for m, v in zip(*flat, strict=True)]
+    return np.array(rows).reshape(*values.shape[:-1], len(levels))
+
+
+# Covariances of points in space, many at once: S = A A^T + noise I, solved in closed form.
+
+
+@dataclass(frozen=True)
+class Ellipsoid:
+    """Covariances (...) by their adjugates, which numpy handles faster than small matrices.
+
+    Attributes:
+        adjugate: xx, yy, zz, xy, xz, yz of the adjugate, each (...).
+        determinant: (...).
+    """
+
+    adjugate: tuple[FloatArray, ...]
+    determinant: FloatArray
+
+    @classmethod
+    def of(cls, root: FloatArray, noise: float) -> Ellipsoid:
+        """Return S = A A^T + noise I.
+
+        Args:
+            root: A, (..., 3, column).
+            noise: Variance added on each axis.
+        """
+        x, y, z = (root[..., axis, :] for axis in range(3))
+        dot = "...i,...i->..."
+        xx, yy, zz = (np.einsum(dot, a, a) + noise for a in (x, y, z))
+        xy, xz, yz = np.einsum(dot, x, y), np.einsum(dot, x, z), np.einsum(dot, y, z)
+        adjugate = (
+            *(yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy),
+            *(xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz),
+        )
+        return cls(adjugate, xx * adjugate[0] + xy * adjugate[3] + xz * adjugate[4])
+
+    def product(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        """Return a^T S^-1 b of vectors (..., 3), as (...)."""
+        return np.asarray(np.sum(a * self.solve(b), axis=-1))
+
+    def solve(self, b: FloatArray) -> FloatArray:
+        """Return S^-1 b of vectors (..., 3), as (..., 3)."""
+        xx, yy, zz, xy, xz, yz = self.adjugate
+        rows = (
+            xx * b[..., 0] + xy * b[..., 1] + xz * b[..., 2],
+            xy * b[..., 0] + yy * b[..., 1] + yz * b[..., 2],
+            xz * b[..., 0] + yz * b[..., 1] + zz * b[..., 2],
+        )
+        return np.stack(rows, axis=-1) / self.determinant[..., None]
+
+    def log_norm(self, dof: float) -> FloatArray:
+        """Return the log density at the centre of a Student t with this scale matrix, (...)."""
+        return log_norm(dof) - 0.5 * np.log(self.determinant)
+
+
+def log_norm(dof: float) -> float:
+    """Return the log density at the centre of the standard 3-variate Student t distribution.
+
+    Args:
+        dof: Degrees of freedom; infinite: normal.
+    """
+    if np.isinf(dof):
+        return -1.5 * log(2.0 * pi)
+    return lgamma((dof + 3.0) / 2.0) - lgamma(dof / 2.0) - 1.5 * log(dof * pi)
+
+
+def log_fall(square: FloatArray, dof: float) -> FloatArray:
+    """Return how far the log density of a 3-variate Student t has fallen from its centre.
+
+    Args:
+        square: Squared distance in scales, (...).
+        dof: Degrees of freedom; infinite: normal.
+    """
+    if np.isinf(dof):
+        return -0.5 * square
+    return -0.5 * (dof + 3.0) * np.log1p(square / dof)
+
+
+def log_student(error: FloatArray, root: FloatArray, noise: float, dof: float) -> FloatArray:
+    """Return log densities of a 3-variate Student t distribution with S = A A^T + noise I.
+
+    Args:
+        error: Deviations, (..., 3).
+        root: A, (..., 3, column).
+        noise: Variance added on each axis.
+        dof: Degrees of freedom; infinite: normal.
+
+    Returns:
+        (...).
+    """
+    spread = Ellipsoid.of(root, noise)
+    return spread.log_norm(dof) + log_fall(spread.product(error, error), dof)
+
+
+# Medians of some of the values, many at once.
+
+
+def masked_median(values: FloatArray, kept: BoolArray) -> FloatArray:
+    """Return the median of the values that are kept in each row.
+
+    Args:
+        values: (row, value).
+        kept: Which of them count, same axes.
+
+    Returns:
+        (row,); 0 where none is kept.
+    """
+    if values.shape[1] == 0:
+        return np.zeros(len(values))
+    ordered = np.sort(np.where(kept, values, np.inf), axis=1)
+    count = kept.sum(axis=1)
+    row = np.arange(len(values))
+    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, values.shape[1] - 1)
+    middle = 0.5 * (ordered[row, low] + ordered[row, high])
+    return np.where(count > 0, middle, 0.0)

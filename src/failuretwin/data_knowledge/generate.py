@@ -1,0 +1,414 @@
+"""Runs made by the twin: any hypotheses, any imperfections, as many as wanted.
+
+Every run has its own random generator, seeded by the plan's seed and the run's number, so a run
+is the same whoever makes it and whatever is made beside it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from multiprocessing import parent_process
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from failuretwin import __version__
+from failuretwin.core.config import canonical, fingerprint
+from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.hypothesis import Fault, Hypothesis
+from failuretwin.core.movements import Movements
+from failuretwin.core.runs import RunTable, Truth
+from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.data_knowledge.timed_log import assemble
+from failuretwin.data_knowledge.workers import Workforce
+from failuretwin.digital_model.disturbances import (
+    Disturbances,
+    actual_movements,
+    delay_commands,
+    draw_disturbances,
+    lagged,
+    sense,
+    stack,
+)
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfections, Range
+from failuretwin.digital_model.physics.engine import PhysicsEngine
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.settling import Settling, loads_in_range
+from failuretwin.digital_model.twin import DigitalTwin, Drive, Engine, ServoEngine
+from failuretwin.failure_behavior.fault import FaultValue
+from failuretwin.failure_behavior.injection import Injection
+from failuretwin.failure_behavior.mode import FaultMode
+from failuretwin.failure_behavior.modes import MODES
+from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# What to simulate: robot, states, imperfections, chance; small enough to write down.
+
+STEP_S = 0.01
+"""Step of the time grid [s], as published."""
+ENGINES = ("servo", "physics")
+LATE_STARTS = 2
+"""Late starts that a run has room for; what more of them push beyond the grid is cut off."""
+LEAST_SAG_RAD = 1e-6
+"""A motor that its load moves by less than this in any pose counts as rigid [rad]."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to simulate.
+
+    Attributes:
+        robot: The robot.
+        hypotheses: States of the robot, in the order in which their runs come.
+        runs_per_class: Runs of each.
+        seed: Seed of all chance.
+        imperfections: What the healthy robot does that its twin does not.
+        movements: How movements are drawn.
+        modes: Fault modes with their distributions, by id.
+        engine: What moves the robot: ``servo`` (the published loops) or ``physics``.
+    """
+
+    robot: Robot
+    hypotheses: Sequence[Hypothesis]
+    runs_per_class: int
+    seed: int = 0
+    imperfections: Imperfections = NO_IMPERFECTIONS
+    movements: RandomMovements = field(default_factory=RandomMovements)
+    modes: Mapping[str, FaultMode] = field(default_factory=lambda: MODES)
+    engine: str = "servo"
+
+    def __post_init__(self) -> None:
+        if self.runs_per_class < 1:
+            raise InputError(f"runs per class is {self.runs_per_class}, expected 1 or more.")
+        if self.engine not in ENGINES:
+            raise unknown_name("engine", self.engine, ENGINES)
+        if len(set(self.hypotheses)) < len(self.hypotheses):
+            raise InputError("a hypothesis is given twice. Give each of them once.")
+        for hypothesis in self.hypotheses:
+            if not hypothesis.known:
+                raise InputError("'unknown' cannot be simulated. Name the faults to simulate.")
+            for fault in hypothesis.faults:
+                if fault.mode not in self.modes:
+                    raise InputError(
+                        f"fault mode {fault.mode!r} cannot be simulated. "
+                        f"Expected one of {', '.join(self.modes)}."
+                    )
+                if self.modes[fault.mode].needs_compliance and self.engine == "servo":
+                    self._check_compliance(fault)
+
+    def _check_compliance(self, fault: Fault) -> None:
+        """Refuse a loss of stiffness in a motor that does not give way at all."""
+        motor = self.robot.motor_names.index(fault.motor)
+        settling = self.imperfections.settling or Settling.ideal(len(self.robot.motors))
+        load = np.abs(loads_in_range(self.robot, settling.payload)[:, motor]).max()
+        if settling.compliance[motor] * load < LEAST_SAG_RAD:
+            raise InputError(
+                f"'{fault}' would not show: with imperfections {self.imperfections.name!r}, "
+                f"{fault.motor} does not give way under load. Choose imperfections in which it "
+                "sags (--imperfections), or another motor."
+            )
+
+    @property
+    def size(self) -> int:
+        """Number of runs."""
+        return len(self.hypotheses) * self.runs_per_class
+
+    @property
+    def time(self) -> FloatArray:
+        """Time grid of every run, (time,) [s]; long enough for a run of two late starts.
+
+        What is drawn out as published is cut to the published length.
+        """
+        length = self.movements.duration_s
+        if not self.as_published and self.imperfections.timing.late_rate > 0.0:
+            length += LATE_STARTS * self.imperfections.timing.late_s[1]
+        return as_floats(np.arange(round(length / STEP_S)) * STEP_S)
+
+    @property
+    def as_published(self) -> bool:
+        """Whether readings are drawn out to the grid as the published data are."""
+        readings = self.imperfections.readings
+        return readings is not None and readings.drawn_out
+
+    def hypothesis_of(self, run: int) -> Hypothesis:
+        """Return the true state of a run."""
+        return self.hypotheses[run // self.runs_per_class]
+
+    def attributes(self) -> dict[str, str | int]:
+        """Return what a run set says of where it comes from."""
+        configuration = {
+            "hypotheses": [str(h) for h in self.hypotheses],
+            "runs_per_class": self.runs_per_class,
+            "imperfections": self.imperfections.name,
+            "engine": self.engine,
+            "movements": vars(self.movements),
+            "modes": {name: vars(mode) for name, mode in self.modes.items()},
+        }
+        return {
+            "robot": self.robot.name,
+            "source": f"simulated by the {self.engine} engine",
+            "seed": self.seed,
+            "failuretwin_version": __version__,
+            "configuration": json.dumps(configuration),
+        }
+
+    def manifest(self) -> dict[str, Any]:
+        """Return all that decides what the runs are, as JSON can hold it, and its hash."""
+        urdf = (self.robot.folder / self.robot.profile.urdf).read_bytes()
+        content = {"plan": canonical(self), "urdf_sha256": hashlib.sha256(urdf).hexdigest()}
+        return {**content, "plan_sha256": fingerprint(content)}
+
+
+# From commands to what the motors are really told, once faults and bad luck have had their say.
+
+
+def drive_of(
+    commanded: Movements,
+    command: FloatArray,
+    time: FloatArray,
+    injection: Injection,
+    chance: Disturbances,
+) -> Drive:
+    """Return what the motors of some runs are told.
+
+    Args:
+        commanded: Movements as commanded.
+        command: Their references, (run, time, motor) [rad].
+        time: Uniform grid, (time,) [s].
+        injection: Faults of the runs.
+        chance: Bad luck of the runs.
+    """
+    faulty, lost = injection.on_movements(commanded, chance.lost)
+    actual = actual_movements(faulty, replace(chance, lost=lost))
+    followed = command if _same(actual, commanded) else actual.reference(time)
+    followed = lagged(followed, time, chance.lag)
+    return Drive(
+        reference=injection.on_reference(followed, time),
+        held=injection.held(time),
+        weakness=injection.weakness(time),
+        compliance=chance.compliance if chance.compliance.any() else None,
+        payload=chance.payload if chance.payload.any() else None,
+    )
+
+
+def _same(one: Movements, other: Movements) -> bool:
+    names = ("initial", "target", "ramp_duration", "start")
+    return all(np.array_equal(getattr(one, n), getattr(other, n), equal_nan=True) for n in names)
+
+
+CHUNK_RUNS = 100
+"""Runs computed at a time: about 30 MB of work."""
+
+
+@dataclass(frozen=True)
+class _Draw:
+    """All chance of one run."""
+
+    movements: Movements
+    faults: tuple[FaultValue, ...]
+    chance: Disturbances
+
+
+def _draw(plan: Plan, run: int) -> _Draw:
+    rng = np.random.default_rng([plan.seed, run])
+    movements = plan.movements.draw(plan.robot, plan.imperfections.schedule, rng)
+    duration = float(plan.time[-1])
+    chance = draw_disturbances(plan.imperfections, plan.robot, plan.movements.count, duration, rng)
+    faults = tuple(
+        plan.modes[fault.mode].draw(fault.motor, plan.movements.count, duration, rng)
+        for fault in plan.hypothesis_of(run).faults
+    )
+    return _Draw(movements, faults, chance)
+
+
+def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
+    """Simulate some of a plan's runs.
+
+    Args:
+        plan: What to simulate.
+        runs: Numbers of the runs, each below `plan.size`.
+    """
+    draws = [_draw(plan, run) for run in runs]
+    chance = stack([draw.chance for draw in draws])
+    commanded = delay_commands(stack_movements([draw.movements for draw in draws]), chance.late)
+    injection = Injection([draw.faults for draw in draws], plan.robot.motor_names, plan.modes)
+    command, time = commanded.reference(plan.time), plan.time
+    felt = chance
+    if plan.engine == "physics":  # its gears have friction of their own
+        felt = replace(chance, friction=np.zeros_like(chance.friction))
+    drive = drive_of(commanded, command, time, injection, felt)
+    position = _engine(plan).angles(drive, time)
+    measured, read = sense(
+        DigitalTwin(plan.robot),
+        plan.imperfections.readings,
+        position,
+        time,
+        commanded.start,
+        chance,
+    )
+    readings = plan.imperfections.readings
+    duration = _durations(plan, commanded, chance)
+    over = time > duration[:, None] + 1e-9
+    measured[over], read[over] = np.nan, np.nan
+    return RunTable(
+        run=[_run_name(plan, run) for run in runs],
+        motor=plan.robot.motor_names,
+        time=time,
+        command=command,
+        measured=measured,
+        measured_rate_hz=1.0 / STEP_S if readings is None else readings.rate_hz,
+        duration=duration,
+        movements=commanded,
+        truth=_truth(plan, runs, injection.as_struck(position, time, commanded.start)),
+        position=read,
+        attributes=plan.attributes(),
+    )
+
+
+def _durations(plan: Plan, commanded: Movements, chance: Disturbances) -> FloatArray:
+    """Return how long each run lasts, (run,) [s]: until the command after it would come."""
+    last = float(plan.time[-1])
+    if plan.as_published or plan.imperfections.timing.late_rate == 0.0:
+        return np.full(len(commanded.start), last)
+    end = commanded.start[:, -1] + chance.late[:, -1] + plan.movements.period_s
+    return np.minimum(end, last)
+
+
+def _engine(plan: Plan) -> Engine:
+    if plan.engine == "servo":
+        return ServoEngine(plan.robot)
+    # Threads in the process that the user started; its workers are as many as there is room for.
+    threads = (os.cpu_count() or 1) if parent_process() is None else 1
+    return PhysicsEngine(plan.robot, threads=threads)
+
+
+def _run_name(plan: Plan, run: int) -> str:
+    return f"{plan.hypothesis_of(run)}/{run % plan.runs_per_class:05d}"
+
+
+def _truth(plan: Plan, runs: Sequence[int], faults: Sequence[Sequence[FaultValue]]) -> Truth:
+    onset = [min((v.onset_s for v in values), default=np.nan) for values in faults]
+    magnitude = [values[0].magnitude if values else np.nan for values in faults]
+    return Truth(
+        fault=[str(plan.hypothesis_of(run)) for run in runs],
+        detail=[{"faults": [value.detail() for value in values]} for values in faults],
+        onset=np.array(onset),
+        magnitude=np.array(magnitude),
+    )
+
+
+def iterate(
+    plan: Plan, runs_at_a_time: int = CHUNK_RUNS, order: Sequence[int] | None = None
+) -> Iterator[RunTable]:
+    """Simulate runs a few at a time and keep none of them.
+
+    Args:
+        plan: What to simulate.
+        runs_at_a_time: Runs in each table; the last one may hold fewer.
+        order: Numbers of the runs to make, each below `plan.size`, such as a random permutation;
+            None: all of them, one hypothesis after the other.
+
+    Raises:
+        InputError: If runs at a time are fewer than one.
+    """
+    if runs_at_a_time < 1:
+        raise InputError(f"runs at a time is {runs_at_a_time}, expected 1 or more.")
+    runs = range(plan.size) if order is None else order
+    for first in range(0, len(runs), runs_at_a_time):
+        yield simulate_runs(plan, runs[first : first + runs_at_a_time])
+
+
+def simulate(
+    plan: Plan,
+    workers: int = 1,
+    on_progress: Callable[[int], None] = lambda runs: None,
+    scheduler: str | None = None,
+) -> xr.Dataset:
+    """Simulate all runs of a plan in memory; `run_factory.produce` has no need to hold them.
+
+    Args:
+        plan: What to simulate.
+        workers: Processes to spread the work over; the result does not depend on it. Scripts that
+            ask for several must be guarded by ``if __name__ == "__main__":``.
+        on_progress: Called with the number of runs that have just been finished.
+        scheduler: Address of a Dask scheduler whose workers do it instead.
+
+    Raises:
+        InputError: If workers are fewer than one or cannot be had.
+    """
+    chunks = [
+        range(first, min(first + CHUNK_RUNS, plan.size))
+        for first in range(0, plan.size, CHUNK_RUNS)
+    ]
+    with Workforce(workers, scheduler).at_work(partial(simulate_runs, plan), chunks) as results:
+        return assemble(_datasets(results, on_progress), plan.size)
+
+
+def _datasets(
+    results: Iterator[tuple[range, RunTable]], on_progress: Callable[[int], None]
+) -> Iterator[tuple[int, xr.Dataset]]:
+    for runs, table in results:
+        yield runs[0], table.to_dataset()
+        on_progress(len(runs))
+
+
+# Runs in which nothing is left to chance: the signature that a fault leaves on the tool.
+
+
+def noise_free_path(
+    twin: DigitalTwin,
+    imperfections: Imperfections,
+    movements: Movements,
+    time: FloatArray,
+    injection: Injection,
+) -> FloatArray:
+    """Return the path of the tool with faults, and without scatter, losses, stalls and glitches.
+
+    Args:
+        twin: Digital twin of the robot.
+        imperfections: How the healthy robot differs from it.
+        movements: As commanded.
+        time: Uniform grid, (time,) [s].
+        injection: Faults of the runs.
+
+    Returns:
+        (run, time, axis) [m].
+    """
+    runs, count = movements.start.shape
+    rng = np.random.default_rng(0)  # asked, but nothing that it says counts
+    luck = draw_disturbances(without_chance(imperfections), twin.robot, count, 0.0, rng)
+    drive = drive_of(movements, movements.reference(time), time, injection, stack([luck] * runs))
+    return twin.path(ServoEngine(twin.robot).angles(drive, time))
+
+
+def without_chance(imperfections: Imperfections) -> Imperfections:
+    """Return imperfections that leave nothing to chance; ranges shrink to their middles."""
+    timing, settling = imperfections.timing, imperfections.settling
+    if settling is not None:
+        settling = replace(settling, scatter=(0.0,) * len(settling.scatter))
+    return replace(
+        imperfections,
+        settling=settling,
+        timing=replace(
+            timing,
+            delay_s=_middle(timing.delay_s),
+            lag_s=_middle(timing.lag_s),
+            ramp_shortening=_middle(timing.ramp_shortening),
+            late_rate=0.0,
+        ),
+        lost_commands=(),
+        readings=None,
+        variation=None,
+    )
+
+
+def _middle(ends: Range) -> Range:
+    middle = 0.5 * (ends[0] + ends[1])
+    return middle, middle

@@ -1,0 +1,220 @@
+"""Who does the work: this process, processes of its own, or the workers of a Dask scheduler.
+
+Needs the extra `cluster`, except for one process.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from typing import TYPE_CHECKING, TypeVar
+
+from failuretwin.core.errors import FailureTwinError, InputError
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+# Clients of Dask: of a scheduler that runs somewhere, or of processes of our own.
+
+ANSWER_S = 5.0
+"""Time that a scheduler has to answer [s]."""
+FIRST_WORKER_S = 30.0
+"""Time that a scheduler's first worker has to come [s]."""
+NEVER = logging.CRITICAL + 1
+IGNORE_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+"""What our own workers run first: an interrupt is for the parent, which then ends them."""
+
+
+@contextmanager
+def dask_client(workers: int, scheduler: str | None) -> Iterator[Client]:
+    """Give a client of a scheduler; leaving the block closes it.
+
+    Args:
+        workers: Processes of our own on this machine, if there is no scheduler.
+        scheduler: Address of a running one.
+
+    Raises:
+        InputError: If Dask is not installed, or the scheduler does not answer or has no workers.
+    """
+    try:
+        import distributed  # noqa: F401
+    except ImportError as error:
+        raise InputError(
+            f"several workers need Dask ({error}). Install it: pip install 'failuretwin[cluster]'."
+        ) from error
+    with _silence():
+        if scheduler is None:
+            with _own_cluster(workers) as client:
+                yield client
+        else:
+            with _connected(scheduler) as client:
+                yield client
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Keep Dask's log to ourselves: what matters comes back as an error."""
+    handlers = logging.getLogger("distributed").handlers
+    before = [handler.level for handler in handlers]
+    for handler in handlers:
+        handler.setLevel(NEVER)
+    try:
+        yield
+    finally:
+        for handler, level in zip(handlers, before, strict=True):
+            handler.setLevel(level)
+
+
+@contextmanager
+def _own_cluster(workers: int) -> Iterator[Client]:
+    from distributed import Client, LocalCluster
+
+    cluster = LocalCluster(
+        n_workers=workers,
+        threads_per_worker=1,
+        processes=True,
+        memory_limit=0,  # no limit: memory is bounded by the size of a piece
+        host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",  # it insists on a port: any, seen from here alone
+        scheduler_kwargs={"dashboard": False},
+        silence_logs=NEVER,
+        preload=[IGNORE_INTERRUPTS],
+    )
+    with cluster, Client(cluster, set_as_default=False) as client:
+        yield client
+
+
+@contextmanager
+def _connected(address: str) -> Iterator[Client]:
+    from distributed import Client
+    from distributed.comm.addressing import get_address_host_port
+
+    try:
+        get_address_host_port(address)  # a client of what is no address is never quite closed
+        client = Client(address, timeout=ANSWER_S, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(
+            f"scheduler {address!r} does not answer ({reason(error)}). Expected the address that "
+            "`dask scheduler` prints when it starts, such as tcp://host:8786."
+        ) from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=FIRST_WORKER_S)
+        except TimeoutError as error:
+            raise InputError(
+                f"scheduler {address!r} has no workers. Start some: dask worker {address}"
+            ) from error
+        yield client
+
+
+def reason(error: BaseException) -> str:
+    """Return what Dask says of an error, on one line."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+TASKS_PER_THREAD = 2
+"""Tasks given out at a time: one to do, one that waits, so that no worker is ever idle."""
+
+
+@dataclass(frozen=True)
+class Workforce:
+    """Who does the work.
+
+    Attributes:
+        workers: Processes on this machine; 1: this process itself.
+        scheduler: Address of a running Dask scheduler, such as ``tcp://host:8786``, whose
+            workers do it instead.
+    """
+
+    workers: int = 1
+    scheduler: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            raise InputError(f"workers is {self.workers}, expected 1 or more.")
+        if self.scheduler is not None and self.workers > 1:
+            raise InputError(
+                f"{self.workers} workers here and those of scheduler {self.scheduler} at once "
+                "cannot do it. Give one or the other."
+            )
+
+    @contextmanager
+    def at_work(
+        self, work: Callable[[Item], Result], items: Iterable[Item]
+    ) -> Iterator[Iterator[tuple[Item, Result]]]:
+        """Give every item with its result, in the order in which they are done.
+
+        A worker that dies is replaced and its items are given to others. Leaving the block ends
+        the work.
+
+        Args:
+            work: What to do; a function that other processes can import.
+            items: What to do it to.
+
+        Raises:
+            InputError: If Dask is not installed, or the scheduler or its workers do not answer
+                or cannot run the work.
+            FailureTwinError: If workers keep dying.
+        """
+        if self.workers == 1 and self.scheduler is None:
+            yield ((item, work(item)) for item in items)
+            return
+        with (
+            dask_client(self.workers, self.scheduler) as client,
+            closing(_spread(client, work, items)) as results,
+        ):
+            yield results
+
+
+ONE_PROCESS = Workforce()
+
+
+def _spread(
+    client: Client, work: Callable[[Item], Result], items: Iterable[Item]
+) -> Generator[tuple[Item, Result]]:
+    """Give items with their results; only as many are given out as workers can do soon."""
+    from distributed import as_completed
+
+    waiting = iter(items)
+    given: dict[Future[Result], Item] = {}
+
+    def give_out() -> list[Future[Result]]:
+        threads = max(1, sum(client.nthreads().values()))
+        futures = []
+        for item in islice(waiting, max(0, TASKS_PER_THREAD * threads - len(given))):
+            future = client.submit(work, item, pure=False)
+            given[future] = item
+            futures.append(future)
+        return futures
+
+    running = as_completed(give_out(), loop=client.loop)
+    for future in running:
+        yield given.pop(future), _result(future)
+        running.update(give_out())
+
+
+def _result(future: Future[Result]) -> Result:
+    from distributed import CancelledError, KilledWorker
+
+    try:
+        return future.result()
+    except KilledWorker as error:
+        raise FailureTwinError(
+            "workers died again and again over the same piece. Look for what ends them, such as "
+            "too little memory, and run the same command again."
+        ) from error
+    except CancelledError as error:
+        raise FailureTwinError(
+            "the scheduler has gone. Start it again and run the same command again."
+        ) from error
+    except (ImportError, AttributeError) as error:
+        raise InputError(
+            f"the workers cannot run failuretwin ({reason(error)}). Install the same version "
+            "there as here."
+        ) from error

@@ -1,1 +1,0 @@
-"""What runs say of each hypothesis: laws of faults, priors, sums over all that is unknown."""

@@ -1,1 +1,0 @@
-"""Laws of the fault modes: how a motor settles with a fault."""

@@ -1,0 +1,218 @@
+"""What a network is trained on: runs as various as a real robot may make them, without end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis, paper_hypotheses
+from failuretwin.core.movements import find_movements
+from failuretwin.core.runs import RunTable, concatenate
+from failuretwin.core.types import IntArray
+from failuretwin.data_knowledge.generate import Plan, simulate_runs
+from failuretwin.decision.learned.features import Encoder, Floats, signals_of, signals_of_table
+from failuretwin.digital_model.nonidealities import Imperfections, Variation
+from failuretwin.digital_model.robot import Robot
+from failuretwin.failure_behavior.mode import FaultMode
+from failuretwin.failure_behavior.modes import MODES, SteadyStateError, Stuck
+from failuretwin.failure_behavior.random_movements import RandomMovements
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Range = tuple[float, float]
+
+COUNT_RAD = float(np.deg2rad(0.24))
+"""One count of the servos whose errors the ranges below were found on [rad]."""
+RUNS_PER_CLASS = 10**9
+"""Runs of each class that a seed has room for: more than any training sees."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One kind of runs.
+
+    Attributes:
+        error_counts: Range of steady-state errors [counts of 0.24 deg].
+        onset_s: Range of the onset of stuck faults [s]; 0: before the run.
+        first_motor_deg: Range of the first motor's targets to both sides [deg]; None: as the
+            robot's profile says.
+    """
+
+    error_counts: Range
+    onset_s: Range
+    first_motor_deg: float | None = None
+
+
+VARIANTS = (
+    Variant((4.0, 20.0), (0.49, 0.49), 70.0),
+    Variant((5.0, 20.0), (0.0, 0.0)),
+    Variant((7.0, 35.0), (0.49, 0.49)),
+    Variant((10.0, 50.0), (0.49, 0.49)),
+    Variant((4.0, 12.0), (0.49, 0.49), 70.0),
+    Variant((4.0, 20.0), (0.0, 2.0)),
+)
+"""Small errors are the hard ones, so they come most often; the paper's are 10 to 50 counts."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """An endless supply of labelled runs, the same for the same seed.
+
+    Attributes:
+        robot: The robot.
+        imperfections: Its healthy behaviour, with the variation to draw robots from.
+        seed: Seed of all chance.
+        variants: Kinds of runs, equally frequent.
+        engine: What moves the robot; see `Plan`.
+    """
+
+    robot: Robot
+    imperfections: Imperfections
+    seed: int = 0
+    variants: tuple[Variant, ...] = VARIANTS
+    engine: str = "servo"
+    hypotheses: tuple[Hypothesis, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hypotheses", paper_hypotheses(self.robot.motor_names))
+
+    @property
+    def movements(self) -> tuple[int, int]:
+        """Fewest and most movements of a run."""
+        count = RandomMovements().count
+        return count, count
+
+    def chunk(self, number: int, runs: int, encoder: Encoder) -> tuple[Floats, IntArray]:
+        """Return some runs as features, with their classes, in random order.
+
+        Args:
+            number: Number of the chunk; each has runs of its own.
+            runs: How many; a variant has as many as another.
+            encoder: Makes the features.
+        """
+        made = [
+            (places, encoder.encode(signals_of_table(table)))
+            for places, table in self._made(number, runs)
+        ]
+        order = np.concatenate([places for places, _ in made])
+        shuffled = np.random.default_rng([self.seed, number, 1]).permutation(runs)
+        features = np.concatenate([part for _, part in made])
+        return features[shuffled], self._classes(number, runs)[order[shuffled]]
+
+    def run_set(self, number: int, runs: int) -> xr.Dataset:
+        """Return the runs of a chunk as a run set that knows their truth."""
+        return concatenate([table.to_dataset() for _, table in self._made(number, runs)])
+
+    def _classes(self, number: int, runs: int) -> IntArray:
+        rng = np.random.default_rng([self.seed, number])
+        return rng.integers(0, len(self.hypotheses), runs)
+
+    def _made(self, number: int, runs: int) -> Iterator[tuple[IntArray, RunTable]]:
+        """Give the runs of each variant, and their places among the classes of the chunk."""
+        classes = self._classes(number, runs)
+        for kind, variant in enumerate(self.variants):
+            places = np.arange(kind, runs, len(self.variants))
+            if len(places):
+                numbers = [
+                    int(classes[i]) * RUNS_PER_CLASS + number * runs + int(i) for i in places
+                ]
+                yield places, simulate_runs(self._plan(variant), numbers)
+
+    def _plan(self, variant: Variant) -> Plan:
+        return Plan(
+            robot=_with_range(self.robot, variant.first_motor_deg),
+            hypotheses=self.hypotheses,
+            runs_per_class=RUNS_PER_CLASS,
+            seed=self.seed,
+            imperfections=self.imperfections,
+            movements=RandomMovements(),
+            modes=_modes(variant),
+            engine=self.engine,
+        )
+
+
+def _modes(variant: Variant) -> Mapping[str, FaultMode]:
+    low, high = variant.error_counts
+    return {
+        **MODES,
+        "stuck": Stuck(onset_s=variant.onset_s),
+        "steady_state_error": SteadyStateError(magnitude=(low * COUNT_RAD, high * COUNT_RAD)),
+    }
+
+
+def _with_range(robot: Robot, degrees: float | None) -> Robot:
+    """Return the robot with another range of the first motor's targets."""
+    if degrees is None:
+        return robot
+    first, *others = robot.motors
+    limit = float(np.deg2rad(degrees))
+    motors = (replace(first, movement_range=(-limit, limit)), *others)
+    return replace(robot, profile=replace(robot.profile, motors=motors))
+
+
+def widened(imperfections: Imperfections, factor: float) -> Imperfections:
+    """Return imperfections whose robots differ `factor` times as much from each other.
+
+    A calibration knows its figures well on the day of its logs; on another day, and with another
+    tool, they are a little different.
+    """
+    variation = imperfections.variation
+    if variation is None:
+        return imperfections
+    wider = Variation(
+        bias=tuple(factor * value for value in variation.bias),
+        compliance=tuple(factor * value for value in variation.compliance),
+        friction=tuple(factor * value for value in variation.friction),
+        scatter=tuple(factor * value for value in variation.scatter),
+        rates=factor * variation.rates,
+        payload=variation.payload,
+    )
+    return replace(imperfections, variation=wider)
+
+
+# What kind of runs a network has learned from, and what to say of others.
+
+
+def movement_counts(runs: xr.Dataset) -> IntArray:
+    """Return the number of movements of each run, (run,)."""
+    signals = signals_of(runs)
+    return find_movements(signals.command, signals.time).exists.sum(axis=1)
+
+
+def movement_range(runs: xr.Dataset) -> tuple[int, int]:
+    """Return the fewest and the most movements of a run."""
+    counts = movement_counts(runs)
+    return int(counts.min()), int(counts.max())
+
+
+def with_doubt(
+    diagnoses: Sequence[Diagnosis], movements: IntArray, known: tuple[int, int] | None
+) -> list[Diagnosis]:
+    """Return diagnoses with a remark on runs such as the network has not learned from.
+
+    Args:
+        diagnoses: Of each run.
+        movements: How many movements each run has, (run,).
+        known: Fewest and most movements of a run that it learned from; None: not known.
+    """
+    if known is None:
+        return list(diagnoses)
+    low, high = known
+    told = f"{low}" if low == high else f"{low} to {high}"
+    return [
+        diagnosis
+        if low <= count <= high
+        else replace(
+            diagnosis,
+            quality=(
+                *diagnosis.quality,
+                f"{count} movements, and the network learned from runs of {told}: its "
+                "probabilities mean little here",
+            ),
+        )
+        for diagnosis, count in zip(diagnoses, movements.tolist(), strict=True)
+    ]

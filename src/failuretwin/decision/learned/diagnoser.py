@@ -1,0 +1,360 @@
+"""A network as a diagnoser, and as an estimator in the sense of scikit-learn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, ClassifierMixin
+from sklearn.utils import check_random_state
+from sklearn.utils.multiclass import check_classification_targets
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.runs import check_motors, check_runs, truth_of
+from failuretwin.core.types import FloatArray
+from failuretwin.decision.learned.data import movement_counts, movement_range, with_doubt
+from failuretwin.decision.learned.features import POINTS, SHARED, Encoder, Floats, signals_of
+from failuretwin.decision.learned.networks import (
+    Batch,
+    Pace,
+    Shape,
+    Standard,
+    build_network,
+    scores_of,
+    shuffled_batches,
+    training,
+)
+from failuretwin.decision.learned.posteriors import (
+    Weights,
+    best_temperature,
+    blended,
+    gated,
+    probabilities,
+    tell,
+    told,
+)
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Runs = Any
+"""A run set, or an array of features: (run, point, channel), or (run, channel) of one point."""
+
+
+class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
+    """A network that says how probable each class is.
+
+    Takes run sets where it has an encoder, and arrays of features anyway.
+
+    Args:
+        network: Name of the network; see `NETWORKS`.
+        encoder: Turns run sets into features; None: arrays only.
+        iterations: Batches to learn from in `fit`.
+        learning_rate: Of Adam, at its highest.
+        decay: Whether it falls to zero at the end along half a cosine.
+        batch_runs: Runs in a batch.
+        random_state: Seed of weights, dropout and order.
+
+    Attributes:
+        classes_: The classes, sorted if they came from `fit`.
+        network_: The trained network.
+        standard_: Mean and spread of each channel.
+        temperature_: What scores are divided by before they become probabilities.
+        movements_: Fewest and most movements of a run that it learned from; None: not known.
+        weights_: How it is blended with the Bayesian diagnosis; None: was never fitted.
+    """
+
+    def __init__(
+        self,
+        network: str = "cnn",
+        encoder: Encoder | None = None,
+        iterations: int = 500,
+        learning_rate: float = 1e-3,
+        decay: bool = True,
+        batch_runs: int = 32,
+        random_state: int | None = None,
+    ) -> None:
+        self.network = network
+        self.encoder = encoder
+        self.iterations = iterations
+        self.learning_rate = learning_rate
+        self.decay = decay
+        self.batch_runs = batch_runs
+        self.random_state = random_state
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.input_tags.three_d_array = True
+        return tags
+
+    def fit(self, X: Runs, y: ArrayLike | None = None) -> LearnedDiagnoser:
+        """Learn from runs.
+
+        Args:
+            X: A run set or an array of features.
+            y: Class of each run; None: as the run set says.
+
+        Raises:
+            InputError: If there is no class to learn from.
+        """
+        if _is_run_set(X) and y is None:
+            y = truth_of(X)
+        self.movements_ = movement_range(X) if _is_run_set(X) else None
+        features, classes = validate_data(
+            self, self._features(X), y, allow_nd=True, dtype=np.float32
+        )
+        check_classification_targets(classes)
+        names, index = np.unique(classes, return_inverse=True)
+        if len(names) < 2:
+            raise InputError(f"all runs are of one class, {names[0]!r}. Expected two at least.")
+        features = _points(features)
+        rng = check_random_state(self.random_state)
+        order = np.random.default_rng(rng.randint(2**31))
+        standard = Standard.of(features)
+        batches = shuffled_batches(
+            standard(features), index.astype(np.int64), self.batch_runs, order
+        )
+        self._learn(batches, standard, names, rng.randint(2**31))
+        return self
+
+    def fit_batches(
+        self,
+        batches: Iterable[Batch],
+        standard: Standard,
+        classes: Sequence[str],
+        movements: tuple[int, int],
+        on_iteration: Callable[[int], None] = lambda done: None,
+    ) -> LearnedDiagnoser:
+        """Learn from batches that somebody else makes, such as a `Stream`.
+
+        Args:
+            batches: Features, not standardised, and numbers of the classes.
+            standard: Mean and spread of the features.
+            classes: Names of the classes.
+            movements: Fewest and most movements of a run.
+            on_iteration: Called after each batch with the number of those done.
+        """
+        seed = check_random_state(self.random_state).randint(2**31)
+        self.n_features_in_, self.movements_ = POINTS, movements
+        standardised = ((standard(features), index) for features, index in batches)
+        self._learn(standardised, standard, np.array(classes), seed, on_iteration)
+        return self
+
+    def _learn(
+        self,
+        batches: Iterable[Batch],
+        standard: Standard,
+        classes: NDArray[Any],
+        seed: int,
+        on_iteration: Callable[[int], None] = lambda done: None,
+    ) -> None:
+        if self.iterations < 1 or self.batch_runs < 1:
+            raise InputError(
+                f"{self.iterations} iterations of {self.batch_runs} runs. Expected one at least of "
+                "both."
+            )
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            network = build_network(
+                self.network, network_shape(self.encoder, len(standard.mean), len(classes))
+            )
+            pace = Pace(self.iterations, self.learning_rate, self.decay)
+            for done in training(network, batches, pace):
+                on_iteration(done)
+        self.network_ = network.cpu()
+        self.classes_, self.standard_, self.temperature_ = classes, standard, 1.0
+        self.weights_: Weights | None = None
+
+    def calibrate(self, X: Runs, y: ArrayLike | None = None) -> LearnedDiagnoser:
+        """Set the temperature at which these runs surprise least; never use a test set.
+
+        Args:
+            X: Runs that the network has not learned from.
+            y: Class of each; None: as the run set says.
+
+        Raises:
+            InputError: If a class is not among those that the network knows.
+        """
+        scores = self.scores(X)
+        number = {name: i for i, name in enumerate(self.classes_.tolist())}
+        truth = np.asarray(truth_of(X) if y is None else y).tolist()
+        strange = sorted({str(name) for name in truth if name not in number})
+        if strange:
+            raise InputError(
+                f"the network does not know {', '.join(strange)}. Expected runs of "
+                f"{', '.join(map(str, number))}."
+            )
+        index = np.array([number[name] for name in truth], dtype=np.int64)
+        self.temperature_ = best_temperature(scores, index)
+        return self
+
+    def scores(self, X: Runs) -> FloatArray:
+        """Return the score of each class, (run, class), before the temperature."""
+        check_is_fitted(self, "network_")
+        features = validate_data(
+            self, self._features(X), allow_nd=True, dtype=np.float32, reset=False
+        )
+        features = _points(features)
+        if features.shape[2] != len(self.standard_.mean):
+            raise InputError(
+                f"features have {features.shape[2]} channels, the network was trained on "
+                f"{len(self.standard_.mean)}."
+            )
+        return scores_of(self.network_, self.standard_(features))
+
+    def predict_proba(self, X: Runs) -> FloatArray:
+        """Return the probability of each class, (run, class), in the order of `classes_`."""
+        return probabilities(self.scores(X), self.temperature_)
+
+    def predict(self, X: Runs) -> NDArray[Any]:
+        """Return the most probable class of each run."""
+        best = self.scores(X).argmax(axis=1)
+        return np.asarray(self.classes_[best])
+
+    def score(
+        self, X: Runs, y: ArrayLike | None = None, sample_weight: ArrayLike | None = None
+    ) -> float:
+        """Return the share of runs that are right.
+
+        Args:
+            X: A run set or an array of features.
+            y: Class of each run; None: as the run set says.
+            sample_weight: Weight of each run.
+        """
+        truth = truth_of(X) if _is_run_set(X) and y is None else y
+        return float(super().score(X, truth, sample_weight))
+
+    def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
+        """Return the diagnosis of each run of a run set.
+
+        Reads `command` and `measured` alone; the truth, where there is any, is only passed on.
+
+        Raises:
+            InputError: If the run set is of another robot, or the network has no encoder.
+        """
+        check_is_fitted(self, "network_")
+        encoder = self._encoder()
+        check_runs(runs, "the run set")
+        check_motors(runs, encoder.robot.name, encoder.robot.motor_names)
+        diagnoses = tell(
+            runs, self.predict_proba, [str(name) for name in self.classes_], self.about
+        )
+        return with_doubt(diagnoses, movement_counts(runs), self.movements_)
+
+    @property
+    def about(self) -> tuple[str, str]:
+        """Protocol and method, as results name them."""
+        encoder = self._encoder()
+        method = f"network {self.network}, {encoder.features} features"
+        if encoder.expected is not None:
+            method += f"; healthy behaviour: {encoder.expected.name}"
+        return encoder.protocol, method
+
+    def _encoder(self) -> Encoder:
+        if self.encoder is None:
+            raise InputError("this network has no encoder, so it takes arrays, not run sets.")
+        return self.encoder
+
+    def _features(self, X: Runs) -> Any:
+        return self._encoder().encode(signals_of(X)) if _is_run_set(X) else X
+
+
+def network_shape(encoder: Encoder | None, channels: int, classes: int) -> Shape:
+    """Return the shape of a network for some features.
+
+    Args:
+        encoder: What makes the features.
+        channels: Their channels.
+        classes: Number of classes.
+    """
+    if encoder is None or encoder.features != "robust":
+        return Shape(channels, classes)
+    return Shape(channels, classes, len(encoder.robot.motors), len(SHARED))
+
+
+def _is_run_set(X: Runs) -> bool:
+    return hasattr(X, "data_vars")
+
+
+def _points(features: Floats) -> Floats:
+    """Return (run, point, channel) of features that may be of one point each."""
+    return features if features.ndim == 3 else features[:, None, :]
+
+
+# Model and network together: the paper's closing idea, in two forms.
+
+HEALTHY = "healthy"
+
+
+class Diagnoser(Protocol):
+    """Whatever diagnoses runs: the Bayesian diagnoser, a network."""
+
+    def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
+        """Return the diagnosis of each run."""
+        ...
+
+
+@dataclass(frozen=True)
+class HybridDiagnoser:
+    """Two diagnosers as one.
+
+    Attributes:
+        bayes: The model-based one; where it gives no verdict, there is none.
+        network: The learned one, of the same classes.
+        weights: Of a blend; None: gated.
+    """
+
+    bayes: Diagnoser
+    network: Diagnoser
+    weights: Weights | None = None
+
+    def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
+        """Return the diagnosis of each run of a run set.
+
+        Onset and size are those of the Bayesian part, where both agree on the fault.
+
+        Raises:
+            InputError: If the parts know different classes.
+        """
+        pairs = zip(self.bayes.diagnose(runs), self.network.diagnose(runs), strict=True)
+        return [self._joined(first, second) for first, second in pairs]
+
+    def _joined(self, bayes: Diagnosis, network: Diagnosis) -> Diagnosis:
+        if bayes.undecided:
+            return bayes
+        if set(bayes.posterior) != set(network.posterior):
+            raise InputError(
+                f"the parts know different classes: {', '.join(bayes.posterior)} and "
+                f"{', '.join(network.posterior)}."
+            )
+        classes = list(bayes.posterior)
+        first = np.array([[bayes.posterior[name] for name in classes]])
+        second = np.array([[network.posterior[name] for name in classes]])
+        if self.weights is None:
+            chances = gated(first, second, classes.index(HEALTHY))[0]
+        else:
+            chances = blended(first, second, self.weights)[0]
+        joined = replace(
+            bayes,
+            posterior=dict(zip(classes, map(float, chances), strict=True)),
+            evidence=(),
+            protocol=max(bayes.protocol, network.protocol),
+            method=f"{'gated' if self.weights is None else 'blended'}: {bayes.method} with "
+            f"{network.method}",
+        )
+        if joined.diagnosis != bayes.diagnosis:
+            joined = replace(
+                joined,
+                onset_s=None,
+                onset_90=None,
+                magnitude=None,
+                magnitude_unit=None,
+                magnitude_90=None,
+            )
+        return told(joined)

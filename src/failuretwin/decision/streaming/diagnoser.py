@@ -1,0 +1,218 @@
+"""Streaming diagnosis of one robot: an answer at every sample."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from failuretwin.connection.links.base import OK, STALE, Answer
+from failuretwin.core.config import fingerprint
+from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.data_knowledge.store import reason, replacing
+from failuretwin.decision.streaming.fleet import MOVEMENTS, StreamingFleet
+from failuretwin.digital_model.nonidealities import Imperfections
+from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.priors import MONITORING
+
+# The state of a stream in a file: plain arrays, read without running anything.
+
+FORMAT = 1
+SUFFIX = ".npz"
+HEADER = "header"
+
+
+def save_fleet(fleet: StreamingFleet, path: str | Path, said: Sequence[Diagnosis] = ()) -> None:
+    """Write the state of a stream; a file of that name is replaced at the end, all at once.
+
+    Args:
+        fleet: The stream.
+        path: Where to.
+        said: Diagnoses to be kept with it.
+
+    Raises:
+        InputError: If the suffix is not .npz.
+        OutputError: If it cannot be written.
+    """
+    path = Path(path)
+    if path.suffix != SUFFIX:
+        raise InputError(f"{path}: the file of a stream ends in {SUFFIX}.")
+    header = {
+        "format": FORMAT,
+        "method": _method(fleet.diagnoser),
+        "robots": fleet.robots,
+        "movements": fleet.movements,
+        "rate_hz": fleet.rate_hz,
+        "said": [dataclasses.asdict(diagnosis) for diagnosis in said],
+    }
+    arrays: dict[str, Any] = {
+        HEADER: np.frombuffer(json.dumps(header).encode(), dtype=np.uint8),
+        **fleet.state(),
+    }
+    with replacing(path) as partial, partial.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
+
+
+def load_fleet(
+    path: str | Path, diagnoser: BayesDiagnoser, robots: int | None = None
+) -> tuple[StreamingFleet, list[Diagnosis]]:
+    """Return a stream as it was saved, and the diagnoses that were kept with it.
+
+    Args:
+        path: The file.
+        diagnoser: The method with which it was saved.
+        robots: How many robots there must be; None: any number.
+
+    Raises:
+        InputError: If it is no such file or of another robot, method or number of robots.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        header = json.loads(arrays.pop(HEADER).tobytes())
+        wrong = _mismatch(header, diagnoser, robots)
+        if wrong:
+            raise InputError(f"{path}: {wrong}")
+        fleet = StreamingFleet(diagnoser, header["robots"], header["rate_hz"], header["movements"])
+        fleet.restore(arrays)
+        said = [Diagnosis.from_fields(fields) for fields in header["said"]]
+    except InputError:
+        raise
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"{path}: cannot be read as a stream ({reason(error)}). Expected a file that `save` of "
+            "a stream wrote."
+        ) from error
+    return fleet, said
+
+
+def _method(diagnoser: BayesDiagnoser) -> str:
+    """Return a hash of all that answers depend on."""
+    known = dataclasses.replace(diagnoser, imperfections=diagnoser.healthy_model.imperfections)
+    return fingerprint(known)
+
+
+def _mismatch(header: dict[str, Any], diagnoser: BayesDiagnoser, robots: int | None) -> str:
+    """Return why a stream does not go on from a file, empty if it does."""
+    if header["format"] != FORMAT:
+        return f"is of format {header['format']}, this version reads {FORMAT}. Begin anew."
+    if header["method"] != _method(diagnoser):
+        return (
+            "was saved with another robot, calibration, hypotheses or priors. Name the same, or "
+            "begin anew."
+        )
+    if robots is not None and header["robots"] != robots:
+        return f"is of {header['robots']} robots, expected {robots}."
+    return ""
+
+
+class StreamingDiagnoser:
+    """Streaming diagnosis of one robot; see `StreamingFleet` for what counts when.
+
+    Args:
+        diagnoser: The method, with its hypotheses and healthy behaviour.
+        rate_hz: True rate of the tool sensor [Hz]; readings that come closer together than it
+            says are taken for drawn out; None: all readings are real.
+        movements: Movements that are remembered, the present one included.
+    """
+
+    def __init__(
+        self,
+        diagnoser: BayesDiagnoser,
+        rate_hz: float | None = None,
+        movements: int = MOVEMENTS,
+    ) -> None:
+        self._fleet = StreamingFleet(diagnoser, 1, rate_hz, movements)
+        self._motors = diagnoser.twin.robot.motor_names
+        self._diagnosis: Diagnosis | None = None
+
+    def update(
+        self,
+        time: float,
+        command: Mapping[str, float] | ArrayLike | None,
+        measured: ArrayLike | None,
+    ) -> Answer:
+        """Take what is known at a time and return what is believed then.
+
+        Args:
+            time: Time of the stream [s]; a sample may come late, as long as its movement lasts.
+            command: Reference of every motor, by name or (motor,) [rad]; None: not known.
+            measured: Tool position, (axis,) [m]; None or NaN: no reading.
+
+        Raises:
+            InputError: If a motor is missing, shapes do not fit or the time is not finite.
+        """
+        reference = None if command is None else self._reference(command)[None]
+        point = None if measured is None else as_floats(measured)[None]
+        if len(self._fleet.update(time, reference, point)):
+            self._diagnosis = self._told()
+        return self._answer()
+
+    def conclude(self) -> Answer:
+        """Count all that has come and return the answer of the batch method."""
+        self._fleet.conclude()
+        self._diagnosis = self._told()
+        return self._answer()
+
+    def save(self, path: str | Path) -> None:
+        """Write the state, all at once; a stream that goes on from it gives the same answers.
+
+        Raises:
+            InputError: If the name does not end in .npz.
+            OutputError: If it cannot be written.
+        """
+        save_fleet(self._fleet, path, [] if self._diagnosis is None else [self._diagnosis])
+
+    @classmethod
+    def load(cls, path: str | Path, diagnoser: BayesDiagnoser) -> StreamingDiagnoser:
+        """Return a stream as it was saved.
+
+        Args:
+            path: The file.
+            diagnoser: The method with which it was saved.
+
+        Raises:
+            InputError: If it is no such file or of another robot, method or number of robots.
+        """
+        stream = cls(diagnoser)
+        stream._fleet, said = load_fleet(path, diagnoser, robots=1)
+        stream._diagnosis = said[0] if said else None
+        return stream
+
+    def _reference(self, command: Mapping[str, float] | ArrayLike) -> FloatArray:
+        if not isinstance(command, Mapping):
+            return as_floats(command)
+        for name in self._motors:
+            if name not in command:
+                raise unknown_name("motor", name, command)
+        return as_floats([command[name] for name in self._motors])
+
+    def _answer(self) -> Answer:
+        state = STALE if self._fleet.stale[0] else OK
+        return Answer(self._fleet.time, state, self._diagnosis)
+
+    def _told(self) -> Diagnosis | None:
+        found = self._fleet.diagnosis(0, self._diagnosis)
+        return None if found is None else replace(found, run="stream")
+
+
+def monitor(twin: DigitalTwin, imperfections: Imperfections | None = None) -> StreamingDiagnoser:
+    """Return what watches a robot at work: settled poses, and faults are rare.
+
+    Args:
+        twin: Digital twin of the robot.
+        imperfections: How the healthy robot differs from it; None: as its profile says.
+    """
+    method = BayesDiagnoser(twin, imperfections, priors=MONITORING, whole_run=False)
+    return StreamingDiagnoser(method)

@@ -1,1 +1,0 @@
-"""What a motion can tell apart at all, before anything has happened."""

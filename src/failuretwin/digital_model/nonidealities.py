@@ -1,0 +1,373 @@
+"""What a healthy robot does that its twin does not: one value, every part switchable.
+
+Figures of a real robot live in TOML files beside the robot's profile, with their source. Ranges
+are drawn anew for each run, rates apply to each movement or reading.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from failuretwin.core.config import from_table, read_toml
+from failuretwin.core.errors import InputError, check_number, check_range, check_share, unknown_name
+from failuretwin.core.types import FloatArray
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.settling import Settling
+
+Range = tuple[float, float]
+
+PROTOCOLS = ("P0", "P0c", "P1", "P2")
+"""How much real data was used: none, healthy logs, unlabelled or labelled runs of the test set."""
+SETTLING_LISTS = ("bias", "compliance", "friction", "scatter")
+"""Figures of `Settling` and `Variation` that have one value for each motor."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How motions run late against their commands.
+
+    Attributes:
+        delay_s: Range of the dead time on top of the servo loop [s].
+        lag_s: Range of the time constant of a first-order lag on top of the servo loop [s].
+        ramp_shortening: Range of the share by which ramps end early [-].
+        late_rate: Share of movements that a stalled bus makes start late [-].
+        late_s: Range of the late start, common to all motors [s].
+        gap_start_s: When readings stop, after the movement before the late one began [s]; they
+            come back with the late start.
+    """
+
+    delay_s: Range = (0.0, 0.0)
+    lag_s: Range = (0.0, 0.0)
+    ramp_shortening: Range = (0.0, 0.0)
+    late_rate: float = 0.0
+    late_s: Range = (0.0, 0.0)
+    gap_start_s: Range = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        check_range("timing: delay_s", self.delay_s, low=-1.0)
+        check_range("timing: ramp_shortening", self.ramp_shortening, low=-1.0, high=0.99)
+        check_share("timing: late_rate", self.late_rate)
+        for name in ("lag_s", "late_s", "gap_start_s"):
+            check_range(f"timing: {name}", getattr(self, name))
+
+
+@dataclass(frozen=True)
+class LostCommand:
+    """A set of motors that lose a command together and stay where they are for one movement.
+
+    Attributes:
+        motors: Their names.
+        rate: Share of punctual movements in which exactly these motors lose it [-].
+        rate_when_late: The same for movements that start late [-].
+    """
+
+    motors: tuple[str, ...]
+    rate: float
+    rate_when_late: float
+
+    def __post_init__(self) -> None:
+        check_share("lost_commands: rate", self.rate)
+        check_share("lost_commands: rate_when_late", self.rate_when_late)
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """When movements are commanded and on what scale.
+
+    Attributes:
+        first_start_s: Range of the first movement's start [s].
+        period_s: Range of the time from one movement to the next [s].
+        whole_counts: Whether targets are whole servo counts.
+    """
+
+    first_start_s: Range = (0.0, 0.0)
+    period_s: Range = (2.0, 2.0)
+    whole_counts: bool = False
+
+    def __post_init__(self) -> None:
+        check_range("schedule: first_start_s", self.first_start_s)
+        check_range("schedule: period_s", self.period_s, low=0.05)
+
+
+@dataclass(frozen=True)
+class Readings:
+    """How the tool sensor samples the motion; without it, every grid time has a sample.
+
+    Attributes:
+        rate_hz: Nominal rate of the readings [Hz].
+        jitter_s: Standard deviation of their times [s].
+        whole_counts: Whether the angles behind the virtual sensor are whole servo counts.
+        glitch_rate: Share of readings spoilt by each motor [-].
+        noise_m: Standard deviation of noise on each axis [m].
+        drawn_out: Fill the grid by straight lines between readings, glitches clamped to the
+            servo's range, as the published data do; otherwise leave readings at the nearest
+            grid time, and gaps and glitches missing.
+    """
+
+    rate_hz: float
+    jitter_s: float = 0.0
+    whole_counts: bool = False
+    glitch_rate: tuple[float, ...] = ()
+    noise_m: float = 0.0
+    drawn_out: bool = False
+
+    def __post_init__(self) -> None:
+        check_number("readings: rate_hz", self.rate_hz, low=0.1, high=1e5)
+        check_number("readings: jitter_s", self.jitter_s)
+        check_number("readings: noise_m", self.noise_m)
+        for rate in self.glitch_rate:
+            check_share("readings: glitch_rate", rate)
+
+
+@dataclass(frozen=True)
+class Variation:
+    """How far a robot may differ from the figures: drawn anew for every run.
+
+    One value for each motor in chain order, or none at all for no variation.
+
+    Attributes:
+        bias: Standard deviation of the constant error [rad].
+        compliance: Standard deviation of the compliance's logarithm [-].
+        friction: Standard deviation of the friction [rad].
+        scatter: Standard deviation of the scatter's logarithm [-].
+        rates: Standard deviation of the logarithm of every rate of losses, late starts and
+            glitches [-].
+        payload: Range of a payload on top of the known one [kg].
+    """
+
+    bias: tuple[float, ...] = ()
+    compliance: tuple[float, ...] = ()
+    friction: tuple[float, ...] = ()
+    scatter: tuple[float, ...] = ()
+    rates: float = 0.0
+    payload: Range = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name in SETTLING_LISTS:
+            for value in getattr(self, name):
+                check_number(f"variation: {name}", value)
+        check_number("variation: rates", self.rates)
+        check_range("variation: payload", self.payload)
+
+
+@dataclass(frozen=True)
+class Imperfections:
+    """Everything that sets a healthy robot apart from the published twin.
+
+    Attributes:
+        name: What to call it in results.
+        source: Where the figures come from.
+        protocol: How much real data the figures have seen: P0 none, P0c healthy logs only.
+        settling: Where motors settle; None: exactly at their targets.
+        timing: Delays, late starts, gaps.
+        lost_commands: Sets of motors whose commands never arrive, and how often.
+        schedule: When movements are commanded.
+        readings: The tool sensor; None: a perfect sample at every grid time.
+        variation: Differences from run to run; None: every run has the same robot.
+    """
+
+    name: str
+    source: str
+    protocol: str = "P0"
+    settling: Settling | None = None
+    timing: Timing = field(default_factory=Timing)
+    lost_commands: tuple[LostCommand, ...] = ()
+    schedule: Schedule = field(default_factory=Schedule)
+    readings: Readings | None = None
+    variation: Variation | None = None
+
+    def __post_init__(self) -> None:
+        if self.protocol not in PROTOCOLS:
+            raise unknown_name("protocol", self.protocol, PROTOCOLS)
+        for late in (False, True):
+            rates = [e.rate_when_late if late else e.rate for e in self.lost_commands]
+            if sum(rates) > 1.0 + 1e-9:
+                raise InputError(
+                    f"lost_commands: the rates add up to {sum(rates):g}, expected 1 at most."
+                )
+
+
+NO_IMPERFECTIONS = Imperfections("none", "the published twin")
+
+CALIBRATION_TABLE = "calibration"
+"""Table of such a file that says of which robot and how the figures were found."""
+GENERIC_NAME = "generic, not calibrated"
+"""What results say of a robot whose healthy behaviour has not been measured."""
+GENERIC_SCATTER_RAD = 0.01
+"""Settled scatter assumed of a robot of which nothing is known [rad], about half a degree."""
+
+
+def generic_imperfections(robot: Robot) -> Imperfections:
+    """Return wide healthy offsets for a robot whose own have not been measured."""
+    zero = (0.0,) * len(robot.motors)
+    scatter = (GENERIC_SCATTER_RAD,) * len(robot.motors)
+    settling = Settling(zero, zero, zero, scatter, 4.0, "assumed, no calibration")
+    return Imperfections(GENERIC_NAME, "assumed", settling=settling)
+
+
+def default_imperfections(robot: Robot) -> Imperfections:
+    """Return those that the robot's profile names, or generic ones."""
+    if robot.imperfections_file is None:
+        return generic_imperfections(robot)
+    return load_imperfections(robot.name, robot)
+
+
+def load_imperfections(name_or_path: str, robot: Robot) -> Imperfections:
+    """Load imperfections.
+
+    Args:
+        name_or_path: ``none``, the name of `robot` for those of its profile, the name of another
+            file beside those, or a TOML file.
+        robot: The robot they are for.
+
+    Raises:
+        InputError: If there are none under this name, or they belong to another robot or do not fit
+            its motors.
+    """
+    if name_or_path == "none":
+        return NO_IMPERFECTIONS
+    path, known = Path(name_or_path), _known_files(robot)
+    if name_or_path in known:
+        path = known[name_or_path]
+    elif path.suffix != ".toml" and not path.exists():
+        names = ", ".join(repr(name) for name in ("none", *known))
+        raise InputError(
+            f"no imperfections {name_or_path!r} of robot {robot.name!r}. Expected {names} or a "
+            "TOML file, such as `failuretwin calibrate` writes."
+        )
+    table = read_toml(path)
+    _check_robot(table.pop(CALIBRATION_TABLE, None), robot, path)
+    try:
+        imperfections = from_table(Imperfections, table, str(path))
+    except InputError as error:
+        where = "" if str(error).startswith(str(path)) else f"{path}: "
+        raise InputError(f"{where}{error}") from error
+    imperfections = _completed(imperfections, len(robot.motors))
+    _check_fit(imperfections, robot, path)
+    return imperfections
+
+
+def _known_files(robot: Robot) -> dict[str, Path]:
+    """Return the files that go by a name: that of the profile, and those that lie beside it."""
+    own = robot.imperfections_file
+    if own is None:
+        return {}
+    return {robot.name: own} | {path.stem: path for path in sorted(own.parent.glob("*.toml"))}
+
+
+def _completed(imperfections: Imperfections, motors: int) -> Imperfections:
+    """Return the imperfections with zeros for what is left out of the settling."""
+    settling = imperfections.settling
+    if settling is None:
+        return imperfections
+    zero = (0.0,) * motors
+    whole = replace(
+        settling,
+        bias=settling.bias or zero,
+        compliance=settling.compliance or zero,
+        friction=settling.friction or zero,
+        scatter=settling.scatter or zero,
+    )
+    return replace(imperfections, settling=whole)
+
+
+def _check_robot(calibration: object, robot: Robot, path: Path) -> None:
+    owner = calibration.get("robot") if isinstance(calibration, dict) else None
+    if owner not in (None, robot.name):
+        raise InputError(
+            f"{path}: is a calibration of robot {owner!r}, not of {robot.name!r}. Name the right "
+            "robot (--robot) or calibrate this one."
+        )
+
+
+def _check_fit(imperfections: Imperfections, robot: Robot, path: Path) -> None:
+    count = len(robot.motors)
+    for name, values in _motor_lists(imperfections).items():
+        if len(values) not in (0, count):
+            raise InputError(
+                f"{path}: {name} has {len(values)} values, expected {count}, one for each motor "
+                f"of {robot.name!r}."
+            )
+    for lost in imperfections.lost_commands:
+        for motor in lost.motors:
+            if motor not in robot.motor_names:
+                raise InputError(
+                    f"{path}: lost_commands: {unknown_name('motor', motor, robot.motor_names)}"
+                )
+
+
+def _motor_lists(imperfections: Imperfections) -> dict[str, tuple[float, ...]]:
+    """Return every figure that has one value for each motor, by the name of its key."""
+    lists: dict[str, tuple[float, ...]] = {}
+    for table in ("settling", "variation"):
+        value = getattr(imperfections, table)
+        if value is not None:
+            lists |= {f"{table}: {name}": getattr(value, name) for name in SETTLING_LISTS}
+    if imperfections.readings is not None:
+        lists["readings: glitch_rate"] = imperfections.readings.glitch_rate
+    return lists
+
+
+# Robots of a kind: imperfections drawn around given ones, for training and for honest doubt.
+
+HIGHEST_LOSS = 0.9
+"""Bound on the share of movements in which some command is lost, however unlucky the draw."""
+
+
+def vary(imperfections: Imperfections, rng: np.random.Generator) -> Imperfections:
+    """Return the imperfections of one robot drawn from the variation of `imperfections`.
+
+    Without a variation they are returned as they are, and nothing is drawn.
+    """
+    variation = imperfections.variation
+    if variation is None:
+        return imperfections
+    settling = imperfections.settling
+    if settling is not None:
+        settling = _vary_settling(settling, variation, rng)
+    factor = float(np.exp(variation.rates * rng.standard_normal()))
+    return replace(
+        _scale_rates(imperfections, factor),
+        name=imperfections.name,
+        settling=settling,
+        variation=None,
+    )
+
+
+def _vary_settling(settling: Settling, variation: Variation, rng: np.random.Generator) -> Settling:
+    def normal(spread: tuple[float, ...]) -> FloatArray:
+        return rng.standard_normal(len(settling.bias)) * np.asarray(spread or 0.0)
+
+    return replace(
+        settling,
+        bias=tuple(settling.bias + normal(variation.bias)),
+        compliance=tuple(settling.compliance * np.exp(normal(variation.compliance))),
+        friction=tuple(settling.friction + normal(variation.friction)),
+        scatter=tuple(settling.scatter * np.exp(normal(variation.scatter))),
+        payload=settling.payload + float(rng.uniform(*variation.payload)),
+    )
+
+
+def _scale_rates(imperfections: Imperfections, factor: float) -> Imperfections:
+    """Return the imperfections with every rate multiplied by `factor`, as far as shares can be."""
+    timing, readings = imperfections.timing, imperfections.readings
+    losses = imperfections.lost_commands
+    most = max(
+        sum(entry.rate for entry in losses), sum(entry.rate_when_late for entry in losses), 1e-9
+    )
+    share = min(factor, HIGHEST_LOSS / most)
+    if readings is not None:
+        glitch_rate = tuple(min(1.0, factor * rate) for rate in readings.glitch_rate)
+        readings = replace(readings, glitch_rate=glitch_rate)
+    return replace(
+        imperfections,
+        timing=replace(timing, late_rate=min(1.0, factor * timing.late_rate)),
+        lost_commands=tuple(
+            replace(entry, rate=share * entry.rate, rate_when_late=share * entry.rate_when_late)
+            for entry in losses
+        ),
+        readings=readings,
+    )

@@ -1,0 +1,211 @@
+"""Faults as they strike: one in one run, and those of one mode at one motor over many runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from failuretwin.core.hypothesis import Fault
+from failuretwin.core.types import FloatArray
+
+# Courses: how severe a fault is over time, from 0 (not there) to 1 (full magnitude).
+
+STEP, RAMP, INTERMITTENT = PROFILES = ("step", "ramp", "intermittent")
+"""Time profiles: at once, growing linearly, coming and going."""
+
+_ROUNDING_S = 1e-9
+"""Times this close are the same: grids and onsets carry rounding errors [s]."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """Severity of one fault over time.
+
+    Attributes:
+        profile: One of `PROFILES`.
+        onset_s: When the fault begins [s].
+        rise_s: Time from the onset to full severity [s]; 0 unless the profile is a ramp.
+        episodes: Begin and end of each time the fault is there [s], in order; for the
+            intermittent profile alone.
+    """
+
+    profile: str
+    onset_s: float
+    rise_s: float = 0.0
+    episodes: tuple[tuple[float, float], ...] = ()
+
+    def detail(self) -> dict[str, Any]:
+        """Return the profile and its parameters as a JSON object."""
+        if self.profile == RAMP:
+            return {"shape": RAMP, "rise_s": self.rise_s}
+        if self.profile == INTERMITTENT:
+            return {"shape": INTERMITTENT, "episodes_s": [list(e) for e in self.episodes]}
+        return {"shape": self.profile}
+
+
+def severities(courses: Sequence[Course], time: FloatArray) -> FloatArray:
+    """Return the severity of many faults.
+
+    Args:
+        courses: One for each run.
+        time: Instants, common to all runs (time,) or of each run (run, time) [s].
+
+    Returns:
+        (run, time), in [0, 1].
+    """
+    onset, rise = _columns(courses)
+    severity = np.where(
+        rise > 0.0,
+        np.clip((time - onset) / np.where(rise > 0.0, rise, 1.0), 0.0, 1.0),
+        time >= onset - _ROUNDING_S,
+    )
+    for run, course in enumerate(courses):
+        if course.profile == INTERMITTENT:
+            at = time if time.ndim == 1 else time[run]
+            edges = np.ravel(course.episodes)
+            severity[run] = np.searchsorted(edges, at + _ROUNDING_S, side="right") % 2
+    return severity
+
+
+def exposures(courses: Sequence[Course], time: FloatArray) -> FloatArray:
+    """Return for how long each fault has been there: the integral of its severity.
+
+    Args:
+        courses: One for each run.
+        time: Instants, (time,) [s].
+
+    Returns:
+        (run, time) [s].
+    """
+    onset, rise = _columns(courses)
+    since = np.maximum(time - onset, 0.0)
+    growing = since**2 / (2.0 * np.where(rise > 0.0, rise, 1.0))
+    exposure = np.where(since < rise, growing, since - 0.5 * rise)
+    for run, course in enumerate(courses):
+        if course.profile == INTERMITTENT:
+            exposure[run] = 0.0
+            for start, end in course.episodes:
+                exposure[run] += np.clip(time - start, 0.0, end - start)
+    return exposure
+
+
+def _columns(courses: Sequence[Course]) -> tuple[FloatArray, FloatArray]:
+    """Return onsets and rise times, each (run, 1) [s]."""
+    onset, rise = np.array([(course.onset_s, course.rise_s) for course in courses]).T
+    return onset[:, None], rise[:, None]
+
+
+def draw_episodes(
+    onset_s: float,
+    end_s: float,
+    share: float,
+    length_s: tuple[float, float],
+    rng: np.random.Generator,
+) -> tuple[tuple[float, float], ...]:
+    """Draw episodes that fill exactly a share of the time from the onset to the end of the run.
+
+    The first begins at the onset. Lengths are drawn uniformly and then scaled so that they add
+    up; the gaps between are uniform over all ways to divide what is left.
+
+    Args:
+        onset_s: Begin of the first episode [s].
+        end_s: End of the run [s].
+        share: Share of the time to fill, in [0, 1].
+        length_s: Range of the lengths [s].
+        rng: Source of chance.
+
+    Returns:
+        Begin and end of each [s]; none where there is nothing to fill.
+    """
+    span = end_s - onset_s
+    filled = share * span
+    if filled <= 0.0:
+        return ()
+    count = max(1, round(filled / (0.5 * sum(length_s))))
+    length = rng.uniform(*length_s, count)
+    length *= filled / length.sum()
+    gap = rng.dirichlet(np.ones(count)) * (span - filled)
+    start = onset_s + np.concatenate([[0.0], np.cumsum(length + gap)[:-1]])
+    return tuple((float(s), float(s + n)) for s, n in zip(start, length, strict=True))
+
+
+PerMovement = NDArray[np.float64 | np.bool_]
+"""Something drawn for each movement: a number, or yes or no."""
+
+
+@dataclass(frozen=True)
+class FaultValue:
+    """One fault as it strikes one run.
+
+    Attributes:
+        fault: Motor and mode.
+        magnitude: Size at full severity in the mode's unit; NaN where it is not known, or not
+            before the motion is.
+        course: Onset and severity over time.
+        per_movement: What was drawn for each movement, (movement,), by its name in the truth.
+    """
+
+    fault: Fault
+    magnitude: float
+    course: Course
+    per_movement: Mapping[str, PerMovement] = field(default_factory=dict)
+
+    @property
+    def onset_s(self) -> float:
+        """When it begins [s]."""
+        return self.course.onset_s
+
+    def detail(self) -> dict[str, Any]:
+        """Return the full truth as a JSON object; what is not known is None."""
+        return {
+            "motor": self.fault.motor,
+            "mode": self.fault.mode,
+            "magnitude": None if np.isnan(self.magnitude) else self.magnitude,
+            "unit": self.fault.magnitude_unit,
+            "onset_s": self.onset_s,
+            "profile": self.course.detail(),
+            **{name: values.tolist() for name, values in self.per_movement.items()},
+        }
+
+
+@dataclass(frozen=True)
+class FaultGroup:
+    """Faults of one mode at one motor, over the runs that have them.
+
+    Attributes:
+        magnitude: Size in the mode's unit, (run,).
+        courses: Onset and severity over time, one for each run.
+        per_movement: What was drawn for each movement, (run, movement), by name.
+    """
+
+    magnitude: FloatArray
+    courses: Sequence[Course]
+    per_movement: Mapping[str, PerMovement] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, values: Sequence[FaultValue]) -> FaultGroup:
+        """Return the faults of several runs as one value."""
+        return cls(
+            magnitude=np.array([value.magnitude for value in values]),
+            courses=[value.course for value in values],
+            per_movement={
+                name: np.stack([value.per_movement[name] for value in values])
+                for name in values[0].per_movement
+            },
+        )
+
+    def severity(self, time: FloatArray) -> FloatArray:
+        """Return the severity (run, time) at `time`, (time,) or (run, time) [s]."""
+        return severities(self.courses, time)
+
+    def effect(self, time: FloatArray) -> FloatArray:
+        """Return magnitude times severity, (run, time), at `time`, (time,) or (run, time) [s]."""
+        return self.magnitude[:, None] * self.severity(time)
+
+    def accumulated(self, time: FloatArray) -> FloatArray:
+        """Return the integral of `effect` up to `time` (time,) [s]: (run, time)."""
+        return self.magnitude[:, None] * exposures(self.courses, time)

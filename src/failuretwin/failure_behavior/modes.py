@@ -1,0 +1,369 @@
+"""The fault modes that can be simulated, by id; more can be registered, others loaded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from failuretwin.core.config import from_table, read_toml
+from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.hypothesis import MAGNITUDE_UNITS
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.failure_behavior.fault import (
+    INTERMITTENT,
+    RAMP,
+    STEP,
+    Course,
+    FaultGroup,
+    PerMovement,
+    draw_episodes,
+)
+from failuretwin.failure_behavior.mode import (
+    FaultMode,
+    MotorMotion,
+    MotorOrders,
+    Range,
+    SignedMode,
+    SizedMode,
+)
+
+# Modes in which the gear holds the motor: stuck, intermittent.
+
+PUBLISHED_ONSET_S = 0.49
+"""Onset of stuck faults in the published data: frozen from 0-based sample 49 of 100 Hz on [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stuck(FaultMode):
+    """The motor keeps the angle that it has at the onset; its magnitude is that angle [rad].
+
+    Intermittent, it is held in episodes, and the magnitude is the angle of the first.
+    """
+
+    mode: ClassVar[str] = "stuck"
+    allowed_profiles: ClassVar[tuple[str, ...]] = (STEP, INTERMITTENT)
+
+    onset_s: Range = (PUBLISHED_ONSET_S, PUBLISHED_ONSET_S)
+    rise_s: Range = field(init=False, default=(0.0, 0.0))
+
+    def _draw_magnitude(self, rng: np.random.Generator) -> float:
+        return np.nan
+
+    def held(self, faults: FaultGroup, time: FloatArray) -> BoolArray:
+        """Return when the motor is held: wherever the fault is there."""
+        return faults.severity(time) > 0.0
+
+    def as_struck(self, faults: FaultGroup, motion: MotorMotion) -> FaultGroup:
+        """Return the faults with the angle at the first instant that the motor is held."""
+        held = self.held(faults, motion.time)
+        first = np.argmax(held, axis=1)
+        angle = motion.position[np.arange(len(first)), first]
+        return replace(faults, magnitude=np.where(held.any(axis=1), angle, np.nan))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Intermittent(SizedMode):
+    """The motor is held in episodes; its magnitude is their share of the time from the onset on."""
+
+    mode: ClassVar[str] = "intermittent"
+    allowed_profiles: ClassVar[tuple[str, ...]] = (INTERMITTENT,)
+    highest: ClassVar[float] = 1.0
+
+    magnitude: Range = (0.2, 0.6)
+    profiles: tuple[str, ...] = (INTERMITTENT,)
+    rise_s: Range = field(init=False, default=(0.0, 0.0))
+    episode_share: Range = field(init=False, default=(0.0, 0.0))
+
+    def _draw_course(
+        self, magnitude: float, onset_s: float, end_s: float, rng: np.random.Generator
+    ) -> Course:
+        """Draw episodes that fill the share that the magnitude says."""
+        episodes = draw_episodes(onset_s, end_s, magnitude, self.episode_s, rng)
+        return Course(INTERMITTENT, onset_s, episodes=episodes)
+
+    def held(self, faults: FaultGroup, time: FloatArray) -> BoolArray:
+        """Return when the motor is held: in every episode."""
+        return faults.severity(time) > 0.0
+
+
+# Modes that spoil the way to the target: slow, lag, backlash, lost commands.
+
+CHANCE, LOST = "chance", "lost"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Slow(SizedMode):
+    """The motor loses a share of its speed; movements cut short what they interrupt."""
+
+    mode: ClassVar[str] = "slow"
+    highest: ClassVar[float] = 0.99
+
+    magnitude: Range = (0.3, 0.8)
+    profiles: tuple[str, ...] = (STEP, RAMP)
+
+    def on_movements(self, faults: FaultGroup, orders: MotorOrders) -> MotorOrders:
+        """Draw out the ramps of movements that start after the onset."""
+        speed = 1.0 - faults.effect(orders.start)
+        return replace(orders, ramp_duration=orders.ramp_duration / speed)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lag(SizedMode):
+    """The motor follows its reference late by a dead time [s].
+
+    The default range lies above the 0.04 to 0.06 s by which healthy motors of the ArmPi FPV lag.
+    """
+
+    mode: ClassVar[str] = "lag"
+
+    magnitude: Range = (0.1, 0.3)
+
+    def on_reference(
+        self, faults: FaultGroup, reference: FloatArray, time: FloatArray
+    ) -> FloatArray:
+        """Delay the reference; it waits where the dead time grows and never runs backwards."""
+        step = (time[-1] - time[0]) / (len(time) - 1)
+        place = np.arange(len(time)) - faults.effect(time) / step
+        place = np.maximum.accumulate(np.maximum(place, 0.0), axis=1)
+        low = place.astype(np.int64)
+        before = np.take_along_axis(reference, low, axis=1)
+        after = np.take_along_axis(reference, np.minimum(low + 1, len(time) - 1), axis=1)
+        return before + (place - low) * (after - before)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Backlash(SizedMode):
+    """The joint has play [rad]: it keeps its place until the motor has turned through it.
+
+    At the onset the motor stands in the middle of the play, so that the joint settles half of it
+    short of each target, seen in the direction of travel.
+    """
+
+    mode: ClassVar[str] = "backlash"
+    allowed_profiles: ClassVar[tuple[str, ...]] = (STEP, RAMP)
+
+    magnitude: Range = (0.03, 0.12)
+    profiles: tuple[str, ...] = (STEP, RAMP)
+    episode_s: Range = field(init=False, default=(0.0, 0.0))
+    episode_share: Range = field(init=False, default=(0.0, 0.0))
+
+    def on_reference(
+        self, faults: FaultGroup, reference: FloatArray, time: FloatArray
+    ) -> FloatArray:
+        """Pass the reference through the play."""
+        half = 0.5 * faults.effect(time).T
+        low, high = reference.T - half, reference.T + half
+        output = np.empty_like(low)
+        here = reference[:, 0]
+        for k in range(len(time)):
+            here = np.minimum(np.maximum(here, low[k]), high[k])
+            output[k] = here
+        return output.T
+
+
+@dataclass(frozen=True, kw_only=True)
+class LostCommands(SizedMode):
+    """A share of the commands never arrives: the motor stays where it is for that movement."""
+
+    mode: ClassVar[str] = "lost_commands"
+    highest: ClassVar[float] = 1.0
+
+    magnitude: Range = (0.3, 0.8)
+
+    def _draw_per_movement(
+        self, movements: int, rng: np.random.Generator
+    ) -> dict[str, PerMovement]:
+        return {CHANCE: rng.random(movements)}
+
+    def _lost(self, faults: FaultGroup, start: FloatArray) -> BoolArray:
+        """Return which movements are lost, (run, movement)."""
+        return np.asarray(faults.per_movement[CHANCE] < faults.effect(start))
+
+    def on_movements(self, faults: FaultGroup, orders: MotorOrders) -> MotorOrders:
+        """Lose commands beside those that get lost anyway."""
+        return replace(orders, lost=orders.lost | self._lost(faults, orders.start))
+
+    def as_struck(self, faults: FaultGroup, motion: MotorMotion) -> FaultGroup:
+        """Return the faults with the movements that this fault has lost."""
+        return replace(faults, per_movement={LOST: self._lost(faults, motion.start)})
+
+
+# Modes that put the motor beside its target: steady-state error, encoder faults, drift.
+
+PUBLISHED_ERROR_RAD = (float(np.deg2rad(10 * 0.24)), float(np.deg2rad(50 * 0.24)))
+"""Bounds of the paper's steady-state errors: 10 and 50 counts of 0.24 deg [rad]."""
+
+OFFSET = "offset_rad"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SteadyStateError(SizedMode):
+    """Every target is missed by an error of random size and sign, drawn anew for each movement.
+
+    The magnitude of a run is the rms of its errors over the movements that start after the onset.
+
+    Attributes:
+        magnitude: Range of the size of one error [rad]; the default is the paper's.
+    """
+
+    mode: ClassVar[str] = "steady_state_error"
+
+    magnitude: Range = PUBLISHED_ERROR_RAD
+    onset_s: Range = (0.0, 0.0)
+
+    def _draw_magnitude(self, rng: np.random.Generator) -> float:
+        return np.nan
+
+    def _draw_per_movement(
+        self, movements: int, rng: np.random.Generator
+    ) -> dict[str, PerMovement]:
+        sign = np.where(rng.random(movements) < 0.5, -1.0, 1.0)
+        return {OFFSET: sign * rng.uniform(*self.magnitude, movements)}
+
+    def on_movements(self, faults: FaultGroup, orders: MotorOrders) -> MotorOrders:
+        """Add its error to every target."""
+        offset = faults.per_movement[OFFSET] * faults.severity(orders.start)
+        return replace(orders, target=orders.target + offset)
+
+    def as_struck(self, faults: FaultGroup, motion: MotorMotion) -> FaultGroup:
+        """Return the faults with the errors as severe as they were, and their rms."""
+        severity = faults.severity(motion.start)
+        offset = faults.per_movement[OFFSET] * severity
+        hit = np.maximum(np.count_nonzero(severity, axis=1), 1)
+        rms = np.sqrt(np.sum(offset**2, axis=1) / hit)
+        return replace(faults, magnitude=rms, per_movement={OFFSET: offset})
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncoderBias(SignedMode):
+    """The position sensor is off by an angle [rad], and so is the motor, everywhere."""
+
+    mode: ClassVar[str] = "encoder_bias"
+
+    magnitude: Range = PUBLISHED_ERROR_RAD
+
+    def on_reference(
+        self, faults: FaultGroup, reference: FloatArray, time: FloatArray
+    ) -> FloatArray:
+        """Shift the reference."""
+        return reference + faults.effect(time)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncoderScale(SignedMode):
+    """The position sensor is off in proportion to the angle: the motor goes (1 + magnitude) as far.
+
+    Seen from the motor's zero angle. The default range is nearly that of runs recorded in 2024
+    with a proportional error, which had shares from -0.63 to 0.73.
+    """
+
+    mode: ClassVar[str] = "encoder_scale"
+    lowest: ClassVar[float] = -1.0
+    highest: ClassVar[float] = 1.0
+
+    magnitude: Range = (0.05, 0.7)
+
+    def on_reference(
+        self, faults: FaultGroup, reference: FloatArray, time: FloatArray
+    ) -> FloatArray:
+        """Stretch the reference about zero."""
+        return reference * (1.0 + faults.effect(time))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drift(SignedMode):
+    """The motor slips away from its target at a rate [rad/s]; what has slipped stays slipped."""
+
+    mode: ClassVar[str] = "drift"
+
+    magnitude: Range = (0.01, 0.05)
+
+    def on_reference(
+        self, faults: FaultGroup, reference: FloatArray, time: FloatArray
+    ) -> FloatArray:
+        """Shift the reference by what has slipped so far."""
+        return reference + faults.accumulated(time)
+
+
+# The mode in which the motor cannot carry its load: torque loss.
+
+
+@dataclass(frozen=True, kw_only=True)
+class TorqueLoss(SizedMode):
+    """The motor loses a share of its stiffness: it sags 1 / (1 - magnitude) times as far."""
+
+    mode: ClassVar[str] = "torque_loss"
+    highest: ClassVar[float] = 0.99
+    needs_compliance: ClassVar[bool] = True
+
+    magnitude: Range = (0.3, 0.7)
+    profiles: tuple[str, ...] = (STEP, RAMP)
+
+    def weakness(self, faults: FaultGroup, time: FloatArray) -> FloatArray:
+        """Return the share of stiffness lost."""
+        return faults.effect(time)
+
+
+_BUILT_IN: tuple[FaultMode, ...] = (
+    Stuck(),
+    SteadyStateError(),
+    Slow(),
+    Lag(),
+    Backlash(),
+    Drift(),
+    Intermittent(),
+    TorqueLoss(),
+    EncoderBias(),
+    EncoderScale(),
+    LostCommands(),
+)
+
+MODES: dict[str, FaultMode] = {mode.mode: mode for mode in _BUILT_IN}
+"""The modes with their default distributions; `stuck` and `steady_state_error` are the paper's."""
+
+
+def register(mode: FaultMode, unit: str) -> None:
+    """Add a mode of your own to `MODES`.
+
+    Args:
+        mode: The mode with its default distributions.
+        unit: Unit of its magnitude, such as ``rad``; ``ratio`` for a share.
+
+    Raises:
+        InputError: If there is a mode of that name.
+    """
+    if mode.mode in MAGNITUDE_UNITS:
+        raise InputError(f"there is a fault mode {mode.mode!r} already. Choose another name.")
+    MAGNITUDE_UNITS[mode.mode] = unit
+    MODES[mode.mode] = mode
+
+
+def load_modes(path: Path) -> Mapping[str, FaultMode]:
+    """Load distributions from a TOML file with one table for each mode.
+
+    Args:
+        path: The file. Modes that it leaves out stay as they are in `MODES`; keys that it leaves
+            out have the defaults of their mode.
+
+    Returns:
+        All modes by id.
+
+    Raises:
+        InputError: If the file cannot be read, or names a mode or key that does not exist, or a
+            value makes no sense.
+    """
+    modes = dict(MODES)
+    for name, table in read_toml(path).items():
+        try:
+            if name not in MODES:
+                raise unknown_name("fault mode", name, MODES)
+            if not isinstance(table, dict):
+                raise InputError(f"{name} is {table!r}, expected a table, such as [{name}].")
+            modes[name] = from_table(type(MODES[name]), table, name)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+    return modes

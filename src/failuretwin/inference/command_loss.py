@@ -1,0 +1,252 @@
+"""What chance may do to the movements of a healthy robot: late starts, commands that get lost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from failuretwin.core.movements import Movements
+from failuretwin.core.numerics import log_of
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.digital_model.nonidealities import Imperfections
+from failuretwin.digital_model.robot import Robot
+
+# How many commands in a row each motor has missed: a chain from movement to movement.
+
+MOST_STATES = 24
+"""States of a chain beyond which no more are added; what is left out is the rarest."""
+
+
+@dataclass(frozen=True)
+class LossesInARow:
+    """A chain: with each movement some motors miss one command more, the others none any longer.
+
+    Attributes:
+        missed: Commands that each motor has missed in a row in each state, (state, motor); none in
+            the first.
+        leads: 1 where a loss (0: of none) leads from a state to a state, (loss, state, state).
+    """
+
+    missed: IntArray
+    leads: FloatArray
+
+    @staticmethod
+    def of(losses: BoolArray, chance: FloatArray, rare: float) -> LossesInARow:
+        """Return the chain of the states that are not too rare, single losses first.
+
+        What is left out counts as fewer losses in a row.
+
+        Args:
+            losses: Motors that each loss hits, (loss, motor); the first hits none.
+            chance: Highest probability of each, (loss,).
+            rare: Losses in a row that are less probable are left out.
+        """
+        states = _states(losses, chance, rare)
+        leads = np.zeros((len(losses), len(states), len(states)))
+        for i, loss in enumerate(losses):
+            for j, state in enumerate(states):
+                leads[i, j, states.index(_known(_one_more(state, loss), states))] = 1.0
+        return LossesInARow(np.array(states), leads)
+
+    def chances(self, rates: FloatArray, log_likelihood: FloatArray | None = None) -> FloatArray:
+        """Return the probability of each state with each movement, (run, movement, state).
+
+        Args:
+            rates: Probability of each loss, (run, movement, loss).
+            log_likelihood: What was seen says of each state, (run, movement, state); each movement
+                is then given all that was seen before it. None: nothing was seen.
+        """
+        runs, count, _ = rates.shape
+        chances = np.empty((runs, count, len(self.missed)))
+        state = np.zeros((runs, len(self.missed)))
+        state[:, 0] = 1.0
+        for m in range(count):
+            chances[:, m] = state = np.einsum("rl,rd,lds->rs", rates[:, m], state, self.leads)
+            if log_likelihood is not None:
+                says = np.where(state > 0.0, log_likelihood[:, m], -np.inf)
+                state = state * np.exp(says - says.max(axis=-1, keepdims=True))
+                state = state / state.sum(axis=-1, keepdims=True)
+        return chances
+
+
+def _states(losses: BoolArray, chance: FloatArray, rare: float) -> list[tuple[int, ...]]:
+    """Return the states that are not too rare, from few losses in a row to many."""
+    none = (0,) * losses.shape[1]
+    newest = {_one_more(none, loss): float(p) for loss, p in zip(losses, chance, strict=True)}
+    found = list(newest)
+    while newest:
+        longer: dict[tuple[int, ...], float] = {}
+        for state, before in newest.items():
+            for loss, now in zip(losses, chance, strict=True):
+                missed = _one_more(state, loss)
+                if missed not in found:
+                    longer[missed] = longer.get(missed, 0.0) + before * float(now)
+        ranked = sorted((p, missed) for missed, p in longer.items() if p > rare)[::-1]
+        newest = {missed: p for p, missed in ranked[: max(MOST_STATES - len(found), 0)]}
+        found += newest
+    return found
+
+
+def _one_more(missed: tuple[int, ...], loss: BoolArray) -> tuple[int, ...]:
+    """Return how many commands in a row the motors have missed after one more loss."""
+    return tuple(n + 1 if hit else 0 for n, hit in zip(missed, loss, strict=True))
+
+
+def _known(missed: tuple[int, ...], states: list[tuple[int, ...]]) -> tuple[int, ...]:
+    """Return the state of `states` that comes nearest: with fewer losses in the longest row."""
+    while missed not in states:
+        longest = max(missed)
+        missed = tuple(n - 1 if n == longest else n for n in missed)
+    return missed
+
+
+OUTLIER_RATE = 0.01
+"""Share of movements after which the tool may be anywhere in its workspace [-]."""
+RARE = 1e-4
+"""Losses in a row that are less probable than this, even if all are late, are left out [-]."""
+NEGLIGIBLE = 1e-5
+"""What is less probable than this given the movements before is left to the outliers [-]."""
+LATE_MARGIN_S = 0.15
+"""A movement that lasts this much longer than the schedule allows started late [s]."""
+
+
+@dataclass(frozen=True)
+class Alternatives:
+    """What may become of each movement: which motors lost how many commands in a row.
+
+    Attributes:
+        lost: Motors that lose their command, (alternative, motor).
+        base: Angles that the motors then go for, (run, movement, alternative, motor) [rad].
+        direction: Sign of their last travel, (run, movement, alternative, motor).
+        log_weight: Log probability of each, (run, movement, alternative).
+    """
+
+    lost: BoolArray
+    base: FloatArray
+    direction: FloatArray
+    log_weight: FloatArray
+
+    def __getitem__(self, runs: slice) -> Alternatives:
+        """Return the alternatives of some of the runs."""
+        return Alternatives(self.lost, self.base[runs], self.direction[runs], self.log_weight[runs])
+
+
+@dataclass(frozen=True)
+class LostCommands:
+    """Which commands get lost, and how often.
+
+    Attributes:
+        robot: The robot.
+        imperfections: Rates of losses and of late starts.
+    """
+
+    robot: Robot
+    imperfections: Imperfections
+
+    def alternatives(self, movements: Movements) -> Alternatives:
+        """Return what may become of each movement; the first is that every command arrives.
+
+        A motor that misses a command stays where it went last: at the target before, or, if it
+        had missed that one too, at the target before that, and so on. Padding is filled with
+        zeros; no evidence belongs to it.
+        """
+        origin, target = np.nan_to_num(movements.origin()), np.nan_to_num(movements.target)
+        travel, rows = np.sign(target - origin), self._in_a_row
+        return Alternatives(
+            lost=rows.missed > 0,
+            base=_of_last_made(target, origin, rows.missed),
+            direction=_of_last_made(travel, _before(travel), rows.missed),
+            log_weight=self._log_weight(rows.chances(self._rates(self.late(movements)))),
+        )
+
+    def given_before(
+        self, alternatives: Alternatives, late: FloatArray, log_likelihood: FloatArray
+    ) -> Alternatives:
+        """Return alternatives with their probability given what was seen of the movements before.
+
+        A motor that was seen to arrive has missed nothing before; one that was seen to stay has.
+
+        Args:
+            alternatives: What may have become of the movements.
+            late: Probability that each started late, (run, movement).
+            log_likelihood: What was seen of each movement says of each alternative, up to a
+                constant, (run, movement, alternative); 0 where nothing was seen.
+        """
+        chances = self._in_a_row.chances(self._rates(late), log_likelihood)
+        chances[chances < NEGLIGIBLE] = 0.0
+        return replace(alternatives, log_weight=self._log_weight(chances))
+
+    def _rates(self, late: FloatArray) -> FloatArray:
+        """Return the probability of each loss, (run, movement, loss); the first: of none.
+
+        Args:
+            late: Probability that each movement started late, (run, movement).
+        """
+        entries = self.imperfections.lost_commands
+        rates = [entry.rate + (entry.rate_when_late - entry.rate) * late for entry in entries]
+        total = sum(rates, np.zeros_like(late))
+        none = np.maximum(1.0 - total, 0.0)
+        shares = np.stack([none, *rates], axis=-1)
+        return shares / np.maximum(total, 1.0)[..., None]  # rounding may exceed one
+
+    @cached_property
+    def _in_a_row(self) -> LossesInARow:
+        names, entries = self.robot.motor_names, self.imperfections.lost_commands
+        losses = [np.isin(names, motors) for motors in ((), *(e.motors for e in entries))]
+        most = self._rates(np.array([0.0, 1.0])).max(axis=0)
+        return LossesInARow.of(np.array(losses), most, RARE)
+
+    @staticmethod
+    def _log_weight(chances: FloatArray) -> FloatArray:
+        return log_of(chances * (1.0 - OUTLIER_RATE))
+
+    @property
+    def late_after_s(self) -> float:
+        """Readings that come back later than this after a command say that it started late [s]."""
+        timing, readings = self.imperfections.timing, self.imperfections.readings
+        between = 1.0 / readings.rate_hz if readings is not None else 0.0
+        return 0.5 * timing.late_s[0] + between if timing.late_rate > 0.0 else np.inf
+
+    def late(self, movements: Movements, resumed: FloatArray | None = None) -> FloatArray:
+        """Return the probability that each movement started late, (run, movement).
+
+        A late start holds up the next command, so the time between commands betrays it. Of the
+        last movement of a run the readings tell: they come back when a late one starts.
+
+        Args:
+            movements: The movements.
+            resumed: Time from each command to the first reading after it, (run, movement) [s], NaN
+                where it is not known; None: nowhere. What is not told so is the rate.
+        """
+        timing = self.imperfections.timing
+        late = np.full(movements.start.shape, timing.late_rate)
+        if resumed is not None and timing.late_rate > 0.0:
+            late[resumed < 0.5 * timing.late_s[0]] = 0.0
+            late[resumed > self.late_after_s] = 1.0
+        longest = self.imperfections.schedule.period_s[1] + LATE_MARGIN_S
+        known = movements.exists[:, 1:]
+        lasted = np.diff(movements.start, axis=1)
+        late[:, :-1] = np.where(known, lasted > longest, late[:, :-1])
+        return late
+
+
+def _of_last_made(values: FloatArray, after: FloatArray, missed: IntArray) -> FloatArray:
+    """Return what belongs to the last movement that a motor made, (run, movement, state, motor).
+
+    Args:
+        values: What belongs to each movement, (run, movement, motor).
+        after: What belongs to the movement before each, (run, movement, motor).
+        missed: Commands that each motor has missed in a row, (state, motor).
+    """
+    earlier = [values, after]
+    while len(earlier) <= missed.max():
+        earlier.append(_before(earlier[-1]))
+    chosen = np.stack(earlier)[missed, :, :, np.arange(missed.shape[1])]
+    return np.moveaxis(chosen, (0, 1), (2, 3)).copy()
+
+
+def _before(values: FloatArray) -> FloatArray:
+    """Return the values of the movement before, (run, movement, ...); zero before the first."""
+    return np.concatenate([np.zeros_like(values[:, :1]), values[:, :-1]], axis=1)

@@ -1,0 +1,139 @@
+"""Bayesian diagnosis: which hypothesis explains where the tool went, and how surely."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis, paper_hypotheses, parse_hypotheses
+from failuretwin.core.runs import check_motors, check_runs, truth_of
+from failuretwin.core.types import BoolArray
+from failuretwin.digital_model.nonidealities import Imperfections, default_imperfections
+from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.evidence import moving_evidence, settled_evidence
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.log_quality import log_quality, without_spoilt
+from failuretwin.inference.posterior import check_weighable, judge, shows_on_way
+from failuretwin.inference.priors import Priors
+from failuretwin.inference.run_likelihood import Scene
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+CHUNK_RUNS = 64
+"""Runs of five movements at a time: keeps the work on nodes in about 100 MB."""
+
+
+@dataclass(frozen=True)
+class BayesDiagnoser:
+    """Posterior over hypotheses from where the tool settled in a run, and how it got there.
+
+    Attributes:
+        twin: Digital twin of the robot.
+        imperfections: How the healthy robot differs from it; None: as its profile says.
+        hypotheses: What may be the case, as `Hypothesis` or in its text form, such as
+            ``["healthy", "motor_1:stuck", "unknown"]``, with the prior odds of the table of
+            failure modes; None: the paper's classes. A single one is always certain.
+        priors: Beliefs about onset and size.
+        whole_run: Whether readings on the way count beside settled poses, where it is known how
+            late this robot starts to move.
+
+    Raises:
+        InputError: If a hypothesis cannot be read or weighed, names a motor that the robot does
+            not have, or is given twice, or none is given.
+    """
+
+    twin: DigitalTwin
+    imperfections: Imperfections | None = None
+    hypotheses: Sequence[Hypothesis | str] | None = None
+    priors: Priors = field(default_factory=Priors)
+    whole_run: bool = True
+
+    def __post_init__(self) -> None:
+        for hypothesis in self.considered:
+            check_weighable(hypothesis)
+
+    @cached_property
+    def considered(self) -> Sequence[Hypothesis]:
+        """What may be the case."""
+        motors = self.twin.robot.motor_names
+        if self.hypotheses is None:
+            return paper_hypotheses(motors)
+        return parse_hypotheses(self.hypotheses, motors)
+
+    @cached_property
+    def healthy_model(self) -> HealthyModel:
+        """What a healthy run looks like."""
+        imperfections = self.imperfections or default_imperfections(self.twin.robot)
+        return HealthyModel(self.twin, imperfections)
+
+    @cached_property
+    def looks_on_way(self) -> bool:
+        """Whether readings on the way count."""
+        return self.whole_run and self.healthy_model.knows_timing
+
+    def on_way(self, usable: BoolArray) -> BoolArray:
+        """Return the movements whose readings on the way count, (run, movement).
+
+        Where a motor settled says all about most faults, and more reliably, so readings on the
+        way count beside it only where some hypothesis shows nowhere else, or where that was not
+        seen.
+
+        Args:
+            usable: Movements with a settled point, (run, movement).
+        """
+        if any(shows_on_way(hypothesis) for hypothesis in self.considered):
+            return np.ones_like(usable)
+        unseen = ~usable
+        unseen[:, 1:] |= unseen[:, :-1]  # what follows tells where it ended
+        return unseen
+
+    def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
+        """Return the diagnosis of each run of a run set.
+
+        Reads `command` and `measured` alone; the truth, where there is any, is only passed on.
+
+        Raises:
+            InputError: If the run set is of another robot or no run holds a movement.
+        """
+        self._check(runs)
+        quality = log_quality(runs)
+        sound = without_spoilt(runs, quality)
+        evidence, moving = settled_evidence(sound), None
+        if evidence.movements.start.shape[1] == 0:
+            raise InputError(
+                "no run holds a movement: `command` never leaves its first value. Expected runs "
+                "of one movement at least."
+            )
+        if self.looks_on_way:
+            moving = moving_evidence(sound, evidence).where(self.on_way(evidence.usable))
+        names = [str(name) for name in runs["run"].values]
+        faults = truth_of(runs)
+        truth: list[str | None] = [None] * len(names) if faults is None else list(faults)
+        results = []
+        chunk = _runs_at_a_time(evidence.movements.start.shape[1])
+        for first in range(0, len(names), chunk):
+            rows = slice(first, first + chunk)
+            way = None if moving is None else moving[rows]
+            scene = Scene(evidence[rows], self.healthy_model, way)
+            judgement = judge(scene, self.considered, self.priors)
+            for at in range(len(names))[rows]:
+                results.append(judgement.conclude(at - first, names[at], quality[at], truth[at]))
+        return results
+
+    def _check(self, runs: xr.Dataset) -> None:
+        check_runs(runs, "the run set")
+        check_motors(runs, self.twin.robot.name, self.twin.robot.motor_names)
+        known, end = self.priors.onset.known_s, float(runs["time"].values[-1])
+        if known is not None and known > end:
+            raise InputError(f"the onset is given as {known:g} s, but the runs end at {end:g} s.")
+
+
+def _runs_at_a_time(movements: int) -> int:
+    """Return how many runs of so many movements to weigh at a time: nodes grow with the square."""
+    return max(1, min(CHUNK_RUNS, 25 * CHUNK_RUNS // max(movements, 1) ** 2))

@@ -1,0 +1,313 @@
+"""By how many nats what is true beats every other hypothesis, if nothing is left to chance.
+
+The truth of each run is made again without scatter, losses and glitches, seen where the run was
+seen, and laid beside the best member of every hypothesis, in units of the declared scatter.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses, parse_hypotheses
+from failuretwin.core.movements import Movements, find_movements
+from failuretwin.core.numerics import log_of
+from failuretwin.core.runs import check_motors, check_runs
+from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.data_knowledge.generate import noise_free_path
+from failuretwin.digital_model.nonidealities import Imperfections, default_imperfections
+from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.failure_behavior.fault import FaultValue
+from failuretwin.failure_behavior.injection import Injection, replayed
+from failuretwin.failure_behavior.modes import MODES
+from failuretwin.inference.evidence import moving_evidence, settled_evidence
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.joint_likelihood import MotorProfile
+from failuretwin.inference.marginal import Law, densities
+from failuretwin.inference.missed_movements import MISSES, log_densities
+from failuretwin.inference.posterior import TIMED, check_weighable, law_of, motor_of
+from failuretwin.inference.priors import Priors
+from failuretwin.inference.readings import true_readings
+from failuretwin.inference.run_likelihood import Scene
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# How well the best member of a hypothesis fits: the best size, held angle or range of errors.
+
+
+def first_spoilt(movements: Movements, onset: FloatArray) -> BoolArray:
+    """Return with which movements the effects of a fault may begin, (run, movement).
+
+    The one under way at the onset, or the next: some faults act at once, others on the next
+    command.
+
+    Args:
+        movements: Movements of the runs.
+        onset: Onset of the fault, (run,) [s]; NaN or before the first movement: the first.
+    """
+    count = np.sum(movements.start <= np.nan_to_num(onset)[:, None], axis=1, keepdims=True)
+    under_way = np.maximum(count - 1, 0)
+    number = np.arange(movements.start.shape[1])
+    next_one = (count > 0) & (number == under_way + 1) & movements.exists
+    return np.asarray((number == under_way) | next_one)
+
+
+def best_fit(scene: Scene, hypothesis: Hypothesis, priors: Priors, first: BoolArray) -> FloatArray:
+    """Return the log density of each run under the best member of a hypothesis, (run,).
+
+    Args:
+        scene: The runs.
+        hypothesis: Healthy or one fault.
+        priors: Ranges of sizes that are considered.
+        first: Movements with which the effects of the fault may begin, (run, movement).
+    """
+    if hypothesis.is_healthy:
+        return np.asarray((scene.log_healthy + scene.on_way).sum(axis=1))
+    fault = hypothesis.faults[0]
+    if fault.mode in MISSES:
+        whole = log_densities(scene, motor_of(scene, fault), fault.mode)[:, -1]
+    else:
+        whole = _by_first_and_cell(scene, law_of(scene, fault, priors))
+    return np.asarray((whole + log_of(first)[..., None]).max(axis=(1, 2)))
+
+
+def _by_first_and_cell(scene: Scene, law: Law) -> FloatArray:
+    """Return the log density of each run, (run, first movement spoilt, cell)."""
+    says = densities(scene, law)
+    healthy, faulty = scene.log_healthy + scene.on_way, says.by_cell + says.way
+    before = np.cumsum(healthy, axis=1) - healthy
+    after = np.cumsum(faulty[:, ::-1], axis=1)[:, ::-1]
+    return np.where(np.isfinite(law.log_prior), before[:, :, None] + after, -np.inf)
+
+
+# Noise-free runs as they are weighed on average: what a distance is expected to cost.
+
+MOST_NATS = 40.0
+"""What one movement counts at most [nats]: about what a tool that may be anywhere costs."""
+
+
+def shrink(dof: float) -> float:
+    """Return the factor on squared distances that makes noise-free falls expected ones.
+
+    Of a 3-variate Student t the log density falls by (dof + 3)/2 log(1 + d2/dof) from its centre.
+    Shifted by d, it loses (dof + 3)/2 log(1 + d2/(dof + 5)) on average over its own scatter:
+    exactly so for small d, by Fisher's information, and within half a nat for any.
+
+    Args:
+        dof: Degrees of freedom; infinite: normal.
+    """
+    return 1.0 if np.isinf(dof) else dof / (dof + 5.0)
+
+
+class NoiseFreeScene(Scene):
+    """Noise-free runs, with densities that are expected ones, relative to a perfect fit.
+
+    Every hypothesis has the scatter of the healthy robot, also at a motor that is held, so that
+    the tool's place counts alone; a command that arrives counts as certain.
+    """
+
+    @cached_property
+    def log_healthy(self) -> FloatArray:
+        """Expected log density of each settled position if no motor is faulty, (run, movement).
+
+        The tool strays along the circle of the motor that strays, not along its tangent: so that
+        of the motor counts that explains the position best.
+        """
+        profiles = [self.profile(motor) for motor in range(len(self.model.scatter))]
+        says = [p.log_density(p.expected[:, :, None], False)[..., 0] for p in profiles]
+        return np.asarray(np.max(says, axis=0))
+
+    def profile(self, motor: int) -> MotorProfile:
+        """Return what each movement is expected to say of one motor, computed once."""
+        if motor not in self._expected:
+            self._expected[motor] = self._with_expected(super().profile(motor))
+        return self._expected[motor]
+
+    @cached_property
+    def _expected(self) -> dict[int, MotorProfile]:
+        return {}
+
+    def _with_expected(self, profile: MotorProfile) -> MotorProfile:
+        own = 1.0 + profile.scatter**2 * profile.precision
+        factor = shrink(profile.dof)
+        return replace(
+            profile,
+            precision=profile.precision / own * factor,
+            square=profile.square * factor,
+            log_weight=_relative(self.alternatives.log_weight),
+            scatter=0.0,
+            outlier=-MOST_NATS,
+        )
+
+
+def _relative(log_weight: FloatArray) -> FloatArray:
+    """Return log weights of alternatives, relative to that of all commands arriving."""
+    return log_weight - log_weight[..., :1]
+
+
+CHUNK_RUNS = 64
+"""Runs at a time: keeps the work on nodes in about 100 MB."""
+
+
+@dataclass(frozen=True)
+class Separation:
+    """How far the truth of some runs is ahead of each hypothesis.
+
+    Attributes:
+        hypotheses: The hypotheses.
+        truth: What is true of each run, among them or not.
+        nats: By how much the truth is expected to beat each, (run, hypothesis) [nats]; 0 for
+            itself.
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    truth: tuple[Hypothesis, ...]
+    nats: FloatArray
+
+    @property
+    def nearest(self) -> FloatArray:
+        """By how much the truth beats the nearest other hypothesis, (run,) [nats]."""
+        own = np.array([[h == truth for h in self.hypotheses] for truth in self.truth])
+        return np.asarray(np.where(own, np.inf, self.nats).min(axis=1))
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Lays noise-free runs beside every hypothesis.
+
+    Attributes:
+        model: The healthy robot and its scatter.
+        hypotheses: What may be the case: healthy or single faults.
+        priors: Ranges of sizes that are considered.
+    """
+
+    model: HealthyModel
+    hypotheses: tuple[Hypothesis, ...]
+    priors: Priors
+
+    def __post_init__(self) -> None:
+        for hypothesis in self.hypotheses:
+            if not hypothesis.known or len(hypothesis.faults) > 1:
+                raise InputError(
+                    f"'{hypothesis}' cannot be laid beside others. Expected healthy or one fault."
+                )
+            check_weighable(hypothesis)
+
+    def fits(
+        self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]], onset: FloatArray
+    ) -> FloatArray:
+        """Return how well the best member of each hypothesis fits, (run, hypothesis) [nats].
+
+        Args:
+            runs: Runs as commanded, with readings where the tool is seen.
+            faults: The true faults of each run.
+            onset: When faults begin in each run, (run,) [s]; NaN: before it.
+        """
+        parts = [
+            self._fits(
+                runs.isel(run=slice(at, at + CHUNK_RUNS)),
+                faults[at : at + CHUNK_RUNS],
+                onset[at : at + CHUNK_RUNS],
+            )
+            for at in range(0, len(faults), CHUNK_RUNS)
+        ]
+        return np.concatenate(parts)
+
+    def _fits(
+        self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]], onset: FloatArray
+    ) -> FloatArray:
+        silent = self.silent(runs, faults)
+        settled = settled_evidence(silent)
+        moving = moving_evidence(silent, settled) if self._needs_way else None
+        scene = NoiseFreeScene(settled, self.model, moving)
+        first = first_spoilt(settled.movements, onset)
+        return np.stack([best_fit(scene, h, self.priors, first) for h in self.hypotheses], axis=1)
+
+    def silent(self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]]) -> xr.Dataset:
+        """Return the runs as they would be seen if nothing were left to chance."""
+        twin, time = self.model.twin, as_floats(runs["time"].values)
+        path = noise_free_path(
+            twin,
+            self.model.imperfections,
+            commanded(runs),
+            time,
+            Injection(faults, twin.robot.motor_names, MODES),
+        )
+        seen = true_readings(runs).seen[..., None]
+        return runs.assign(measured=(("run", "time", "axis"), np.where(seen, path, np.nan)))
+
+    @property
+    def _needs_way(self) -> bool:
+        """Whether the way counts: only of faults that show there, if the timing is known."""
+        modes = {fault.mode for h in self.hypotheses for fault in h.faults}
+        return not modes.isdisjoint(TIMED) and self.model.knows_timing
+
+
+def commanded(runs: xr.Dataset) -> Movements:
+    """Return the movements of a run set: as it tells them, else as `command` shows them."""
+    names = ("target", "ramp_duration", "movement_start")
+    command = as_floats(runs["command"].values)
+    if all(name in runs for name in names):
+        return Movements(command[:, 0], *(as_floats(runs[name].values) for name in names))
+    return find_movements(command, as_floats(runs["time"].values))
+
+
+def separation(
+    twin: DigitalTwin,
+    runs: xr.Dataset,
+    imperfections: Imperfections | None = None,
+    hypotheses: Sequence[Hypothesis | str] | None = None,
+    priors: Priors | None = None,
+) -> Separation:
+    """Return by how much the truth of simulated runs is expected to beat each hypothesis.
+
+    Args:
+        twin: Digital twin of the robot.
+        runs: A run set with its truth (`fault`, `fault_detail`, `onset`), of the modes as they
+            come.
+        imperfections: The declared scatter and chance of the robot that the runs are of; without
+            lost commands, scatter alone counts. None: as its profile says.
+        hypotheses: What the truth is laid beside: healthy and single faults, as `Hypothesis` or
+            in the text form; None: the paper's.
+        priors: Ranges of sizes that are considered; None: the default.
+
+    Raises:
+        InputError: If the truth is not told, or a run has several faults at once.
+    """
+    check_runs(runs, "the run set")
+    check_motors(runs, twin.robot.name, twin.robot.motor_names)
+    truth, faults = truth_and_faults(runs)
+    motors = twin.robot.motor_names
+    asked = paper_hypotheses(motors) if hypotheses is None else parse_hypotheses(hypotheses, motors)
+    model = HealthyModel(twin, imperfections or default_imperfections(twin.robot))
+    everything = tuple(dict.fromkeys((*asked, *truth)))
+    judge = Judge(model, everything, priors or Priors())
+    fit = judge.fits(runs, faults, as_floats(runs["onset"].values))
+    own = fit[np.arange(len(truth)), [everything.index(h) for h in truth]]
+    return Separation(asked, truth, own[:, None] - fit[:, : len(asked)])
+
+
+def truth_and_faults(
+    runs: xr.Dataset,
+) -> tuple[tuple[Hypothesis, ...], list[list[FaultValue]]]:
+    """Return what is true of each run, and its faults as they strike it.
+
+    Raises:
+        InputError: If the run set does not tell.
+    """
+    for name in ("fault", "fault_detail", "onset"):
+        if name not in runs:
+            raise InputError(
+                f"the run set does not tell its truth: no variable `{name}`. Expected simulated "
+                "runs, such as `failuretwin simulate` writes."
+            )
+    truth = tuple(Hypothesis.parse(str(name)) for name in runs["fault"].values)
+    details = [json.loads(str(text)) for text in runs["fault_detail"].values]
+    return truth, [[replayed(fault) for fault in detail["faults"]] for detail in details]

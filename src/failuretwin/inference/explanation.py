@@ -1,0 +1,137 @@
+"""Diagnoses in plain words: the verdict, what speaks for it, what else it may be, what to do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from failuretwin.core.hypothesis import Diagnosis, Fault, Hypothesis, MovementEvidence
+from failuretwin.data_knowledge.failure_modes import failure_modes, plain_name
+
+SURE = 0.95
+"""Posterior mass that the hypotheses named as possible hold together."""
+TELLING_NATS = 1.0
+"""Evidence of a movement worth telling [nats]: it changes the odds by a factor of 2.7."""
+
+
+def percent(probability: float) -> str:
+    """Return a probability in per cent that never claims certainty."""
+    if probability > 0.999:
+        return "over 99.9 %"
+    return f"{100 * probability:.1f} %" if probability > 0.99 else f"{100 * probability:.0f} %"
+
+
+def verdict(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> str:
+    """Return the diagnosis as one sentence.
+
+    Args:
+        diagnosis: With its estimates filled in.
+        ranked: Its hypotheses from the most to the least probable.
+    """
+    if diagnosis.undecided:
+        return f"cannot tell, because {diagnosis.undecided}"
+    best = ranked[0]
+    text = plain_name(best)
+    if not best.is_healthy:
+        text += _size_and_onset(diagnosis, best)
+    text += f", {percent(diagnosis.posterior[str(best)])} sure"
+    possible = possible_hypotheses(diagnosis, ranked)
+    if len(possible) > 1:
+        others = [f"{plain_name(h)} {percent(diagnosis.posterior[str(h)])}" for h in possible[1:3]]
+        text += f" (or {', '.join(others)})"
+    return text
+
+
+_SIZES = {
+    "stuck": " at {size:z.0f} {unit}",
+    "steady_state_error": " by about {size:.1f} {unit}",
+    "encoder_bias": " by {size:+.1f} {unit}",
+    "backlash": " of {size:.1f} {unit}",
+    "drift": " by {size:+.2f} {unit}",
+    "lag": " by {size:.2f} {unit}",
+    "encoder_scale": " by {size:+.0f} {unit}",
+    "slow": " by {size:.0f} {unit}",
+    "torque_loss": " by {size:.0f} {unit}",
+    "lost_commands": " ({size:.0f} {unit} of them)",
+    "intermittent": " ({size:.0f} {unit} of the time)",
+}
+"""How the magnitude of a mode is told; a mode that is not here has its size in brackets."""
+
+_TOLD_UNITS = {
+    "rad": (180.0 / math.pi, "deg"),
+    "rad/s": (180.0 / math.pi, "deg/s"),
+    "m": (1e3, "mm"),
+    "ratio": (1e2, "%"),
+}
+"""Factor to the unit that people read, and its name, by unit; any other is told as it is."""
+
+
+def _size_and_onset(diagnosis: Diagnosis, hypothesis: Hypothesis) -> str:
+    onset = round(diagnosis.onset_s or 0.0, 1)
+    since = f" since {onset:.1f} s" if onset else " since before the run"
+    if len(hypothesis.faults) != 1 or diagnosis.magnitude is None:
+        return since if onset else ""
+    fault, size = hypothesis.faults[0], diagnosis.magnitude
+    return size_words(fault, size) + (since if onset or fault.mode == "stuck" else "")
+
+
+def size_words(fault: Fault, size: float) -> str:
+    """Return the size of a fault as it is told behind its name, such as `` by about 2.4 deg``.
+
+    Args:
+        fault: Any, also of a mode that was registered.
+        size: Its magnitude, in the unit of its mode.
+    """
+    factor, unit = _TOLD_UNITS.get(fault.magnitude_unit, (1.0, fault.magnitude_unit))
+    text = _SIZES.get(fault.mode, " ({size:.3g} {unit})")
+    return text.format(size=factor * size, unit=unit)
+
+
+def possible_hypotheses(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> Sequence[Hypothesis]:
+    """Return the fewest hypotheses that together are `SURE`."""
+    total = np.cumsum([diagnosis.posterior[str(h)] for h in ranked])
+    return ranked[: int(np.searchsorted(total, SURE)) + 1]
+
+
+def explanation(
+    diagnosis: Diagnosis, ranked: Sequence[Hypothesis], losses: Sequence[str]
+) -> tuple[str, ...]:
+    """Return what speaks for the verdict, what else it may be and what to do, a line each.
+
+    Args:
+        diagnosis: With evidence filled in.
+        ranked: Its hypotheses from the most to the least probable.
+        losses: Commands that seem not to have arrived.
+    """
+    if diagnosis.undecided:
+        return ("Log again, for five movements or more, with the tool in view while it rests.",)
+    lines = list(_evidence_lines(diagnosis.evidence, ranked))
+    lines += losses
+    possible = possible_hypotheses(diagnosis, ranked)
+    if len(possible) > 1:
+        names = " or ".join(plain_name(h) for h in possible)
+        lines.append(f"cannot be told apart in this run: {names}")
+    for fault in ranked[0].faults:
+        mode = failure_modes()[fault.mode]
+        lines.append(f"possible causes: {', '.join(mode.mechanisms)}")
+        lines.append(f"what to do: {mode.advice}")
+    return tuple(lines)
+
+
+def _evidence_lines(
+    evidence: Sequence[MovementEvidence], ranked: Sequence[Hypothesis]
+) -> list[str]:
+    if len(ranked) < 2:
+        return []
+    best, second = plain_name(ranked[0]), plain_name(ranked[1])
+    lines = []
+    for item in evidence:
+        if item.nats >= TELLING_NATS:
+            lines.append(f"movement {item.movement}: {item.nats:.1f} nats for {best} over {second}")
+        elif item.nats <= -TELLING_NATS:
+            lines.append(
+                f"movement {item.movement}: {-item.nats:.1f} nats for {second} over {best}"
+            )
+    return lines

@@ -1,0 +1,217 @@
+"""Where a robot without a fault settles, how surely, and what chance may do to a movement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from failuretwin.core.movements import Movements
+from failuretwin.core.numerics import Ellipsoid, log_fall
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.digital_model.nonidealities import Imperfections, Timing
+from failuretwin.digital_model.settling import Settling, loads_in_range
+from failuretwin.digital_model.twin import SAG_ROUNDS, DigitalTwin
+from failuretwin.inference.command_loss import OUTLIER_RATE, Alternatives, LostCommands
+from failuretwin.inference.evidence import SettledEvidence
+
+PATH_NOISE_M = 0.001
+"""Noise assumed of a settled tool position where the sensor is not known [m]."""
+LEAST_NOISE_M = 0.0003
+"""What a calibration leaves unsaid of the tool's path: bending links, bearings [m]; assumed."""
+
+
+@dataclass(frozen=True)
+class HealthyModel:
+    """Distribution of settled tool positions of the healthy robot.
+
+    Attributes:
+        twin: Kinematics.
+        imperfections: Offsets, scatter and rates of lost commands.
+        blur: Factor on all scatter and noise; 1 for a robot as it is.
+    """
+
+    twin: DigitalTwin
+    imperfections: Imperfections
+    blur: float = 1.0
+
+    @cached_property
+    def settling(self) -> Settling:
+        """Settled offsets; of ideal motors where the imperfections have none."""
+        return self.imperfections.settling or Settling.ideal(len(self.twin.robot.motors))
+
+    @cached_property
+    def scatter(self) -> FloatArray:
+        """Scale of the settled scatter and of what is not known of the robot, (motor,) [rad]."""
+        return self.blur * self._sharp_scatter
+
+    @property
+    def _sharp_scatter(self) -> FloatArray:
+        scatter, doubt = np.asarray(self.settling.scatter), self.imperfections.variation
+        if doubt is None:
+            return np.hypot(scatter, self._rounding)
+        robot, settling = self.twin.robot, self.settling
+        load = np.sqrt(np.mean(loads_in_range(robot, settling.payload) ** 2, axis=0))
+        variance = scatter**2 * np.exp(2.0 * _spread(doubt.scatter) ** 2) + self._rounding**2
+        variance = variance + _spread(doubt.bias) ** 2 + _spread(doubt.friction) ** 2
+        yielding = np.asarray(settling.compliance) * load * _spread(doubt.compliance)
+        return np.sqrt(variance + yielding**2)
+
+    @property
+    def _rounding(self) -> float:
+        """Standard deviation of what whole servo counts round off [rad]."""
+        readings = self.imperfections.readings
+        if readings is None or not readings.whole_counts:
+            return 0.0
+        return abs(self.twin.robot.servo_units.rad_per_count) / np.sqrt(12.0)
+
+    @cached_property
+    def path_noise(self) -> float:
+        """Noise of a settled tool position that belongs to no motor [m]."""
+        readings = self.imperfections.readings
+        if readings is None or self.imperfections.settling is None:
+            return self.blur * PATH_NOISE_M
+        return self.blur * float(np.hypot(readings.noise_m, LEAST_NOISE_M))
+
+    @property
+    def knows_timing(self) -> bool:
+        """Whether it is known how late and how evenly this robot starts to move."""
+        exact = self.imperfections.settling is None
+        return exact or self.imperfections.timing != Timing()
+
+    @cached_property
+    def lag_s(self) -> float:
+        """Mean lag of the motion behind the command [s]: servo loops, dead time, first-order lag.
+
+        A loop follows a ramp one over its integral gain late.
+        """
+        timing = self.imperfections.timing
+        loops = [1.0 / motor.loop.I for motor in self.twin.robot.motors]
+        return float(np.mean(loops) + np.mean(timing.delay_s) + np.mean(timing.lag_s))
+
+    @cached_property
+    def shortening(self) -> float:
+        """Mean share by which ramps end early [-]."""
+        return float(np.mean(self.imperfections.timing.ramp_shortening))
+
+    @cached_property
+    def none_held(self) -> BoolArray:
+        """The mask that holds no motor, (motor,)."""
+        return np.zeros(len(self.scatter), dtype=bool)
+
+    @cached_property
+    def outlier_log_density(self) -> float:
+        """Log of the outlier rate times the density of "anywhere within reach" [1/m3]."""
+        return float(np.log(OUTLIER_RATE) - np.log(4.0 / 3.0 * np.pi * self.reach**3))
+
+    @cached_property
+    def reach(self) -> float:
+        """How far the tool can be from the base at most [m]: links and slides laid end to end."""
+        robot, chain = self.twin.robot, self.twin.robot.chain
+        links = sum(float(np.linalg.norm(joint.T_pj[:3, 3])) for joint in chain.joints)
+        slides = sum(
+            max(abs(end) for end in motor.movement_range)
+            for motor, joint in zip(robot.motors, chain.joints, strict=True)
+            if joint.prismatic
+        )
+        return links + slides + float(np.linalg.norm(chain.T_jt[:3, 3]))
+
+    @cached_property
+    def lost_commands(self) -> LostCommands:
+        """Which commands get lost, and how often."""
+        return LostCommands(self.twin.robot, self.imperfections)
+
+    def alternatives(self, movements: Movements) -> Alternatives:
+        """Return what may become of each movement; the first is that every command arrives."""
+        return self.lost_commands.alternatives(movements)
+
+    def given_before(
+        self, evidence: SettledEvidence, alternatives: Alternatives, terms: FloatArray
+    ) -> Alternatives:
+        """Return alternatives with their probability given what was seen of the movements before.
+
+        Args:
+            evidence: Settled positions.
+            alternatives: What may have become of each movement, whatever was seen.
+            terms: How well they explain the settled positions, from `explain`.
+        """
+        possible = np.isfinite(alternatives.log_weight)
+        density = terms - np.where(possible, alternatives.log_weight, 0.0)
+        says = np.logaddexp(np.log1p(-OUTLIER_RATE) + density, self.outlier_log_density)
+        says = np.where(evidence.usable[..., None], says, 0.0)
+        late = self.late(evidence.movements, evidence.resumed)
+        return self.lost_commands.given_before(alternatives, late, says)
+
+    def late(self, movements: Movements, resumed: FloatArray | None = None) -> FloatArray:
+        """Return the probability that each movement started late, (run, movement).
+
+        Args:
+            movements: The movements.
+            resumed: Time from each command to the first reading after it, (run, movement) [s];
+                None: not known.
+        """
+        return self.lost_commands.late(movements, resumed)
+
+    def settle(self, base: FloatArray, direction: FloatArray, held: BoolArray) -> FloatArray:
+        """Return the angles at which the motors settle, (..., motor) [rad].
+
+        Args:
+            base: Angles that they go for, (..., motor) [rad].
+            direction: Sign of their last travel, (..., motor).
+            held: Motors that stay exactly at `base`, (motor,).
+        """
+        robot = self.twin.robot
+        near = base
+        for _ in range(SAG_ROUNDS):
+            offset = self.settling.offset(robot, near, direction)
+            near = base + np.where(held, 0.0, offset)
+        return near
+
+    def explain(
+        self, evidence: SettledEvidence, alternatives: Alternatives
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return how well each alternative explains the settled positions, and with which pose.
+
+        Args:
+            evidence: Settled positions.
+            alternatives: What may have become of each movement.
+
+        Returns:
+            Log weight times density of each alternative if no motor is faulty,
+            (run, movement, alternative) [log 1/m3], and the pose, scattered so as to meet the
+            position, (run, movement, alternative, motor) [rad].
+        """
+        pose = self.settle(alternatives.base, alternatives.direction, self.none_held)
+        predicted, jacobian = self.twin.path_and_jacobian(pose)
+        error = evidence.point[:, :, None] - predicted
+        spread = Ellipsoid.of(jacobian * self.scatter, self.path_noise**2)
+        dof = self.settling.tail_dof
+        density = spread.log_norm(dof) + log_fall(spread.product(error, error), dof)
+        return (
+            alternatives.log_weight + density,
+            pose + scattered(spread, jacobian, self.scatter, error),
+        )
+
+
+def scattered(
+    spread: Ellipsoid, jacobian: FloatArray, scale: FloatArray, error: FloatArray
+) -> FloatArray:
+    """Return by how much motors scatter, at the most probable, to meet a settled position.
+
+    Args:
+        spread: Covariance of the position, (...).
+        jacobian: Its derivative by the angles, (..., 3, motor) [m/rad].
+        scale: Scatter of each motor, (motor,) [rad].
+        error: Position minus expected position, (..., 3) [m].
+
+    Returns:
+        (..., motor) [rad].
+    """
+    pull = spread.solve(error)
+    return np.asarray(scale**2 * np.einsum("...ak,...a->...k", jacobian, pull))
+
+
+def _spread(deviation: tuple[float, ...]) -> FloatArray:
+    """Return standard deviations as an array that fits any number of motors; none are zero."""
+    return np.asarray(deviation or 0.0)

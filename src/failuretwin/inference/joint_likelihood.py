@@ -1,0 +1,353 @@
+"""What every movement says of the angle of one motor, whatever becomes of the others.
+
+As one motor moves and the others settle as healthy ones, the tool runs on a circle. Near the
+angle that brings it nearest to where it was seen, the squared distance is a parabola: four
+numbers say all that a movement can say of this motor, and any fault of it is weighed by them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from failuretwin.core.numerics import Ellipsoid, log_norm
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.inference.command_loss import Alternatives
+from failuretwin.inference.evidence import SettledEvidence
+from failuretwin.inference.healthy_model import HealthyModel, scattered
+
+REFINEMENTS = 2
+"""Newton steps from the point of the circle nearest to the tool; more change nothing."""
+LONGEST_STEP_RAD = 0.3
+"""Bound on such a step: near a singular pose the parabola promises too much."""
+HELD_BEYOND = 1.1
+"""Share of the range of movements within which a motor may stand, on one side of its target."""
+NEGLIGIBLE_NATS = 9.0
+"""What lies this far below the tool being anywhere, wherever the motor stands, is left out."""
+LARGEST_OFFSET_RAD = 0.9
+"""Furthest from its target that a motor is taken to have settled without being stuck [rad]; the
+largest encoder faults that are considered."""
+LEAST_PRECISION = 1e-3
+"""Precision [1/rad2] below which a movement says nothing of the motor: the tool is on its axis."""
+
+
+@dataclass(frozen=True)
+class MotorProfile:
+    """Evidence on the settled angle of one motor, (..., alternative) each.
+
+    Leading axes are run and movement, and one more where another motor takes several angles.
+    Alternatives that are not possible are zero throughout, their weight aside.
+
+    Attributes:
+        best: Angle that brings the tool nearest to where it was seen [rad].
+        precision: Curvature of the squared distance there [1/rad2].
+        square: Squared distance at `best`, in scales of the others' scatter.
+        log_weight: Log of the alternative's weight times the density's norm.
+        expected: Angle at which the motor settles if it is healthy [rad].
+        scatter: Scale of its own settled scatter [rad].
+        dof: Degrees of freedom of the scatter.
+        outlier: Log density of the tool being anywhere, times its rate.
+        usable: Movements with evidence, (run, movement).
+        around: Whether angles a full turn apart, which are the same, may both come up.
+        pose: Angles of all motors that explain the position best, with this motor at `best` and
+            the others scattered, (..., alternative, motor) [rad].
+        beside: Angle at which the motor settles if a fault takes it off its target, apart from
+            what the fault itself adds [rad]: it sags in the pose that it is really in, for which
+            `best` stands.
+    """
+
+    best: FloatArray
+    precision: FloatArray
+    square: FloatArray
+    log_weight: FloatArray
+    expected: FloatArray
+    scatter: float
+    dof: float
+    outlier: float
+    usable: BoolArray
+    around: bool
+    pose: FloatArray
+    beside: FloatArray
+
+    def __getitem__(self, run: int) -> MotorProfile:
+        """Return what one of the runs says, without the axis of runs."""
+        return replace(
+            self,
+            best=self.best[run],
+            precision=self.precision[run],
+            square=self.square[run],
+            log_weight=self.log_weight[run],
+            expected=self.expected[run],
+            usable=self.usable[run],
+            pose=self.pose[run],
+            beside=self.beside[run],
+        )
+
+    def log_terms(self, angle: FloatArray, held: bool) -> FloatArray:
+        """Return log weight times density of each alternative.
+
+        Args:
+            angle: Where the motor settles, scatter aside, (..., alternative) [rad].
+            held: Whether the gear holds it exactly there.
+        """
+        precision, log_weight = self._with_scatter(held)
+        off = self._turned(angle - self.best)
+        return log_weight + self._fall(self.square + precision * off**2)
+
+    def log_density(self, angle: FloatArray, held: bool) -> FloatArray:
+        """Return the log density of each settled position, whatever became of the commands.
+
+        Args:
+            angle: Where the motor settles, scatter aside, (..., node, alternative) [rad], or with
+                a last axis of 1 if it is the same whatever became of the commands.
+            held: Whether the gear holds it exactly there.
+
+        Returns:
+            (..., node) [log 1/m3]; 0 for movements that are not usable.
+        """
+        precision, log_weight = self._with_scatter(held)
+        lead = log_weight.shape[:-1]
+        angle = np.broadcast_to(angle, (*lead, *angle.shape[-2:]))
+        total = np.ones((*lead, angle.shape[-2]))
+        matters = log_weight + self._fall(self.square) > self.outlier - NEGLIGIBLE_NATS
+        # Alternative by alternative: large temporary arrays would cost more than the arithmetic.
+        for k in range(log_weight.shape[-1]):
+            some = matters[..., k]
+            if not some.any():
+                continue
+            at = angle[some, :, k if angle.shape[-1] > 1 else 0]
+            off = self._turned(at - self.best[some, k, None])
+            off *= off
+            off *= precision[some, k, None]
+            off += self.square[some, k, None]
+            fall = self._fall(off)
+            fall += log_weight[some, k, None] - self.outlier
+            total[some] += np.exp(fall, out=fall)
+        found = self.outlier + np.log(total)
+        usable = self.usable.reshape(self.usable.shape + (1,) * (found.ndim - 2))
+        return np.where(usable, found, 0.0)
+
+    def _turned(self, off: FloatArray) -> FloatArray:
+        """Return differences of angles, the shorter way around."""
+        return off - 2.0 * np.pi * np.rint(off / (2.0 * np.pi)) if self.around else off
+
+    def _with_scatter(self, held: bool) -> tuple[FloatArray, FloatArray]:
+        """Return precision and log weight once the motor's own scatter counts."""
+        if held:
+            return self.precision, self.log_weight
+        inflation = 1.0 + self.scatter**2 * self.precision
+        return self.precision / inflation, self.log_weight - 0.5 * np.log(inflation)
+
+    def _fall(self, square: FloatArray) -> FloatArray:
+        if np.isinf(self.dof):
+            return -0.5 * square
+        fall = square / self.dof
+        np.log1p(fall, out=fall)
+        fall *= -0.5 * (self.dof + 3.0)
+        return fall
+
+
+def motor_profiles(
+    evidence: SettledEvidence,
+    model: HealthyModel,
+    alternatives: Alternatives,
+    motors: Sequence[int],
+    *,
+    other: int | None = None,
+    other_angle: FloatArray | None = None,
+    other_held: bool = False,
+) -> list[MotorProfile]:
+    """Return what each movement says of some motors, each by itself.
+
+    Args:
+        evidence: Settled positions.
+        model: The healthy robot.
+        alternatives: What may have become of each movement.
+        motors: Indices of the motors.
+        other: Index of another motor that has a fault of its own, if any.
+        other_angle: Where it settles, (run, movement, node, alternative) [rad].
+        other_held: Whether the gear holds it exactly there.
+    """
+    base, direction = alternatives.base, alternatives.direction
+    log_weight, point = alternatives.log_weight, evidence.point[:, :, None]
+    another = model.none_held.copy()
+    if other is not None and other_angle is not None:
+        base, direction = base[:, :, None], direction[:, :, None]
+        log_weight, point = log_weight[:, :, None], point[:, :, None]
+        base = np.repeat(base, other_angle.shape[2], axis=2)
+        base[..., other] = other_angle
+        another[other] = True
+    lead = base.shape[:-1]
+    worthwhile = np.isfinite(log_weight)
+    worthwhile[..., 0] = True  # where the motor settles if it gets its command is always told
+    possible = np.broadcast_to(worthwhile, lead)
+    base, direction = base[possible], np.broadcast_to(direction, base.shape)[possible]
+    point = np.broadcast_to(point, (*lead, 3))[possible]
+    log_weight = np.broadcast_to(log_weight, lead)[possible]
+    expected = model.settle(base, direction, another)
+    # A leading axis for the motors: own marks each of them among all, (own, 1, motor).
+    own = np.eye(len(model.scatter), dtype=bool)[list(motors)][:, None]
+    scale = np.where(own | (another & other_held), 0.0, model.scatter)
+    angle = nearest_on_circle(model, expected, own, point)
+    for _ in range(REFINEMENTS):
+        pose = np.where(own, angle[..., None], base)
+        settled = model.settle(pose, direction, own | another)
+        predicted, jacobian = model.twin.path_and_jacobian(settled)
+        spread = Ellipsoid.of(jacobian * scale[..., None, :], model.path_noise**2)
+        lever, error = np.sum(jacobian * own[..., None, :], axis=-1), point - predicted
+        precision = spread.product(lever, lever)
+        slope = spread.product(lever, error)
+        step = slope / np.maximum(precision, LEAST_PRECISION)
+        taken = np.clip(step, -LONGEST_STEP_RAD, LONGEST_STEP_RAD)
+        angle = angle + taken
+    square = spread.product(error, error) - taken * (2.0 * slope - precision * taken)
+    settled = settled + scattered(spread, jacobian, scale, error - lever * taken[..., None])
+    settled = np.where(own, angle[..., None], settled)
+    beside = _beside(model, expected, direction, base, own, angle)
+    dof = model.settling.tail_dof
+    weighed = log_weight + log_norm(dof) - 0.5 * np.log(spread.determinant)
+
+    def everywhere(values: FloatArray, elsewhere: float = 0.0) -> FloatArray:
+        found = np.full((*lead, *values.shape[1:]), elsewhere)
+        found[possible] = values
+        return found
+
+    return [
+        MotorProfile(
+            best=everywhere(angle[i]),
+            precision=everywhere(precision[i]),
+            square=everywhere(np.maximum(square[i], 0.0)),
+            log_weight=everywhere(weighed[i], -np.inf),
+            expected=everywhere(expected[..., motor]),
+            scatter=float(model.scatter[motor]),
+            dof=dof,
+            outlier=model.outlier_log_density,
+            usable=evidence.usable,
+            around=_may_turn_around(model, motor),
+            pose=everywhere(settled[i]),
+            beside=everywhere(beside[i]),
+        )
+        for i, motor in enumerate(motors)
+    ]
+
+
+def _beside(
+    model: HealthyModel,
+    expected: FloatArray,
+    direction: FloatArray,
+    base: FloatArray,
+    own: BoolArray,
+    angle: FloatArray,
+) -> FloatArray:
+    """Return where each motor settles that a fault takes towards some angle, (own, ...) [rad].
+
+    Args:
+        model: The healthy robot.
+        expected: Angles at which the motors settle if healthy, (..., motor) [rad].
+        direction: Sign of their last travel, (..., motor).
+        base: Angles that they go for, (..., motor) [rad].
+        own: Which motor is meant, (own, ..., motor).
+        angle: Where the fault takes it, (own, ...) [rad].
+    """
+    far = LARGEST_OFFSET_RAD
+    pose = np.where(own, np.clip(angle[..., None], expected - far, expected + far), expected)
+    offset = model.settling.offset(model.twin.robot, pose, direction)
+    return np.asarray(np.sum((base + offset) * own, axis=-1))
+
+
+def _may_turn_around(model: HealthyModel, motor: int) -> bool:
+    """Return whether a motor may be half a turn or more from where it should be."""
+    low, high = model.twin.robot.motors[motor].movement_range
+    return not model.twin.robot.chain.joints[motor].prismatic and HELD_BEYOND * (high - low) > np.pi
+
+
+def nearest_on_circle(
+    model: HealthyModel, pose: FloatArray, own: BoolArray, point: FloatArray
+) -> FloatArray:
+    """Return the angle of each motor that brings the tool nearest to `point`, (own, ...) [rad].
+
+    Three poses say where the circle lies (the line, if the joint slides).
+
+    Args:
+        model: The healthy robot.
+        pose: Angles of all motors, (..., motor) [rad].
+        own: Which motor is meant, (own, ..., motor).
+        point: Tool position, (..., axis) [m].
+    """
+    turned = np.array([0.0, 0.5 * np.pi, np.pi])[:, None]
+    path = model.twin.path(np.where(own[..., None, :], turned, pose[..., None, :]))
+    first, quarter, half = path[..., 0, :], path[..., 1, :], path[..., 2, :]
+    centre = 0.5 * (first + half)
+    cosine, sine, toward = first - centre, quarter - centre, point - centre
+    found = np.arctan2(np.sum(toward * sine, axis=-1), np.sum(toward * cosine, axis=-1))
+    here = np.sum(pose * own, axis=-1)
+    found = found + 2.0 * np.pi * np.rint((here - found) / (2.0 * np.pi))
+    slides = np.array([joint.prismatic for joint in model.twin.robot.chain.joints])
+    if not slides.any():
+        return np.asarray(found)
+    along = (half - first) / np.pi
+    length = np.maximum(np.sum(along**2, axis=-1), 1e-12)
+    reached = np.sum((point - first) * along, axis=-1) / length
+    return np.where((own & slides).any(axis=-1), reached, found)
+
+
+# What every movement says by itself: of a healthy robot, and of each motor alone.
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What every movement says by itself, whatever fault may have come later.
+
+    Attributes:
+        model: The healthy robot.
+        alternatives: What may have become of each movement, given the movements before.
+        density: Log density of its settled position under each alternative if no motor is faulty,
+            (run, movement, alternative) [log 1/m3].
+        poses: Pose that explains the settled position then, (run, movement, alternative, motor)
+            [rad].
+        profiles: What each movement says of each motor.
+    """
+
+    model: HealthyModel
+    alternatives: Alternatives
+    density: FloatArray
+    poses: FloatArray
+    profiles: Sequence[MotorProfile]
+
+    @property
+    def terms(self) -> FloatArray:
+        """Log weight times density of each alternative, (run, movement, alternative)."""
+        return self.alternatives.log_weight + self.density
+
+
+def find(evidence: SettledEvidence, model: HealthyModel) -> Findings:
+    """Return what every movement says by itself."""
+    usual = model.alternatives(evidence.movements)
+    density, poses = explained(evidence, model, usual)
+    found = given_before(evidence, model, usual, density)
+    profiles = motor_profiles(evidence, model, found, range(len(model.scatter)))
+    return Findings(model, found, density, poses, profiles)
+
+
+def explained(
+    evidence: SettledEvidence, model: HealthyModel, alternatives: Alternatives
+) -> tuple[FloatArray, FloatArray]:
+    """Return how well each alternative explains the settled positions, as in `Findings`."""
+    as_likely = replace(alternatives, log_weight=np.zeros_like(alternatives.log_weight))
+    return model.explain(evidence, as_likely)
+
+
+def given_before(
+    evidence: SettledEvidence, model: HealthyModel, usual: Alternatives, density: FloatArray
+) -> Alternatives:
+    """Return alternatives with their probability given what was seen of the movements before.
+
+    Args:
+        evidence: Settled positions.
+        model: The healthy robot.
+        usual: What may have become of each movement, whatever was seen.
+        density: How well that explains the settled positions.
+    """
+    return model.given_before(evidence, usual, usual.log_weight + density)

@@ -1,0 +1,274 @@
+"""Faults as laws: where a motor settles with a fault, over nodes of all that is unknown of it.
+
+The fault begins with some movement; movements before it are those of a healthy robot. Sums over
+the first movement and the nodes are exact; what each node says of a movement comes from the
+profile of the motor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from failuretwin.core.numerics import Weighted, log_sum
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.inference.joint_likelihood import MotorProfile
+from failuretwin.inference.run_likelihood import Scene, share_of
+
+# What runs say of a hypothesis: evidence, posterior of what is unknown, estimates.
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What one run says of a fault that is taken to be there.
+
+    Attributes:
+        onset: Distribution of the onset [s]; None without a fault.
+        size: Distribution of the magnitude; None where it has none.
+        became: Probability of each alternative, (movement, alternative).
+    """
+
+    onset: Weighted | None
+    size: Weighted | None
+    became: FloatArray
+
+
+@dataclass(frozen=True)
+class Weight:
+    """What some runs say of one hypothesis.
+
+    Attributes:
+        log_evidence: Log marginal likelihood of each run, (run,).
+        by_movement: Log density of each movement of a run given all others, (movement,), by the
+            run's index; asked for few hypotheses alone.
+        settled: The same of its settled position alone.
+        estimate: Onset and size in a run, by its index; asked for the best hypothesis alone.
+    """
+
+    log_evidence: FloatArray
+    by_movement: Callable[[int], FloatArray]
+    settled: Callable[[int], FloatArray]
+    estimate: Callable[[int], Estimate]
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Log evidence of each run, and of first movement and cell given it.
+
+    Attributes:
+        log_evidence: (run,).
+        log_share: Log posterior, (run, movement first spoilt, cell).
+    """
+
+    log_evidence: FloatArray
+    log_share: FloatArray
+
+
+def posterior_of(
+    log_healthy: FloatArray,
+    density: FloatArray,
+    log_prior: FloatArray,
+    on_way: tuple[FloatArray, FloatArray],
+) -> Posterior:
+    """Sum over the first movement that a fault spoils and over its cells.
+
+    Args:
+        log_healthy: Log density of each settled position if all is well, (run, movement).
+        density: The same with the fault, (run, movement, cell).
+        log_prior: Log probability of first movement and cell, (run, movement, cell).
+        on_way: Log density of the readings on the way if all is well, (run, movement), and with
+            the fault, (run, movement, cell) or the same for all cells, (run, movement, 1).
+    """
+    healthy, faulty = log_healthy + on_way[0], density + on_way[1]
+    before = np.cumsum(healthy, axis=1) - healthy
+    after = np.cumsum(faulty[:, ::-1], axis=1)[:, ::-1]
+    joint = before[:, :, None] + after + log_prior
+    log_evidence = log_sum(joint, axis=(1, 2))
+    log_share = joint - log_evidence[:, None, None]
+    return Posterior(log_evidence, log_share)
+
+
+def given_others(healthy: FloatArray, faulty: FloatArray, log_share: FloatArray) -> FloatArray:
+    """Return the log density of each movement of a run given all others, (movement,).
+
+    It is one over the posterior mean of one over its density.
+
+    Args:
+        healthy: Log density of each movement if all is well, (movement,).
+        faulty: The same with the fault, (movement, cell).
+        log_share: Log posterior of first movement spoilt and cell, (movement, cell).
+    """
+    affected = np.logaddexp.accumulate(log_share, axis=0)
+    not_yet = np.full_like(healthy, -np.inf)
+    later = log_sum(log_share, axis=1)[::-1]
+    not_yet[:-1] = np.logaddexp.accumulate(later)[::-1][1:]
+    return -np.logaddexp(log_sum(affected - faulty, axis=1), not_yet - healthy)
+
+
+@dataclass(frozen=True)
+class Law:
+    """How a fault makes one motor settle.
+
+    Attributes:
+        motor: Index of the motor.
+        held: Whether the gear holds the motor exactly at `angle`.
+        angle: Where it settles, (run, movement, node, alternative) [rad]; axes may be 1.
+        log_prior: Log probability of the first movement spoilt and the node,
+            (run, movement, node), or of the group of nodes where nodes are redrawn.
+        size: Magnitude of the fault at each node, (run, node).
+        onsets: Onset at each node of a run, by its index, (movement, node, sample) [s], and the
+            share of each sample, same axes; axes of nodes and movements may be 1.
+        redrawn: Log weights of the nodes in each group, (group, node), where every movement draws
+            its own node; None: one node holds for the whole run.
+        on_way: Log density of the readings on the way at each node, (run, movement, node); None:
+            as for any motor that settles off its target.
+        gain: By how much the motor is off for each unit of an amount that holds for the run,
+            (run, movement, alternative) [rad]; None: other movements do not tell.
+    """
+
+    motor: int
+    held: bool
+    angle: FloatArray
+    log_prior: FloatArray
+    size: FloatArray
+    onsets: Callable[[int], tuple[FloatArray, FloatArray]]
+    redrawn: FloatArray | None = None
+    on_way: FloatArray | None = None
+    gain: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class Densities:
+    """Log densities of each movement with a fault.
+
+    Attributes:
+        by_node: Of its settled position at each node, (run, movement, node).
+        by_cell: The same with nodes that are redrawn summed in their groups,
+            (run, movement, cell).
+        way: Of its readings on the way, (run, movement, cell) or the same for all cells,
+            (run, movement, 1).
+    """
+
+    by_node: FloatArray
+    by_cell: FloatArray
+    way: FloatArray
+
+
+def densities(scene: Scene, law: Law) -> Densities:
+    """Return what each movement says of a fault of one motor."""
+    by_node = by_cell = scene.profile(law.motor).log_density(law.angle, law.held)
+    if law.redrawn is not None:
+        by_cell = _in_groups(by_node, law.redrawn)
+    way = law.on_way
+    if way is None:
+        way = scene.on_way_off(law.motor, law.gain)[..., None]
+    return Densities(by_node, by_cell, way)
+
+
+def _in_groups(by_node: FloatArray, log_weight: FloatArray) -> FloatArray:
+    """Return the log of weighted sums over nodes, (run, movement, group).
+
+    Args:
+        by_node: Logs of what is summed, (run, movement, node).
+        log_weight: (group, node).
+    """
+    top = by_node.max(axis=-1, keepdims=True)
+    return np.asarray(top + np.log(np.exp(by_node - top) @ np.exp(log_weight).T))
+
+
+def weigh(scene: Scene, law: Law) -> Weight:
+    """Return what the runs say of a fault of one motor."""
+    profile, says = scene.profile(law.motor), densities(scene, law)
+    by_node, density, way = says.by_node, says.by_cell, says.way
+    healthy = scene.log_healthy
+    found = posterior_of(healthy, density, law.log_prior, (scene.on_way, way))
+
+    def by_movement(run: int) -> FloatArray:
+        usual, faulty = healthy[run] + scene.on_way[run], density[run] + way[run]
+        return given_others(usual, faulty, found.log_share[run])
+
+    def settled(run: int) -> FloatArray:
+        return given_others(healthy[run], density[run], found.log_share[run])
+
+    def estimate(run: int) -> Estimate:
+        share = np.exp(found.log_share[run])
+        if law.redrawn is None:
+            cells = share.sum(axis=0)
+            size = Weighted(_of_run(law.size, run), cells)
+            nodes = np.broadcast_to(cells, by_node[run].shape)
+        else:
+            of_node = np.exp(by_node[run][:, None] + law.redrawn - density[run][..., None])
+            size = _rms(scene.evidence.movements.exists[run], of_node, share, law.size[0])
+            nodes = np.einsum("fg,mgn->mn", share, of_node)
+        became = _became(profile, law, run, share, nodes)
+        return Estimate(_onset(law, run, share), size, became)
+
+    return Weight(found.log_evidence, by_movement, settled, estimate)
+
+
+def _of_run(values: FloatArray, run: int) -> FloatArray:
+    """Return the part of one run; a leading axis of 1 is the same for all."""
+    return np.asarray(values[run if len(values) > 1 else 0])
+
+
+def _onset(law: Law, run: int, share: FloatArray) -> Weighted:
+    """Return the distribution of the onset of a run [s]."""
+    onset, part = law.onsets(run)
+    if onset.shape[1] == 1:
+        share = share.sum(axis=1, keepdims=True)
+    weight = share[..., None] * part
+    return Weighted(np.broadcast_to(onset, weight.shape).ravel(), weight.ravel())
+
+
+def _rms(exists: BoolArray, nodes: FloatArray, share: FloatArray, offset: FloatArray) -> Weighted:
+    """Return the distribution of the rms of redrawn offsets over the movements spoilt.
+
+    The mean square is a sum of independent terms; it is taken as normal with their mean and
+    variance, for every first movement and group.
+
+    Args:
+        exists: Movements that are there, (movement,).
+        nodes: Posterior of each node, (movement, group, node).
+        share: Posterior of first movement and group, (movement, group).
+        offset: Offsets, (node,).
+    """
+    there = exists[:, None]
+    second, fourth = (np.einsum("mgn,n->mg", nodes, offset**p) * there for p in (2, 4))
+
+    def from_here(values: FloatArray) -> FloatArray:
+        return np.cumsum(values[::-1], axis=0)[::-1]
+
+    count = np.maximum(from_here(there.astype(np.float64)), 1.0)
+    mean = from_here(second) / count
+    spread = np.sqrt(np.maximum(from_here(fourth - second**2), 0.0)) / count
+    steps = np.linspace(-2.4, 2.4, 25)
+    squares = mean[..., None] + spread[..., None] * steps
+    weight = share[..., None] * np.exp(-0.5 * steps**2)
+    return Weighted(np.sqrt(np.maximum(squares, 0.0)).ravel(), weight.ravel())
+
+
+def _became(
+    profile: MotorProfile, law: Law, run: int, share: FloatArray, nodes: FloatArray
+) -> FloatArray:
+    """Return the probability of each alternative at the most probable nodes of a run.
+
+    Args:
+        profile: What each movement says of the motor.
+        law: The fault.
+        run: Index of the run.
+        share: Posterior of first movement and cell, (movement, cell).
+        nodes: Posterior of each node, (movement, node).
+
+    Returns:
+        (movement, alternative).
+    """
+    angle = _of_run(law.angle, run)
+    shape = (*nodes.shape, angle.shape[-1])
+    best = np.argmax(nodes, axis=1)
+    angle = np.broadcast_to(angle, shape)[np.arange(len(best)), best]
+    spoilt = np.cumsum(share.sum(axis=1))[:, None] > 0.5
+    own = profile[run]
+    terms = np.where(spoilt, own.log_terms(angle, law.held), own.log_terms(own.expected, False))
+    return share_of(terms, profile.outlier, own.usable)

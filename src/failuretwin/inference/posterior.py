@@ -1,0 +1,426 @@
+"""Some runs with every hypothesis weighed: the posterior, and the diagnosis of each in words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import (
+    UNKNOWN,
+    Diagnosis,
+    Fault,
+    Hypothesis,
+    MovementEvidence,
+    single_faults,
+)
+from failuretwin.core.numerics import log_sum
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.data_knowledge.failure_modes import prior_odds
+from failuretwin.inference.double_faults import weigh_pair
+from failuretwin.inference.evidence import SettledEvidence
+from failuretwin.inference.explanation import explanation, verdict
+from failuretwin.inference.fault_models import (
+    AMOUNTS,
+    LOCAL_STEPS,
+    drift_law,
+    error_law,
+    lag_law,
+    lasting_law,
+    slow_law,
+)
+from failuretwin.inference.log_quality import LogQuality
+from failuretwin.inference.marginal import Estimate, Law, Weight, weigh
+from failuretwin.inference.missed_movements import MISSES, weigh_misses
+from failuretwin.inference.priors import Priors
+from failuretwin.inference.run_likelihood import Scene
+from failuretwin.inference.stuck import stuck_law
+from failuretwin.inference.two_joint_likelihood import two_angles
+from failuretwin.inference.unknown import weigh_unknown
+
+# From a hypothesis to what runs say of it: the one place that knows the law of each mode.
+
+UNKNOWN_ODDS = 1.0
+"""Odds of `unknown` against healthy where nothing is seen; each explanation of what is seen has
+odds of its own in its evidence, none has more."""
+MOST_FAULTS = 2
+"""Faults that can be weighed at once."""
+
+
+def _lasting(mode: str) -> Callable[[Scene, int, Priors], Law]:
+    return lambda scene, motor, priors: lasting_law(
+        scene, motor, mode, priors.onset.before_run(mode)
+    )
+
+
+LAWS: Mapping[str, Callable[[Scene, int, Priors], Law]] = {
+    "stuck": lambda scene, motor, priors: stuck_law(scene, motor, priors.onset),
+    "steady_state_error": lambda scene, motor, priors: error_law(
+        scene, motor, priors.error_ranges, priors.onset.before_run("steady_state_error")
+    ),
+    "drift": lambda scene, motor, priors: drift_law(scene, motor, priors.onset.before_run("drift")),
+    **{mode: _lasting(mode) for mode in AMOUNTS},
+}
+"""Law of each mode that makes a motor settle beside its target."""
+TIMED: Mapping[str, Callable[[Scene, int, float], Law]] = {"lag": lag_law, "slow": slow_law}
+"""Law of each mode that shows on the way."""
+WEIGHABLE = (*LAWS, *TIMED, *MISSES)
+"""Modes that can be weighed."""
+
+
+def check_weighable(hypothesis: Hypothesis) -> None:
+    """Refuse a hypothesis that cannot be weighed.
+
+    Raises:
+        InputError: If a mode cannot be weighed, or not together with another.
+    """
+    if len(hypothesis.faults) > MOST_FAULTS:
+        raise InputError(
+            f"hypothesis '{hypothesis}' has {len(hypothesis.faults)} faults. Expected "
+            f"{MOST_FAULTS} at most."
+        )
+    known = WEIGHABLE if len(hypothesis.faults) == 1 else tuple(LAWS)
+    for fault in hypothesis.faults:
+        if fault.mode not in known:
+            raise InputError(
+                f"fault mode {fault.mode!r} cannot be weighed in '{hypothesis}'. Expected one of "
+                f"{', '.join(known)}."
+            )
+
+
+def shows_on_way(hypothesis: Hypothesis) -> bool:
+    """Return whether a hypothesis shows in how the motors move more than in where they settle."""
+    return not hypothesis.known or any(fault.mode in TIMED for fault in hypothesis.faults)
+
+
+def log_prior(hypotheses: Sequence[Hypothesis], priors: Priors) -> FloatArray:
+    """Return the log prior probability of each hypothesis, (hypothesis,)."""
+    odds = np.array([prior_odds(h) if h.known else UNKNOWN_ODDS for h in hypotheses])
+    odds[[h.is_healthy for h in hypotheses]] *= priors.healthy_odds
+    return np.asarray(np.log(odds / odds.sum()))
+
+
+def weigh_all(scene: Scene, hypotheses: Sequence[Hypothesis], priors: Priors) -> list[Weight]:
+    """Return what runs say of each hypothesis, in their order."""
+    known = [h for h in hypotheses if h.known]
+    weights = {h: weigh_hypothesis(scene, h, priors) for h in known}
+    if len(known) < len(hypotheses):
+        others = [
+            (prior_odds(h), weigh_hypothesis(scene, h, priors)) for h in left_out(scene, known)
+        ]
+        weights[UNKNOWN] = weigh_unknown(scene, _weigh_healthy, others, known)
+    return [weights[h] for h in hypotheses]
+
+
+def left_out(scene: Scene, known: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return the single faults that can be weighed but are not among the known hypotheses."""
+    names = scene.model.twin.robot.motor_names
+    return [h for h in single_faults(names, WEIGHABLE) if h.faults and h not in known]
+
+
+def weigh_hypothesis(scene: Scene, hypothesis: Hypothesis, priors: Priors) -> Weight:
+    """Return what runs say of one known hypothesis."""
+    if hypothesis.is_healthy:
+        return _weigh_healthy(scene)
+    if len(hypothesis.faults) == 2:
+        scenes = [scene[run] for run in range(len(scene.log_healthy))]
+        one, two = hypothesis.faults
+        return weigh_pair(scenes, [_laws_of_two(alone, one, two, priors) for alone in scenes])
+    fault = hypothesis.faults[0]
+    if fault.mode in MISSES:
+        early = priors.onset.before_run(fault.mode)
+        return weigh_misses(scene, motor_of(scene, fault), fault.mode, early)
+    return weigh(scene, law_of(scene, fault, priors))
+
+
+def motor_of(scene: Scene, fault: Fault) -> int:
+    """Return the index of the motor that has the fault."""
+    return scene.model.twin.robot.motor_names.index(fault.motor)
+
+
+def law_of(scene: Scene, fault: Fault, priors: Priors) -> Law:
+    """Return the law of a fault, of any mode but those of `MISSES`."""
+    motor = motor_of(scene, fault)
+    if fault.mode in TIMED:
+        return TIMED[fault.mode](scene, motor, priors.onset.before_run(fault.mode))
+    return LAWS[fault.mode](scene, motor, priors)
+
+
+def _laws_of_two(scene: Scene, one: Fault, two: Fault, priors: Priors) -> tuple[Law, Law]:
+    """Return the laws of two faults that are there at once; those held look where both point."""
+    first, second = sorted((motor_of(scene, one), motor_of(scene, two)))
+    seen = two_angles(scene.evidence, scene.model, scene.alternatives, (first, second))
+
+    def law(fault: Fault) -> Law:
+        if fault.mode != "stuck":
+            return law_of(scene, fault, priors)
+        motor = motor_of(scene, fault)
+        at = seen.pair.index(motor)
+        width = np.sqrt(seen.covariance[..., at])
+        nodes = seen.angle[..., at, None] + width[..., None] * LOCAL_STEPS
+        return stuck_law(scene, motor, priors.onset, nodes.reshape(len(nodes), -1))
+
+    return law(one), law(two)
+
+
+def _weigh_healthy(scene: Scene) -> Weight:
+    """Return what runs say of no motor being faulty."""
+    by_movement = scene.log_healthy + scene.on_way
+
+    def estimate(run: int) -> Estimate:
+        return Estimate(None, None, scene.became[run])
+
+    of_run, settled = by_movement.__getitem__, scene.log_healthy.__getitem__
+    return Weight(by_movement.sum(axis=1), of_run, settled, estimate)
+
+
+# What keeps a run from being judged, and what happened in it besides any fault.
+
+UNEXPLAINED_NATS = 1.0
+"""A movement whose density is within this of "anywhere within reach" is not explained [nats]."""
+FEW_MOVEMENTS = 2
+"""So few usable movements carry a verdict only if one hypothesis holds half of the probability."""
+LIKELY = 0.5
+"""Probability from which a lost command is told [-]."""
+
+
+def unused_movements(evidence: SettledEvidence, run: int) -> list[str]:
+    """Return why movements of a run are not used, a line each."""
+    lines = []
+    for movement in np.flatnonzero(evidence.movements.exists[run] & ~evidence.usable[run]):
+        if evidence.moving[run, movement]:
+            reason = "the tool does not come to rest"
+        else:
+            reason = "no reading while the tool is at rest"
+        lines.append(f"movement {movement + 1} not used: {reason}")
+    return lines
+
+
+def why_undecided(
+    quality: LogQuality,
+    evidence: SettledEvidence,
+    run: int,
+    probability: float,
+    by_movement: FloatArray,
+    outlier_log_density: float,
+) -> str:
+    """Return why a run allows no verdict, empty if it does.
+
+    Args:
+        quality: Defects of the log.
+        evidence: Settled positions.
+        run: Index of the run.
+        probability: Posterior of the best hypothesis.
+        by_movement: Log density of each movement under the best hypothesis, (movement,).
+        outlier_log_density: That of a tool anywhere within reach.
+    """
+    if quality.fatal:
+        return quality.fatal
+    usable = evidence.usable[run]
+    if not evidence.movements.exists[run].any():
+        return "no motor is told to move"
+    if not usable.any():
+        return "the tool is not seen at rest after any movement"
+    if usable.sum() <= FEW_MOVEMENTS and probability < 0.5:
+        count = int(usable.sum())
+        return f"only {count} movement{'s' * (count != 1)} can be used and no hypothesis stands out"
+    unexplained = usable & (by_movement < outlier_log_density + UNEXPLAINED_NATS)
+    if 2 * unexplained.sum() <= usable.sum():
+        return ""
+    which = ", ".join(str(m + 1) for m in np.flatnonzero(unexplained))
+    return (
+        f"after movement {which} the tool is nowhere near where any of the hypotheses puts it: "
+        "wrong units or robot, a spoilt sensor, or a fault of another kind"
+    )
+
+
+def lost_commands(
+    became: FloatArray, lost: BoolArray, motors: Sequence[str], faulty: Sequence[str]
+) -> list[str]:
+    """Return the commands of a run that seem not to have arrived, a line each.
+
+    Args:
+        became: Probability of each alternative, (movement, alternative).
+        lost: Motors that lose their command in it, (alternative, motor).
+        motors: Names of the motors.
+        faulty: Motors whose fault is told anyway.
+    """
+    lines = []
+    for movement, share in enumerate(became):
+        missing = share @ lost > LIKELY
+        told = [m for m, gone in zip(motors, missing, strict=True) if gone and m not in faulty]
+        if told:
+            names = " and ".join(motor.replace("_", " ") for motor in told)
+            lines.append(f"movement {movement + 1}: {names} did not get the command")
+    return lines
+
+
+LEVELS = (0.05, 0.5, 0.95)
+"""Quantiles that are told: the ends of a 90 % interval and the median."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a run lies in a stream.
+
+    Attributes:
+        begin_s: When it begins [s].
+        movements: Movements of the stream before it.
+        before: What was said before; of a fault that is older than the run, its onset stands.
+    """
+
+    begin_s: float = 0.0
+    movements: int = 0
+    before: Diagnosis | None = None
+
+    def known_onset(self, hypothesis: Hypothesis) -> Diagnosis | None:
+        """Return what was said before, if that was the same fault, older than the run.
+
+        Args:
+            hypothesis: What is said now.
+        """
+        before = self.before
+        if before is None or before.onset_s is None or before.diagnosis != str(hypothesis):
+            return None
+        return before if before.onset_s < self.begin_s else None
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Some runs with every hypothesis weighed.
+
+    Attributes:
+        scene: The runs.
+        hypotheses: What may be the case.
+        log_prior: (hypothesis,).
+        log_posterior: (run, hypothesis).
+        weights: What the runs say of each hypothesis, in their order.
+    """
+
+    scene: Scene
+    hypotheses: Sequence[Hypothesis]
+    log_prior: FloatArray
+    log_posterior: FloatArray
+    weights: Sequence[Weight]
+
+    def undecided(self, run: int, quality: LogQuality) -> str:
+        """Return why a run allows no verdict, empty if it does.
+
+        Args:
+            run: Index of the run.
+            quality: Defects of its log.
+        """
+        best = int(np.argmax(self.log_posterior[run]))
+        return why_undecided(
+            quality,
+            self.scene.evidence,
+            run,
+            float(np.exp(self.log_posterior[run, best])),
+            self.weights[best].settled(run),
+            self.scene.model.outlier_log_density,
+        )
+
+    def posterior(self, run: int, undecided: str) -> FloatArray:
+        """Return the posterior of a run, (hypothesis,).
+
+        Args:
+            run: Index of the run.
+            undecided: Why it allows no verdict. Then nothing is learnt: the prior stands.
+        """
+        return np.exp(self.log_prior if undecided else self.log_posterior[run])
+
+    def conclude(
+        self,
+        run: int,
+        name: str,
+        quality: LogQuality,
+        truth: str | None = None,
+        place: Place = Place(),
+    ) -> Diagnosis:
+        """Return the diagnosis of a run.
+
+        Args:
+            run: Index of the run.
+            name: What to call it.
+            quality: Defects of its log.
+            truth: What was wrong, where known; it is only passed on.
+            place: Where it lies in a stream, whose times and movements are told.
+        """
+        evidence, imperfections = self.scene.evidence, self.scene.model.imperfections
+        order = np.argsort(-self.log_posterior[run], kind="stable")
+        ranked = [self.hypotheses[i] for i in order]
+        best, undecided = self.weights[order[0]], self.undecided(run, quality)
+        posterior = self.posterior(run, undecided)
+        used = "settled poses" if self.scene.moving is None else "whole run"
+        diagnosis = Diagnosis(
+            run=name,
+            truth=truth,
+            posterior={str(h): float(p) for h, p in zip(self.hypotheses, posterior, strict=True)},
+            quality=(*quality.remarks, *unused_movements(evidence, run)),
+            undecided=undecided,
+            protocol=imperfections.protocol,
+            method=f"bayes, {used}; healthy behaviour: {imperfections.name}",
+        )
+        losses: list[str] = []
+        if not undecided:
+            diagnosis = replace(diagnosis, evidence=self._evidence(run, order, place))
+            estimate = best.estimate(run)
+            losses = self._losses(estimate, ranked[0])
+            diagnosis = _with_estimate(diagnosis, ranked[0], estimate, place)
+        return replace(
+            diagnosis,
+            verdict=verdict(diagnosis, ranked),
+            explanation=explanation(diagnosis, ranked, losses),
+        )
+
+    def _evidence(self, run: int, order: IntArray, place: Place) -> tuple[MovementEvidence, ...]:
+        """Return what each usable movement says of the best hypothesis against the second."""
+        if len(order) < 2:
+            return ()
+        best, second = (self.weights[i].by_movement(run) for i in order[:2])
+        usable = np.flatnonzero(self.scene.evidence.usable[run])
+        return tuple(
+            MovementEvidence(place.movements + int(m) + 1, float(best[m] - second[m]))
+            for m in usable
+        )
+
+    def _losses(self, estimate: Estimate, hypothesis: Hypothesis) -> list[str]:
+        """Return the commands that seem not to have arrived if `hypothesis` is true."""
+        motors = self.scene.model.twin.robot.motor_names
+        faulty = [fault.motor for fault in hypothesis.faults]
+        return lost_commands(estimate.became, self.scene.alternatives.lost, motors, faulty)
+
+
+def judge(scene: Scene, hypotheses: Sequence[Hypothesis], priors: Priors) -> Judgement:
+    """Weigh every hypothesis by some runs.
+
+    Args:
+        scene: The runs.
+        hypotheses: What may be the case.
+        priors: Beliefs about onset and size.
+    """
+    weights, prior = weigh_all(scene, hypotheses, priors), log_prior(hypotheses, priors)
+    log_joint = np.stack([weight.log_evidence for weight in weights], axis=1) + prior
+    log_posterior = log_joint - log_sum(log_joint, axis=1)[:, None]
+    return Judgement(scene, hypotheses, prior, log_posterior, weights)
+
+
+def _with_estimate(
+    diagnosis: Diagnosis, hypothesis: Hypothesis, estimate: Estimate, place: Place
+) -> Diagnosis:
+    """Return the diagnosis with onset and magnitude of the fault that is most probable."""
+    if estimate.onset is not None:
+        early, middle, late = (place.begin_s + estimate.onset.quantiles(LEVELS)).tolist()
+        diagnosis = replace(diagnosis, onset_s=middle, onset_90=(early, late))
+        known = place.known_onset(hypothesis)
+        if known is not None:
+            diagnosis = replace(diagnosis, onset_s=known.onset_s, onset_90=known.onset_90)
+    if estimate.size is not None:
+        low, half, high = estimate.size.quantiles(LEVELS).tolist()
+        unit = hypothesis.faults[0].magnitude_unit
+        diagnosis = replace(
+            diagnosis, magnitude=half, magnitude_unit=unit, magnitude_90=(low, high)
+        )
+    return diagnosis

@@ -1,0 +1,235 @@
+"""A stuck motor: one unknown angle after an unknown onset.
+
+The onset falls in one of two stretches for each movement: on the plateau before it (the motor
+then stands where it had settled) or on its ramp (it stands somewhere on the way). From there on
+the motor keeps its angle and the others behave as healthy ones.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import gammaln
+
+from failuretwin.core.numerics import log_of, log_sum, log_trapezoid_weights
+from failuretwin.core.types import FloatArray
+from failuretwin.inference.fault_models import nodes_around
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.marginal import Law
+from failuretwin.inference.onset import SHARES, OnsetPrior
+from failuretwin.inference.run_likelihood import Scene
+
+COARSE_NODES = 49
+"""Nodes spread evenly over the range of the held angle."""
+PRIOR_STEPS = np.array([-5, -2.5, -1, 0, 1, 2.5, 5.0])
+"""Nodes around each angle that the prior favours, in the scale of its peak."""
+SETTLED_SCALE, ON_THE_WAY_SCALE = 2.0, 8.0
+"""How sharply the prior ties the held angle to where the motor had settled, and to where its ramp
+was at a known onset, in scatters of the motor."""
+LAG_STEPS_S = np.array([-0.03, -0.015, 0.0, 0.015, 0.03])
+"""Steps by which the lag may differ from run to run [s]."""
+LATE_SHARES = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
+"""Points at which late starts are sampled, as shares of their range."""
+FREE_IF_KNOWN = 0.05
+"""Probability that the held angle is unrelated to the commands where the onset is known."""
+
+
+def stuck_law(scene: Scene, motor: int, prior: OnsetPrior, likely: FloatArray | None = None) -> Law:
+    """Return the law of `motor` being stuck.
+
+    Args:
+        scene: The runs.
+        motor: Index of the motor.
+        prior: When and where it may have got stuck.
+        likely: Angles to integrate over besides those that movements point to if this motor alone
+            is faulty, (run, node) [rad].
+    """
+    angle = _angle_nodes(scene, motor, prior)
+    if likely is not None:
+        angle = np.sort(np.concatenate([angle, likely.clip(*scene.held_range(motor))], axis=1))
+    parts = _log_prior(scene, motor, angle, prior)  # (run, movement, plateau | ramp, node)
+    log_prior = log_sum(parts, axis=2)
+
+    def of_run(run: int) -> tuple[FloatArray, FloatArray]:
+        onset, share = _onsets(scene[run], motor, angle[run], prior.known_s)
+        whole = np.where(np.isfinite(log_prior[run]), log_prior[run], 0.0)
+        of_part = np.exp(parts[run] - whole[:, None])
+        plateau = np.repeat(of_part[:, 0, :, None], len(SHARES), axis=-1)
+        ramp = np.repeat(of_part[:, 1, :, None], onset.shape[-1] - len(SHARES), axis=-1)
+        return onset, share * np.concatenate([plateau, ramp], axis=-1)
+
+    return Law(
+        motor=motor,
+        held=True,
+        angle=angle[:, None, :, None],
+        log_prior=log_prior,
+        size=angle,
+        onsets=of_run,
+        on_way=scene.on_way_held(motor, angle),
+    )
+
+
+def _angle_nodes(scene: Scene, motor: int, prior: OnsetPrior) -> FloatArray:
+    """Return angles to integrate over, sorted, (run, node) [rad].
+
+    They crowd where the likelihood or the prior may have a peak.
+    """
+    low, high = scene.held_range(motor)
+    profile = scene.profile(motor)
+    runs = len(profile.best)
+    width = np.sqrt(1.0 / np.maximum(profile.precision[..., 0], 1.0) + 1e-10)
+    local = nodes_around(profile.best[..., 0], width, profile.usable, low)
+    coarse = np.broadcast_to(np.linspace(low, high, COARSE_NODES), (runs, COARSE_NODES))
+    origin, _ = _ends(scene, motor)
+    scale = max(profile.scatter, 1e-4)
+    tied = [origin[..., None] + SETTLED_SCALE * scale * PRIOR_STEPS]
+    if prior.known_s is not None:
+        way = _position_at(scene, motor, prior.known_s)
+        tied.append(way[..., None] + ON_THE_WAY_SCALE * scale * PRIOR_STEPS)
+    # Padded movements favour no angle, so that a run is judged as it is on its own.
+    there = scene.evidence.movements.exists[..., None]
+    peaks = [np.where(there, angles, low).reshape(runs, -1) for angles in tied]
+    nodes = [coarse, local, *peaks]
+    return np.sort(np.clip(np.concatenate(nodes, axis=1), low, high), axis=1)
+
+
+def _log_prior(scene: Scene, motor: int, angle: FloatArray, prior: OnsetPrior) -> FloatArray:
+    """Return log prior masses, (run, movement first affected, plateau | ramp, node).
+
+    Each stretch has its share of the prior; within it the nodes carry the density of the angle
+    times the weights of the trapezoidal rule, normalised so that no mass is lost between nodes.
+    """
+    origin, target = _ends(scene, motor)
+    scale = max(float(scene.model.scatter[motor]), 1e-4)
+    low, high = scene.held_range(motor)
+    plateau = _student(angle[:, None] - origin[..., None], SETTLED_SCALE * scale, 4.0)
+    if prior.known_s is not None:
+        way = _position_at(scene, motor, prior.known_s)
+        ramp = _student(angle[:, None] - way[..., None], ON_THE_WAY_SCALE * scale, 4.0)
+    else:
+        ramp = _between(angle[:, None], origin[..., None], target[..., None], 4.0 * scale)
+    tied = np.stack([plateau, ramp], axis=2)
+    share = FREE_IF_KNOWN if prior.known_s is not None else prior.free
+    mixed = np.logaddexp(np.log1p(-share) + tied, np.log(share) - np.log(high - low))
+    mass = mixed + log_trapezoid_weights(angle)[:, None, None]
+    mass -= log_sum(mass, axis=-1)[..., None]
+    return mass + log_of(_onset_weights(scene, motor, prior))[..., None]
+
+
+def _student(error: FloatArray, scale: float, dof: float) -> FloatArray:
+    constant = gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * np.log(dof * np.pi) - np.log(scale)
+    return constant - 0.5 * (dof + 1) * np.log1p((error / scale) ** 2 / dof)
+
+
+def _between(x: FloatArray, a: FloatArray, b: FloatArray, margin: float) -> FloatArray:
+    """Return the log density of being anywhere between `a` and `b`, give or take `margin`."""
+    low, high = np.minimum(a, b) - margin, np.maximum(a, b) + margin
+    return np.where((x >= low) & (x <= high), -np.log(high - low), -np.inf)
+
+
+def _position_at(scene: Scene, motor: int, onset_s: float) -> FloatArray:
+    """Return where each ramp has come to at `onset_s`, lag counted, (run, movement) [rad]."""
+    movements = scene.evidence.movements
+    origin, target = _ends(scene, motor)
+    duration = np.maximum(movements.ramp_duration[..., motor], 1e-6)
+    done = np.clip((onset_s - scene.model.lag_s - movements.start) / duration, 0.0, 1.0)
+    return origin + (target - origin) * np.nan_to_num(done)
+
+
+def _ends(scene: Scene, motor: int) -> tuple[FloatArray, FloatArray]:
+    """Return where each ramp of `motor` begins and ends, (run, movement) [rad]; padding is 0.
+
+    These are the angles at which it settles, off its targets as it is when healthy.
+    """
+    movements = scene.evidence.movements
+    settled = scene.profile(motor).expected[..., 0]
+    off = np.nan_to_num(settled - movements.target[..., motor])
+    at_first = scene.start[:, motor] - movements.initial[:, motor]
+    before = np.concatenate([at_first[:, None], off[:, :-1]], axis=1)
+    return np.nan_to_num(movements.origin()[..., motor]) + before, np.nan_to_num(settled)
+
+
+def _stretches(scene: Scene, motor: int) -> tuple[FloatArray, FloatArray]:
+    """Return begin and end of plateau and ramp of each movement, (run, movement, 2) [s].
+
+    The plateau of the first movement is the time before it, from the start of the run. Movements
+    that are likely to have started late count as begun by so much later.
+    """
+    movements, model = scene.evidence.movements, scene.model
+    late_s = float(np.mean(model.imperfections.timing.late_s))
+    start = movements.start + model.lag_s + scene.late * late_s
+    reached = start + movements.ramp_duration[..., motor] * (1.0 - model.shortening)
+    plateau_begin = np.concatenate([np.zeros_like(start[:, :1]), reached[:, :-1]], axis=1)
+    begin = np.stack([np.minimum(plateau_begin, start), start], axis=-1)
+    return begin, np.stack([start, reached], axis=-1)
+
+
+def _onset_weights(scene: Scene, motor: int, prior: OnsetPrior) -> FloatArray:
+    """Return the prior probability of each stretch, (run, movement, plateau | ramp)."""
+    begin, end = _stretches(scene, motor)
+    length = np.nan_to_num(np.maximum(end - begin, 0.0))
+    if prior.known_s is not None:
+        inside = (begin <= prior.known_s) & (prior.known_s < end)
+        none = ~inside.any(axis=(1, 2))
+        inside[none, -1, 1] = True
+        return inside.astype(np.float64)
+    later = length.copy()
+    later[:, 0] = 0.0
+    total = later.sum(axis=(1, 2), keepdims=True)
+    early = np.where(total > 0, prior.before_run("stuck"), 1.0)
+    weights = (1.0 - early) * later / np.where(total > 0, total, 1.0)
+    weights[:, 0] = 0.5 * early[:, 0]
+    return weights
+
+
+def _onsets(
+    scene: Scene, motor: int, angle: FloatArray, known_s: float | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return onsets of one run [s] and their share of their stretch, (movement, node, sample).
+
+    The first samples are for the plateau, where any time is as likely; before the first movement
+    that is before the run, or, with its share of the run's length, until then. The others are for
+    the ramp, where the held angle says when.
+
+    Args:
+        scene: A single run.
+        motor: Index of the motor.
+        angle: Held angles, (node,) [rad].
+        known_s: The onset, where it is known [s].
+    """
+    movements, model = scene.evidence.movements, scene.model
+    begin, end = (np.nan_to_num(x[0]) for x in _stretches(scene, motor))
+    origin, target = (x[0] for x in _ends(scene, motor))
+    travel = target - origin
+    span = np.where(np.abs(travel) > 1e-6, travel, np.inf)
+    done = np.clip((angle - origin[:, None]) / span[:, None], 0.0, 1.0)
+    shift, shift_share = _starts(model, scene.late[0])
+    ramp = np.nan_to_num(movements.ramp_duration[0, :, motor]) * (1.0 - model.shortening)
+    on_ramp = np.nan_to_num(movements.start[0])[:, None] + done * ramp[:, None]
+    on_ramp = np.maximum(on_ramp[..., None] + shift, 0.0)
+    on_plateau = begin[:, 0, None] + SHARES * (end - begin)[:, 0, None]
+    on_plateau[0, 0] = 0.0
+    plateau_share = np.full((len(begin), len(SHARES)), 1 / len(SHARES))
+    waits = end[0, 0] / max(float(end.max()), 1e-9)
+    plateau_share[0] = np.append(1.0 - waits, np.full(len(SHARES) - 1, waits / (len(SHARES) - 1)))
+    on_plateau = np.repeat(on_plateau[:, None], len(angle), axis=1)
+    onset = np.concatenate([on_plateau, on_ramp], axis=-1)
+    if known_s is not None:
+        onset = np.full_like(onset, known_s)
+    share = np.concatenate([plateau_share, shift_share], axis=-1)
+    return onset, np.broadcast_to(share[:, None], onset.shape)
+
+
+def _starts(model: HealthyModel, late: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return by how much motions start after their command, (start,) [s], and how probable it is.
+
+    (movement, start).
+
+    Args:
+        model: The healthy robot.
+        late: Probability that each movement starts late, (movement,).
+    """
+    low, high = model.imperfections.timing.late_s
+    shift = model.lag_s + np.concatenate([LAG_STEPS_S, low + LATE_SHARES * (high - low)])
+    punctual = np.repeat((1.0 - late)[:, None] / len(LAG_STEPS_S), len(LAG_STEPS_S), axis=1)
+    held_up = np.repeat(late[:, None] / len(LATE_SHARES), len(LATE_SHARES), axis=1)
+    return shift, np.concatenate([punctual, held_up], axis=1)

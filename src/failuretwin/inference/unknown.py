@@ -1,0 +1,221 @@
+"""What none of the known faults explains: the best of many other explanations.
+
+Faults that the set leaves out, one motor or two that are off in any regular way or none, and, for
+what is nothing of that kind, a healthy robot with far more scatter. Each has odds of its own, and
+the best counts alone: many poor explanations are no good one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, product
+
+import numpy as np
+
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.numerics import log_sum
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.inference.marginal import Estimate, Weight
+from failuretwin.inference.run_likelihood import Scene
+from failuretwin.inference.two_joint_likelihood import TwoAngles, two_angles
+from failuretwin.inference.unmodelled_offsets import Course, Lines, follow
+
+# One motor or two that are off, each in its own way, whatever may have done that.
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How a motor is off.
+
+    Attributes:
+        spread: Deviation of what it is off by: as a share of its range if it is held, in rad if
+            it is off by a constant or redrawn, as a ratio if by its angle; 0: it is well.
+        held: Whether it stands at one angle whatever the target.
+        by_angle: Whether it is off in proportion to its angle.
+        redrawn: Whether each movement draws its own.
+    """
+
+    spread: float
+    held: bool = False
+    by_angle: bool = False
+    redrawn: bool = False
+
+    @property
+    def amount(self) -> bool:
+        """Whether it is off by an amount that holds for the run."""
+        return self.spread > 0.0 and not self.redrawn
+
+
+WELL = Kind(0.0)
+OFF_AS: Mapping[str, Kind] = {
+    "stuck": Kind(0.4, held=True),
+    "encoder_bias": Kind(0.3),
+    "encoder_scale": Kind(0.4, by_angle=True),
+    "steady_state_error": Kind(0.4, redrawn=True),
+}
+"""Kinds, by the mode that is the simplest case of each. Spreads are wide enough for most of what a
+motor can do within its range."""
+OFF = tuple(OFF_AS.values())
+ONE_OFF = (*product(OFF, (WELL,)), *product((WELL,), OFF))
+TWO_OFF = tuple(product(OFF, OFF))
+KINDS = (*ONE_OFF, *TWO_OFF)
+LOG_CHANCE = -np.log([2 * len(ONE_OFF)] * len(ONE_OFF) + [2 * len(TWO_OFF)] * len(TWO_OFF))
+"""Log probability of each of `KINDS`: one motor as often as two."""
+
+
+def weigh_off_anyhow(scene: Scene, known: Sequence[Hypothesis] = ()) -> Weight | None:
+    """Return what the runs say of one motor or two being off; None of an arm of a single motor.
+
+    Args:
+        scene: The runs.
+        known: Hypotheses; two motors that are off as one of them says are left out.
+    """
+    pairs = list(combinations(range(len(scene.model.scatter)), 2))
+    if not pairs:
+        return None
+    settled, ways = zip(*(_weigh(scene, pair, known) for pair in pairs), strict=True)
+    says = [one + way for one, way in zip(settled, ways, strict=True)]
+    whole = np.stack([one.sum(axis=1) for one in says], axis=1)
+    best = np.argmax(whole, axis=1)
+    none = np.zeros(scene.alternatives.log_weight.shape[1:])
+    return Weight(
+        log_evidence=log_sum(whole, axis=1) - np.log(len(pairs)),
+        by_movement=lambda run: says[best[run]][run],
+        settled=lambda run: settled[best[run]][run],
+        estimate=lambda run: Estimate(None, None, none),
+    )
+
+
+def way_of_two(scene: Scene, pair: tuple[int, int]) -> FloatArray:
+    """Return log densities of the way with two motors off, (run, movement)."""
+    if scene.transients is None:
+        return scene.on_way
+    return _weigh(scene, (min(pair), max(pair)))[1]
+
+
+def _weigh(
+    scene: Scene, pair: tuple[int, int], known: Sequence[Hypothesis] = ()
+) -> tuple[FloatArray, FloatArray]:
+    """Return log densities of settled positions and of the way, (run, movement) each."""
+    seen = two_angles(scene.evidence, scene.model, scene.alternatives, pair)
+    outlier = scene.model.outlier_log_density
+    course = follow(seen, _lines(scene, seen), scene.usable, outlier)
+    chance = np.where(_among(known, scene, pair), -np.inf, LOG_CHANCE)
+    total = course.says.sum(axis=-1) + chance  # (run, kind)
+    best, run = np.argmax(total, axis=1), np.arange(len(total))
+    says = course.says[run, best]
+    # What chance and the other kinds add belongs to no movement more than to another.
+    more = log_sum(total, axis=1) - says.sum(axis=1)
+    share = np.where(scene.usable, 1.0, 0.0) / np.maximum(scene.usable.sum(axis=1), 1)[:, None]
+    says = says + share * more[:, None]
+    if scene.transients is None:
+        return says, np.zeros_like(says)
+    return says, _on_way(scene, seen, Course(says, course.way[run, best], course.angle[run, best]))
+
+
+def _among(known: Sequence[Hypothesis], scene: Scene, pair: tuple[int, int]) -> BoolArray:
+    """Return which of `KINDS` of two motors are known hypotheses, (kind,)."""
+    names = [scene.model.twin.robot.motor_names[motor] for motor in pair]
+    said = [{fault.motor: OFF_AS.get(fault.mode) for fault in h.faults} for h in known]
+    kinds = [tuple(one[name] for name in names) for one in said if set(one) == set(names)]
+    return np.array([kind in kinds for kind in KINDS])
+
+
+def _on_way(scene: Scene, seen: TwoAngles, course: Course) -> FloatArray:
+    """Return log densities of the way if the two motors went where they were seen to settle."""
+    transients, pair = scene.transients, list(seen.pair)
+    assert transients is not None
+    followed = course.way >= 0
+    way = np.maximum(course.way, 0)[..., None]
+    at = np.take_along_axis(seen.angle, way[..., None], axis=2)[:, :, 0]
+    ends = transients.judge.expected.copy()
+    ends[..., pair] = np.where(followed[..., None], at, course.angle)[:, :, None]
+    became = np.where(followed, seen.became[way[..., 0]], 0)
+    return transients.toward(ends, became, seen.pair[0])
+
+
+def _lines(scene: Scene, seen: TwoAngles) -> Lines:
+    """Return where two motors may stand, for each of `KINDS`."""
+    pair = list(seen.pair)
+    motors = [scene.model.twin.robot.motors[motor] for motor in pair]
+    ends = np.array([motor.movement_range for motor in motors])
+    middle, length = ends.mean(axis=1), ends[:, 1] - ends[:, 0]
+    target = np.nan_to_num(scene.evidence.movements.target[..., pair])
+    scatter = scene.model.scatter[pair] ** 2
+    held, by_angle, redrawn, amount = (
+        np.array([[bool(getattr(kind, name)) for kind in kinds] for kinds in KINDS])
+        for name in ("held", "by_angle", "redrawn", "amount")
+    )
+    spread = np.array([[kind.spread for kind in kinds] for kinds in KINDS])
+    slope = np.where(by_angle, target[:, :, None], 1.0)
+    deviation = np.where(amount, spread * np.where(held, length, 1.0), 1.0)
+    return Lines(
+        centre=np.where(held, 0.0, seen.expected[:, :, None]),
+        slope=np.where(amount, slope, 0.0),
+        noise=np.where(held, 0.0, scatter) + np.where(redrawn, spread**2, 0.0),
+        amount=(np.where(held, middle, 0.0), deviation**2),
+        well=seen.expected,
+        well_noise=scatter,
+    )
+
+
+BLURS = (3.0, 8.0, 25.0)
+"""Factors on the scatter: just more than tails allow, to anywhere near."""
+WAY_BLUR = 8.0
+"""The same where the motors settle as they should, but get there in another way."""
+BLURRED_ODDS = 0.5
+"""Odds, against healthy, of far more scatter, in any of these ways."""
+OFF_ODDS = 1.0
+"""The same of one motor or two being off anyhow."""
+LEFT_OUT = 0.5
+"""Factor on the odds of a fault that the set leaves out. All three were chosen on simulated runs,
+for no more than 2 % of the known runs lost (docs/diagnosis.md)."""
+
+
+def weigh_unknown(
+    scene: Scene,
+    healthy: Callable[[Scene], Weight],
+    left_out: Sequence[tuple[float, Weight]],
+    known: Sequence[Hypothesis],
+) -> Weight:
+    """Return what the runs say of a fault that is not among the known ones, times its odds.
+
+    Args:
+        scene: The runs.
+        healthy: What weighs a healthy robot.
+        left_out: Faults that are not among the known ones: their odds against healthy, and what
+            the runs say of them.
+        known: The known hypotheses; two motors that are off as one of them says are no unknown.
+    """
+    found = [(LEFT_OUT * odds, weight) for odds, weight in left_out]
+    blurred = _blurred(scene)
+    found += [(BLURRED_ODDS / len(blurred), healthy(other)) for other in blurred]
+    anyhow = weigh_off_anyhow(scene, known)
+    if anyhow is not None:
+        found.append((OFF_ODDS, anyhow))
+    return _best([weight for _, weight in found], np.log([odds for odds, _ in found]))
+
+
+def _blurred(scene: Scene) -> list[Scene]:
+    """Return the runs as they look to who expects far more scatter, settled or moving."""
+    blurred = [replace(scene, model=replace(scene.model, blur=blur)) for blur in BLURS]
+    if scene.moving is not None:
+        blurred.append(replace(scene, way_blur=WAY_BLUR))
+    return blurred
+
+
+def _best(weights: Sequence[Weight], log_prior: FloatArray) -> Weight:
+    """Return what the runs say of the best explanation of each, without a size."""
+    joint = np.stack([weight.log_evidence for weight in weights], axis=1) + log_prior
+    best = np.argmax(joint, axis=1)
+
+    def estimate(run: int) -> Estimate:
+        return replace(weights[best[run]].estimate(run), size=None)
+
+    return Weight(
+        log_evidence=joint[np.arange(len(best)), best],
+        by_movement=lambda run: weights[best[run]].by_movement(run),
+        settled=lambda run: weights[best[run]].settled(run),
+        estimate=estimate,
+    )
