@@ -3,7 +3,7 @@
 Told from the truth alone, not from any diagnosis: what the fault does is the difference to the
 same life without it. It can be shown once it is expected to beat every other hypothesis by
 `SHOWN_NATS`, in units of the declared scatter and of the declared chance of lost commands
-(docs/ambiguity.md): a motor that stays where it was for one movement can as well have lost a
+(docs/isolability.md): a motor that stays where it was for one movement can as well have lost a
 command.
 """
 
@@ -25,7 +25,7 @@ from failuretwin.failure_behavior.fault import STEP, Course, FaultValue
 from failuretwin.failure_behavior.injection import ScheduledFault
 from failuretwin.failure_behavior.modes import OFFSET, SteadyStateError
 from failuretwin.failure_behavior.random_movements import stack_movements
-from failuretwin.inference.expected_bayes_factors import separation
+from failuretwin.inference.expected_bayes_factors import expected_log_bayes_factors
 
 ERROR = SteadyStateError.mode
 SHOWN_NATS = 5.0
@@ -109,7 +109,7 @@ class CanShow:
         numbers = np.arange(first - 1, last)
         runs = self._prefixes(fault, numbers).to_dataset()
         twin = DigitalTwin(self.emulation.robot)
-        ahead = separation(twin, runs, self.emulation.imperfections).nearest
+        ahead = expected_log_bayes_factors(twin, runs, self.emulation.imperfections).nearest
         shown = np.flatnonzero(ahead >= SHOWN_NATS)
         return int(shown[0]) + 1 if len(shown) else None
 

@@ -32,15 +32,15 @@ from failuretwin.decision.metrics.probability import (
 from failuretwin.digital_model.nonidealities import load_imperfections
 from failuretwin.failure_behavior.fault import FaultValue
 from failuretwin.failure_behavior.modes import MODES, SteadyStateError, Stuck
-from failuretwin.inference.evidence import moving_evidence, settled_evidence
-from failuretwin.inference.log_quality import log_quality, without_spoilt
+from failuretwin.inference.evidence import settled_evidence, transient_samples
+from failuretwin.inference.log_quality import drop_invalid, log_quality
 from failuretwin.inference.onset import OnsetPrior
-from failuretwin.inference.posterior import weigh_hypothesis
+from failuretwin.inference.posterior import marginal_likelihood_of
 from failuretwin.inference.priors import Priors
-from failuretwin.inference.run_likelihood import Scene
+from failuretwin.inference.run_likelihood import RunLikelihood
 
 EARLY = 0.5
-PRIORS = Priors(onset=OnsetPrior(early=EARLY, free=0.01))
+PRIORS = Priors(onset=OnsetPrior(prior_before_run=EARLY, free=0.01))
 """Half of the faults were there before the run; held angles come from where the motor was."""
 CHUNK = 500
 DRAWS = 199
@@ -135,15 +135,17 @@ def outcomes(
 ) -> Iterator[Outcome]:
     """Diagnose runs, and draw onset and size from their posterior given the true hypothesis."""
     diagnoses = diagnoser.diagnose(runs)
-    sound = without_spoilt(runs, log_quality(runs))
+    sound = drop_invalid(runs, log_quality(runs))
     evidence = settled_evidence(sound)
-    moving = moving_evidence(sound, evidence).where(diagnoser.on_way(evidence.usable))
+    moving = transient_samples(sound, evidence).where(diagnoser.transient_mask(evidence.usable))
     names = runs["fault"].values
     for name in dict.fromkeys(names):
         rows = np.flatnonzero(names == name)
         first, stop = int(rows[0]), int(rows[-1]) + 1
-        scene = Scene(evidence[first:stop], diagnoser.healthy_model, moving[first:stop])
-        weight = weigh_hypothesis(scene, Hypothesis.parse(str(name)), PRIORS)
+        likelihood = RunLikelihood(
+            evidence[first:stop], diagnoser.healthy_model, moving[first:stop]
+        )
+        weight = marginal_likelihood_of(likelihood, Hypothesis.parse(str(name)), PRIORS)
         for row in rows:
             estimate = weight.estimate(int(row) - first)
             yield Outcome(

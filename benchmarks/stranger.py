@@ -6,7 +6,7 @@ The physics engine moves the arm, with the imperfections of a real one; its sag,
 stick and its servos are not those that the diagnoser reckons with. Faults strike as published
 (stuck from 0.49 s on, errors of 10 to 50 counts from the start), then with onsets anywhere in the
 first eight seconds. Separable are the runs whose truth beats the nearest other hypothesis by
-5 nats or more, in units of the declared scatter (docs/ambiguity.md).
+5 nats or more, in units of the declared scatter (docs/isolability.md).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from failuretwin.digital_model.nonidealities import Imperfections, load_imperfec
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import FaultMode
 from failuretwin.failure_behavior.modes import MODES
-from failuretwin.inference.expected_bayes_factors import separation
+from failuretwin.inference.expected_bayes_factors import expected_log_bayes_factors
 
 SEPARABLE_NATS = 5.0
 ALARMS = (0.99, 0.999)
@@ -66,7 +66,7 @@ class Stranger:
 
     def ahead(self, runs: xr.Dataset) -> FloatArray:
         """Return by how much the truth of each run beats the nearest other, (run,) [nats]."""
-        return separation(self.diagnoser.twin, runs, self.imperfections).nearest
+        return expected_log_bayes_factors(self.diagnoser.twin, runs, self.imperfections).nearest
 
 
 def main() -> None:

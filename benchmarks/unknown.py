@@ -6,7 +6,7 @@
 Offered are the paper's nine hypotheses and `unknown`; true are faults of other modes, two faults
 at once, and two kinds of fault that no law describes: a gear that runs eccentrically, and a stop
 that cuts off the ends of a motor's range. A run is foreign if its truth beats every one of the
-nine by 5 nats or more, as docs/ambiguity.md reckons it; of two faults and of those without a law,
+nine by 5 nats or more, as docs/isolability.md reckons it; of two faults and of those without a law,
 at sizes and an onset that explain the run exactly. The loss is that on runs of the nine, with
 `unknown` in the set and without. With --forget, `unknown` does without the law of the mode that is
 true, as if nobody had thought of it.
@@ -43,8 +43,12 @@ from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.fault import FaultGroup
 from failuretwin.failure_behavior.mode import Range, SizedMode
 from failuretwin.failure_behavior.modes import register
-from failuretwin.inference.expected_bayes_factors import Judge, separation, truth_and_faults
-from failuretwin.inference.posterior import WEIGHABLE
+from failuretwin.inference.expected_bayes_factors import (
+    ExpectedLogBayesFactor,
+    expected_log_bayes_factors,
+    truth_and_faults,
+)
+from failuretwin.inference.posterior import DIAGNOSABLE_MODES
 
 FOREIGN_NATS = 5.0
 DISTANCES = (FOREIGN_NATS, 15.0, 40.0, np.inf)
@@ -113,12 +117,12 @@ def main() -> None:
     diagnoser = ft.BayesDiagnoser(twin, healthy, [*nine, UNKNOWN])
     print(f"{'left out':24s} {'foreign':>8s}   of the foreign: called unknown; others: {OTHERS}")
     parts = []
-    for name, true in left_out(robot):
+    for name, true in unlisted(robot):
         per_class = -(-options.runs // len(true))
         plan = ft.Plan(robot, true, per_class, options.seed, healthy, engine=options.engine)
         runs = ft.simulate(plan)
-        known_laws = tuple(mode for mode in WEIGHABLE if mode != name or not options.forget)
-        with patch("failuretwin.inference.posterior.WEIGHABLE", known_laws):
+        known_laws = tuple(mode for mode in DIAGNOSABLE_MODES if mode != name or not options.forget)
+        with patch("failuretwin.inference.posterior.DIAGNOSABLE_MODES", known_laws):
             said = np.array([_kind(d) for d in diagnoser.diagnose(runs)])
         nats_ahead = ahead(diagnoser, runs, nine, healthy)
         tell(name, said, nats_ahead >= FOREIGN_NATS)
@@ -154,7 +158,7 @@ def tell(name: str, said: NDArray[np.str_], some: BoolArray) -> None:
     print(f"{name:24s} {foreign:>8s}   {share(unknown, len(chosen))}; {others}", flush=True)
 
 
-def left_out(robot: Robot) -> Iterator[tuple[str, list[Hypothesis]]]:
+def unlisted(robot: Robot) -> Iterator[tuple[str, list[Hypothesis]]]:
     """Return what is true, by kind: every motor, or neighbouring pairs of motors."""
     for mode in (*LEFT_OUT, *ALIEN):
         motors = robot.motor_names
@@ -175,16 +179,16 @@ def ahead(
 ) -> FloatArray:
     """Return by how much the truth of each run beats the nearest of the nine, (run,) [nats]."""
     truth, faults = truth_and_faults(runs)
-    if len(truth[0].faults) == 1 and truth[0].faults[0].mode in WEIGHABLE:
-        return separation(diagnoser.twin, runs, healthy, nine).nearest
+    if len(truth[0].faults) == 1 and truth[0].faults[0].mode in DIAGNOSABLE_MODES:
+        return expected_log_bayes_factors(diagnoser.twin, runs, healthy, nine).nearest
     # Two faults, or one without a law, explain it exactly: densities are relative to that.
-    judge = Judge(diagnoser.healthy_model, tuple(nine), diagnoser.priors)
+    judge = ExpectedLogBayesFactor(diagnoser.healthy_model, tuple(nine), diagnoser.priors)
     return -judge.fits(runs, faults, runs["onset"].values).max(axis=1)
 
 
 def tell_loss(runs: xr.Dataset, diagnoser: ft.BayesDiagnoser) -> None:
     """Print what `unknown` costs on runs of the nine."""
-    known = [h for h in diagnoser.considered if h.known]
+    known = [h for h in diagnoser.hypothesis_set if h.known]
     without = ft.BayesDiagnoser(diagnoser.twin, diagnoser.imperfections, known).diagnose(runs)
     found = diagnoser.diagnose(runs)
     for name, results in (("without unknown", without), ("with it", found)):

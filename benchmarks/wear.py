@@ -185,7 +185,7 @@ def _filter_seconds(tracker: Tracker, done: Tracked) -> float:
     """Return the time that the filter alone takes for the runs of a block [s]."""
     begin = time.perf_counter()
     for step in done.steps:
-        tracker, _ = tracker.follow(step.evidence, step.suspicion)
+        tracker, _ = tracker.follow(step.evidence, step.fault_probability)
     return time.perf_counter() - begin
 
 

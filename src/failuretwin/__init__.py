@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.twin import DigitalTwin
     from failuretwin.inference.diagnoser import BayesDiagnoser
-    from failuretwin.inference.isolability import ambiguity
+    from failuretwin.inference.isolability import isolability
     from failuretwin.inference.priors import Priors
 
 __version__ = "0.1.0"
@@ -30,7 +30,7 @@ _HOME = {
     "Priors": "inference.priors",
     "ReadOptions": "data_knowledge.read",
     "StreamingDiagnoser": "decision.streaming.diagnoser",
-    "ambiguity": "inference.isolability",
+    "isolability": "inference.isolability",
     "iterate": "data_knowledge.generate",
     "load_robot": "digital_model.robot",
     "read_runs": "data_knowledge.read",
@@ -46,7 +46,7 @@ __all__ = [
     "ReadOptions",
     "StreamingDiagnoser",
     "__version__",
-    "ambiguity",
+    "isolability",
     "iterate",
     "load_robot",
     "read_runs",

@@ -3,14 +3,14 @@ from __future__ import annotations
 import numpy as np
 
 from failuretwin.app.tables import _group_lines, _size_lines
-from failuretwin.inference.isolability import Ambiguity
+from failuretwin.inference.isolability import IsolabilityReport
 
 BIAS, SCALE, STUCK = "motor_1:encoder_bias", "motor_1:encoder_scale", "motor_2:stuck"
 
 
 def found(groups, detected, isolated):
     """What can be told apart of two faults of 0.1 (rad or a ratio), considered up to 0.4."""
-    return Ambiguity(
+    return IsolabilityReport(
         hypotheses=("healthy", BIAS, SCALE, STUCK),
         nats=np.zeros((4, 4)),
         groups=groups,

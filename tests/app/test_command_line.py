@@ -153,7 +153,7 @@ def test_what_such_motions_show_is_told(results, failuretwin, simulated):
         (
             ",".join(f"motor_{k}:{m}" for k in (1, 2, 3, 4) for m in MANY),
             "which of these 20 hypotheses such motions tell apart may take longer to work "
-            "out than the diagnosis (done for up to 16): call failuretwin.ambiguity in Python",
+            "out than the diagnosis (done for up to 16): call failuretwin.isolability in Python",
         ),
     ],
     ids=["no single fault", "many"],

@@ -50,7 +50,7 @@ entries = st.lists(st.sampled_from(SETS), min_size=1, max_size=4, unique=True).f
 )
 def test_probabilities_of_all_alternatives_add_up(twin, entries, late, late_rate):
     """In all to one, less outliers; those of the losses of a set to the rate of the set."""
-    found = model(twin, entries, late_rate).alternatives(movements(late))
+    found = model(twin, entries, late_rate).outcomes(movements(late))
     weights = np.exp(found.log_weight[0]) / (1.0 - OUTLIER_RATE)
     np.testing.assert_allclose(weights.sum(axis=-1), 1.0, rtol=1e-12)
     for motors, rate, when_late in entries:
@@ -63,7 +63,7 @@ def test_probabilities_of_all_alternatives_add_up(twin, entries, late, late_rate
 @given(motors=st.sampled_from(SETS), lost=st.lists(st.booleans(), min_size=1, max_size=5))
 def test_motors_that_miss_commands_in_a_row_stand_where_they_went_last(twin, motors, lost):
     commanded, hit = movements([False] * len(lost)), np.isin(MOTORS, motors)
-    found = model(twin, [(motors, 0.2, 0.2)], 0.0).alternatives(commanded)
+    found = model(twin, [(motors, 0.2, 0.2)], 0.0).outcomes(commanded)
     origin, target = commanded.origin()[0], commanded.target[0]
     stands, travelled = commanded.initial[0], np.zeros(4)
     for m, missing in enumerate(lost):
@@ -77,7 +77,7 @@ def test_motors_that_miss_commands_in_a_row_stand_where_they_went_last(twin, mot
 
 def test_a_motor_that_missed_two_travelled_last_in_the_movement_before_both(twin):
     commanded = movements([False, False, False])
-    found = model(twin, [(("motor_2",), 0.03, 0.03)], 0.0).alternatives(commanded)
+    found = model(twin, [(("motor_2",), 0.03, 0.03)], 0.0).outcomes(commanded)
     travel = np.sign(commanded.target - commanded.origin())[0, :, 1]
     assert len(found.lost) == 3
     np.testing.assert_array_equal(found.direction[0, 2, :, 1], travel[[2, 1, 0]])
@@ -87,7 +87,7 @@ def test_a_motor_that_missed_two_travelled_last_in_the_movement_before_both(twin
 def test_motors_may_lose_every_command(twin, share, count):
     """Rates that add up to one, give or take rounding, leave no chance that all arrives."""
     entries = [(motors, share, share) for motors in SETS[:count]]
-    found = model(twin, entries, 0.5).alternatives(movements([False, True, False]))
+    found = model(twin, entries, 0.5).outcomes(movements([False, True, False]))
     assert np.exp(found.log_weight[..., 0]).max() < 1e-9
     total = np.exp(found.log_weight).sum(axis=-1)
     np.testing.assert_allclose(total, 1.0 - OUTLIER_RATE, rtol=1e-9)
@@ -95,7 +95,7 @@ def test_motors_may_lose_every_command(twin, share, count):
 
 def test_rare_losses_in_a_row_are_left_out(twin):
     rate = 0.9 * np.sqrt(RARE)
-    found = model(twin, [(("motor_1",), rate, rate)], 0.0).alternatives(movements([False] * 3))
+    found = model(twin, [(("motor_1",), rate, rate)], 0.0).outcomes(movements([False] * 3))
     assert found.lost.tolist() == [[False] * 4, [True, False, False, False]]
 
 
@@ -118,6 +118,6 @@ def test_a_run_has_the_alternatives_that_it_has_among_others(twin):
             for name in ("target", "ramp_duration", "start")
         ),
     )
-    alone, both = healthy.alternatives(short), healthy.alternatives(padded)
+    alone, both = healthy.outcomes(short), healthy.outcomes(padded)
     for name in ("base", "direction", "log_weight"):
         np.testing.assert_array_equal(getattr(both, name)[:1, :2], getattr(alone, name))

@@ -115,7 +115,7 @@ def lossy():
     )
 
 
-def alternatives(twin, imperfections, starts):
+def outcomes(twin, imperfections, starts):
     count = len(starts)
     movements = Movements(
         initial=np.zeros((1, 4)),
@@ -123,11 +123,11 @@ def alternatives(twin, imperfections, starts):
         ramp_duration=np.full((1, count, 4), 0.8),
         start=np.array(starts, dtype=float)[None],
     )
-    return HealthyModel(twin, imperfections).alternatives(movements)
+    return HealthyModel(twin, imperfections).outcomes(movements)
 
 
 def test_a_motor_that_loses_its_command_stays(twin, lossy):
-    found = alternatives(twin, lossy, [0.0, 2.0])
+    found = outcomes(twin, lossy, [0.0, 2.0])
     arrives, lost = found.base[0, :, 0], found.base[0, :, 1]
     np.testing.assert_array_equal(arrives, TARGETS)
     np.testing.assert_array_equal(lost[:, 0], [0.0, TARGETS[0, 0]])
@@ -136,7 +136,7 @@ def test_a_motor_that_loses_its_command_stays(twin, lossy):
 
 def test_late_movements_lose_more_commands(twin, lossy):
     """A late start holds up the next command; of the last movement only the rate is known."""
-    found = alternatives(twin, lossy, [0.0, 2.0, 5.0])
+    found = outcomes(twin, lossy, [0.0, 2.0, 5.0])
     weights = np.exp(found.log_weight[0]) / (1 - OUTLIER_RATE)
     rates = np.array([0.1, 0.5, 0.1 + 0.3 * 0.4])
     np.testing.assert_allclose(weights[:, 1:].sum(axis=1), rates)
@@ -148,7 +148,7 @@ def test_late_movements_lose_more_commands(twin, lossy):
 
 
 def test_a_motor_that_misses_two_commands_stays_where_it_was_before_both(twin, lossy):
-    found = alternatives(twin, lossy, [0.0, 2.0, 4.0])
+    found = outcomes(twin, lossy, [0.0, 2.0, 4.0])
     assert not found.lost[0].any() and found.lost[1:, 0].all()
     # Before the third movement it was told TARGETS[1], before the second TARGETS[0].
     np.testing.assert_array_equal(found.base[0, 1, 2, 0], 0.0)

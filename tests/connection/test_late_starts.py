@@ -13,7 +13,7 @@ from failuretwin.digital_model.disturbances import draw_disturbances
 from failuretwin.digital_model.nonidealities import LostCommand, Timing, load_imperfections
 from failuretwin.inference.command_loss import LostCommands
 from failuretwin.inference.evidence import settled_evidence
-from failuretwin.inference.run_likelihood import Scene
+from failuretwin.inference.run_likelihood import RunLikelihood
 
 RUNS = 60
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
@@ -39,9 +39,9 @@ def test_late_starts_are_read_off_commands_and_readings(armpi, known, engine):
         pytest.importorskip("mujoco")
     plan = Plan(armpi, (HEALTHY,), RUNS, 12, known, engine=engine)
     evidence = settled_evidence(simulate(plan))
-    found = LostCommands(armpi, known).late(evidence.movements, evidence.resumed)
+    found = LostCommands(armpi, known).late(evidence.movements, evidence.first_reading_delay)
     truth = np.array([late_movements(known, plan, run) for run in range(RUNS)])
-    told = np.isfinite(evidence.resumed)
+    told = np.isfinite(evidence.first_reading_delay)
     there = evidence.movements.exists
     assert told.all(axis=1).sum() > 0.8 * RUNS
     np.testing.assert_array_equal(found[told & there], truth[told & there])
@@ -65,14 +65,16 @@ def one_movement():
         (2.0, 1.1, 1.0),
     ],
 )
-def test_silence_after_the_last_command_is_a_late_start(armpi, known, rate_hz, resumed, late):
+def test_silence_after_the_last_command_is_a_late_start(
+    armpi, known, rate_hz, first_reading_delay, late
+):
     slow = replace(
         known,
         timing=Timing(late_rate=0.25, late_s=(1.0, 1.5)),
         readings=replace(known.readings, rate_hz=rate_hz),
     )
     losses = LostCommands(armpi, slow)
-    found = losses.late(one_movement(), np.array([[resumed]]))
+    found = losses.late(one_movement(), np.array([[first_reading_delay]]))
     assert found.tolist() == [[late]]
     assert losses.late(one_movement()).tolist() == [[0.25]]
 
@@ -80,7 +82,7 @@ def test_silence_after_the_last_command_is_a_late_start(armpi, known, rate_hz, r
 def test_lines_between_readings_tell_nothing_of_a_late_start(armpi, known):
     published = replace(known, readings=replace(known.readings, drawn_out=True))
     runs = simulate(Plan(armpi, (HEALTHY,), 3, 0, published))
-    assert np.isnan(settled_evidence(runs).resumed).all()
+    assert np.isnan(settled_evidence(runs).first_reading_delay).all()
 
 
 def test_a_healthy_robot_that_loses_three_commands_in_a_row_is_healthy(armpi, known, twin, run_of):
@@ -116,6 +118,6 @@ def test_seen_losses_count_once(twin, armpi, known, run_of):
             stands[m, 0] = stands[m - 1, 0]
         pose = model.settle(stands, np.zeros_like(stands), model.none_held)
         evidence = settled_evidence(run_of(targets, twin.path(pose), MOTORS, rate=10.0))
-        return Scene(evidence, model).log_healthy.sum()
+        return RunLikelihood(evidence, model).log_healthy.sum()
 
     assert healthy((2, 3)) == pytest.approx(healthy((2, 4)), abs=1.0)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from failuretwin.inference.command_loss import MOST_STATES, LossesInARow
+from failuretwin.inference.command_loss import MOST_STATES, ConsecutiveLossHmm
 
 SETS = [s for size in (1, 2) for s in combinations(range(3), size)]
 MOVEMENTS = 4
@@ -42,7 +42,7 @@ def histories(losses, rates):
 def test_chances_are_those_of_all_histories(sets, seed):
     """State by state, as far as those that were left out leave them alone."""
     losses, rates = losses_of(sets), rates_of(sets, seed)
-    chain = LossesInARow.of(losses, rates[0].max(axis=0), 1e-4)
+    chain = ConsecutiveLossHmm.of(losses, rates[0].max(axis=0), 1e-4)
     known = [tuple(missed) for missed in chain.missed.tolist()]
     exact = [dict.fromkeys(known, 0.0) for _ in range(MOVEMENTS)]
     left_out = np.zeros(MOVEMENTS)
@@ -53,7 +53,7 @@ def test_chances_are_those_of_all_histories(sets, seed):
                 left_out[m] += share
             else:
                 exact[m][states[m]] += share
-    got = chain.chances(rates)[0]
+    got = chain.forward(rates)[0]
     np.testing.assert_allclose(got.sum(axis=-1), 1.0, rtol=1e-12)
     for m in range(MOVEMENTS):
         more = got[m] - [exact[m][state] for state in known]
@@ -69,7 +69,7 @@ def test_chances_are_those_of_all_histories(sets, seed):
 def test_what_was_seen_counts_as_bayes_says(sets, seed):
     """Given all before, a state has its share of all histories, weighed by what was seen."""
     losses, rates = losses_of(sets), rates_of(sets, seed)
-    chain = LossesInARow.of(losses, np.append(1.0, np.full(len(sets), 0.3)), 1e-6)
+    chain = ConsecutiveLossHmm.of(losses, np.append(1.0, np.full(len(sets), 0.3)), 1e-6)
     known = [tuple(missed) for missed in chain.missed.tolist()]
     says = 3.0 * np.random.default_rng(seed).standard_normal((1, MOVEMENTS, len(known)))
     joint = np.zeros((MOVEMENTS, len(known)))
@@ -79,34 +79,34 @@ def test_what_was_seen_counts_as_bayes_says(sets, seed):
             seen = np.exp(sum(says[0, i, at[i]] for i in range(m)))
             joint[m, at[m]] += np.prod(chances) * seen
     expected = joint / joint.sum(axis=-1, keepdims=True)
-    np.testing.assert_allclose(chain.chances(rates, says)[0], expected, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(chain.forward(rates, says)[0], expected, rtol=1e-9, atol=1e-15)
 
 
 def test_evidence_that_says_nothing_changes_nothing():
     sets = [(0,), (0, 1)]
     losses, rates = losses_of(sets), rates_of(sets, 7)
-    chain = LossesInARow.of(losses, rates[0].max(axis=0), 1e-4)
+    chain = ConsecutiveLossHmm.of(losses, rates[0].max(axis=0), 1e-4)
     silent = np.full((1, MOVEMENTS, len(chain.missed)), -700.0)
-    np.testing.assert_allclose(chain.chances(rates, silent), chain.chances(rates), rtol=1e-12)
+    np.testing.assert_allclose(chain.forward(rates, silent), chain.forward(rates), rtol=1e-12)
 
 
 def test_one_motor_misses_as_many_in_a_row_as_are_not_too_rare():
-    chain = LossesInARow.of(losses_of([(0,)]), np.array([0.9, 0.1]), 0.9e-3)
+    chain = ConsecutiveLossHmm.of(losses_of([(0,)]), np.array([0.9, 0.1]), 0.9e-3)
     assert chain.missed[:, 0].tolist() == [0, 1, 2, 3]
-    missed = chain.chances(np.full((1, 9, 2), [0.9, 0.1]))[0, -1]
+    missed = chain.forward(np.full((1, 9, 2), [0.9, 0.1]))[0, -1]
     # The last state holds three or more in a row.
     np.testing.assert_allclose(missed, [0.9, 0.09, 0.009, 0.001], rtol=1e-12)
 
 
 def test_chains_end_although_losses_are_certain():
-    chain = LossesInARow.of(losses_of([(0,), (1,)]), np.array([0.0, 1.0, 1.0]), 1e-4)
+    chain = ConsecutiveLossHmm.of(losses_of([(0,), (1,)]), np.array([0.0, 1.0, 1.0]), 1e-4)
     assert len(chain.missed) == MOST_STATES
 
 
 def test_what_is_impossible_is_not_made_probable_by_what_was_seen():
     """Nobody has missed two commands with the first movement, whatever it looks like."""
-    chain = LossesInARow.of(losses_of([(0,)]), np.array([0.9, 0.1]), 1e-3)
+    chain = ConsecutiveLossHmm.of(losses_of([(0,)]), np.array([0.9, 0.1]), 1e-3)
     looks = np.zeros((1, 2, len(chain.missed)))
     looks[:, 0, 2] = 1e4
-    found = chain.chances(np.full((1, 2, 2), [0.9, 0.1]), looks)
+    found = chain.forward(np.full((1, 2, 2), [0.9, 0.1]), looks)
     np.testing.assert_allclose(found[0, 1, :3], [0.9, 0.09, 0.01], rtol=1e-12)

@@ -243,9 +243,9 @@ def test_after_the_repair_it_goes_on(armpi):
 @pytest.mark.parametrize("chance", [0.6, 0.999, np.nan])
 def test_one_doubtful_run_is_left_out_and_no_more(armpi, chance):
     evidence = evidence_of(armpi, truth(100), 10)
-    suspicion = np.full(100, 0.1)
-    suspicion[40] = chance
-    _, steps = follow_all(fresh(armpi), evidence, suspicion)
+    fault_probability = np.full(100, 0.1)
+    fault_probability[40] = chance
+    _, steps = follow_all(fresh(armpi), evidence, fault_probability)
     told = fates(steps)
     assert told[41] == "discarded"
     assert Counter(told.values())["learned"] >= 73

@@ -26,7 +26,7 @@ def evidence(armpi):
 
 
 @pytest.fixture(scope="module")
-def suspicion():
+def fault_probability():
     """Some doubtful runs, one without a verdict, and a fault that is declared and repaired."""
     chance = np.full(RUNS, 0.1)
     chance[[12, 30]] = 0.999, np.nan
@@ -34,12 +34,12 @@ def suspicion():
     return chance
 
 
-def written(path, start, evidence, suspicion, pieces):
+def written(path, start, evidence, fault_probability, pieces):
     """Follow runs in pieces, each with a tracker that knows the file alone."""
     first = 0
     for last in pieces:
         history = read_history(path, start)
-        _, steps = follow_all(history.tracker, evidence[first:last], suspicion[first:last])
+        _, steps = follow_all(history.tracker, evidence[first:last], fault_probability[first:last])
         append_history(history, steps)
         first = last
     return path.read_bytes()
@@ -61,22 +61,24 @@ def assert_same(one, other):
 
 
 @pytest.mark.parametrize("pieces", [[40, RUNS], [1, 26, 27, 51, 60, RUNS], [RUNS]])
-def test_going_on_from_the_file_is_going_on(armpi, evidence, suspicion, tmp_path, pieces):
+def test_going_on_from_the_file_is_going_on(armpi, evidence, fault_probability, tmp_path, pieces):
     """The same file, byte for byte, and the same tracker as without a break."""
     start = fresh(armpi)
-    through, steps = follow_all(start, evidence, suspicion)
+    through, steps = follow_all(start, evidence, fault_probability)
     append_history(read_history(tmp_path / "through.history.jsonl", start), steps)
     path = tmp_path / "pieces.history.jsonl"
     assert (
-        written(path, start, evidence, suspicion, pieces)
+        written(path, start, evidence, fault_probability, pieces)
         == (tmp_path / "through.history.jsonl").read_bytes()
     )
     assert_same(read_history(path, start).tracker, through)
 
 
-def test_a_line_a_run_with_its_name_state_and_deviations(armpi, evidence, suspicion, tmp_path):
+def test_a_line_a_run_with_its_name_state_and_deviations(
+    armpi, evidence, fault_probability, tmp_path
+):
     path = tmp_path / "cal.history.jsonl"
-    written(path, fresh(armpi), evidence, suspicion, [RUNS])
+    written(path, fresh(armpi), evidence, fault_probability, [RUNS])
     head, *rows = [json.loads(line) for line in path.read_text().splitlines()]
     assert head["history_of"] == "armpi_fpv"
     assert [row["run"] for row in rows] == [f"run {i}" for i in range(RUNS)]
@@ -100,10 +102,10 @@ def test_where_there_is_none_it_begins(armpi, tmp_path):
     assert (history.tracker, history.steps) == (start, ())
 
 
-def test_a_line_cut_anywhere_is_a_shorter_history(armpi, evidence, suspicion, tmp_path):
+def test_a_line_cut_anywhere_is_a_shorter_history(armpi, evidence, fault_probability, tmp_path):
     """Whatever a killed writer leaves: read as far as it goes, and the next one goes on."""
     path, start = tmp_path / "cal.history.jsonl", fresh(armpi)
-    whole = written(path, start, evidence, suspicion, [RUNS])
+    whole = written(path, start, evidence, fault_probability, [RUNS])
     ends = np.flatnonzero(np.frombuffer(whole, np.uint8) == ord("\n"))
     rng = np.random.default_rng(0)
     for cut in [1, ends[0], ends[0] + 1, *rng.integers(ends[0], len(whole), 12), len(whole) - 1]:
@@ -112,7 +114,7 @@ def test_a_line_cut_anywhere_is_a_shorter_history(armpi, evidence, suspicion, tm
         complete = int(np.sum(ends < cut))
         assert len(history.steps) == max(complete - 1, 0)
         done = len(history.steps)
-        _, steps = follow_all(history.tracker, evidence[done:], suspicion[done:])
+        _, steps = follow_all(history.tracker, evidence[done:], fault_probability[done:])
         append_history(history, steps)
         assert path.read_bytes() == whole
 
@@ -176,18 +178,20 @@ def test_a_run_that_says_nothing_is_kept_too(armpi, tmp_path):
         (lambda lines: ["\x00\xff", *lines[1:]], "line 1: is damaged"),
     ],
 )
-def test_damage_is_named(armpi, evidence, suspicion, tmp_path, spoil, told):
+def test_damage_is_named(armpi, evidence, fault_probability, tmp_path, spoil, told):
     path, start = tmp_path / "cal.history.jsonl", fresh(armpi)
-    lines = written(path, start, evidence, suspicion, [5]).decode().splitlines()
+    lines = written(path, start, evidence, fault_probability, [5]).decode().splitlines()
     path.write_text("".join(f"{line}\n" for line in spoil(lines)), encoding="latin-1")
     with pytest.raises(InputError, match=told):
         read_history(path, start)
 
 
 @pytest.mark.parametrize("what", ["settling", "doubt", "limits"])
-def test_a_history_of_another_calibration_is_refused(armpi, evidence, suspicion, tmp_path, what):
+def test_a_history_of_another_calibration_is_refused(
+    armpi, evidence, fault_probability, tmp_path, what
+):
     path, start = tmp_path / "cal.history.jsonl", fresh(armpi)
-    written(path, start, evidence, suspicion, [3])
+    written(path, start, evidence, fault_probability, [3])
     settling = replace(CALIBRATION.settling, bias=(0.0,) * 4)
     other = {
         "settling": fresh(armpi, replace(CALIBRATION, settling=settling)),
@@ -198,10 +202,10 @@ def test_a_history_of_another_calibration_is_refused(armpi, evidence, suspicion,
         read_history(path, other)
 
 
-def test_two_at_a_time_are_refused(armpi, evidence, suspicion, tmp_path):
+def test_two_at_a_time_are_refused(armpi, evidence, fault_probability, tmp_path):
     path, start = tmp_path / "cal.history.jsonl", fresh(armpi)
     late = read_history(path, start)
-    before = written(path, start, evidence, suspicion, [3])
+    before = written(path, start, evidence, fault_probability, [3])
     _, steps = follow_all(late.tracker, evidence[:2])
     with pytest.raises(OutputError, match="has changed since it was read"):
         append_history(late, steps)
@@ -209,10 +213,10 @@ def test_two_at_a_time_are_refused(armpi, evidence, suspicion, tmp_path):
 
 
 def test_a_full_disk_leaves_the_history_as_it_was(
-    armpi, evidence, suspicion, tmp_path, monkeypatch
+    armpi, evidence, fault_probability, tmp_path, monkeypatch
 ):
     path, start = tmp_path / "cal.history.jsonl", fresh(armpi)
-    before = written(path, start, evidence, suspicion, [3])
+    before = written(path, start, evidence, fault_probability, [3])
     history, write = read_history(path, start), os.write
 
     def some(descriptor, text):

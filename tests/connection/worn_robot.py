@@ -77,10 +77,12 @@ def evidence_of(robot, wear, seed=0, readings=False, calibration=CALIBRATION):
     return run_evidence(seen, robot, calibration.settling, range(len(wear)))
 
 
-def follow_all(tracker, evidence, suspicion=0.1):
+def follow_all(tracker, evidence, fault_probability=0.1):
     """Return the tracker after many runs, and all steps; one suspicion, or one for each run."""
     steps = []
-    for run, chance in zip(evidence, np.broadcast_to(suspicion, len(evidence)), strict=True):
+    for run, chance in zip(
+        evidence, np.broadcast_to(fault_probability, len(evidence)), strict=True
+    ):
         tracker, step = tracker.follow(run, float(chance))
         steps.append(step)
     return tracker, steps

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
-from failuretwin.inference.evidence import MOST_READINGS, moving_evidence, settled_evidence
+from failuretwin.inference.evidence import MOST_READINGS, settled_evidence, transient_samples
 
 STARTS = np.array([0.03, 2.05, 4.06])
 TARGETS = np.array([[0.5, -0.3], [-0.4, 0.2], [0.1, 0.6]])
@@ -55,7 +55,7 @@ def drawn_out(first, every=10, count=600):
 
 def readings(runs):
     settled = settled_evidence(runs)
-    return settled, moving_evidence(runs, settled)
+    return settled, transient_samples(runs, settled)
 
 
 @given(first=st.integers(0, 9))

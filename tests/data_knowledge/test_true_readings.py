@@ -11,7 +11,7 @@ from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.log_quality import log_quality
-from failuretwin.inference.readings import true_readings
+from failuretwin.inference.readings import measured_samples
 
 STARTS = np.array([0.03, 2.05, 4.06, 6.07])
 TARGETS = np.array([[0.5, -0.3], [-0.4, 0.2], [0.1, 0.6], [0.7, -0.5]])
@@ -81,7 +81,7 @@ GAPS = [(0.0, 0.0), (2.4, 4.9), (3.3, 5.0), (4.5, 6.3)]
 def test_readings_are_where_lines_meet(noise_m, gap, held):
     """The very readings come back, and no others; also where values are held at both ends."""
     at, point = readings(noise_m, gap=gap)
-    found = true_readings(run_set(drawn(grid(), at, point, held=held), 10.0))
+    found = measured_samples(run_set(drawn(grid(), at, point, held=held), 10.0))
     np.testing.assert_array_equal(np.flatnonzero(found.seen[0]), at)
     np.testing.assert_allclose(found.point[0, at], point, rtol=0, atol=1e-15)
     assert np.isnan(found.point[0, ~found.seen[0]]).all()
@@ -107,7 +107,7 @@ def test_single_precision_is_straight_enough():
     at, point = readings(0.001, gap=(2.4, 4.9))
     path = drawn(grid(), at, point).astype(np.float32)
     runs = run_set(path, 10.0, grid().astype(np.float32).astype(float))
-    found = true_readings(runs)
+    found = measured_samples(runs)
     np.testing.assert_array_equal(np.flatnonzero(found.seen[0]), at)
 
 
@@ -118,7 +118,7 @@ def test_readings_between_two_times_of_the_grid_count_once():
     point = turning(followed(at)) + np.random.default_rng(1).normal(0.0, 0.001, (len(at), 3))
     path = np.stack([np.interp(grid(), at, p) for p in point.T], axis=-1)
     path[(grid() < at[0]) | (grid() > at[-1])] = np.nan
-    found = true_readings(run_set(path, 10.0))
+    found = measured_samples(run_set(path, 10.0))
     seen = grid()[found.seen[0]]
     assert len(seen) == pytest.approx(len(at), abs=2)
     assert np.abs(seen[:, None] - at).min(axis=1).max() < STEP_S
@@ -131,12 +131,12 @@ def test_the_motion_itself_is_never_taken_for_lines(tool, rate_hz):
     where each time of a finer grid is read and only the rate is given too low."""
     time = grid(0.005)
     path, every = tool(followed(time)), 200 // rate_hz
-    own = true_readings(run_set(path[::every], rate_hz, time[::every]))
+    own = measured_samples(run_set(path[::every], rate_hz, time[::every]))
     assert own.seen.all()
     lone = np.full_like(path, np.nan)
     lone[::every] = path[::every]
-    assert true_readings(run_set(lone, rate_hz, time)).seen[0].sum() == len(time[::every])
-    dense = true_readings(run_set(path, rate_hz, time))
+    assert measured_samples(run_set(lone, rate_hz, time)).seen[0].sum() == len(time[::every])
+    dense = measured_samples(run_set(path, rate_hz, time))
     assert dense.seen.all()
     assert dense.filled.all() == (every > 1)
 
@@ -145,7 +145,7 @@ def test_a_steady_slide_that_is_drawn_out_counts_as_a_line():
     """Nothing tells it from a gap; where it sets out and where it stops there are readings."""
     at = np.arange(0, len(grid()), 10)
     point = sliding(followed(grid()[at]))
-    found = true_readings(run_set(drawn(grid(), at, point), 10.0))
+    found = measured_samples(run_set(drawn(grid(), at, point), 10.0))
     lost = np.setdiff1d(at, np.flatnonzero(found.seen[0]))
     assert 0 < len(lost) < 0.4 * len(at)
     since = grid()[lost][:, None] - STARTS
@@ -166,7 +166,7 @@ def test_a_value_held_while_motors_travel_is_no_rest(last, rests):
 def test_a_value_held_by_a_sensor_that_flickers_is_no_rest():
     """It never said the same twice before, so that the end is not its own."""
     at, point = readings(noise_m=0.001, last=7.0)
-    found = true_readings(run_set(drawn(grid(), at, point, held=True), 10.0))
+    found = measured_samples(run_set(drawn(grid(), at, point, held=True), 10.0))
     assert grid()[found.seen[0]].max() < 7.0
 
 
@@ -175,7 +175,7 @@ def test_paths_filled_otherwise_pass_as_they_are():
     at = np.arange(0, len(grid()), 10)
     angle = followed(grid()[at])
     filled = np.stack([np.interp(grid(), grid()[at], a) for a in angle.T], axis=-1)
-    found = true_readings(run_set(turning(filled), 10.0))
+    found = measured_samples(run_set(turning(filled), 10.0))
     assert found.filled.all()
     assert found.seen.all()
     assert np.isnan(settled_evidence(run_set(turning(filled), 10.0)).resumed).all()
@@ -184,7 +184,7 @@ def test_paths_filled_otherwise_pass_as_they_are():
 def test_without_a_lower_rate_every_sample_is_a_reading():
     at, point = readings(0.001, gap=(2.4, 4.9))
     path = drawn(grid(), at, point)
-    found = true_readings(run_set(path, 100.0))
+    found = measured_samples(run_set(path, 100.0))
     np.testing.assert_array_equal(found.seen[0], np.isfinite(path).all(axis=1))
 
 
@@ -198,7 +198,7 @@ def test_runs_are_judged_alone():
     paths = [drawn(grid(), at, point), lone, np.full_like(lone, np.nan)]
     runs = [run_set(path, 10.0).assign_coords(run=[str(i)]) for i, path in enumerate(paths)]
     before = paths[0].copy()
-    found = true_readings(xr.concat(runs, "run", data_vars="minimal"))
+    found = measured_samples(xr.concat(runs, "run", data_vars="minimal"))
     np.testing.assert_array_equal(found.seen[0], found.seen[1])
     assert not found.seen[2].any()
     np.testing.assert_array_equal(runs[0]["measured"].values[0], before)

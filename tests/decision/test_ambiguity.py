@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from coaxial_arm import ARM_M, coaxial_twin
 
-from failuretwin import BayesDiagnoser, ambiguity
+from failuretwin import BayesDiagnoser, isolability
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses, single_faults
 from failuretwin.core.movements import Movements
@@ -16,9 +16,12 @@ from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.nonidealities import Imperfections, Readings
 from failuretwin.digital_model.settling import Settling
 from failuretwin.failure_behavior.modes import MODES, SteadyStateError
-from failuretwin.inference.expected_bayes_factors import Judge, shrink
+from failuretwin.inference.expected_bayes_factors import (
+    ExpectedLogBayesFactor,
+    expected_distance_factor,
+)
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.isolability import Trials, _groups, _motions
+from failuretwin.inference.isolability import MonteCarloFaults, _groups, _motions
 from failuretwin.inference.priors import Priors
 
 TIME = 0.01 * np.arange(1000)
@@ -71,14 +74,14 @@ def coaxial(tmp_path_factory):
 def test_a_motor_that_is_never_told_to_move_may_be_stuck(twin):
     idle = TARGETS.copy()
     idle[:, 0] = 0.0
-    found = ambiguity(twin, motion(idle), TIME, scattered([0.005] * 4))
+    found = isolability(twin, motion(idle), TIME, scattered([0.005] * 4))
     assert told(found, "motor_1:stuck", "healthy") == pytest.approx(0.0, abs=0.05)
     assert found.groups == (("healthy", "motor_1:stuck"),)
     assert min(told(found, f"motor_{k}:stuck", "healthy") for k in (2, 3, 4)) > 40.0
 
 
 def test_a_motor_that_moves_is_not_taken_for_stuck(twin):
-    found = ambiguity(twin, motion(TARGETS), TIME, scattered([0.005] * 4))
+    found = isolability(twin, motion(TARGETS), TIME, scattered([0.005] * 4))
     assert found.groups == ()
 
 
@@ -87,10 +90,10 @@ def test_play_of_motors_about_one_axis_shows_whose_it_is_only_if_they_turn_apart
     there = np.array([0.5, -0.3, 0.4, -0.6, 0.1])
     crossing = np.array([0.5, 0.8, -0.4, 0.3, 0.6])
     scatter = scattered([0.003, 0.003])
-    together = ambiguity(
+    together = isolability(
         coaxial, motion(np.stack([there, there], 1)), TIME, scatter, faults(*names)
     )
-    apart = ambiguity(
+    apart = isolability(
         coaxial, motion(np.stack([there, crossing], 1)), TIME, scatter, faults(*names)
     )
 
@@ -105,7 +108,7 @@ def test_play_of_motors_about_one_axis_shows_whose_it_is_only_if_they_turn_apart
 def test_a_shifted_zero_about_one_axis_never_shows_whose_it_is(coaxial):
     names = ("motor_1:encoder_bias", "motor_2:encoder_bias")
     targets = np.random.default_rng(0).uniform(-1, 1, (5, 2))
-    found = ambiguity(coaxial, motion(targets), TIME, scattered([0.003, 0.003]), faults(*names))
+    found = isolability(coaxial, motion(targets), TIME, scattered([0.003, 0.003]), faults(*names))
     assert found.groups == (names,)
 
 
@@ -120,7 +123,7 @@ def expected_smallest(scatter, movements):
 )
 def test_the_smallest_size_is_where_half_the_squared_distance_says(coaxial, scatter, onset, spoilt):
     targets = np.random.default_rng(0).uniform(-1, 1, (5, 2))
-    found = ambiguity(
+    found = isolability(
         coaxial,
         motion(targets),
         TIME,
@@ -139,7 +142,7 @@ def test_sizes_may_begin_at_nothing(coaxial):
     said = {}
     for low in (0.0, 0.001, 0.01):
         priors = Priors(error_ranges=((low, 0.4),))
-        found = ambiguity(
+        found = isolability(
             coaxial, motion(targets), TIME, scattered([0.02] * 2), faults(name), priors
         )
         said[low] = found.detected[name]
@@ -151,14 +154,16 @@ def test_sizes_may_begin_at_nothing(coaxial):
 def test_separation_grows_with_the_square_of_the_size(twin):
     """Compare with half of the squared distance, linearised at the healthy poses."""
     bias, scatter = Hypothesis.parse("motor_3:encoder_bias"), 0.03
-    judge = Judge(HealthyModel(twin, scattered([scatter] * 4)), (HEALTHY, bias), Priors())
-    trials = Trials(judge, _motions(twin, motion(TARGETS), TIME), 0.0)
+    compute_posterior = ExpectedLogBayesFactor(
+        HealthyModel(twin, scattered([scatter] * 4)), (HEALTHY, bias), Priors()
+    )
+    trials = MonteCarloFaults(compute_posterior, _motions(twin, motion(TARGETS), TIME), 0.0)
     sizes = np.array([0.02, 0.03, 0.04])
     _, jacobian = twin.path_and_jacobian(TARGETS)
     lever = jacobian[..., 2]
     spread = scatter**2 * jacobian @ jacobian.swapaxes(-1, -2) + NOISE_M**2 * np.eye(3)
     square = np.einsum("ma,ma->", lever, np.linalg.solve(spread, lever[..., None])[..., 0])
-    ahead = trials.ahead([(bias, float(size)) for size in sizes])[:, 0]
+    ahead = trials.log_bayes_factor([(bias, float(size)) for size in sizes])[:, 0]
     np.testing.assert_allclose(ahead, 0.5 * square * sizes**2, rtol=0.08)
     assert ahead[2] / ahead[0] == pytest.approx(4.0, rel=0.05)
 
@@ -175,9 +180,9 @@ def test_expected_falls_are_those_of_simulated_scatter(square):
     shift = np.array([np.sqrt(square), 0.0, 0.0])
     # Both signs: what is odd in the shift cancels.
     drawn = 0.5 * np.mean(cost(noise + shift) + cost(noise - shift)) - np.mean(cost(noise))
-    formula = 0.5 * (dof + 3.0) * np.log1p(square * shrink(dof) / dof)
+    formula = 0.5 * (dof + 3.0) * np.log1p(square * expected_distance_factor(dof) / dof)
     assert formula == pytest.approx(drawn, rel=0.04, abs=min(0.5, 0.05 * square))
-    assert shrink(np.inf) == 1.0
+    assert expected_distance_factor(np.inf) == 1.0
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +196,7 @@ def real_motions(armpi, measured_armpi):
 def test_faults_above_the_smallest_size_are_found_and_those_well_below_are_not(
     twin, armpi, measured_armpi, real_motions
 ):
-    smallest = ambiguity(twin, *real_motions, measured_armpi).isolated
+    smallest = isolability(twin, *real_motions, measured_armpi).isolated
     diagnoser = BayesDiagnoser(twin, measured_armpi)
     right = {}
     for factor in (0.4, 2.0):
@@ -208,7 +213,7 @@ def test_faults_above_the_smallest_size_are_found_and_those_well_below_are_not(
 
 
 def test_stuck_motors_of_real_motions_are_told_apart(twin, armpi, measured_armpi, real_motions):
-    found = ambiguity(twin, *real_motions, measured_armpi)
+    found = isolability(twin, *real_motions, measured_armpi)
     assert found.hypotheses == tuple(map(str, paper_hypotheses(armpi.motor_names)))
     assert found.groups == ()
     for by_fault in (found.detected, found.isolated, found.typical, found.largest):
@@ -223,8 +228,8 @@ def test_stuck_motors_of_real_motions_are_told_apart(twin, armpi, measured_armpi
 
 def test_a_late_motor_is_told_by_its_way_where_the_timing_is_known(twin, measured_armpi):
     hypotheses = single_faults(["motor_2"], ["lag", "slow"])
-    known = ambiguity(twin, motion(TARGETS), TIME, measured_armpi, hypotheses)
-    unknown = ambiguity(twin, motion(TARGETS), TIME, scattered([0.006] * 4), hypotheses)
+    known = isolability(twin, motion(TARGETS), TIME, measured_armpi, hypotheses)
+    unknown = isolability(twin, motion(TARGETS), TIME, scattered([0.006] * 4), hypotheses)
     assert known.groups == ()
     assert ("healthy", "motor_2:lag") in [group[:2] for group in unknown.groups]
 
@@ -234,10 +239,10 @@ def test_losses_that_chance_may_bring_hide_a_fault_of_one_movement(twin, measure
     late = {"hypotheses": faults(*names), "onset_s": 7.9}
     sound = dataclasses.replace(measured_armpi, lost_commands=())
     assert (
-        told(ambiguity(twin, motion(TARGETS), TIME, measured_armpi, **late), names[0], "healthy")
+        told(isolability(twin, motion(TARGETS), TIME, measured_armpi, **late), names[0], "healthy")
         < 4.0
     )
-    assert told(ambiguity(twin, motion(TARGETS), TIME, sound, **late), names[0], "healthy") > 10.0
+    assert told(isolability(twin, motion(TARGETS), TIME, sound, **late), names[0], "healthy") > 10.0
 
 
 def test_groups_hold_all_that_are_alike_and_none_that_are_not():
@@ -253,30 +258,30 @@ def test_groups_hold_all_that_are_alike_and_none_that_are_not():
 
 def test_wrong_requests_are_refused(twin):
     with pytest.raises(InputError, match=r"shape \(1000, 3\), expected \(..., 1000 times, 4 motor"):
-        ambiguity(twin, motion(TARGETS)[:, :3], TIME)
+        isolability(twin, motion(TARGETS)[:, :3], TIME)
     with pytest.raises(InputError, match="never leaves its first value"):
-        ambiguity(twin, np.zeros((1000, 4)), TIME)
+        isolability(twin, np.zeros((1000, 4)), TIME)
     two = [Hypothesis.parse("motor_1:stuck+motor_2:stuck")]
     with pytest.raises(InputError, match="Expected healthy or one fault"):
-        ambiguity(twin, motion(TARGETS), TIME, hypotheses=two)
+        isolability(twin, motion(TARGETS), TIME, hypotheses=two)
 
 
 def test_hypotheses_may_be_given_as_text(twin):
     texts = ["motor_1:stuck", "motor_2:stuck"]
-    found = ambiguity(twin, motion(TARGETS), TIME, hypotheses=texts)
+    found = isolability(twin, motion(TARGETS), TIME, hypotheses=texts)
     assert found.hypotheses == ("healthy", *texts)
     with pytest.raises(InputError, match="unknown motor 'motor_9'"):
-        ambiguity(twin, motion(TARGETS), TIME, hypotheses=["motor_9:stuck"])
+        isolability(twin, motion(TARGETS), TIME, hypotheses=["motor_9:stuck"])
 
 
 @pytest.mark.parametrize("onset_s", [-1.0, 10.0, 50.0, np.nan])
 def test_an_onset_outside_the_motion_is_refused(twin, onset_s):
     with pytest.raises(InputError, match=rf"`onset_s` is {onset_s:g} s, expected .* to 9.99 s"):
-        ambiguity(twin, motion(TARGETS), TIME, onset_s=onset_s)
+        isolability(twin, motion(TARGETS), TIME, onset_s=onset_s)
 
 
 def test_the_page_prints_what_it_says(capsys):
-    page = (Path(__file__).parents[2] / "docs" / "ambiguity.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "isolability.md").read_text()
     code, said = re.findall(r"```(?:python)?\n(.*?)```", page, re.DOTALL)
     exec(code, {})
     printed, expected = capsys.readouterr().out.split(), said.split()

@@ -16,7 +16,7 @@ from failuretwin.inference import fault_models as steady_state_error
 from failuretwin.inference import stuck
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.priors import Priors, priors_of
-from failuretwin.inference.run_likelihood import Scene
+from failuretwin.inference.run_likelihood import RunLikelihood
 
 PAPER = [str(h) for h in paper_hypotheses([f"motor_{k}" for k in range(1, 5)])]
 COUNT = np.deg2rad(0.24)
@@ -167,9 +167,9 @@ def test_without_evidence_nothing_is_learnt(twin, blind):
 @pytest.mark.parametrize("motor", range(4))
 def test_density_of_the_held_angle_has_area_one(twin, blind, motor, onset_s):
     """Where no movement says anything, integrating the prior of angle and onset gives one."""
-    scene = Scene(settled_evidence(blind), BayesDiagnoser(twin).healthy_model)
+    likelihood = RunLikelihood(settled_evidence(blind), BayesDiagnoser(twin).healthy_model)
     prior = priors_of(twin.robot, None, onset_s).onset
-    mass = np.exp(stuck.stuck_law(scene, motor, prior).log_prior).sum(axis=(1, 2))
+    mass = np.exp(stuck.stuck_model(likelihood, motor, prior).log_prior).sum(axis=(1, 2))
     np.testing.assert_allclose(mass, 1.0, rtol=0, atol=1e-9)
 
 
@@ -284,9 +284,9 @@ def test_hypothesis_that_cannot_be_weighed_is_refused(twin, hypothesis, message)
 def test_hypotheses_may_be_given_as_text(twin, few):
     texts = ["healthy", "motor_3:stuck", "motor_1:stuck+motor_2:drift"]
     told = BayesDiagnoser(twin, hypotheses=texts)
-    assert told.considered == tuple(Hypothesis.parse(text) for text in texts)
+    assert told.hypothesis_set == tuple(Hypothesis.parse(text) for text in texts)
     first = told.diagnose(few.isel(run=[0]))
-    assert first == BayesDiagnoser(twin, hypotheses=told.considered).diagnose(few.isel(run=[0]))
+    assert first == BayesDiagnoser(twin, hypotheses=told.hypothesis_set).diagnose(few.isel(run=[0]))
 
 
 @pytest.mark.parametrize(

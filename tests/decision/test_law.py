@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 
-from failuretwin.inference.marginal import given_others, posterior_of
+from failuretwin.inference.marginal import change_point_posterior, leave_one_out
 
 
 def problem(seed, movements, cells, ways):
@@ -23,7 +23,7 @@ def problem(seed, movements, cells, ways):
         return healthy, density, np.log(prior), way
 
 
-def joint_of(healthy, density, prior, left_out=()):
+def joint_of(healthy, density, prior, unlisted=()):
     """Return the log joint density of all movements but some, case by case, (first, cell)."""
     movements, cells = density.shape[1:]
     joint = np.full((movements, cells), -np.inf)
@@ -32,7 +32,7 @@ def joint_of(healthy, density, prior, left_out=()):
             terms = [
                 density[0, m, cell] if m >= first else healthy[0, m]
                 for m in range(movements)
-                if m not in left_out
+                if m not in unlisted
             ]
             joint[first, cell] = sum(terms) + prior[0, first, cell]
     return joint
@@ -47,15 +47,17 @@ def joint_of(healthy, density, prior, left_out=()):
 def test_posterior_is_that_of_enumeration(seed, movements, cells, same_way):
     ways = 1 if same_way else cells
     healthy, density, prior, (way, way_with) = problem(seed, movements, cells, ways)
-    found = posterior_of(healthy, density, prior, (way, way_with))
+    found = change_point_posterior(healthy, density, prior, (way, way_with))
     whole, whole_with = healthy + way, density + way_with
     joint = joint_of(whole, whole_with, prior)
     total = logsumexp(joint)
     assert found.log_evidence[0] == pytest.approx(total, abs=1e-9)
-    np.testing.assert_allclose(np.exp(found.log_share[0]), np.exp(joint - total), atol=1e-12)
+    np.testing.assert_allclose(
+        np.exp(found.log_responsibility[0]), np.exp(joint - total), atol=1e-12
+    )
     for m in range(movements):
-        others = logsumexp(joint_of(whole, whole_with, prior, left_out=(m,)))
-        alone = given_others(whole[0], whole_with[0], found.log_share[0])[m]
+        others = logsumexp(joint_of(whole, whole_with, prior, unlisted=(m,)))
+        alone = leave_one_out(whole[0], whole_with[0], found.log_responsibility[0])[m]
         assert alone == pytest.approx(total - others, abs=1e-6)
 
 
@@ -63,23 +65,23 @@ def test_posterior_is_that_of_enumeration(seed, movements, cells, same_way):
 def test_settled_part_is_judged_in_the_light_of_all_evidence(seed, movements, cells):
     """One over the posterior mean of one over the density, case by case."""
     healthy, density, prior, way = problem(seed, movements, cells, 1)
-    found = posterior_of(healthy, density, prior, way)
-    share = np.exp(found.log_share[0])
+    found = change_point_posterior(healthy, density, prior, way)
+    share = np.exp(found.log_responsibility[0])
     for m in range(movements):
         inverse = sum(
             share[first, cell] / np.exp(density[0, m, cell] if m >= first else healthy[0, m])
             for first in range(movements)
             for cell in range(cells)
         )
-        settled = given_others(healthy[0], density[0], found.log_share[0])[m]
+        settled = leave_one_out(healthy[0], density[0], found.log_responsibility[0])[m]
         assert settled == pytest.approx(-np.log(inverse), abs=1e-6)
 
 
 def test_without_evidence_the_prior_stands():
     healthy, density, prior, _ = problem(0, 4, 3, 1)
     none = np.zeros((1, 4)), np.zeros((1, 4, 1))
-    found = posterior_of(0.0 * healthy, 0.0 * density, prior, none)
+    found = change_point_posterior(0.0 * healthy, 0.0 * density, prior, none)
     assert found.log_evidence[0] == pytest.approx(0.0, abs=1e-12)
-    np.testing.assert_allclose(np.exp(found.log_share), np.exp(prior), atol=1e-12)
-    alone = given_others(np.zeros(4), np.zeros((4, 1)), found.log_share[0])
+    np.testing.assert_allclose(np.exp(found.log_responsibility), np.exp(prior), atol=1e-12)
+    alone = leave_one_out(np.zeros(4), np.zeros((4, 1)), found.log_responsibility[0])
     np.testing.assert_allclose(alone, 0.0, atol=1e-9)

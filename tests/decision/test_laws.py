@@ -12,32 +12,41 @@ from failuretwin.inference import double_faults as pairs
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.fault_models import (
     AMOUNTS,
-    drift_law,
-    error_law,
-    lag_law,
-    lasting_law,
+    constant_fault_model,
+    drift_model,
+    lag_model,
     offset_nodes,
     size_nodes,
-    slow_law,
+    slow_model,
+    steady_state_error_model,
 )
 from failuretwin.inference.onset import OnsetPrior
-from failuretwin.inference.posterior import WEIGHABLE, weigh_all, weigh_hypothesis
+from failuretwin.inference.posterior import (
+    DIAGNOSABLE_MODES,
+    marginal_likelihood_of,
+    marginal_likelihoods,
+)
 from failuretwin.inference.priors import Priors
-from failuretwin.inference.run_likelihood import Scene
-from failuretwin.inference.stuck import stuck_law
+from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.stuck import stuck_model
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 RANGES = ((0.02, 0.08), (0.04, 0.2))
 
-LAWS = {
-    "stuck": lambda scene, early: stuck_law(scene, 1, OnsetPrior(early)),
-    "stuck at a known time": lambda scene, early: stuck_law(scene, 1, OnsetPrior(known_s=2.3)),
-    "steady_state_error": lambda scene, early: error_law(scene, 1, RANGES, early),
-    "drift": lambda scene, early: drift_law(scene, 1, early),
-    "lag": lambda scene, early: lag_law(scene, 1, early),
-    "slow": lambda scene, early: slow_law(scene, 1, early),
+FAULT_MODELS = {
+    "stuck": lambda likelihood, early: stuck_model(likelihood, 1, OnsetPrior(early)),
+    "stuck at a known time": lambda likelihood, early: stuck_model(
+        likelihood, 1, OnsetPrior(known_s=2.3)
+    ),
+    "steady_state_error": lambda likelihood, early: steady_state_error_model(
+        likelihood, 1, RANGES, early
+    ),
+    "drift": lambda likelihood, early: drift_model(likelihood, 1, early),
+    "lag": lambda likelihood, early: lag_model(likelihood, 1, early),
+    "slow": lambda likelihood, early: slow_model(likelihood, 1, early),
     **{
-        mode: lambda scene, early, mode=mode: lasting_law(scene, 1, mode, early) for mode in AMOUNTS
+        mode: lambda likelihood, early, mode=mode: constant_fault_model(likelihood, 1, mode, early)
+        for mode in AMOUNTS
     },
 }
 
@@ -53,44 +62,44 @@ def runs(imperfect):
 
 
 @pytest.fixture(scope="module")
-def scene(twin, runs):
-    return Scene(settled_evidence(runs), BayesDiagnoser(twin).healthy_model)
+def likelihood(twin, runs):
+    return RunLikelihood(settled_evidence(runs), BayesDiagnoser(twin).healthy_model)
 
 
 @pytest.fixture(scope="module")
 def blind(twin, runs):
-    return Scene(settled_evidence(runs.assign(measured=np.nan * runs["measured"])),
+    return RunLikelihood(settled_evidence(runs.assign(measured=np.nan * runs["measured"])),
                  BayesDiagnoser(twin).healthy_model)  # fmt: skip
 
 
 @pytest.mark.parametrize("early", [0.0, 0.3, 1.0])
-@pytest.mark.parametrize("law", LAWS)
-def test_prior_mass_of_a_law_is_one(scene, law, early):
+@pytest.mark.parametrize("law", FAULT_MODELS)
+def test_prior_mass_of_a_law_is_one(likelihood, fault_model, early):
     """Over all onsets and nodes, or groups of nodes, and within each group."""
-    found = LAWS[law](scene, early)
+    found = FAULT_MODELS[fault_model](likelihood, early)
     mass = np.exp(found.log_prior).sum(axis=(1, 2))
     np.testing.assert_allclose(mass, 1.0, atol=1e-9)
     if found.redrawn is not None:
         np.testing.assert_allclose(np.exp(found.redrawn).sum(axis=1), 1.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("law", LAWS)
-def test_no_fault_begins_with_a_movement_that_is_not_there(scene, law):
-    found = LAWS[law](scene, 0.3)
+@pytest.mark.parametrize("law", FAULT_MODELS)
+def test_no_fault_begins_with_a_movement_that_is_not_there(likelihood, fault_model):
+    found = FAULT_MODELS[fault_model](likelihood, 0.3)
     mass = np.exp(found.log_prior).sum(axis=2)
-    assert (scene.evidence.movements.exists.sum(axis=1) < 5).any()
-    np.testing.assert_array_equal(mass[~scene.evidence.movements.exists], 0.0)
+    assert (likelihood.evidence.movements.exists.sum(axis=1) < 5).any()
+    np.testing.assert_array_equal(mass[~likelihood.evidence.movements.exists], 0.0)
 
 
-@pytest.mark.parametrize("law", LAWS)
-def test_onsets_lie_in_the_run(scene, law):
+@pytest.mark.parametrize("law", FAULT_MODELS)
+def test_onsets_lie_in_the_run(likelihood, fault_model):
     """No later than the end of the last movement; of a stuck motor, of its ramp if that is late."""
-    found, evidence = LAWS[law](scene, 0.3), scene.evidence
+    found, evidence = FAULT_MODELS[fault_model](likelihood, 0.3), likelihood.evidence
     for run in range(9):
         onset, share = np.broadcast_arrays(*found.onsets(run))
         assert (share >= 0.0).all()
         assert np.isfinite(onset).all()
-        late = 3.0 if "stuck" in law else 0.0
+        late = 3.0 if "stuck" in fault_model else 0.0
         last = max(np.nanmax(evidence.end[run]), np.nanmax(evidence.movements.start[run]) + late)
         prior = np.exp(found.log_prior[run]).sum(axis=1) > 0.0
         possible = np.broadcast_to(prior[:, None, None] if len(onset) > 1 else True, onset.shape)
@@ -100,7 +109,7 @@ def test_onsets_lie_in_the_run(scene, law):
 
 @pytest.mark.parametrize(
     "hypothesis",
-    [*single_faults(MOTORS[1:2], WEIGHABLE), UNKNOWN,
+    [*single_faults(MOTORS[1:2], DIAGNOSABLE_MODES), UNKNOWN,
      Hypothesis.parse("motor_2:encoder_bias+motor_3:stuck"),
      Hypothesis.parse("motor_1:drift+motor_4:steady_state_error")],
     ids=str,
@@ -109,9 +118,9 @@ def test_without_evidence_every_hypothesis_is_as_good(blind, hypothesis):
     """The density of no reading at all is one, whatever may be wrong."""
     if hypothesis == UNKNOWN:
         known = Hypothesis.parse("motor_2:stuck")
-        evidence = weigh_all(blind, (known, UNKNOWN), Priors())[1].log_evidence
+        evidence = marginal_likelihoods(blind, (known, UNKNOWN), Priors())[1].log_evidence
     else:
-        evidence = weigh_hypothesis(blind, hypothesis, Priors()).log_evidence
+        evidence = marginal_likelihood_of(blind, hypothesis, Priors()).log_evidence
     np.testing.assert_allclose(evidence, 0.0, atol=1e-6)
 
 
@@ -153,11 +162,11 @@ def test_errors_are_as_likely_within_each_range(ranges):
         assert weight[inside].sum() == pytest.approx(1.0)
 
 
-def test_drifts_of_all_rates_and_both_signs_are_as_likely(scene):
-    law = drift_law(scene, 0, 0.6)
-    mass = np.exp(law.log_prior[0]).sum(axis=0)
+def test_drifts_of_all_rates_and_both_signs_are_as_likely(likelihood):
+    fault_model = drift_model(likelihood, 0, 0.6)
+    mass = np.exp(fault_model.log_prior[0]).sum(axis=0)
     low, high = magnitude_range("drift")
-    size = law.size[0]
+    size = fault_model.size[0]
     assert np.abs(size).min() == pytest.approx(low)
     assert np.abs(size).max() == pytest.approx(high)
     assert mass @ size == pytest.approx(0.0, abs=1e-12)
@@ -165,11 +174,11 @@ def test_drifts_of_all_rates_and_both_signs_are_as_likely(scene):
 
 
 @pytest.mark.parametrize("mode", ["stuck", "encoder_bias", "drift"])
-def test_thinning_a_law_for_pairs_loses_no_mass(scene, monkeypatch, mode):
+def test_thinning_a_law_for_pairs_loses_no_mass(likelihood, monkeypatch, mode):
     monkeypatch.setattr(pairs, "MOST_NODES", 48)
-    alone = scene[3]
-    law = LAWS[mode](alone, 0.3)
-    few = pairs._thinned(alone, law)
-    assert few.log_prior.shape[2] == pairs.MOST_NODES < law.log_prior.shape[2]
-    whole, kept = (np.exp(x.log_prior[0]).sum(axis=1) for x in (law, few))
+    alone = likelihood[3]
+    fault_model = FAULT_MODELS[mode](alone, 0.3)
+    few = pairs._thinned(alone, fault_model)
+    assert few.log_prior.shape[2] == pairs.MOST_NODES < fault_model.log_prior.shape[2]
+    whole, kept = (np.exp(x.log_prior[0]).sum(axis=1) for x in (fault_model, few))
     np.testing.assert_allclose(kept, whole, atol=1e-12)

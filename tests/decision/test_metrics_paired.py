@@ -30,10 +30,12 @@ def test_bootstrap_interval_is_that_of_scipy():
     rng = np.random.default_rng(0)
     first, second = rng.exponential(size=90), rng.exponential(size=90)
     ours = log_score_gain(first, second, np.random.default_rng(1))
-    judge = bootstrap(
+    compute_posterior = bootstrap(
         (first - second,), np.mean, n_resamples=10_000, method="percentile", rng=rng
     ).confidence_interval
-    np.testing.assert_allclose(ours.interval, (judge.low, judge.high), atol=0.01)
+    np.testing.assert_allclose(
+        ours.interval, (compute_posterior.low, compute_posterior.high), atol=0.01
+    )
     assert ours.mean == ours.finite_mean == pytest.approx(np.mean(first) - np.mean(second))
     assert ours.runs == 90
 

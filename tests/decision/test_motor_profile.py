@@ -9,7 +9,7 @@ from failuretwin.digital_model.settling import Settling
 from failuretwin.inference.command_loss import OUTLIER_RATE
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.healthy_model import PATH_NOISE_M, HealthyModel
-from failuretwin.inference.run_likelihood import Scene
+from failuretwin.inference.run_likelihood import RunLikelihood
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 SCATTER = np.array([0.005, 0.006, 0.005, 0.004])
@@ -37,7 +37,7 @@ def scene_of(twin, run_of):
         targets = rng.uniform(-0.8, 0.8, (2, 4))
         points = twin.path(targets + off + 0.003 * rng.normal(size=(2, 4)))
         runs = run_of(targets, points, MOTORS)
-        return Scene(settled_evidence(runs), HealthyModel(twin, IMPERFECT))
+        return RunLikelihood(settled_evidence(runs), HealthyModel(twin, IMPERFECT))
 
     return make
 
@@ -45,13 +45,13 @@ def scene_of(twin, run_of):
 class BruteForce:
     """The density of a settled position over the angle of one motor, by scipy."""
 
-    def __init__(self, scene, movement, motor):
-        self.twin, self.model, self.motor = scene.model.twin, scene.model, motor
-        self.point = scene.evidence.point[0, movement]
-        alternatives = scene.alternatives
-        self.base = alternatives.base[0, movement]
-        self.direction = alternatives.direction[0, movement]
-        self.weight = np.exp(alternatives.log_weight[0, movement])
+    def __init__(self, likelihood, movement, motor):
+        self.twin, self.model, self.motor = likelihood.model.twin, likelihood.model, motor
+        self.point = likelihood.evidence.point[0, movement]
+        outcomes = likelihood.outcomes
+        self.base = outcomes.base[0, movement]
+        self.direction = outcomes.direction[0, movement]
+        self.weight = np.exp(outcomes.log_weight[0, movement])
 
     def pose(self, angle, alternative):
         """Where the arm settles if the motor ends at `angle`: gravity and friction on the rest."""
@@ -91,11 +91,11 @@ class BruteForce:
 @pytest.mark.parametrize("motor", range(4))
 def test_best_angle_is_where_the_squared_distance_is_least(scene_of, motor, off):
     """Found by bounded minimisation around it, within a fifth of its own deviation."""
-    scene = scene_of(motor, off * np.eye(4)[motor])
-    profile = scene.profile(motor)
+    likelihood = scene_of(motor, off * np.eye(4)[motor])
+    profile = likelihood.profile(motor)
     for movement in range(2):
-        force = BruteForce(scene, movement, motor)
-        best, precision = (x[0, movement, 0] for x in (profile.best, profile.precision))
+        force = BruteForce(likelihood, movement, motor)
+        best, precision = (x[0, movement, 0] for x in (profile.mode, profile.precision))
         width = 1.0 / np.sqrt(precision)
         found = optimize.minimize_scalar(
             force.square,
@@ -104,7 +104,7 @@ def test_best_angle_is_where_the_squared_distance_is_least(scene_of, motor, off)
             options={"xatol": 0.02 * width},
         )
         assert found.x == pytest.approx(best, abs=0.2 * width)
-        assert found.fun == pytest.approx(profile.square[0, movement, 0], abs=0.02, rel=0.02)
+        assert found.fun == pytest.approx(profile.min_distance2[0, movement, 0], abs=0.02, rel=0.02)
 
 
 @pytest.mark.parametrize("held", [True, False])
@@ -115,11 +115,11 @@ def test_densities_are_those_of_brute_force(scene_of, motor, off, held):
 
     A parabola stands for a circle: the further away, the larger the error [nats for each rad].
     """
-    scene = scene_of(10 + motor, off * np.eye(4)[motor])
-    profile = scene.profile(motor)
+    likelihood = scene_of(10 + motor, off * np.eye(4)[motor])
+    profile = likelihood.profile(motor)
     for movement in range(2):
-        force = BruteForce(scene, movement, motor)
-        best, precision = (x[0, movement, 0] for x in (profile.best, profile.precision))
+        force = BruteForce(likelihood, movement, motor)
+        best, precision = (x[0, movement, 0] for x in (profile.mode, profile.precision))
         width = np.sqrt(1.0 / precision + (0.0 if held else SCATTER[motor] ** 2))
         steps = width * np.array([-3.0, -1.0, 0.0, 0.5, 2.0])
         angles = np.broadcast_to(best + steps[:, None], (1, 2, 5, 1))
@@ -131,15 +131,15 @@ def test_densities_are_those_of_brute_force(scene_of, motor, off, held):
 @pytest.mark.parametrize("motor", range(4))
 def test_a_healthy_motor_is_the_healthy_robot(scene_of, motor):
     """A motor that settles where healthy ones do, scatter and all, is no fault."""
-    scene = scene_of(5, np.zeros(4))
-    profile = scene.profile(motor)
+    likelihood = scene_of(5, np.zeros(4))
+    profile = likelihood.profile(motor)
     found = profile.log_density(profile.expected[:, :, None], False)[..., 0]
-    np.testing.assert_allclose(found, scene.log_healthy, rtol=0, atol=0.05)
+    np.testing.assert_allclose(found, likelihood.log_healthy, rtol=0, atol=0.05)
 
 
 def test_far_angles_are_left_to_the_outliers(scene_of):
-    scene = scene_of(1, np.zeros(4))
-    profile = scene.profile(0)
-    far = np.broadcast_to(profile.best[:, :, None] + 2.0, (1, 2, 1, profile.best.shape[-1]))
+    likelihood = scene_of(1, np.zeros(4))
+    profile = likelihood.profile(0)
+    far = np.broadcast_to(profile.mode[:, :, None] + 2.0, (1, 2, 1, profile.mode.shape[-1]))
     np.testing.assert_allclose(profile.log_density(far, True), np.log(ANYWHERE), atol=0.2)
     assert np.exp(profile.outlier) == pytest.approx(ANYWHERE, rel=1e-6)

@@ -14,10 +14,10 @@ from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfecti
 from failuretwin.digital_model.settling import Settling
 from failuretwin.inference.evidence import SettledEvidence, settled_evidence
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.run_likelihood import Scene
-from failuretwin.inference.two_joint_likelihood import two_angles
-from failuretwin.inference.unknown import weigh_off_anyhow
-from failuretwin.inference.unmodelled_offsets import Belief
+from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.two_joint_likelihood import two_joint_likelihood
+from failuretwin.inference.unknown import unmodelled_offsets_likelihood
+from failuretwin.inference.unmodelled_offsets import GaussianBelief
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 SCATTER = np.array([0.005, 0.006, 0.005, 0.004])
@@ -36,22 +36,22 @@ def scene_of(twin, run_of):
     def make(seed, off, count=1):
         targets = np.random.default_rng(seed).uniform(-0.6, 0.6, (count, 4))
         runs = run_of(targets, twin.path(targets + off), MOTORS)
-        return Scene(settled_evidence(runs), HealthyModel(twin, PLAIN))
+        return RunLikelihood(settled_evidence(runs), HealthyModel(twin, PLAIN))
 
     return make
 
 
-def found_angles(scene, pair):
-    return two_angles(scene.evidence, scene.model, scene.alternatives, pair)
+def found_angles(likelihood, pair):
+    return two_joint_likelihood(likelihood.evidence, likelihood.model, likelihood.outcomes, pair)
 
 
 @pytest.mark.parametrize("pair", PAIRS)
 def test_two_motors_are_found_where_they_stand(scene_of, pair):
     off = np.zeros(4)
     off[list(pair)] = 0.5, -0.4
-    scene = scene_of(2, off)
-    truth = scene.evidence.movements.target[0, 0] + off
-    found = found_angles(scene, pair)
+    likelihood = scene_of(2, off)
+    truth = likelihood.evidence.movements.target[0, 0] + off
+    found = found_angles(likelihood, pair)
     ways = np.isfinite(found.log_weight[0, 0])
     error = found.angle[0, 0, ways] - truth[list(pair)]
     deviation = np.sqrt(found.covariance[0, 0, ways, :2])
@@ -64,19 +64,21 @@ def test_any_two_angles_are_as_probable_as_quadrature_says(scene_of, twin, pair)
     off = np.zeros(4)
     off[list(pair)] = 0.3, 0.35
     off[[k for k in range(4) if k not in pair]] = 0.006, -0.005
-    scene = scene_of(POSE[pair], off)
-    found = found_angles(scene, pair)
+    likelihood = scene_of(POSE[pair], off)
+    found = found_angles(likelihood, pair)
     told = np.exp(found.log_weight[0, 0]).sum()
     others = SCATTER.copy()
     others[list(pair)] = 0.0
 
     def density(angle):
-        pose = np.broadcast_to(scene.evidence.movements.target[0, 0], (*angle.shape[:-1], 4)).copy()
+        pose = np.broadcast_to(
+            likelihood.evidence.movements.target[0, 0], (*angle.shape[:-1], 4)
+        ).copy()
         pose[..., list(pair)] = angle
         place, jacobian = twin.path_and_jacobian(pose)
         root = jacobian * others
-        spread = root @ np.swapaxes(root, -1, -2) + scene.model.path_noise**2 * np.eye(3)
-        error = scene.evidence.point[0, 0] - place
+        spread = root @ np.swapaxes(root, -1, -2) + likelihood.model.path_noise**2 * np.eye(3)
+        error = likelihood.evidence.point[0, 0] - place
         square = np.einsum("...i,...i", error, np.linalg.solve(spread, error[..., None])[..., 0])
         norm = stats.multivariate_t.pdf(np.zeros(3), np.zeros(3), np.eye(3), DOF)
         fall = (1.0 + square / DOF) ** (-0.5 * (DOF + 3.0))
@@ -101,7 +103,7 @@ def test_a_belief_learns_as_regression_does():
     noise = roots @ np.swapaxes(roots, 1, 2) + 0.1 * np.eye(2)
     variance = np.array([0.5, 2.0])
     error = rng.normal(size=(4, 2))
-    belief = Belief(np.zeros((1, 1, 2)), np.array([[[*variance, 0.0]]]))
+    belief = GaussianBelief(np.zeros((1, 1, 2)), np.array([[[*variance, 0.0]]]))
     total = 0.0
     for m in range(4):
         own = np.array([noise[m, 0, 0], noise[m, 1, 1], noise[m, 0, 1]])
@@ -120,32 +122,32 @@ def test_a_belief_learns_as_regression_does():
     np.testing.assert_allclose(belief.mean[0, 0], gain @ error.ravel(), atol=1e-9)
 
 
-def of_points(scene, points):
+def of_points(likelihood, points):
     """Return a scene of as many runs of one movement, that settle at the points."""
-    m, count = scene.evidence.movements, len(points)
+    m, count = likelihood.evidence.movements, len(points)
     one = np.ones((count, 1))
     evidence = SettledEvidence(
         Movements(*(np.repeat(v, count, axis=0) for v in vars(m).values())),
         points[:, None],
         one > 0,
         one < 0,
-        one * scene.evidence.begin,
-        one * scene.evidence.end,
-        one * scene.evidence.resumed,
+        one * likelihood.evidence.begin,
+        one * likelihood.evidence.end,
+        one * likelihood.evidence.first_reading_delay,
     )
-    return Scene(evidence, scene.model)
+    return RunLikelihood(evidence, likelihood.model)
 
 
 def test_densities_integrate_to_no_more_than_one(scene_of):
     """Over all places that the arm reaches, and with scatter so wide that few points will do."""
-    scene = scene_of(4, np.zeros(4))
-    scene = replace(scene, model=replace(scene.model, blur=25.0))
+    likelihood = scene_of(4, np.zeros(4))
+    likelihood = replace(likelihood, model=replace(likelihood.model, scatter_factor=25.0))
     rng = np.random.default_rng(4)
-    reach, count = scene.model.reach + 0.1, 4000
+    reach, count = likelihood.model.reach + 0.1, 4000
     points = rng.normal(size=(count, 3))
     radius = reach * rng.uniform(size=(count, 1)) ** (1 / 3)
     points *= radius / np.linalg.norm(points, axis=1, keepdims=True)
-    density = np.exp(weigh_off_anyhow(of_points(scene, points)).log_evidence)
+    density = np.exp(unmodelled_offsets_likelihood(of_points(likelihood, points)).log_evidence)
     whole = 4 / 3 * np.pi * reach**3 * density.mean()
     error = 4 / 3 * np.pi * reach**3 * density.std() / np.sqrt(count)
     assert error < 0.15
@@ -160,9 +162,9 @@ def test_two_slides_that_are_off_are_a_closed_form(tmp_path, run_of):
     model = HealthyModel(twin, NO_IMPERFECTIONS)
     for off in ([0.1, 0.15, 0.0], [0.0, -0.1, 0.1]):
         runs = run_of(targets, twin.path(targets + off), names)
-        scene = Scene(settled_evidence(runs), model)
-        healthy = scene.log_healthy.sum()
-        found = weigh_off_anyhow(scene).log_evidence[0]
+        likelihood = RunLikelihood(settled_evidence(runs), model)
+        healthy = likelihood.log_healthy.sum()
+        found = unmodelled_offsets_likelihood(likelihood).log_evidence[0]
         # Four places to 1 mm each, but for two amounts of 0.3 m: what they cost is told by Occam.
         sharp = 4 * np.log((2 * np.pi * model.path_noise**2) ** -1.5)
         occam = 2 * np.log(model.path_noise / 2 / 0.3) - 0.5 * (np.sum(np.square(off)) / 0.3**2)
@@ -175,6 +177,8 @@ def test_an_arm_of_one_motor_has_no_pair(tmp_path, run_of):
     twin = small_twin(tmp_path, "slide", GANTRY[:1])
     runs = run_of([[0.1], [0.2]], twin.path(np.array([[0.1], [0.2]])), ("motor_1",))
     assert (
-        weigh_off_anyhow(Scene(settled_evidence(runs), HealthyModel(twin, NO_IMPERFECTIONS)))
+        unmodelled_offsets_likelihood(
+            RunLikelihood(settled_evidence(runs), HealthyModel(twin, NO_IMPERFECTIONS))
+        )
         is None
     )

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
-from failuretwin.inference.onset import OnsetPrior, Stretches, at_movement_starts
+from failuretwin.inference.onset import OnsetIntervals, OnsetPrior, next_movement
 from failuretwin.inference.priors import Priors
 
 lengths = st.lists(st.floats(0.0, 5.0), min_size=1, max_size=8)
@@ -18,7 +18,7 @@ def stretches(parts, padding=0):
     """Return stretches of these lengths, and as many padded ones as `padding` says."""
     end = np.concatenate([np.cumsum(parts), np.full(padding, np.nan)])[None]
     begin = np.concatenate([np.zeros((1, 1)), end[:, :-1]], axis=1)
-    return Stretches(begin, end, np.isfinite(end))
+    return OnsetIntervals(begin, end, np.isfinite(end))
 
 
 @given(parts=lengths, early=earlies, padding=st.integers(0, 3))
@@ -61,7 +61,7 @@ def test_onsets_are_spread_as_their_prior_says(parts, early):
 def test_a_run_has_the_onsets_that_it_has_among_longer_ones():
     start = np.array([[0.5, 2.0, np.nan], [0.0, 2.0, 4.0]])
     movements = Movements(np.zeros((2, 1)), np.zeros((2, 3, 1)), np.full((2, 3, 1), 0.5), start)
-    found = at_movement_starts(movements)
+    found = next_movement(movements)
     np.testing.assert_allclose(found.weights(0.4), [[0.4 + 0.15, 0.45, 0.0], [0.4, 0.3, 0.3]])
     onset, share = found.samples(0.4, 0)
     assert np.isfinite(onset).all()

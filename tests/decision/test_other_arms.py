@@ -22,8 +22,8 @@ from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.inference import diagnoser as bayes
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.posterior import WEIGHABLE
-from failuretwin.inference.run_likelihood import Scene
+from failuretwin.inference.posterior import DIAGNOSABLE_MODES
+from failuretwin.inference.run_likelihood import RunLikelihood
 
 KINDS = {
     "none": lambda robot: NO_IMPERFECTIONS,
@@ -62,10 +62,10 @@ def test_bundled_arms_are_diagnosed(name, kind):
 def test_any_mode_can_be_weighed_in_short_runs(armpi, twin, kind, count):
     """All hypotheses, `unknown` too; of a single movement hardly any can be told from others."""
     imperfections = KINDS[kind](armpi)
-    modes = [mode for mode in WEIGHABLE if mode != "torque_loss"]
+    modes = [mode for mode in DIAGNOSABLE_MODES if mode != "torque_loss"]
     faults = single_faults(["motor_2"], modes)
     plan = Plan(armpi, faults, 1, 3, imperfections, RandomMovements(count=count))
-    weighed = (*single_faults(["motor_2", "motor_3"], WEIGHABLE), UNKNOWN)
+    weighed = (*single_faults(["motor_2", "motor_3"], DIAGNOSABLE_MODES), UNKNOWN)
     check(BayesDiagnoser(twin, imperfections, weighed).diagnose(simulate(plan)))
 
 
@@ -117,10 +117,10 @@ def test_a_slide_is_where_the_tool_is(gantry, run_of):
     points = targets + np.array([[0.03, 0.0, -0.05], [0.0, 0.07, 0.0]])
     runs = run_of(targets, points, gantry.robot.motor_names)
     model = HealthyModel(gantry, generic_imperfections(gantry.robot))
-    scene = Scene(settled_evidence(runs), model)
+    likelihood = RunLikelihood(settled_evidence(runs), model)
     for motor in range(3):
-        profile = scene.profile(motor)
-        np.testing.assert_allclose(profile.best[0, :, 0], points[:, motor], atol=1e-9)
+        profile = likelihood.profile(motor)
+        np.testing.assert_allclose(profile.mode[0, :, 0], points[:, motor], atol=1e-9)
         np.testing.assert_allclose(profile.precision[0, :, 0], 1.0 / model.path_noise**2)
 
 
@@ -138,8 +138,10 @@ def test_angles_a_full_turn_apart_are_the_same(scara, run_of):
     settled = targets.copy()
     settled[:, 1] = -2.6
     runs = run_of(targets, scara.path(settled), scara.robot.motor_names)
-    scene = Scene(settled_evidence(runs), HealthyModel(scara, generic_imperfections(scara.robot)))
-    profile = scene.profile(1)
+    likelihood = RunLikelihood(
+        settled_evidence(runs), HealthyModel(scara, generic_imperfections(scara.robot))
+    )
+    profile = likelihood.profile(1)
     angle = np.array([-2.6, 2.0 * np.pi - 2.6, 0.0])[:, None]
     there, again, elsewhere = profile.log_density(np.broadcast_to(angle, (1, 2, 3, 1)), True)[0].T
     np.testing.assert_allclose(there, again, atol=1e-9)

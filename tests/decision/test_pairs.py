@@ -9,9 +9,9 @@ from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.nonidealities import load_imperfections
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.onset import OnsetPrior
-from failuretwin.inference.posterior import weigh_hypothesis
+from failuretwin.inference.posterior import marginal_likelihood_of
 from failuretwin.inference.priors import Priors
-from failuretwin.inference.run_likelihood import Scene
+from failuretwin.inference.run_likelihood import RunLikelihood
 
 PAIRS = tuple(
     Hypothesis.parse(text)
@@ -77,27 +77,27 @@ def test_a_second_fault_that_cannot_show_changes_nothing(twin, imperfect, monkey
     """A fault of motor 4 whose only size is nothing leaves what is said of a fault of motor 1."""
     from failuretwin.core.numerics import log_of
     from failuretwin.inference import posterior as weighing
-    from failuretwin.inference.marginal import Law
-    from failuretwin.inference.onset import at_once
+    from failuretwin.inference.marginal import FaultModel
+    from failuretwin.inference.onset import immediate
 
-    def nothing(scene, motor, priors):
-        stretches = at_once(scene.evidence)
-        return Law(
+    def nothing(likelihood, motor, priors):
+        stretches = immediate(likelihood.evidence)
+        return FaultModel(
             motor=motor,
             held=False,
-            angle=scene.profile(motor).expected[:, :, None],
+            angle=likelihood.profile(motor).expected[:, :, None],
             log_prior=log_of(stretches.weights(0.5))[..., None],
             size=np.zeros((1, 1)),
             onsets=stretches.onsets(0.5),
         )
 
     runs = imperfect.isel(run=[5, 105])
-    scene = Scene(settled_evidence(runs), BayesDiagnoser(twin).healthy_model)
+    likelihood = RunLikelihood(settled_evidence(runs), BayesDiagnoser(twin).healthy_model)
     priors = Priors(onset=OnsetPrior(early=0.5))
-    single = weigh_hypothesis(scene, Hypothesis.parse(f"motor_1:{one}"), priors)
-    monkeypatch.setattr(weighing, "LAWS", {**weighing.LAWS, other: nothing})
+    single = marginal_likelihood_of(likelihood, Hypothesis.parse(f"motor_1:{one}"), priors)
+    monkeypatch.setattr(weighing, "LAWS", {**weighing.FAULT_MODELS, other: nothing})
     both = Hypothesis.parse(f"motor_1:{one}+motor_4:{other}")
-    pair = weigh_hypothesis(scene, both, priors)
+    pair = marginal_likelihood_of(likelihood, both, priors)
     # Scales do not explain the errors of the second run: in far tails a parabola is a rough one.
     off = 0.3 if one == "encoder_scale" else 0.1
     np.testing.assert_allclose(pair.log_evidence, single.log_evidence, atol=off)

@@ -8,7 +8,7 @@ from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
 from failuretwin.digital_model.nonidealities import Imperfections, Readings, Timing
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.evidence import moving_evidence, settled_evidence
+from failuretwin.inference.evidence import settled_evidence, transient_samples
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.transient_likelihood import (
     DOF,
@@ -16,8 +16,8 @@ from failuretwin.inference.transient_likelihood import (
     ROUGHNESS_M,
     SEEN,
     UNSEEN,
-    RampModel,
-    Ramps,
+    TransientHypothesis,
+    TransientLikelihood,
 )
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
@@ -63,7 +63,7 @@ class Case:
             measured_rate_hz=10.0,
         ).to_dataset()
         settled = settled_evidence(runs)
-        self.ramps = RampModel(self.model, settled, moving_evidence(runs, settled))
+        self.ramps = TransientLikelihood(self.model, settled, transient_samples(runs, settled))
 
     def angles(self, time):
         """Lag, late starts, delays and slowness as told, (time, motor) [rad]."""
@@ -76,9 +76,9 @@ class Case:
             angles = np.where(time[:, None] >= start, here, angles)
         return angles
 
-    def judge(self, movement, origin, destination, duration, delay):
+    def compute_posterior(self, movement, origin, destination, duration, delay):
         """Return log densities of one movement over cases; arguments (case, motor)."""
-        ramps = Ramps(
+        ramps = TransientHypothesis(
             np.array([0]), np.array([movement]), origin[None], destination[None],
             duration[None], delay,
         )  # fmt: skip
@@ -93,12 +93,14 @@ class Case:
         duration = 0.8 * (1.0 + np.multiply.outer(np.array(factors) - 1.0, own))
         delay = np.multiply.outer(delays, own)
         shaped = [np.broadcast_to(x, (cases, 4)).copy() for x in (end, duration, delay)]
-        return self.judge(movement, origin, *shaped)
+        return self.compute_posterior(movement, origin, *shaped)
 
     def at_rest(self, movement, pose):
         """Return the log density of one movement in which no motor moves."""
         still = np.broadcast_to(pose, (1, 4))
-        return self.judge(movement, still, still, np.full((1, 4), 0.8), np.zeros((1, 4)))[0]
+        return self.compute_posterior(
+            movement, still, still, np.full((1, 4), 0.8), np.zeros((1, 4))
+        )[0]
 
 
 @pytest.fixture(scope="module")

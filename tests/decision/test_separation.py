@@ -10,7 +10,11 @@ from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
 from failuretwin.data_knowledge.generate import Plan, simulate, without_chance
 from failuretwin.digital_model.nonidealities import default_imperfections
 from failuretwin.failure_behavior.modes import MODES
-from failuretwin.inference.expected_bayes_factors import Judge, separation, truth_and_faults
+from failuretwin.inference.expected_bayes_factors import (
+    ExpectedLogBayesFactor,
+    expected_log_bayes_factors,
+    truth_and_faults,
+)
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.priors import Priors
 
@@ -24,7 +28,7 @@ def quiet(imperfections):
 
 
 def test_the_truth_is_nearest_to_itself(twin, imperfect):
-    found = separation(twin, imperfect)
+    found = expected_log_bayes_factors(twin, imperfect)
     own = [found.hypotheses.index(truth) for truth in found.truth]
     np.testing.assert_array_equal(found.nats[np.arange(180), own], 0.0)
     others = found.nats.copy()
@@ -33,7 +37,7 @@ def test_the_truth_is_nearest_to_itself(twin, imperfect):
 
 
 def test_runs_that_are_far_ahead_are_diagnosed_right(twin, imperfect, diagnoses):
-    ahead = separation(twin, imperfect).nearest >= 5.0
+    ahead = expected_log_bayes_factors(twin, imperfect).nearest >= 5.0
     right = np.array([d.truth == d.diagnosis for d in diagnoses])
     assert ahead.sum() >= 130
     assert right[ahead].mean() >= 0.97
@@ -42,16 +46,20 @@ def test_runs_that_are_far_ahead_are_diagnosed_right(twin, imperfect, diagnoses)
 
 def test_a_run_is_separated_alone(twin, imperfect):
     some = imperfect.isel(run=[3, 50, 130])
-    whole = separation(twin, imperfect).nats[[3, 50, 130]]
-    np.testing.assert_allclose(separation(twin, some).nats, whole, rtol=1e-9, atol=1e-9)
+    whole = expected_log_bayes_factors(twin, imperfect).nats[[3, 50, 130]]
+    np.testing.assert_allclose(
+        expected_log_bayes_factors(twin, some).nats, whole, rtol=1e-9, atol=1e-9
+    )
 
 
 def test_readings_count_only_by_being_there(twin, imperfect):
     some = imperfect.isel(run=[25, 105])
     moved = some.assign(measured=some["measured"] + 0.1)
     blind = some.assign(measured=some["measured"] * np.nan)
-    np.testing.assert_array_equal(separation(twin, moved).nats, separation(twin, some).nats)
-    np.testing.assert_allclose(separation(twin, blind).nats, 0.0, atol=1e-12)
+    np.testing.assert_array_equal(
+        expected_log_bayes_factors(twin, moved).nats, expected_log_bayes_factors(twin, some).nats
+    )
+    np.testing.assert_allclose(expected_log_bayes_factors(twin, blind).nats, 0.0, atol=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -62,9 +70,11 @@ def of_all_modes(armpi, measured_armpi):
 
 
 def test_runs_are_made_again_as_they_were(twin, armpi, measured_armpi, of_all_modes):
-    judge = Judge(HealthyModel(twin, without_chance(measured_armpi)), (HEALTHY,), Priors())
+    compute_posterior = ExpectedLogBayesFactor(
+        HealthyModel(twin, without_chance(measured_armpi)), (HEALTHY,), Priors()
+    )
     faults = truth_and_faults(of_all_modes)[1]
-    again = judge.silent(of_all_modes, faults)
+    again = compute_posterior.noise_free(of_all_modes, faults)
     np.testing.assert_allclose(again["measured"], of_all_modes["measured"], rtol=0, atol=1e-12)
 
 
@@ -80,11 +90,15 @@ def test_runs_are_made_again_as_they_were(twin, armpi, measured_armpi, of_all_mo
 def test_a_law_puts_the_tool_where_the_simulator_does(twin, armpi, measured_armpi, mode, motor):
     hypothesis = Hypothesis.parse(f"{motor}:{mode}")
     known = quiet(measured_armpi)
-    law = dataclasses.replace(MODES[mode], onset_s=(0.0, 0.0), profiles=("step",))
-    runs = simulate(Plan(armpi, [hypothesis], 4, 1, without_chance(known), modes={mode: law}))
-    judge = Judge(HealthyModel(twin, known), (hypothesis, HEALTHY), Priors())
+    fault_model = dataclasses.replace(MODES[mode], onset_s=(0.0, 0.0), profiles=("step",))
+    runs = simulate(
+        Plan(armpi, [hypothesis], 4, 1, without_chance(known), modes={mode: fault_model})
+    )
+    compute_posterior = ExpectedLogBayesFactor(
+        HealthyModel(twin, known), (hypothesis, HEALTHY), Priors()
+    )
     faults = truth_and_faults(runs)[1]
-    own, healthy = judge.fits(runs, faults, runs["onset"].values).T
+    own, healthy = compute_posterior.fits(runs, faults, runs["onset"].values).T
     travel = np.diff(
         runs["target"].values[:, :, runs["motor"].values == motor][..., 0], prepend=0.0
     )
@@ -98,8 +112,10 @@ def test_a_law_puts_the_tool_where_the_simulator_does(twin, armpi, measured_armp
 def test_without_losses_scatter_alone_counts(twin, armpi, imperfect):
     known = default_imperfections(armpi)
     stuck = imperfect.isel(run=range(20, 100))
-    lossy = separation(twin, stuck).nats[:, 0]
-    sound = separation(twin, stuck, dataclasses.replace(known, lost_commands=())).nats[:, 0]
+    lossy = expected_log_bayes_factors(twin, stuck).nats[:, 0]
+    sound = expected_log_bayes_factors(
+        twin, stuck, dataclasses.replace(known, lost_commands=())
+    ).nats[:, 0]
     # What healthy had set aside for losses now speaks for it: a few tenths of a nat.
     assert (sound >= lossy - 0.5).all()
     assert sound.mean() > 1.1 * lossy.mean()
@@ -107,10 +123,10 @@ def test_without_losses_scatter_alone_counts(twin, armpi, imperfect):
 
 def test_a_truth_that_is_not_among_the_hypotheses_has_a_nearest_too(twin, imperfect):
     two = [HEALTHY, Hypothesis.parse("motor_2:stuck")]
-    found = separation(twin, imperfect, hypotheses=["healthy", "motor_2:stuck"])
+    found = expected_log_bayes_factors(twin, imperfect, hypotheses=["healthy", "motor_2:stuck"])
     assert found.hypotheses == tuple(two)
     assert found.nats.shape == (180, 2)
-    whole = separation(twin, imperfect)
+    whole = expected_log_bayes_factors(twin, imperfect)
     np.testing.assert_allclose(found.nats, whole.nats[:, [0, 2]], rtol=0, atol=1e-9)
     strange = [truth not in two for truth in found.truth]
     np.testing.assert_array_equal(found.nearest[strange], found.nats[strange].min(axis=1))
@@ -118,8 +134,8 @@ def test_a_truth_that_is_not_among_the_hypotheses_has_a_nearest_too(twin, imperf
 
 def test_wrong_runs_are_refused(twin, armpi, imperfect):
     with pytest.raises(InputError, match="does not tell its truth: no variable `fault_detail`"):
-        separation(twin, imperfect.drop_vars("fault_detail"))
+        expected_log_bayes_factors(twin, imperfect.drop_vars("fault_detail"))
     both = Hypothesis.parse("motor_1:stuck+motor_2:stuck")
     runs = simulate(Plan(armpi, [both], 1))
     with pytest.raises(InputError, match="Expected healthy or one fault"):
-        separation(twin, runs)
+        expected_log_bayes_factors(twin, runs)

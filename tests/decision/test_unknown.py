@@ -17,11 +17,11 @@ from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.nonidealities import load_imperfections
 from failuretwin.inference import posterior as weighing
 from failuretwin.inference.evidence import settled_evidence
-from failuretwin.inference.expected_bayes_factors import separation
-from failuretwin.inference.marginal import Weight
-from failuretwin.inference.posterior import weigh_all
-from failuretwin.inference.run_likelihood import Scene
-from failuretwin.inference.unknown import LEFT_OUT, weigh_unknown
+from failuretwin.inference.expected_bayes_factors import expected_log_bayes_factors
+from failuretwin.inference.marginal import MarginalLikelihood
+from failuretwin.inference.posterior import marginal_likelihoods
+from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.unknown import LEFT_OUT, unknown_likelihood
 
 TWO_AT_ONCE = (
     Hypothesis.parse("motor_1:steady_state_error+motor_3:steady_state_error"),
@@ -70,7 +70,9 @@ def foreign(twin, armpi):
     known = load_imperfections("armpi_fpv", armpi)
     faults = [h for h in single_faults(armpi.motor_names, FOREIGN) if h.faults]
     runs = simulate(Plan(armpi, faults, 5, 9, known))
-    nearest = separation(twin, runs, known, paper_hypotheses(armpi.motor_names)).nearest
+    nearest = expected_log_bayes_factors(
+        twin, runs, known, paper_hypotheses(armpi.motor_names)
+    ).nearest
     return runs.isel(run=np.flatnonzero(nearest >= 8.0))
 
 
@@ -97,21 +99,27 @@ def test_known_faults_stay_known(diagnoser, imperfect, diagnoses):
 
 
 def test_known_hypotheses_weigh_the_same_beside_unknown(diagnoser, imperfect, armpi):
-    scene = Scene(settled_evidence(imperfect.isel(run=[0, 30, 120])), diagnoser.healthy_model)
+    likelihood = RunLikelihood(
+        settled_evidence(imperfect.isel(run=[0, 30, 120])), diagnoser.healthy_model
+    )
     nine = paper_hypotheses(armpi.motor_names)
-    alone = weigh_all(scene, nine, diagnoser.priors)
-    beside = weigh_all(scene, (*nine, UNKNOWN), diagnoser.priors)
+    alone = marginal_likelihoods(likelihood, nine, diagnoser.priors)
+    beside = marginal_likelihoods(likelihood, (*nine, UNKNOWN), diagnoser.priors)
     for one, other in zip(alone, beside[:-1], strict=True):
         np.testing.assert_array_equal(one.log_evidence, other.log_evidence)
 
 
 def test_unknown_counts_its_best_explanation_alone(diagnoser, imperfect):
     """A left-out fault that explains a run counts by its odds; poor ones beside it add nothing."""
-    scene = Scene(settled_evidence(imperfect.isel(run=[0, 30])), diagnoser.healthy_model)
-    sure = Weight(np.full(2, 500.0), *(np.zeros((2, 5)).__getitem__,) * 2, lambda run: None)
+    likelihood = RunLikelihood(
+        settled_evidence(imperfect.isel(run=[0, 30])), diagnoser.healthy_model
+    )
+    sure = MarginalLikelihood(
+        np.full(2, 500.0), *(np.zeros((2, 5)).__getitem__,) * 2, lambda run: None
+    )
 
-    def says(left_out):
-        return weigh_unknown(scene, lambda other: sure, left_out, []).log_evidence
+    def says(unlisted):
+        return unknown_likelihood(likelihood, lambda other: sure, unlisted, []).log_evidence
 
     good = replace(sure, log_evidence=np.full(2, 600.0))
     expected = np.log(0.3 * LEFT_OUT) + 600.0

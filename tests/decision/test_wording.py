@@ -20,7 +20,7 @@ from failuretwin.inference.explanation import (
     size_words,
     verdict,
 )
-from failuretwin.inference.posterior import WEIGHABLE
+from failuretwin.inference.posterior import DIAGNOSABLE_MODES
 
 SIZED = {
     "stuck": (np.deg2rad(-12.3), "motor 3 stuck at -12 deg since 2.5 s, 98 % sure"),
@@ -66,7 +66,7 @@ def test_verdicts_say_motor_size_onset_and_how_sure(mode):
 
 
 def test_every_mode_has_its_words():
-    assert set(SIZED) == set(WEIGHABLE)
+    assert set(SIZED) == set(DIAGNOSABLE_MODES)
 
 
 @pytest.mark.parametrize("onset_s", [0.0, 0.04])

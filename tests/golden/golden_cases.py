@@ -16,6 +16,7 @@ from golden_entry import (
     augmented_features,
     calibrate,
     evidence_of,
+    expected_log_bayes_factors,
     healthy,
     log_quality,
     monitor,
@@ -24,7 +25,6 @@ from golden_entry import (
     priors_of,
     robust_features,
     run_evidence,
-    separation,
     signals_of,
     twin,
     with_log_evidence,
@@ -55,7 +55,7 @@ class Case:
 def told(diagnoser, runs):
     """Return all that is said of some runs, by run."""
     diagnoses, says = with_log_evidence(diagnoser, runs)
-    names = [str(hypothesis) for hypothesis in diagnoser.considered]
+    names = [str(hypothesis) for hypothesis in diagnoser.hypothesis_set]
     return {
         diagnosis.run: said(diagnosis) | {"log_evidence": dict(zip(names, row, strict=True))}
         for diagnosis, row in zip(diagnoses, says, strict=True)
@@ -145,7 +145,7 @@ def evidence(runs, change=lambda runs: runs):
             "moving": settled.moving[i],
             "begin": settled.begin[i],
             "end": settled.end[i],
-            "resumed": settled.resumed[i],
+            "resumed": settled.first_reading_delay[i],
             "readings on the way": moving.seen[i].sum(axis=1),
             "their mean time": moving.since[i].mean(axis=1),
             "their mean point": moving.point[i].mean(axis=1),
@@ -163,7 +163,7 @@ def stream(run, make):
         answer = diagnoser.update(float(time[i]), command[i], measured[i])
         if i % 100 == 99:
             answers[f"{time[i]:.2f} s"] = said(answer.diagnosis) | {"state": str(answer.state)}
-    return answers | {"end": said(diagnoser.conclude().diagnosis)}
+    return answers | {"end": said(diagnoser.to_diagnosis().diagnosis)}
 
 
 def plain_stream():
@@ -189,7 +189,7 @@ def fleet():
         robots.update(float(time[i]), command[:, i], measured[:, i])
         if i % 125 == 124:
             found[f"{time[i]:.2f} s"] = robots.posterior
-    robots.conclude()
+    robots.to_diagnosis()
     return found | {
         "end": robots.posterior,
         "verdicts": [said(robots.diagnosis(k)) for k in (0, 2)],
@@ -220,7 +220,7 @@ def apart():
     """Return what a planned motion can tell apart."""
     runs = load("nine").isel(run=[0])
     hypotheses = ["motor_2:stuck", "motor_3:steady_state_error", "motor_2:lag"]
-    found = ft.ambiguity(
+    found = ft.isolability(
         twin(), runs["command"].values[0], runs["time"].values, hypotheses=hypotheses
     )
     names = ("hypotheses", "nats", "groups", "detected", "isolated", "typical", "largest")
@@ -229,7 +229,7 @@ def apart():
 
 def separated(runs, hypotheses=None):
     some = load(runs)
-    found = separation(twin(), some, hypotheses=hypotheses)
+    found = expected_log_bayes_factors(twin(), some, hypotheses=hypotheses)
     names = [str(hypothesis) for hypothesis in found.hypotheses]
     rows = zip(some["run"].values, found.nats, strict=True)
     return {run: dict(zip(names, nats, strict=True)) for run, nats in rows}

@@ -33,10 +33,10 @@ from failuretwin.digital_model.nonidealities import (
 )
 from failuretwin.failure_behavior.modes import MODES
 from failuretwin.inference import diagnoser as bayes
-from failuretwin.inference import posterior as judgement
-from failuretwin.inference.evidence import moving_evidence, settled_evidence
-from failuretwin.inference.expected_bayes_factors import separation
-from failuretwin.inference.log_quality import log_quality, without_spoilt
+from failuretwin.inference import posterior as posterior
+from failuretwin.inference.evidence import settled_evidence, transient_samples
+from failuretwin.inference.expected_bayes_factors import expected_log_bayes_factors
+from failuretwin.inference.log_quality import drop_invalid, log_quality
 from failuretwin.inference.priors import MONITORING, priors_of
 
 __all__ = [
@@ -48,6 +48,7 @@ __all__ = [
     "Tracker",
     "augmented_features",
     "calibrate",
+    "expected_log_bayes_factors",
     "generic_imperfections",
     "load_run_set",
     "log_quality",
@@ -58,7 +59,6 @@ __all__ = [
     "priors_of",
     "run_evidence",
     "save_run_set",
-    "separation",
     "signals_of",
 ]
 
@@ -86,22 +86,24 @@ def robust_features(robot, imperfections, runs):
 
 def evidence_of(diagnoser, runs):
     """Return what the runs say where the tool rests, and on the way as far as that counts."""
-    sound = without_spoilt(runs, log_quality(runs))
+    sound = drop_invalid(runs, log_quality(runs))
     settled = settled_evidence(sound)
-    if not diagnoser.looks_on_way:
+    if not diagnoser.uses_transients:
         return settled, None
-    return settled, moving_evidence(sound, settled).where(diagnoser.on_way(settled.usable))
+    return settled, transient_samples(sound, settled).where(
+        diagnoser.transient_mask(settled.usable)
+    )
 
 
 def with_log_evidence(diagnoser, runs):
     """Return the diagnoses, and the log evidence before the prior, (run, hypothesis)."""
     kept = []
 
-    def judge(*arguments):
-        kept.append(judgement.judge(*arguments))
+    def compute_posterior(*arguments):
+        kept.append(posterior.compute_posterior(*arguments))
         return kept[-1]
 
-    with mock.patch.object(bayes, "judge", judge):
+    with mock.patch.object(bayes, "compute_posterior", compute_posterior):
         diagnoses = diagnoser.diagnose(runs)
     says = [np.stack([weight.log_evidence for weight in j.weights], axis=1) for j in kept]
     return diagnoses, np.concatenate(says)

@@ -23,7 +23,7 @@ from failuretwin.digital_model.urdf_check import JointReport, UrdfReport
 from failuretwin.digital_model.urdf_findings import has_range
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.explanation import size_words
-from failuretwin.inference.isolability import Ambiguity, ambiguity
+from failuretwin.inference.isolability import IsolabilityReport, isolability
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -165,21 +165,22 @@ def ambiguity_lines(runs: xr.Dataset, diagnoser: BayesDiagnoser) -> list[str]:
         runs: The runs that were diagnosed.
         diagnoser: Who diagnosed them; of its hypotheses healthy and single faults count.
     """
-    single = [h for h in diagnoser.considered if h.known and len(h.faults) <= 1]
-    left_out = _left_out_lines([h for h in diagnoser.considered if h not in single])
+    single = [h for h in diagnoser.hypothesis_set if h.known and len(h.faults) <= 1]
+    left_out = _left_out_lines([h for h in diagnoser.hypothesis_set if h not in single])
     if not any(h.faults for h in single):
         return left_out
     if len(single) > MOST_HYPOTHESES:
         return [
             f"which of these {len(single)} hypotheses such motions tell apart may take longer to "
             f"work out than the diagnosis (done for up to {MOST_HYPOTHESES}): call "
-            "failuretwin.ambiguity in Python (docs/ambiguity.md), or name fewer with --hypotheses",
+            "failuretwin.isolability in Python (docs/isolability.md), or name fewer with "
+            "--hypotheses",
             *left_out,
         ]
     command = as_floats(runs["command"].values)
     moving = np.flatnonzero(np.ptp(command, axis=1).any(axis=1))
     some = moving[np.unique(np.linspace(0, len(moving) - 1, MOST_MOTIONS).astype(int))]
-    found = ambiguity(
+    found = isolability(
         diagnoser.twin,
         command[some],
         as_floats(runs["time"].values),
@@ -201,7 +202,7 @@ def _left_out_lines(others: Sequence[Hypothesis]) -> list[str]:
     return [f"what motions tell apart is said of single faults only, not of {' and '.join(names)}"]
 
 
-def _group_lines(found: Ambiguity) -> list[str]:
+def _group_lines(found: IsolabilityReport) -> list[str]:
     """Return the groups, with the sizes at which their faults look alike."""
     groups = [
         " or ".join(_name(name, found.typical.get(name)) for name in group)
@@ -214,7 +215,7 @@ def _group_lines(found: Ambiguity) -> list[str]:
     return [f"cannot be told apart by such motions{when}: {'; '.join(groups)}"]
 
 
-def _size_lines(found: Ambiguity) -> list[str]:
+def _size_lines(found: IsolabilityReport) -> list[str]:
     """Return the smallest sizes that are found, and what is known of faults never found."""
     hidden = [name for name, size in found.isolated.items() if size is None]
     alarms = {name: found.detected[name] for name in hidden}

@@ -15,7 +15,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.robot import Robot, shown_unit
-from failuretwin.inference.isolability import suspicion
+from failuretwin.inference.isolability import fault_probability
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -53,10 +53,10 @@ def learn_robot(
     learning = runs.isel(run=np.flatnonzero(~inside))
     first = calibrate(learning, robot, name, source, thorough=False)
     _refuse_scatter(first, robot)
-    doubt = suspicion(learning, robot, first.imperfections)
+    doubt = fault_probability(learning, robot, first.imperfections)
     _refuse_suspects(learning, doubt)
     judged = runs.isel(run=np.flatnonzero(inside)) if inside.any() else None
-    found = calibrate(learning, robot, name, source, suspicion=doubt, judged=judged)
+    found = calibrate(learning, robot, name, source, fault_probability=doubt, judged=judged)
     _refuse_left_out(found)
     return replace(found, left_out=(*labelled, *found.left_out)), runs
 

@@ -19,7 +19,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.data_knowledge.store import check_writable
 from failuretwin.inference.diagnoser import BayesDiagnoser
-from failuretwin.inference.log_quality import log_quality, without_spoilt
+from failuretwin.inference.log_quality import drop_invalid, log_quality
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -80,7 +80,7 @@ def diagnose_tracked(
         advance: Called with the number of runs just diagnosed.
     """
     tracker, steps, known = history.tracker, list[Step](), set(history.keys)
-    seen = observe(without_spoilt(runs, log_quality(runs)))
+    seen = observe(drop_invalid(runs, log_quality(runs)))
     found: list[Diagnosis] = []
     for batch in _batches(runs):
         now = replace(diagnoser, imperfections=tracker.imperfections)

@@ -33,7 +33,7 @@ def row_of(step: Step) -> dict[str, Any]:
         "number": step.number,
         "run": step.evidence.run,
         "key": step.evidence.key,
-        "probability_faulty": None if np.isnan(step.suspicion) else step.suspicion,
+        "probability_faulty": None if np.isnan(step.fault_probability) else step.fault_probability,
         "level": step.level,
         "alarm": step.alarm,
         "fates": [list(fate) for fate in step.fates],
@@ -66,7 +66,7 @@ def step_of(line: str, where: str) -> Step:
         return Step(
             number=int(row["number"]),
             evidence=RunEvidence(str(row["run"]), str(row["key"]), error, design),
-            suspicion=float("nan") if chance is None else float(chance),
+            fault_probability=float("nan") if chance is None else float(chance),
             level=float(row["level"]),
             alarm=str(row["alarm"]),
             fates=tuple((int(number), fate) for number, fate in row["fates"]),

@@ -60,7 +60,7 @@ class Step:
     Attributes:
         number: How many runs have come with it.
         evidence: What it says.
-        suspicion: Probability that it is faulty; NaN where nothing can be told.
+        fault_probability: Probability that it is faulty; NaN where nothing can be told.
         level: Sum of what runs say for a fault [nats].
         alarm: What is suspected, or empty.
         fates: What became of earlier runs or of this one, by number.
@@ -70,7 +70,7 @@ class Step:
 
     number: int
     evidence: RunEvidence
-    suspicion: float
+    fault_probability: float
     level: float
     alarm: str
     fates: tuple[tuple[int, Fate], ...]
@@ -142,17 +142,17 @@ class Tracker:
         start = calibrated_state(settling, calibration.variation, unit)
         return cls(robot, calibration, settling, unit, start, start, limits or WearLimits())
 
-    def follow(self, evidence: RunEvidence, suspicion: float) -> tuple[Tracker, Step]:
+    def follow(self, evidence: RunEvidence, fault_probability: float) -> tuple[Tracker, Step]:
         """Return the tracker after one more run, and what it changed.
 
         Args:
             evidence: What the run says.
-            suspicion: Probability that the run is faulty; NaN where nothing can be told.
+            fault_probability: Probability that the run is faulty; NaN where nothing can be told.
         """
         number = self.arrived + 1
-        sound = bool(suspicion < SUSPECT) and evidence.error.size > 0
+        sound = bool(fault_probability < SUSPECT) and evidence.error.size > 0
         window = (*self.window, Waiting(number, evidence, sound))
-        level = min(max(self.level + _score(suspicion), 0.0), DECLARED_NATS + MOST_SCORE)
+        level = min(max(self.level + _score(fault_probability), 0.0), DECLARED_NATS + MOST_SCORE)
         fates: list[tuple[int, Fate]] = [] if sound else [(number, "discarded")]
         alarm = self._declared(window, level)
         if alarm:
@@ -168,7 +168,14 @@ class Tracker:
             snapshots = (*self.past, after.state)[-(self.limits.horizon // DELAY) :]
             after = replace(after, past=snapshots)
         step = Step(
-            number, evidence, suspicion, level, alarm, tuple(fates), after.learned_at, after.state
+            number,
+            evidence,
+            fault_probability,
+            level,
+            alarm,
+            tuple(fates),
+            after.learned_at,
+            after.state,
         )
         return after, step
 
@@ -236,9 +243,9 @@ class Tracker:
         )
 
 
-def _score(suspicion: float) -> float:
+def _score(fault_probability: float) -> float:
     """Return what a run says for a fault [nats]; nothing where nothing can be told."""
-    if np.isnan(suspicion):
+    if np.isnan(fault_probability):
         return 0.0
-    share = min(max(suspicion, 1e-6), 1.0 - 1e-6)
+    share = min(max(fault_probability, 1e-6), 1.0 - 1e-6)
     return float(np.clip(np.log(share / (1.0 - share)), -MOST_SCORE, MOST_SCORE))

@@ -20,20 +20,20 @@ MOST_STATES = 24
 
 
 @dataclass(frozen=True)
-class LossesInARow:
+class ConsecutiveLossHmm:
     """A chain: with each movement some motors miss one command more, the others none any longer.
 
     Attributes:
         missed: Commands that each motor has missed in a row in each state, (state, motor); none in
             the first.
-        leads: 1 where a loss (0: of none) leads from a state to a state, (loss, state, state).
+        transition: 1 where a loss (0: of none) leads from a state to a state, (loss, state, state).
     """
 
     missed: IntArray
-    leads: FloatArray
+    transition: FloatArray
 
     @staticmethod
-    def of(losses: BoolArray, chance: FloatArray, rare: float) -> LossesInARow:
+    def of(losses: BoolArray, chance: FloatArray, rare: float) -> ConsecutiveLossHmm:
         """Return the chain of the states that are not too rare, single losses first.
 
         What is left out counts as fewer losses in a row.
@@ -48,9 +48,9 @@ class LossesInARow:
         for i, loss in enumerate(losses):
             for j, state in enumerate(states):
                 leads[i, j, states.index(_known(_one_more(state, loss), states))] = 1.0
-        return LossesInARow(np.array(states), leads)
+        return ConsecutiveLossHmm(np.array(states), leads)
 
-    def chances(self, rates: FloatArray, log_likelihood: FloatArray | None = None) -> FloatArray:
+    def forward(self, rates: FloatArray, log_likelihood: FloatArray | None = None) -> FloatArray:
         """Return the probability of each state with each movement, (run, movement, state).
 
         Args:
@@ -63,7 +63,7 @@ class LossesInARow:
         state = np.zeros((runs, len(self.missed)))
         state[:, 0] = 1.0
         for m in range(count):
-            chances[:, m] = state = np.einsum("rl,rd,lds->rs", rates[:, m], state, self.leads)
+            chances[:, m] = state = np.einsum("rl,rd,lds->rs", rates[:, m], state, self.transition)
             if log_likelihood is not None:
                 says = np.where(state > 0.0, log_likelihood[:, m], -np.inf)
                 state = state * np.exp(says - says.max(axis=-1, keepdims=True))
@@ -113,14 +113,14 @@ LATE_MARGIN_S = 0.15
 
 
 @dataclass(frozen=True)
-class Alternatives:
+class CommandOutcomes:
     """What may become of each movement: which motors lost how many commands in a row.
 
     Attributes:
-        lost: Motors that lose their command, (alternative, motor).
-        base: Angles that the motors then go for, (run, movement, alternative, motor) [rad].
-        direction: Sign of their last travel, (run, movement, alternative, motor).
-        log_weight: Log probability of each, (run, movement, alternative).
+        lost: Motors that lose their command, (outcome, motor).
+        base: Angles that the motors then go for, (run, movement, outcome, motor) [rad].
+        direction: Sign of their last travel, (run, movement, outcome, motor).
+        log_weight: Log probability of each, (run, movement, outcome).
     """
 
     lost: BoolArray
@@ -128,9 +128,11 @@ class Alternatives:
     direction: FloatArray
     log_weight: FloatArray
 
-    def __getitem__(self, runs: slice) -> Alternatives:
-        """Return the alternatives of some of the runs."""
-        return Alternatives(self.lost, self.base[runs], self.direction[runs], self.log_weight[runs])
+    def __getitem__(self, runs: slice) -> CommandOutcomes:
+        """Return the outcomes of some of the runs."""
+        return CommandOutcomes(
+            self.lost, self.base[runs], self.direction[runs], self.log_weight[runs]
+        )
 
 
 @dataclass(frozen=True)
@@ -145,7 +147,7 @@ class LostCommands:
     robot: Robot
     imperfections: Imperfections
 
-    def alternatives(self, movements: Movements) -> Alternatives:
+    def outcomes(self, movements: Movements) -> CommandOutcomes:
         """Return what may become of each movement; the first is that every command arrives.
 
         A motor that misses a command stays where it went last: at the target before, or, if it
@@ -154,29 +156,29 @@ class LostCommands:
         """
         origin, target = np.nan_to_num(movements.origin()), np.nan_to_num(movements.target)
         travel, rows = np.sign(target - origin), self._in_a_row
-        return Alternatives(
+        return CommandOutcomes(
             lost=rows.missed > 0,
             base=_of_last_made(target, origin, rows.missed),
             direction=_of_last_made(travel, _before(travel), rows.missed),
-            log_weight=self._log_weight(rows.chances(self._rates(self.late(movements)))),
+            log_weight=self._log_weight(rows.forward(self._rates(self.late(movements)))),
         )
 
-    def given_before(
-        self, alternatives: Alternatives, late: FloatArray, log_likelihood: FloatArray
-    ) -> Alternatives:
-        """Return alternatives with their probability given what was seen of the movements before.
+    def filtered_outcomes(
+        self, outcomes: CommandOutcomes, late: FloatArray, log_likelihood: FloatArray
+    ) -> CommandOutcomes:
+        """Return outcomes with their probability given what was seen of the movements before.
 
         A motor that was seen to arrive has missed nothing before; one that was seen to stay has.
 
         Args:
-            alternatives: What may have become of the movements.
+            outcomes: What may have become of the movements.
             late: Probability that each started late, (run, movement).
-            log_likelihood: What was seen of each movement says of each alternative, up to a
-                constant, (run, movement, alternative); 0 where nothing was seen.
+            log_likelihood: What was seen of each movement says of each outcome, up to a
+                constant, (run, movement, outcome); 0 where nothing was seen.
         """
-        chances = self._in_a_row.chances(self._rates(late), log_likelihood)
+        chances = self._in_a_row.forward(self._rates(late), log_likelihood)
         chances[chances < NEGLIGIBLE] = 0.0
-        return replace(alternatives, log_weight=self._log_weight(chances))
+        return replace(outcomes, log_weight=self._log_weight(chances))
 
     def _rates(self, late: FloatArray) -> FloatArray:
         """Return the probability of each loss, (run, movement, loss); the first: of none.
@@ -192,11 +194,11 @@ class LostCommands:
         return shares / np.maximum(total, 1.0)[..., None]  # rounding may exceed one
 
     @cached_property
-    def _in_a_row(self) -> LossesInARow:
+    def _in_a_row(self) -> ConsecutiveLossHmm:
         names, entries = self.robot.motor_names, self.imperfections.lost_commands
         losses = [np.isin(names, motors) for motors in ((), *(e.motors for e in entries))]
         most = self._rates(np.array([0.0, 1.0])).max(axis=0)
-        return LossesInARow.of(np.array(losses), most, RARE)
+        return ConsecutiveLossHmm.of(np.array(losses), most, RARE)
 
     @staticmethod
     def _log_weight(chances: FloatArray) -> FloatArray:
@@ -209,7 +211,9 @@ class LostCommands:
         between = 1.0 / readings.rate_hz if readings is not None else 0.0
         return 0.5 * timing.late_s[0] + between if timing.late_rate > 0.0 else np.inf
 
-    def late(self, movements: Movements, resumed: FloatArray | None = None) -> FloatArray:
+    def late(
+        self, movements: Movements, first_reading_delay: FloatArray | None = None
+    ) -> FloatArray:
         """Return the probability that each movement started late, (run, movement).
 
         A late start holds up the next command, so the time between commands betrays it. Of the
@@ -217,14 +221,15 @@ class LostCommands:
 
         Args:
             movements: The movements.
-            resumed: Time from each command to the first reading after it, (run, movement) [s], NaN
-                where it is not known; None: nowhere. What is not told so is the rate.
+            first_reading_delay: Time from each command to the first reading after it, (run,
+                movement) [s], NaN where it is not known; None: nowhere. What is not told so is the
+                rate.
         """
         timing = self.imperfections.timing
         late = np.full(movements.start.shape, timing.late_rate)
-        if resumed is not None and timing.late_rate > 0.0:
-            late[resumed < 0.5 * timing.late_s[0]] = 0.0
-            late[resumed > self.late_after_s] = 1.0
+        if first_reading_delay is not None and timing.late_rate > 0.0:
+            late[first_reading_delay < 0.5 * timing.late_s[0]] = 0.0
+            late[first_reading_delay > self.late_after_s] = 1.0
         longest = self.imperfections.schedule.period_s[1] + LATE_MARGIN_S
         known = movements.exists[:, 1:]
         lasted = np.diff(movements.start, axis=1)

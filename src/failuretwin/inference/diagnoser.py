@@ -15,12 +15,16 @@ from failuretwin.core.runs import check_motors, check_runs, truth_of
 from failuretwin.core.types import BoolArray
 from failuretwin.digital_model.nonidealities import Imperfections, default_imperfections
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.inference.evidence import moving_evidence, settled_evidence
+from failuretwin.inference.evidence import settled_evidence, transient_samples
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.log_quality import log_quality, without_spoilt
-from failuretwin.inference.posterior import check_weighable, judge, shows_on_way
+from failuretwin.inference.log_quality import drop_invalid, log_quality
+from failuretwin.inference.posterior import (
+    check_diagnosable,
+    compute_posterior,
+    shows_in_transients,
+)
 from failuretwin.inference.priors import Priors
-from failuretwin.inference.run_likelihood import Scene
+from failuretwin.inference.run_likelihood import RunLikelihood
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -55,11 +59,11 @@ class BayesDiagnoser:
     whole_run: bool = True
 
     def __post_init__(self) -> None:
-        for hypothesis in self.considered:
-            check_weighable(hypothesis)
+        for hypothesis in self.hypothesis_set:
+            check_diagnosable(hypothesis)
 
     @cached_property
-    def considered(self) -> Sequence[Hypothesis]:
+    def hypothesis_set(self) -> Sequence[Hypothesis]:
         """What may be the case."""
         motors = self.twin.robot.motor_names
         if self.hypotheses is None:
@@ -73,11 +77,11 @@ class BayesDiagnoser:
         return HealthyModel(self.twin, imperfections)
 
     @cached_property
-    def looks_on_way(self) -> bool:
+    def uses_transients(self) -> bool:
         """Whether readings on the way count."""
         return self.whole_run and self.healthy_model.knows_timing
 
-    def on_way(self, usable: BoolArray) -> BoolArray:
+    def transient_mask(self, usable: BoolArray) -> BoolArray:
         """Return the movements whose readings on the way count, (run, movement).
 
         Where a motor settled says all about most faults, and more reliably, so readings on the
@@ -87,7 +91,7 @@ class BayesDiagnoser:
         Args:
             usable: Movements with a settled point, (run, movement).
         """
-        if any(shows_on_way(hypothesis) for hypothesis in self.considered):
+        if any(shows_in_transients(hypothesis) for hypothesis in self.hypothesis_set):
             return np.ones_like(usable)
         unseen = ~usable
         unseen[:, 1:] |= unseen[:, :-1]  # what follows tells where it ended
@@ -103,15 +107,15 @@ class BayesDiagnoser:
         """
         self._check(runs)
         quality = log_quality(runs)
-        sound = without_spoilt(runs, quality)
+        sound = drop_invalid(runs, quality)
         evidence, moving = settled_evidence(sound), None
         if evidence.movements.start.shape[1] == 0:
             raise InputError(
                 "no run holds a movement: `command` never leaves its first value. Expected runs "
                 "of one movement at least."
             )
-        if self.looks_on_way:
-            moving = moving_evidence(sound, evidence).where(self.on_way(evidence.usable))
+        if self.uses_transients:
+            moving = transient_samples(sound, evidence).where(self.transient_mask(evidence.usable))
         names = [str(name) for name in runs["run"].values]
         faults = truth_of(runs)
         truth: list[str | None] = [None] * len(names) if faults is None else list(faults)
@@ -120,10 +124,12 @@ class BayesDiagnoser:
         for first in range(0, len(names), chunk):
             rows = slice(first, first + chunk)
             way = None if moving is None else moving[rows]
-            scene = Scene(evidence[rows], self.healthy_model, way)
-            judgement = judge(scene, self.considered, self.priors)
+            likelihood = RunLikelihood(evidence[rows], self.healthy_model, way)
+            posterior_of_runs = compute_posterior(likelihood, self.hypothesis_set, self.priors)
             for at in range(len(names))[rows]:
-                results.append(judgement.conclude(at - first, names[at], quality[at], truth[at]))
+                results.append(
+                    posterior_of_runs.to_diagnosis(at - first, names[at], quality[at], truth[at])
+                )
         return results
 
     def _check(self, runs: xr.Dataset) -> None:

@@ -14,7 +14,7 @@ from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.numerics import masked_median
 from failuretwin.core.runs import measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
-from failuretwin.inference.readings import TrueReadings, grid_steps, true_readings
+from failuretwin.inference.readings import MeasuredSamples, grid_steps, measured_samples
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -45,8 +45,8 @@ class SettledEvidence:
         moving: Movements whose readings do not come to rest, (run, movement).
         begin: When the readings that count begin, (run, movement) [s].
         end: End of each plateau, (run, movement) [s].
-        resumed: Time from each command to the first reading after it, (run, movement) [s]; NaN
-            where there is none or where straight lines fill the gaps between readings.
+        first_reading_delay: Time from each command to the first reading after it, (run, movement)
+            [s]; NaN where there is none or where straight lines fill the gaps between readings.
     """
 
     movements: Movements
@@ -55,7 +55,7 @@ class SettledEvidence:
     moving: BoolArray
     begin: FloatArray
     end: FloatArray
-    resumed: FloatArray
+    first_reading_delay: FloatArray
 
     def __getitem__(self, runs: slice) -> SettledEvidence:
         """Return the evidence of some of the runs."""
@@ -67,7 +67,7 @@ class SettledEvidence:
             self.moving[runs],
             self.begin[runs],
             self.end[runs],
-            self.resumed[runs],
+            self.first_reading_delay[runs],
         )
 
 
@@ -98,7 +98,7 @@ def rest_begin(start: FloatArray, ramp_duration: FloatArray, end: FloatArray) ->
     return np.maximum(reached, end - WINDOW_S)
 
 
-def rest(samples: FloatArray, inside: BoolArray) -> Rest:
+def estimate_rest(samples: FloatArray, inside: BoolArray) -> Rest:
     """Return where the tool rests in some stretches of time.
 
     Args:
@@ -121,7 +121,7 @@ def settled_evidence(runs: xr.Dataset) -> SettledEvidence:
     Args:
         runs: A run set; `command` (run, time, motor) and `measured` (run, time, axis) are read.
     """
-    time, readings = as_floats(runs["time"].values), true_readings(runs)
+    time, readings = as_floats(runs["time"].values), measured_samples(runs)
     measured = readings.point
     movements = find_movements(as_floats(runs["command"].values), time)
     end = _plateau_ends(movements, measured, time)
@@ -129,10 +129,10 @@ def settled_evidence(runs: xr.Dataset) -> SettledEvidence:
     shape = movements.start.shape
     point, usable, moving = np.zeros((*shape, 3)), np.zeros(shape, bool), np.zeros(shape, bool)
     item = np.nonzero(movements.exists & (begin < end))
-    found = rest(*_between(measured, time, item[0], begin[item], end[item]))
+    found = estimate_rest(*_between(measured, time, item[0], begin[item], end[item]))
     point[item], usable[item], moving[item] = found.point, found.usable, found.moving
-    resumed = _resumed(movements, readings, time, SILENT_PERIODS / measured_rate(runs))
-    return SettledEvidence(movements, point, usable, moving, begin, end, resumed)
+    first_reading_delay = _resumed(movements, readings, time, SILENT_PERIODS / measured_rate(runs))
+    return SettledEvidence(movements, point, usable, moving, begin, end, first_reading_delay)
 
 
 def _between(
@@ -146,7 +146,7 @@ def _between(
 
 
 def _resumed(
-    movements: Movements, readings: TrueReadings, time: FloatArray, silence: float
+    movements: Movements, readings: MeasuredSamples, time: FloatArray, silence: float
 ) -> FloatArray:
     """Return the time from each command to the first reading after it, (run, movement) [s].
 
@@ -186,7 +186,7 @@ MOST_READINGS = 12
 
 
 @dataclass(frozen=True)
-class MovingEvidence:
+class TransientSamples:
     """Readings on the way, for each movement of many runs.
 
     Attributes:
@@ -199,16 +199,16 @@ class MovingEvidence:
     point: FloatArray
     seen: BoolArray
 
-    def __getitem__(self, runs: slice) -> MovingEvidence:
+    def __getitem__(self, runs: slice) -> TransientSamples:
         """Return the evidence of some of the runs."""
-        return MovingEvidence(self.since[runs], self.point[runs], self.seen[runs])
+        return TransientSamples(self.since[runs], self.point[runs], self.seen[runs])
 
-    def where(self, wanted: BoolArray) -> MovingEvidence:
+    def where(self, wanted: BoolArray) -> TransientSamples:
         """Return the evidence of some of the movements alone, (run, movement)."""
-        return MovingEvidence(self.since, self.point, self.seen & wanted[..., None])
+        return TransientSamples(self.since, self.point, self.seen & wanted[..., None])
 
 
-def moving_evidence(runs: xr.Dataset, settled: SettledEvidence) -> MovingEvidence:
+def transient_samples(runs: xr.Dataset, settled: SettledEvidence) -> TransientSamples:
     """Return the readings of each movement before those that `settled` has used.
 
     Of densely sampled paths readings are left out evenly, so that no two lie closer than the true
@@ -219,7 +219,7 @@ def moving_evidence(runs: xr.Dataset, settled: SettledEvidence) -> MovingEvidenc
         settled: Where the tool settled in the same runs.
     """
     time = as_floats(runs["time"].values)
-    readings, least_step = true_readings(runs), 0.9 / measured_rate(runs)
+    readings, least_step = measured_samples(runs), 0.9 / measured_rate(runs)
     measured, read = readings.point, readings.seen.copy()
     for run in np.flatnonzero(readings.filled):
         read[run] &= _corners(measured[run], grid_steps(runs))
@@ -235,7 +235,7 @@ def moving_evidence(runs: xr.Dataset, settled: SettledEvidence) -> MovingEvidenc
         since[run, movement, : len(rows)] = time[rows] - start[run, movement]
         point[run, movement, : len(rows)] = measured[run, rows]
         seen[run, movement, : len(rows)] = True
-    return MovingEvidence(since, point, seen)
+    return TransientSamples(since, point, seen)
 
 
 def _corners(path: FloatArray, every: int) -> BoolArray:

@@ -26,15 +26,20 @@ from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.fault import FaultValue
 from failuretwin.failure_behavior.injection import Injection, replayed
 from failuretwin.failure_behavior.modes import MODES
-from failuretwin.inference.evidence import moving_evidence, settled_evidence
+from failuretwin.inference.evidence import settled_evidence, transient_samples
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.joint_likelihood import MotorProfile
-from failuretwin.inference.marginal import Law, densities
-from failuretwin.inference.missed_movements import MISSES, log_densities
-from failuretwin.inference.posterior import TIMED, check_weighable, law_of, motor_of
+from failuretwin.inference.joint_likelihood import JointLikelihood
+from failuretwin.inference.marginal import FaultModel, movement_log_likelihoods
+from failuretwin.inference.missed_movements import MISSED_MOVEMENT_FAULTS, log_densities
+from failuretwin.inference.posterior import (
+    TRANSIENT_FAULTS,
+    check_diagnosable,
+    fault_model_of,
+    motor_of,
+)
 from failuretwin.inference.priors import Priors
-from failuretwin.inference.readings import true_readings
-from failuretwin.inference.run_likelihood import Scene
+from failuretwin.inference.readings import measured_samples
+from failuretwin.inference.run_likelihood import RunLikelihood
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -42,7 +47,7 @@ if TYPE_CHECKING:
 # How well the best member of a hypothesis fits: the best size, held angle or range of errors.
 
 
-def first_spoilt(movements: Movements, onset: FloatArray) -> BoolArray:
+def first_affected(movements: Movements, onset: FloatArray) -> BoolArray:
     """Return with which movements the effects of a fault may begin, (run, movement).
 
     The one under way at the onset, or the next: some faults act at once, others on the next
@@ -59,32 +64,34 @@ def first_spoilt(movements: Movements, onset: FloatArray) -> BoolArray:
     return np.asarray((number == under_way) | next_one)
 
 
-def best_fit(scene: Scene, hypothesis: Hypothesis, priors: Priors, first: BoolArray) -> FloatArray:
+def max_likelihood(
+    likelihood: RunLikelihood, hypothesis: Hypothesis, priors: Priors, first: BoolArray
+) -> FloatArray:
     """Return the log density of each run under the best member of a hypothesis, (run,).
 
     Args:
-        scene: The runs.
+        likelihood: The runs.
         hypothesis: Healthy or one fault.
         priors: Ranges of sizes that are considered.
         first: Movements with which the effects of the fault may begin, (run, movement).
     """
     if hypothesis.is_healthy:
-        return np.asarray((scene.log_healthy + scene.on_way).sum(axis=1))
+        return np.asarray((likelihood.log_healthy + likelihood.log_transient).sum(axis=1))
     fault = hypothesis.faults[0]
-    if fault.mode in MISSES:
-        whole = log_densities(scene, motor_of(scene, fault), fault.mode)[:, -1]
+    if fault.mode in MISSED_MOVEMENT_FAULTS:
+        whole = log_densities(likelihood, motor_of(likelihood, fault), fault.mode)[:, -1]
     else:
-        whole = _by_first_and_cell(scene, law_of(scene, fault, priors))
+        whole = _by_first_and_cell(likelihood, fault_model_of(likelihood, fault, priors))
     return np.asarray((whole + log_of(first)[..., None]).max(axis=(1, 2)))
 
 
-def _by_first_and_cell(scene: Scene, law: Law) -> FloatArray:
+def _by_first_and_cell(likelihood: RunLikelihood, fault_model: FaultModel) -> FloatArray:
     """Return the log density of each run, (run, first movement spoilt, cell)."""
-    says = densities(scene, law)
-    healthy, faulty = scene.log_healthy + scene.on_way, says.by_cell + says.way
+    says = movement_log_likelihoods(likelihood, fault_model)
+    healthy, faulty = likelihood.log_healthy + likelihood.log_transient, says.by_cell + says.way
     before = np.cumsum(healthy, axis=1) - healthy
     after = np.cumsum(faulty[:, ::-1], axis=1)[:, ::-1]
-    return np.where(np.isfinite(law.log_prior), before[:, :, None] + after, -np.inf)
+    return np.where(np.isfinite(fault_model.log_prior), before[:, :, None] + after, -np.inf)
 
 
 # Noise-free runs as they are weighed on average: what a distance is expected to cost.
@@ -93,7 +100,7 @@ MOST_NATS = 40.0
 """What one movement counts at most [nats]: about what a tool that may be anywhere costs."""
 
 
-def shrink(dof: float) -> float:
+def expected_distance_factor(dof: float) -> float:
     """Return the factor on squared distances that makes noise-free falls expected ones.
 
     Of a 3-variate Student t the log density falls by (dof + 3)/2 log(1 + d2/dof) from its centre.
@@ -106,7 +113,7 @@ def shrink(dof: float) -> float:
     return 1.0 if np.isinf(dof) else dof / (dof + 5.0)
 
 
-class NoiseFreeScene(Scene):
+class ExpectedRunLikelihood(RunLikelihood):
     """Noise-free runs, with densities that are expected ones, relative to a perfect fit.
 
     Every hypothesis has the scatter of the healthy robot, also at a motor that is held, so that
@@ -124,31 +131,31 @@ class NoiseFreeScene(Scene):
         says = [p.log_density(p.expected[:, :, None], False)[..., 0] for p in profiles]
         return np.asarray(np.max(says, axis=0))
 
-    def profile(self, motor: int) -> MotorProfile:
+    def profile(self, motor: int) -> JointLikelihood:
         """Return what each movement is expected to say of one motor, computed once."""
         if motor not in self._expected:
             self._expected[motor] = self._with_expected(super().profile(motor))
         return self._expected[motor]
 
     @cached_property
-    def _expected(self) -> dict[int, MotorProfile]:
+    def _expected(self) -> dict[int, JointLikelihood]:
         return {}
 
-    def _with_expected(self, profile: MotorProfile) -> MotorProfile:
+    def _with_expected(self, profile: JointLikelihood) -> JointLikelihood:
         own = 1.0 + profile.scatter**2 * profile.precision
-        factor = shrink(profile.dof)
+        factor = expected_distance_factor(profile.dof)
         return replace(
             profile,
             precision=profile.precision / own * factor,
-            square=profile.square * factor,
-            log_weight=_relative(self.alternatives.log_weight),
+            min_distance2=profile.min_distance2 * factor,
+            log_weight=_relative(self.outcomes.log_weight),
             scatter=0.0,
             outlier=-MOST_NATS,
         )
 
 
 def _relative(log_weight: FloatArray) -> FloatArray:
-    """Return log weights of alternatives, relative to that of all commands arriving."""
+    """Return log weights of outcomes, relative to that of all commands arriving."""
     return log_weight - log_weight[..., :1]
 
 
@@ -157,7 +164,7 @@ CHUNK_RUNS = 64
 
 
 @dataclass(frozen=True)
-class Separation:
+class LogBayesFactors:
     """How far the truth of some runs is ahead of each hypothesis.
 
     Attributes:
@@ -179,7 +186,7 @@ class Separation:
 
 
 @dataclass(frozen=True)
-class Judge:
+class ExpectedLogBayesFactor:
     """Lays noise-free runs beside every hypothesis.
 
     Attributes:
@@ -198,7 +205,7 @@ class Judge:
                 raise InputError(
                     f"'{hypothesis}' cannot be laid beside others. Expected healthy or one fault."
                 )
-            check_weighable(hypothesis)
+            check_diagnosable(hypothesis)
 
     def fits(
         self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]], onset: FloatArray
@@ -223,14 +230,16 @@ class Judge:
     def _fits(
         self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]], onset: FloatArray
     ) -> FloatArray:
-        silent = self.silent(runs, faults)
+        silent = self.noise_free(runs, faults)
         settled = settled_evidence(silent)
-        moving = moving_evidence(silent, settled) if self._needs_way else None
-        scene = NoiseFreeScene(settled, self.model, moving)
-        first = first_spoilt(settled.movements, onset)
-        return np.stack([best_fit(scene, h, self.priors, first) for h in self.hypotheses], axis=1)
+        moving = transient_samples(silent, settled) if self._needs_way else None
+        likelihood = ExpectedRunLikelihood(settled, self.model, moving)
+        first = first_affected(settled.movements, onset)
+        return np.stack(
+            [max_likelihood(likelihood, h, self.priors, first) for h in self.hypotheses], axis=1
+        )
 
-    def silent(self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]]) -> xr.Dataset:
+    def noise_free(self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]]) -> xr.Dataset:
         """Return the runs as they would be seen if nothing were left to chance."""
         twin, time = self.model.twin, as_floats(runs["time"].values)
         path = noise_free_path(
@@ -240,14 +249,14 @@ class Judge:
             time,
             Injection(faults, twin.robot.motor_names, MODES),
         )
-        seen = true_readings(runs).seen[..., None]
+        seen = measured_samples(runs).seen[..., None]
         return runs.assign(measured=(("run", "time", "axis"), np.where(seen, path, np.nan)))
 
     @property
     def _needs_way(self) -> bool:
         """Whether the way counts: only of faults that show there, if the timing is known."""
         modes = {fault.mode for h in self.hypotheses for fault in h.faults}
-        return not modes.isdisjoint(TIMED) and self.model.knows_timing
+        return not modes.isdisjoint(TRANSIENT_FAULTS) and self.model.knows_timing
 
 
 def commanded(runs: xr.Dataset) -> Movements:
@@ -259,13 +268,13 @@ def commanded(runs: xr.Dataset) -> Movements:
     return find_movements(command, as_floats(runs["time"].values))
 
 
-def separation(
+def expected_log_bayes_factors(
     twin: DigitalTwin,
     runs: xr.Dataset,
     imperfections: Imperfections | None = None,
     hypotheses: Sequence[Hypothesis | str] | None = None,
     priors: Priors | None = None,
-) -> Separation:
+) -> LogBayesFactors:
     """Return by how much the truth of simulated runs is expected to beat each hypothesis.
 
     Args:
@@ -288,10 +297,10 @@ def separation(
     asked = paper_hypotheses(motors) if hypotheses is None else parse_hypotheses(hypotheses, motors)
     model = HealthyModel(twin, imperfections or default_imperfections(twin.robot))
     everything = tuple(dict.fromkeys((*asked, *truth)))
-    judge = Judge(model, everything, priors or Priors())
+    judge = ExpectedLogBayesFactor(model, everything, priors or Priors())
     fit = judge.fits(runs, faults, as_floats(runs["onset"].values))
     own = fit[np.arange(len(truth)), [everything.index(h) for h in truth]]
-    return Separation(asked, truth, own[:, None] - fit[:, : len(asked)])
+    return LogBayesFactors(asked, truth, own[:, None] - fit[:, : len(asked)])
 
 
 def truth_and_faults(

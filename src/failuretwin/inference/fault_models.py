@@ -14,10 +14,10 @@ from failuretwin.core.numerics import log_of, log_sum, log_trapezoid_weights, we
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.failure_modes import magnitude_range
 from failuretwin.digital_model.settling import sag
-from failuretwin.inference.joint_likelihood import MotorProfile
-from failuretwin.inference.marginal import Law
-from failuretwin.inference.onset import Stretches, at_movement_starts, at_once
-from failuretwin.inference.run_likelihood import Scene
+from failuretwin.inference.joint_likelihood import JointLikelihood
+from failuretwin.inference.marginal import FaultModel
+from failuretwin.inference.onset import OnsetIntervals, immediate, next_movement
+from failuretwin.inference.run_likelihood import RunLikelihood
 
 # Nodes of an unknown that holds for the whole run: dense where a movement may point.
 
@@ -69,12 +69,12 @@ def size_nodes(
 
 
 def pointed(
-    profile: MotorProfile, settled: FloatArray, gain: FloatArray
+    profile: JointLikelihood, settled: FloatArray, gain: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the amount that each movement points to and its deviation, (run, movement)."""
     safe = np.where(np.abs(gain) > 1e-9, gain, 1.0)
     spread = np.sqrt(1.0 / np.maximum(profile.precision[..., 0], 1e-6) + profile.scatter**2)
-    return (profile.best[..., 0] - settled) / safe, spread / np.abs(safe)
+    return (profile.mode[..., 0] - settled) / safe, spread / np.abs(safe)
 
 
 @dataclass(frozen=True)
@@ -83,34 +83,34 @@ class Amount:
 
     Attributes:
         gain: Offset of the settled angle for each unit of amount, from scene and motor:
-            (run, movement, alternative) [rad].
+            (run, movement, outcome) [rad].
         of_size: Amount that belongs to a magnitude.
         to_size: Magnitude that belongs to an amount.
         signed: Whether magnitudes have a sign.
     """
 
-    gain: Callable[[Scene, int], FloatArray]
+    gain: Callable[[RunLikelihood, int], FloatArray]
     of_size: Callable[[FloatArray], FloatArray] = lambda size: size
     to_size: Callable[[FloatArray], FloatArray] = lambda amount: amount
     signed: bool = True
 
 
-def _everywhere(scene: Scene, motor: int) -> FloatArray:
-    return np.ones(scene.alternatives.base.shape[:3])
+def _everywhere(likelihood: RunLikelihood, motor: int) -> FloatArray:
+    return np.ones(likelihood.outcomes.base.shape[:3])
 
 
-def _by_angle(scene: Scene, motor: int) -> FloatArray:
-    return np.asarray(scene.alternatives.base[..., motor])
+def _by_angle(likelihood: RunLikelihood, motor: int) -> FloatArray:
+    return np.asarray(likelihood.outcomes.base[..., motor])
 
 
-def _behind(scene: Scene, motor: int) -> FloatArray:
+def _behind(likelihood: RunLikelihood, motor: int) -> FloatArray:
     """Half of the play, against the direction of the last travel."""
-    return np.asarray(-0.5 * scene.alternatives.direction[..., motor])
+    return np.asarray(-0.5 * likelihood.outcomes.direction[..., motor])
 
 
-def _by_sag(scene: Scene, motor: int) -> FloatArray:
-    model, alternatives = scene.model, scene.alternatives
-    pose = model.settle(alternatives.base, alternatives.direction, model.none_held)
+def _by_sag(likelihood: RunLikelihood, motor: int) -> FloatArray:
+    model, outcomes = likelihood.model, likelihood.outcomes
+    pose = model.settle(outcomes.base, outcomes.direction, model.none_held)
     settling = model.settling
     yielding = sag(model.twin.robot, pose, np.asarray(settling.compliance), settling.payload)
     return np.asarray(yielding[..., motor])
@@ -130,18 +130,20 @@ AMOUNTS: Mapping[str, Amount] = {
 """Modes of a constant magnitude, by id."""
 
 
-def lasting_law(scene: Scene, motor: int, mode: str, early: float) -> Law:
-    """Return the law of a fault whose magnitude is the same from its onset on.
+def constant_fault_model(
+    likelihood: RunLikelihood, motor: int, mode: str, prior_before_run: float
+) -> FaultModel:
+    """Return the fault model of a fault whose magnitude is the same from its onset on.
 
     Args:
-        scene: The runs.
+        likelihood: The runs.
         motor: Index of the motor.
         mode: Id of the mode, one of `AMOUNTS`.
-        early: Probability that the fault was there before the run.
+        prior_before_run: Probability that the fault was there before the run.
     """
-    amount, profile = AMOUNTS[mode], scene.profile(motor)
-    gain = amount.gain(scene, motor)
-    settled = profile.beside
+    amount, profile = AMOUNTS[mode], likelihood.profile(motor)
+    gain = amount.gain(likelihood, motor)
+    settled = profile.faulty_baseline
     best, width = pointed(profile, settled[..., 0], gain[..., 0])
     best = np.clip(best, -1e3, 1e3)
     slope = _slope(amount, best)
@@ -153,14 +155,14 @@ def lasting_law(scene: Scene, motor: int, mode: str, early: float) -> Law:
         amount.signed,
     )
     offset = gain[:, :, None] * amount.of_size(size)[:, None, :, None]
-    stretches = at_once(scene.evidence)
-    return Law(
+    stretches = immediate(likelihood.evidence)
+    return FaultModel(
         motor=motor,
         held=False,
         angle=settled[:, :, None] + offset,
-        log_prior=log_of(stretches.weights(early))[..., None] + log_size[:, None],
+        log_prior=log_of(stretches.weights(prior_before_run))[..., None] + log_size[:, None],
         size=size,
-        onsets=stretches.onsets(early),
+        onsets=stretches.onsets(prior_before_run),
         gain=gain,
     )
 
@@ -184,19 +186,19 @@ WITHIN = np.linspace(-0.4, 0.4, 5) / CELLS
 """Where in its part an onset may be, beside its middle, as shares of the length of the stretch."""
 
 
-def drift_law(scene: Scene, motor: int, early: float) -> Law:
-    """Return the law of a motor that slips away from its targets at a constant rate.
+def drift_model(likelihood: RunLikelihood, motor: int, prior_before_run: float) -> FaultModel:
+    """Return the fault model of a motor that slips away from its targets at a constant rate.
 
     Args:
-        scene: The runs.
+        likelihood: The runs.
         motor: Index of the motor.
-        early: Probability that it slips from the start of the run.
+        prior_before_run: Probability that it slips from the start of the run.
     """
-    middle = np.nan_to_num(0.5 * (scene.evidence.begin + scene.evidence.end))
-    settled = scene.profile(motor).beside
-    rate, log_rate = _rates(scene, motor, settled, middle)
-    stretches = at_once(scene.evidence)
-    onset, log_onset = _onsets(stretches, early)  # (run, movement, onset)
+    middle = np.nan_to_num(0.5 * (likelihood.evidence.begin + likelihood.evidence.end))
+    settled = likelihood.profile(motor).faulty_baseline
+    rate, log_rate = _rates(likelihood, motor, settled, middle)
+    stretches = immediate(likelihood.evidence)
+    onset, log_onset = _onsets(stretches, prior_before_run)  # (run, movement, onset)
     length = np.nan_to_num(stretches.end - stretches.begin)[..., None] * np.ones_like(onset)
     length[..., 0] = 0.0  # before the run is no stretch of it
     runs, movements, onsets = onset.shape
@@ -215,7 +217,7 @@ def drift_law(scene: Scene, motor: int, early: float) -> Law:
             np.full((1, 1, len(WITHIN)), 1.0 / len(WITHIN)),
         )
 
-    return Law(
+    return FaultModel(
         motor=motor,
         held=False,
         angle=settled[:, :, None] + offset[..., None],
@@ -226,19 +228,19 @@ def drift_law(scene: Scene, motor: int, early: float) -> Law:
 
 
 def _rates(
-    scene: Scene, motor: int, settled: FloatArray, since: FloatArray
+    likelihood: RunLikelihood, motor: int, settled: FloatArray, since: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return rates, sorted, and the log of their prior, (run, rate) each.
 
     They crowd where the movements together point if the motor slips from the start of the run.
 
     Args:
-        scene: The runs.
+        likelihood: The runs.
         motor: Index of the motor.
-        settled: Where it settles apart from what has slipped, (run, movement, alternative) [rad].
+        settled: Where it settles apart from what has slipped, (run, movement, outcome) [rad].
         since: For how long it has slipped then, (run, movement) [s].
     """
-    profile = scene.profile(motor)
+    profile = likelihood.profile(motor)
     best, width = pointed(profile, settled[..., 0], since)
     weight = np.where(profile.usable & (since > 0.0), 1.0 / width**2, 0.0)
     total = weight.sum(axis=1, keepdims=True)
@@ -248,13 +250,13 @@ def _rates(
     return size_nodes(together, spread, some, magnitude_range("drift"), signed=True)
 
 
-def _onsets(stretches: Stretches, early: float) -> tuple[FloatArray, FloatArray]:
+def _onsets(stretches: OnsetIntervals, prior_before_run: float) -> tuple[FloatArray, FloatArray]:
     """Return onsets [s] and their log prior, (run, movement, onset); the first is the start."""
     begin, end = np.nan_to_num(stretches.begin), np.nan_to_num(stretches.end)
     inside = begin[..., None] + ONSETS * (end - begin)[..., None]
-    weight = stretches.weights(early)
+    weight = stretches.weights(prior_before_run)
     late = weight.copy()
-    late[:, 0] = np.maximum(late[:, 0] - early, 0.0)
+    late[:, 0] = np.maximum(late[:, 0] - prior_before_run, 0.0)
     before = weight - late
     onset = np.concatenate([np.zeros_like(inside[..., :1]), inside], axis=-1)
     shares = np.concatenate(
@@ -271,68 +273,72 @@ TIMED_NODES = 12
 """Magnitudes to sum over."""
 
 
-def lag_law(scene: Scene, motor: int, early: float) -> Law:
-    """Return the law of a motor that follows its reference late; it settles as a healthy one.
+def lag_model(likelihood: RunLikelihood, motor: int, prior_before_run: float) -> FaultModel:
+    """Return the fault model of a motor that is late but settles as a healthy one.
 
     Args:
-        scene: The runs.
+        likelihood: The runs.
         motor: Index of the motor.
-        early: Probability that the fault was there before the run.
+        prior_before_run: Probability that the fault was there before the run.
     """
     delay = np.linspace(*magnitude_range("lag"), TIMED_NODES)
     way = None
-    if scene.transients is not None:
-        way = scene.transients.timed(motor, np.ones(TIMED_NODES), delay)
-    angle = scene.profile(motor).expected[:, :, None]
-    return _law(scene, motor, delay, np.repeat(angle, TIMED_NODES, axis=2), way, early)
+    if likelihood.transients is not None:
+        way = likelihood.transients.delayed_or_slow(motor, np.ones(TIMED_NODES), delay)
+    angle = likelihood.profile(motor).expected[:, :, None]
+    return _law(
+        likelihood, motor, delay, np.repeat(angle, TIMED_NODES, axis=2), way, prior_before_run
+    )
 
 
-def slow_law(scene: Scene, motor: int, early: float) -> Law:
-    """Return the law of a motor that has lost speed; movements that follow cut it short.
+def slow_model(likelihood: RunLikelihood, motor: int, prior_before_run: float) -> FaultModel:
+    """Return the fault model of a motor that has lost speed; movements that follow cut it short.
 
     Args:
-        scene: The runs.
+        likelihood: The runs.
         motor: Index of the motor.
-        early: Probability that the fault was there before the run.
+        prior_before_run: Probability that the fault was there before the run.
     """
     share = np.linspace(*magnitude_range("slow"), TIMED_NODES)
     factor = 1.0 / (1.0 - share)
-    begin, end = _reached(scene, motor, factor)
+    begin, end = _reached(likelihood, motor, factor)
     way = None
-    if scene.transients is not None:
-        way = scene.transients.timed(motor, factor, np.zeros(TIMED_NODES), begin)
-    short = end - np.nan_to_num(scene.evidence.movements.target[..., motor])[..., None]
-    angle = scene.profile(motor).expected[:, :, None] + short[..., None]
-    return _law(scene, motor, share, angle, way, early)
+    if likelihood.transients is not None:
+        way = likelihood.transients.delayed_or_slow(motor, factor, np.zeros(TIMED_NODES), begin)
+    short = end - np.nan_to_num(likelihood.evidence.movements.target[..., motor])[..., None]
+    angle = likelihood.profile(motor).expected[:, :, None] + short[..., None]
+    return _law(likelihood, motor, share, angle, way, prior_before_run)
 
 
 def _law(
-    scene: Scene,
+    likelihood: RunLikelihood,
     motor: int,
     size: FloatArray,
     angle: FloatArray,
     way: FloatArray | None,
-    early: float,
-) -> Law:
-    stretches = at_movement_starts(scene.evidence.movements)
-    log_first = log_of(stretches.weights(early)) - np.log(TIMED_NODES)
-    return Law(
+    prior_before_run: float,
+) -> FaultModel:
+    stretches = next_movement(likelihood.evidence.movements)
+    log_first = log_of(stretches.weights(prior_before_run)) - np.log(TIMED_NODES)
+    return FaultModel(
         motor=motor,
         held=False,
         angle=angle,
         log_prior=np.repeat(log_first[..., None], TIMED_NODES, axis=2),
         size=size[None],
-        onsets=stretches.onsets(early),
-        on_way=way,
+        onsets=stretches.onsets(prior_before_run),
+        log_transient=way,
     )
 
 
-def _reached(scene: Scene, motor: int, factor: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _reached(
+    likelihood: RunLikelihood, motor: int, factor: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return where a slow motor begins and ends each movement, (run, movement, node) [rad]."""
-    movements = scene.evidence.movements
+    movements = likelihood.evidence.movements
     target = np.nan_to_num(movements.target[..., motor])[..., None]
     needed = np.nan_to_num(movements.ramp_duration[..., motor])[..., None] * factor
-    available = (scene.evidence.end - movements.start)[..., None]
+    available = (likelihood.evidence.end - movements.start)[..., None]
     done = np.divide(available, needed, out=np.ones_like(needed), where=needed > 0.0)
     done = np.clip(np.nan_to_num(done, nan=1.0), 0.0, 1.0)
     here = np.repeat(movements.initial[:, motor, None], len(factor), axis=1)
@@ -360,25 +366,27 @@ ERROR_NODES = 36
 """Sizes to sum over on each side of zero, up to the largest error considered."""
 
 
-def error_law(scene: Scene, motor: int, ranges: Sequence[Range], early: float) -> Law:
-    """Return the law of `motor` having a steady-state error.
+def steady_state_error_model(
+    likelihood: RunLikelihood, motor: int, ranges: Sequence[Range], prior_before_run: float
+) -> FaultModel:
+    """Return the fault model of `motor` having a steady-state error.
 
     Args:
-        scene: The runs.
+        likelihood: The runs.
         motor: Index of the motor.
         ranges: Run-level ranges of the error's size [rad], equally likely.
-        early: Probability that it was there before the run.
+        prior_before_run: Probability that it was there before the run.
     """
     offset, log_weight = offset_nodes(ranges)
-    stretches = at_movement_starts(scene.evidence.movements)
-    log_first = log_of(stretches.weights(early))
-    return Law(
+    stretches = next_movement(likelihood.evidence.movements)
+    log_first = log_of(stretches.weights(prior_before_run))
+    return FaultModel(
         motor=motor,
         held=False,
-        angle=scene.profile(motor).beside[:, :, None] + offset[:, None],
+        angle=likelihood.profile(motor).faulty_baseline[:, :, None] + offset[:, None],
         log_prior=np.repeat(log_first[..., None] - np.log(len(ranges)), len(ranges), axis=2),
         size=offset[None],
-        onsets=stretches.onsets(early),
+        onsets=stretches.onsets(prior_before_run),
         redrawn=log_weight,
     )
 

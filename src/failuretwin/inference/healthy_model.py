@@ -13,7 +13,7 @@ from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.nonidealities import Imperfections, Timing
 from failuretwin.digital_model.settling import Settling, loads_in_range
 from failuretwin.digital_model.twin import SAG_ROUNDS, DigitalTwin
-from failuretwin.inference.command_loss import OUTLIER_RATE, Alternatives, LostCommands
+from failuretwin.inference.command_loss import OUTLIER_RATE, CommandOutcomes, LostCommands
 from failuretwin.inference.evidence import SettledEvidence
 
 PATH_NOISE_M = 0.001
@@ -34,7 +34,7 @@ class HealthyModel:
 
     twin: DigitalTwin
     imperfections: Imperfections
-    blur: float = 1.0
+    scatter_factor: float = 1.0
 
     @cached_property
     def settling(self) -> Settling:
@@ -44,7 +44,7 @@ class HealthyModel:
     @cached_property
     def scatter(self) -> FloatArray:
         """Scale of the settled scatter and of what is not known of the robot, (motor,) [rad]."""
-        return self.blur * self._sharp_scatter
+        return self.scatter_factor * self._sharp_scatter
 
     @property
     def _sharp_scatter(self) -> FloatArray:
@@ -71,8 +71,8 @@ class HealthyModel:
         """Noise of a settled tool position that belongs to no motor [m]."""
         readings = self.imperfections.readings
         if readings is None or self.imperfections.settling is None:
-            return self.blur * PATH_NOISE_M
-        return self.blur * float(np.hypot(readings.noise_m, LEAST_NOISE_M))
+            return self.scatter_factor * PATH_NOISE_M
+        return self.scatter_factor * float(np.hypot(readings.noise_m, LEAST_NOISE_M))
 
     @property
     def knows_timing(self) -> bool:
@@ -122,36 +122,39 @@ class HealthyModel:
         """Which commands get lost, and how often."""
         return LostCommands(self.twin.robot, self.imperfections)
 
-    def alternatives(self, movements: Movements) -> Alternatives:
+    def outcomes(self, movements: Movements) -> CommandOutcomes:
         """Return what may become of each movement; the first is that every command arrives."""
-        return self.lost_commands.alternatives(movements)
+        return self.lost_commands.outcomes(movements)
 
-    def given_before(
-        self, evidence: SettledEvidence, alternatives: Alternatives, terms: FloatArray
-    ) -> Alternatives:
-        """Return alternatives with their probability given what was seen of the movements before.
+    def filtered_outcomes(
+        self, evidence: SettledEvidence, outcomes: CommandOutcomes, terms: FloatArray
+    ) -> CommandOutcomes:
+        """Return outcomes with their probability given what was seen of the movements before.
 
         Args:
             evidence: Settled positions.
-            alternatives: What may have become of each movement, whatever was seen.
+            outcomes: What may have become of each movement, whatever was seen.
             terms: How well they explain the settled positions, from `explain`.
         """
-        possible = np.isfinite(alternatives.log_weight)
-        density = terms - np.where(possible, alternatives.log_weight, 0.0)
+        possible = np.isfinite(outcomes.log_weight)
+        density = terms - np.where(possible, outcomes.log_weight, 0.0)
         says = np.logaddexp(np.log1p(-OUTLIER_RATE) + density, self.outlier_log_density)
         says = np.where(evidence.usable[..., None], says, 0.0)
-        late = self.late(evidence.movements, evidence.resumed)
-        return self.lost_commands.given_before(alternatives, late, says)
+        late = self.late(evidence.movements, evidence.first_reading_delay)
+        return self.lost_commands.filtered_outcomes(outcomes, late, says)
 
-    def late(self, movements: Movements, resumed: FloatArray | None = None) -> FloatArray:
+    def late(
+        self, movements: Movements, first_reading_delay: FloatArray | None = None
+    ) -> FloatArray:
         """Return the probability that each movement started late, (run, movement).
 
         Args:
             movements: The movements.
-            resumed: Time from each command to the first reading after it, (run, movement) [s];
+            first_reading_delay: Time from each command to the first reading after it, (run,
+                movement) [s];
                 None: not known.
         """
-        return self.lost_commands.late(movements, resumed)
+        return self.lost_commands.late(movements, first_reading_delay)
 
     def settle(self, base: FloatArray, direction: FloatArray, held: BoolArray) -> FloatArray:
         """Return the angles at which the motors settle, (..., motor) [rad].
@@ -169,27 +172,27 @@ class HealthyModel:
         return near
 
     def explain(
-        self, evidence: SettledEvidence, alternatives: Alternatives
+        self, evidence: SettledEvidence, outcomes: CommandOutcomes
     ) -> tuple[FloatArray, FloatArray]:
-        """Return how well each alternative explains the settled positions, and with which pose.
+        """Return how well each outcome explains the settled positions, and with which pose.
 
         Args:
             evidence: Settled positions.
-            alternatives: What may have become of each movement.
+            outcomes: What may have become of each movement.
 
         Returns:
-            Log weight times density of each alternative if no motor is faulty,
-            (run, movement, alternative) [log 1/m3], and the pose, scattered so as to meet the
-            position, (run, movement, alternative, motor) [rad].
+            Log weight times density of each outcome if no motor is faulty,
+            (run, movement, outcome) [log 1/m3], and the pose, scattered so as to meet the
+            position, (run, movement, outcome, motor) [rad].
         """
-        pose = self.settle(alternatives.base, alternatives.direction, self.none_held)
+        pose = self.settle(outcomes.base, outcomes.direction, self.none_held)
         predicted, jacobian = self.twin.path_and_jacobian(pose)
         error = evidence.point[:, :, None] - predicted
         spread = Ellipsoid.of(jacobian * self.scatter, self.path_noise**2)
         dof = self.settling.tail_dof
         density = spread.log_norm(dof) + log_fall(spread.product(error, error), dof)
         return (
-            alternatives.log_weight + density,
+            outcomes.log_weight + density,
             pose + scattered(spread, jacobian, self.scatter, error),
         )
 

@@ -33,7 +33,7 @@ from failuretwin.failure_behavior.fault import STEP, FaultValue
 from failuretwin.failure_behavior.mode import FaultMode, SizedMode
 from failuretwin.failure_behavior.modes import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser
-from failuretwin.inference.expected_bayes_factors import Judge
+from failuretwin.inference.expected_bayes_factors import ExpectedLogBayesFactor
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.priors import Priors
 
@@ -50,7 +50,7 @@ Case = tuple[Hypothesis, float]
 
 
 @dataclass(frozen=True)
-class Trials:
+class MonteCarloFaults:
     """Some motions to try faults on.
 
     Attributes:
@@ -59,11 +59,11 @@ class Trials:
         onset_s: When faults begin [s].
     """
 
-    judge: Judge
+    judge: ExpectedLogBayesFactor
     motions: xr.Dataset
     onset_s: float
 
-    def ahead(self, cases: Sequence[Case]) -> FloatArray:
+    def log_bayes_factor(self, cases: Sequence[Case]) -> FloatArray:
         """Return by how much the truth beats each hypothesis, (case, hypothesis) [nats].
 
         It is the median over motions and draws.
@@ -117,8 +117,8 @@ LEAST = 0.001
 """No smaller share of the largest size is tried: ranges of errors may begin at 0."""
 
 
-def smallest_sizes(
-    trials: Trials, hypothesis: Hypothesis, considered: tuple[float, float]
+def minimum_detectable_sizes(
+    trials: MonteCarloFaults, hypothesis: Hypothesis, considered: tuple[float, float]
 ) -> tuple[float | None, float | None]:
     """Return the smallest sizes at which a fault is told from healthy, and from everything else.
 
@@ -133,7 +133,7 @@ def smallest_sizes(
     own = trials.judge.hypotheses.index(hypothesis)
 
     def ahead(sizes: FloatArray) -> FloatArray:
-        nats = trials.ahead([(hypothesis, float(size)) for size in sizes])
+        nats = trials.log_bayes_factor([(hypothesis, float(size)) for size in sizes])
         nats[:, own] = np.inf
         return np.stack([nats[:, 0], nats.min(axis=1)])
 
@@ -177,7 +177,7 @@ LEAST_TYPICAL = 0.02
 
 
 @dataclass(frozen=True)
-class Ambiguity:
+class IsolabilityReport:
     """What can be told apart by a motion.
 
     Attributes:
@@ -203,7 +203,7 @@ class Ambiguity:
     largest: Mapping[str, float]
 
 
-def ambiguity(
+def isolability(
     twin: DigitalTwin,
     command: ArrayLike,
     time: ArrayLike,
@@ -211,7 +211,7 @@ def ambiguity(
     hypotheses: Sequence[Hypothesis | str] | None = None,
     priors: Priors | None = None,
     onset_s: float = 0.0,
-) -> Ambiguity:
+) -> IsolabilityReport:
     """Return what a planned motion can tell apart; nothing needs to be measured.
 
     Args:
@@ -233,16 +233,18 @@ def ambiguity(
     motors = twin.robot.motor_names
     asked = paper_hypotheses(motors) if hypotheses is None else parse_hypotheses(hypotheses, motors)
     model = HealthyModel(twin, imperfections or default_imperfections(twin.robot))
-    judge = Judge(model, tuple(dict.fromkeys((HEALTHY, *asked))), priors or Priors())
+    judge = ExpectedLogBayesFactor(
+        model, tuple(dict.fromkeys((HEALTHY, *asked))), priors or Priors()
+    )
     motions = _motions(twin, command, time)
     _check_onset(onset_s, float(motions["time"].values[-1]))
-    trials = Trials(judge, motions, onset_s)
+    trials = MonteCarloFaults(judge, motions, onset_s)
     considered = {h: _sizes(h, judge.priors) for h in judge.hypotheses}
-    nats = trials.ahead([(h, _typical(*sizes)) for h, sizes in considered.items()])
+    nats = trials.log_bayes_factor([(h, _typical(*sizes)) for h, sizes in considered.items()])
     sized = {h: sizes for h, sizes in considered.items() if np.isfinite(sizes).all()}
-    smallest = {str(h): smallest_sizes(trials, h, sizes) for h, sizes in sized.items()}
+    smallest = {str(h): minimum_detectable_sizes(trials, h, sizes) for h, sizes in sized.items()}
     names = tuple(str(h) for h in judge.hypotheses)
-    return Ambiguity(
+    return IsolabilityReport(
         hypotheses=names,
         nats=nats,
         groups=_groups(names, nats[1:] < APART_NATS),
@@ -347,7 +349,7 @@ MOST_LOST = 0.1
 """A healthy motor loses at most this share of its commands, however often these logs did."""
 
 
-def suspicion(runs: xr.Dataset, robot: Robot, learned: Imperfections) -> FloatArray:
+def fault_probability(runs: xr.Dataset, robot: Robot, learned: Imperfections) -> FloatArray:
     """Return the probability that each run is faulty, (run,); 0 where nothing can be told.
 
     A fit to faulty runs takes their errors for scatter and their stuck motors for lost commands,

@@ -14,7 +14,7 @@ import numpy as np
 
 from failuretwin.core.numerics import Ellipsoid, log_norm
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.inference.command_loss import Alternatives
+from failuretwin.inference.command_loss import CommandOutcomes
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel, scattered
 
@@ -34,73 +34,73 @@ LEAST_PRECISION = 1e-3
 
 
 @dataclass(frozen=True)
-class MotorProfile:
-    """Evidence on the settled angle of one motor, (..., alternative) each.
+class JointLikelihood:
+    """Evidence on the settled angle of one motor, (..., outcome) each.
 
     Leading axes are run and movement, and one more where another motor takes several angles.
     Alternatives that are not possible are zero throughout, their weight aside.
 
     Attributes:
-        best: Angle that brings the tool nearest to where it was seen [rad].
+        mode: Angle that brings the tool nearest to where it was seen [rad].
         precision: Curvature of the squared distance there [1/rad2].
-        square: Squared distance at `best`, in scales of the others' scatter.
-        log_weight: Log of the alternative's weight times the density's norm.
+        min_distance2: Squared distance at `mode`, in scales of the others' scatter.
+        log_weight: Log of the outcome's weight times the density's norm.
         expected: Angle at which the motor settles if it is healthy [rad].
         scatter: Scale of its own settled scatter [rad].
         dof: Degrees of freedom of the scatter.
         outlier: Log density of the tool being anywhere, times its rate.
         usable: Movements with evidence, (run, movement).
-        around: Whether angles a full turn apart, which are the same, may both come up.
-        pose: Angles of all motors that explain the position best, with this motor at `best` and
-            the others scattered, (..., alternative, motor) [rad].
-        beside: Angle at which the motor settles if a fault takes it off its target, apart from
-            what the fault itself adds [rad]: it sags in the pose that it is really in, for which
-            `best` stands.
+        wraps: Whether angles a full turn apart, which are the same, may both come up.
+        map_pose: Angles of all motors that explain the position best, with this motor at `mode` and
+            the others scattered, (..., outcome, motor) [rad].
+        faulty_baseline: Angle at which the motor settles if a fault takes it off its target, apart
+            from what the fault itself adds [rad]: it sags in the pose that it is really in, for
+            which `mode` stands.
     """
 
-    best: FloatArray
+    mode: FloatArray
     precision: FloatArray
-    square: FloatArray
+    min_distance2: FloatArray
     log_weight: FloatArray
     expected: FloatArray
     scatter: float
     dof: float
     outlier: float
     usable: BoolArray
-    around: bool
-    pose: FloatArray
-    beside: FloatArray
+    wraps: bool
+    map_pose: FloatArray
+    faulty_baseline: FloatArray
 
-    def __getitem__(self, run: int) -> MotorProfile:
+    def __getitem__(self, run: int) -> JointLikelihood:
         """Return what one of the runs says, without the axis of runs."""
         return replace(
             self,
-            best=self.best[run],
+            mode=self.mode[run],
             precision=self.precision[run],
-            square=self.square[run],
+            min_distance2=self.min_distance2[run],
             log_weight=self.log_weight[run],
             expected=self.expected[run],
             usable=self.usable[run],
-            pose=self.pose[run],
-            beside=self.beside[run],
+            map_pose=self.map_pose[run],
+            faulty_baseline=self.faulty_baseline[run],
         )
 
     def log_terms(self, angle: FloatArray, held: bool) -> FloatArray:
-        """Return log weight times density of each alternative.
+        """Return log weight times density of each outcome.
 
         Args:
-            angle: Where the motor settles, scatter aside, (..., alternative) [rad].
+            angle: Where the motor settles, scatter aside, (..., outcome) [rad].
             held: Whether the gear holds it exactly there.
         """
         precision, log_weight = self._with_scatter(held)
-        off = self._turned(angle - self.best)
-        return log_weight + self._fall(self.square + precision * off**2)
+        off = self._turned(angle - self.mode)
+        return log_weight + self._fall(self.min_distance2 + precision * off**2)
 
     def log_density(self, angle: FloatArray, held: bool) -> FloatArray:
         """Return the log density of each settled position, whatever became of the commands.
 
         Args:
-            angle: Where the motor settles, scatter aside, (..., node, alternative) [rad], or with
+            angle: Where the motor settles, scatter aside, (..., node, outcome) [rad], or with
                 a last axis of 1 if it is the same whatever became of the commands.
             held: Whether the gear holds it exactly there.
 
@@ -111,17 +111,17 @@ class MotorProfile:
         lead = log_weight.shape[:-1]
         angle = np.broadcast_to(angle, (*lead, *angle.shape[-2:]))
         total = np.ones((*lead, angle.shape[-2]))
-        matters = log_weight + self._fall(self.square) > self.outlier - NEGLIGIBLE_NATS
+        matters = log_weight + self._fall(self.min_distance2) > self.outlier - NEGLIGIBLE_NATS
         # Alternative by alternative: large temporary arrays would cost more than the arithmetic.
         for k in range(log_weight.shape[-1]):
             some = matters[..., k]
             if not some.any():
                 continue
             at = angle[some, :, k if angle.shape[-1] > 1 else 0]
-            off = self._turned(at - self.best[some, k, None])
+            off = self._turned(at - self.mode[some, k, None])
             off *= off
             off *= precision[some, k, None]
-            off += self.square[some, k, None]
+            off += self.min_distance2[some, k, None]
             fall = self._fall(off)
             fall += log_weight[some, k, None] - self.outlier
             total[some] += np.exp(fall, out=fall)
@@ -131,7 +131,7 @@ class MotorProfile:
 
     def _turned(self, off: FloatArray) -> FloatArray:
         """Return differences of angles, the shorter way around."""
-        return off - 2.0 * np.pi * np.rint(off / (2.0 * np.pi)) if self.around else off
+        return off - 2.0 * np.pi * np.rint(off / (2.0 * np.pi)) if self.wraps else off
 
     def _with_scatter(self, held: bool) -> tuple[FloatArray, FloatArray]:
         """Return precision and log weight once the motor's own scatter counts."""
@@ -149,29 +149,29 @@ class MotorProfile:
         return fall
 
 
-def motor_profiles(
+def joint_likelihoods(
     evidence: SettledEvidence,
     model: HealthyModel,
-    alternatives: Alternatives,
+    outcomes: CommandOutcomes,
     motors: Sequence[int],
     *,
     other: int | None = None,
     other_angle: FloatArray | None = None,
     other_held: bool = False,
-) -> list[MotorProfile]:
+) -> list[JointLikelihood]:
     """Return what each movement says of some motors, each by itself.
 
     Args:
         evidence: Settled positions.
         model: The healthy robot.
-        alternatives: What may have become of each movement.
+        outcomes: What may have become of each movement.
         motors: Indices of the motors.
         other: Index of another motor that has a fault of its own, if any.
-        other_angle: Where it settles, (run, movement, node, alternative) [rad].
+        other_angle: Where it settles, (run, movement, node, outcome) [rad].
         other_held: Whether the gear holds it exactly there.
     """
-    base, direction = alternatives.base, alternatives.direction
-    log_weight, point = alternatives.log_weight, evidence.point[:, :, None]
+    base, direction = outcomes.base, outcomes.direction
+    log_weight, point = outcomes.log_weight, evidence.point[:, :, None]
     another = model.none_held.copy()
     if other is not None and other_angle is not None:
         base, direction = base[:, :, None], direction[:, :, None]
@@ -215,19 +215,19 @@ def motor_profiles(
         return found
 
     return [
-        MotorProfile(
-            best=everywhere(angle[i]),
+        JointLikelihood(
+            mode=everywhere(angle[i]),
             precision=everywhere(precision[i]),
-            square=everywhere(np.maximum(square[i], 0.0)),
+            min_distance2=everywhere(np.maximum(square[i], 0.0)),
             log_weight=everywhere(weighed[i], -np.inf),
             expected=everywhere(expected[..., motor]),
             scatter=float(model.scatter[motor]),
             dof=dof,
             outlier=model.outlier_log_density,
             usable=evidence.usable,
-            around=_may_turn_around(model, motor),
-            pose=everywhere(settled[i]),
-            beside=everywhere(beside[i]),
+            wraps=_may_turn_around(model, motor),
+            map_pose=everywhere(settled[i]),
+            faulty_baseline=everywhere(beside[i]),
         )
         for i, motor in enumerate(motors)
     ]
@@ -297,52 +297,52 @@ def nearest_on_circle(
 
 
 @dataclass(frozen=True)
-class Findings:
+class MovementLikelihoods:
     """What every movement says by itself, whatever fault may have come later.
 
     Attributes:
         model: The healthy robot.
-        alternatives: What may have become of each movement, given the movements before.
-        density: Log density of its settled position under each alternative if no motor is faulty,
-            (run, movement, alternative) [log 1/m3].
-        poses: Pose that explains the settled position then, (run, movement, alternative, motor)
+        outcomes: What may have become of each movement, given the movements before.
+        density: Log density of its settled position under each outcome if no motor is faulty,
+            (run, movement, outcome) [log 1/m3].
+        poses: Pose that explains the settled position then, (run, movement, outcome, motor)
             [rad].
         profiles: What each movement says of each motor.
     """
 
     model: HealthyModel
-    alternatives: Alternatives
+    outcomes: CommandOutcomes
     density: FloatArray
     poses: FloatArray
-    profiles: Sequence[MotorProfile]
+    profiles: Sequence[JointLikelihood]
 
     @property
     def terms(self) -> FloatArray:
-        """Log weight times density of each alternative, (run, movement, alternative)."""
-        return self.alternatives.log_weight + self.density
+        """Log weight times density of each outcome, (run, movement, outcome)."""
+        return self.outcomes.log_weight + self.density
 
 
-def find(evidence: SettledEvidence, model: HealthyModel) -> Findings:
+def movement_likelihoods(evidence: SettledEvidence, model: HealthyModel) -> MovementLikelihoods:
     """Return what every movement says by itself."""
-    usual = model.alternatives(evidence.movements)
-    density, poses = explained(evidence, model, usual)
-    found = given_before(evidence, model, usual, density)
-    profiles = motor_profiles(evidence, model, found, range(len(model.scatter)))
-    return Findings(model, found, density, poses, profiles)
+    usual = model.outcomes(evidence.movements)
+    density, poses = likelihood_given_outcome(evidence, model, usual)
+    found = filtered_outcomes(evidence, model, usual, density)
+    profiles = joint_likelihoods(evidence, model, found, range(len(model.scatter)))
+    return MovementLikelihoods(model, found, density, poses, profiles)
 
 
-def explained(
-    evidence: SettledEvidence, model: HealthyModel, alternatives: Alternatives
+def likelihood_given_outcome(
+    evidence: SettledEvidence, model: HealthyModel, outcomes: CommandOutcomes
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how well each alternative explains the settled positions, as in `Findings`."""
-    as_likely = replace(alternatives, log_weight=np.zeros_like(alternatives.log_weight))
+    """Return how well each outcome explains the settled positions, as in `MovementLikelihoods`."""
+    as_likely = replace(outcomes, log_weight=np.zeros_like(outcomes.log_weight))
     return model.explain(evidence, as_likely)
 
 
-def given_before(
-    evidence: SettledEvidence, model: HealthyModel, usual: Alternatives, density: FloatArray
-) -> Alternatives:
-    """Return alternatives with their probability given what was seen of the movements before.
+def filtered_outcomes(
+    evidence: SettledEvidence, model: HealthyModel, usual: CommandOutcomes, density: FloatArray
+) -> CommandOutcomes:
+    """Return outcomes with their probability given what was seen of the movements before.
 
     Args:
         evidence: Settled positions.
@@ -350,4 +350,4 @@ def given_before(
         usual: What may have become of each movement, whatever was seen.
         density: How well that explains the settled positions.
     """
-    return model.given_before(evidence, usual, usual.log_weight + density)
+    return model.filtered_outcomes(evidence, usual, usual.log_weight + density)

@@ -10,7 +10,7 @@ import numpy as np
 
 from failuretwin.core.runs import AXES, measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
-from failuretwin.inference.readings import true_readings
+from failuretwin.inference.readings import measured_samples
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -69,11 +69,11 @@ def log_quality(runs: xr.Dataset) -> list[LogQuality]:
     """
     time = as_floats(runs["time"].values)
     command = as_floats(runs["command"].values)
-    measured, rate = true_readings(runs).point, measured_rate(runs)
+    measured, rate = measured_samples(runs).point, measured_rate(runs)
     return [_quality(time, c, m, rate) for c, m in zip(command, measured, strict=True)]
 
 
-def without_spoilt(runs: xr.Dataset, quality: Sequence[LogQuality]) -> xr.Dataset:
+def drop_invalid(runs: xr.Dataset, quality: Sequence[LogQuality]) -> xr.Dataset:
     """Return the runs with spoilt readings missing; the given run set stays as it is."""
     if not any(q.spoilt for q in quality):
         return runs

@@ -14,8 +14,8 @@ import numpy as np
 
 from failuretwin.core.numerics import Weighted, log_sum
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.inference.joint_likelihood import MotorProfile
-from failuretwin.inference.run_likelihood import Scene, share_of
+from failuretwin.inference.joint_likelihood import JointLikelihood
+from failuretwin.inference.run_likelihood import RunLikelihood, share_of
 
 # What runs say of a hypothesis: evidence, posterior of what is unknown, estimates.
 
@@ -27,16 +27,16 @@ class Estimate:
     Attributes:
         onset: Distribution of the onset [s]; None without a fault.
         size: Distribution of the magnitude; None where it has none.
-        became: Probability of each alternative, (movement, alternative).
+        outcome_probability: Probability of each outcome, (movement, outcome).
     """
 
     onset: Weighted | None
     size: Weighted | None
-    became: FloatArray
+    outcome_probability: FloatArray
 
 
 @dataclass(frozen=True)
-class Weight:
+class MarginalLikelihood:
     """What some runs say of one hypothesis.
 
     Attributes:
@@ -54,43 +54,45 @@ class Weight:
 
 
 @dataclass(frozen=True)
-class Posterior:
+class ChangePointPosterior:
     """Log evidence of each run, and of first movement and cell given it.
 
     Attributes:
         log_evidence: (run,).
-        log_share: Log posterior, (run, movement first spoilt, cell).
+        log_responsibility: Log posterior, (run, movement first spoilt, cell).
     """
 
     log_evidence: FloatArray
-    log_share: FloatArray
+    log_responsibility: FloatArray
 
 
-def posterior_of(
+def change_point_posterior(
     log_healthy: FloatArray,
     density: FloatArray,
     log_prior: FloatArray,
-    on_way: tuple[FloatArray, FloatArray],
-) -> Posterior:
+    log_transient: tuple[FloatArray, FloatArray],
+) -> ChangePointPosterior:
     """Sum over the first movement that a fault spoils and over its cells.
 
     Args:
         log_healthy: Log density of each settled position if all is well, (run, movement).
         density: The same with the fault, (run, movement, cell).
         log_prior: Log probability of first movement and cell, (run, movement, cell).
-        on_way: Log density of the readings on the way if all is well, (run, movement), and with
-            the fault, (run, movement, cell) or the same for all cells, (run, movement, 1).
+        log_transient: Log density of the readings on the way if all is well, (run, movement), and
+            with the fault, (run, movement, cell) or the same for all cells, (run, movement, 1).
     """
-    healthy, faulty = log_healthy + on_way[0], density + on_way[1]
+    healthy, faulty = log_healthy + log_transient[0], density + log_transient[1]
     before = np.cumsum(healthy, axis=1) - healthy
     after = np.cumsum(faulty[:, ::-1], axis=1)[:, ::-1]
     joint = before[:, :, None] + after + log_prior
     log_evidence = log_sum(joint, axis=(1, 2))
-    log_share = joint - log_evidence[:, None, None]
-    return Posterior(log_evidence, log_share)
+    log_responsibility = joint - log_evidence[:, None, None]
+    return ChangePointPosterior(log_evidence, log_responsibility)
 
 
-def given_others(healthy: FloatArray, faulty: FloatArray, log_share: FloatArray) -> FloatArray:
+def leave_one_out(
+    healthy: FloatArray, faulty: FloatArray, log_responsibility: FloatArray
+) -> FloatArray:
     """Return the log density of each movement of a run given all others, (movement,).
 
     It is one over the posterior mean of one over its density.
@@ -98,23 +100,23 @@ def given_others(healthy: FloatArray, faulty: FloatArray, log_share: FloatArray)
     Args:
         healthy: Log density of each movement if all is well, (movement,).
         faulty: The same with the fault, (movement, cell).
-        log_share: Log posterior of first movement spoilt and cell, (movement, cell).
+        log_responsibility: Log posterior of first movement spoilt and cell, (movement, cell).
     """
-    affected = np.logaddexp.accumulate(log_share, axis=0)
+    affected = np.logaddexp.accumulate(log_responsibility, axis=0)
     not_yet = np.full_like(healthy, -np.inf)
-    later = log_sum(log_share, axis=1)[::-1]
+    later = log_sum(log_responsibility, axis=1)[::-1]
     not_yet[:-1] = np.logaddexp.accumulate(later)[::-1][1:]
     return -np.logaddexp(log_sum(affected - faulty, axis=1), not_yet - healthy)
 
 
 @dataclass(frozen=True)
-class Law:
+class FaultModel:
     """How a fault makes one motor settle.
 
     Attributes:
         motor: Index of the motor.
         held: Whether the gear holds the motor exactly at `angle`.
-        angle: Where it settles, (run, movement, node, alternative) [rad]; axes may be 1.
+        angle: Where it settles, (run, movement, node, outcome) [rad]; axes may be 1.
         log_prior: Log probability of the first movement spoilt and the node,
             (run, movement, node), or of the group of nodes where nodes are redrawn.
         size: Magnitude of the fault at each node, (run, node).
@@ -122,10 +124,10 @@ class Law:
             share of each sample, same axes; axes of nodes and movements may be 1.
         redrawn: Log weights of the nodes in each group, (group, node), where every movement draws
             its own node; None: one node holds for the whole run.
-        on_way: Log density of the readings on the way at each node, (run, movement, node); None:
-            as for any motor that settles off its target.
+        log_transient: Log density of the readings on the way at each node, (run, movement, node);
+            None: as for any motor that settles off its target.
         gain: By how much the motor is off for each unit of an amount that holds for the run,
-            (run, movement, alternative) [rad]; None: other movements do not tell.
+            (run, movement, outcome) [rad]; None: other movements do not tell.
     """
 
     motor: int
@@ -135,12 +137,12 @@ class Law:
     size: FloatArray
     onsets: Callable[[int], tuple[FloatArray, FloatArray]]
     redrawn: FloatArray | None = None
-    on_way: FloatArray | None = None
+    log_transient: FloatArray | None = None
     gain: FloatArray | None = None
 
 
 @dataclass(frozen=True)
-class Densities:
+class MovementLogLikelihoods:
     """Log densities of each movement with a fault.
 
     Attributes:
@@ -156,15 +158,19 @@ class Densities:
     way: FloatArray
 
 
-def densities(scene: Scene, law: Law) -> Densities:
+def movement_log_likelihoods(
+    likelihood: RunLikelihood, fault_model: FaultModel
+) -> MovementLogLikelihoods:
     """Return what each movement says of a fault of one motor."""
-    by_node = by_cell = scene.profile(law.motor).log_density(law.angle, law.held)
-    if law.redrawn is not None:
-        by_cell = _in_groups(by_node, law.redrawn)
-    way = law.on_way
+    by_node = by_cell = likelihood.profile(fault_model.motor).log_density(
+        fault_model.angle, fault_model.held
+    )
+    if fault_model.redrawn is not None:
+        by_cell = _in_groups(by_node, fault_model.redrawn)
+    way = fault_model.log_transient
     if way is None:
-        way = scene.on_way_off(law.motor, law.gain)[..., None]
-    return Densities(by_node, by_cell, way)
+        way = likelihood.log_transient_offset(fault_model.motor, fault_model.gain)[..., None]
+    return MovementLogLikelihoods(by_node, by_cell, way)
 
 
 def _in_groups(by_node: FloatArray, log_weight: FloatArray) -> FloatArray:
@@ -178,34 +184,41 @@ def _in_groups(by_node: FloatArray, log_weight: FloatArray) -> FloatArray:
     return np.asarray(top + np.log(np.exp(by_node - top) @ np.exp(log_weight).T))
 
 
-def weigh(scene: Scene, law: Law) -> Weight:
+def marginal_likelihood(likelihood: RunLikelihood, fault_model: FaultModel) -> MarginalLikelihood:
     """Return what the runs say of a fault of one motor."""
-    profile, says = scene.profile(law.motor), densities(scene, law)
+    profile, says = (
+        likelihood.profile(fault_model.motor),
+        movement_log_likelihoods(likelihood, fault_model),
+    )
     by_node, density, way = says.by_node, says.by_cell, says.way
-    healthy = scene.log_healthy
-    found = posterior_of(healthy, density, law.log_prior, (scene.on_way, way))
+    healthy = likelihood.log_healthy
+    found = change_point_posterior(
+        healthy, density, fault_model.log_prior, (likelihood.log_transient, way)
+    )
 
     def by_movement(run: int) -> FloatArray:
-        usual, faulty = healthy[run] + scene.on_way[run], density[run] + way[run]
-        return given_others(usual, faulty, found.log_share[run])
+        usual, faulty = healthy[run] + likelihood.log_transient[run], density[run] + way[run]
+        return leave_one_out(usual, faulty, found.log_responsibility[run])
 
     def settled(run: int) -> FloatArray:
-        return given_others(healthy[run], density[run], found.log_share[run])
+        return leave_one_out(healthy[run], density[run], found.log_responsibility[run])
 
     def estimate(run: int) -> Estimate:
-        share = np.exp(found.log_share[run])
-        if law.redrawn is None:
+        share = np.exp(found.log_responsibility[run])
+        if fault_model.redrawn is None:
             cells = share.sum(axis=0)
-            size = Weighted(_of_run(law.size, run), cells)
+            size = Weighted(_of_run(fault_model.size, run), cells)
             nodes = np.broadcast_to(cells, by_node[run].shape)
         else:
-            of_node = np.exp(by_node[run][:, None] + law.redrawn - density[run][..., None])
-            size = _rms(scene.evidence.movements.exists[run], of_node, share, law.size[0])
+            of_node = np.exp(by_node[run][:, None] + fault_model.redrawn - density[run][..., None])
+            size = _rms(
+                likelihood.evidence.movements.exists[run], of_node, share, fault_model.size[0]
+            )
             nodes = np.einsum("fg,mgn->mn", share, of_node)
-        became = _became(profile, law, run, share, nodes)
-        return Estimate(_onset(law, run, share), size, became)
+        outcome_probability = _became(profile, fault_model, run, share, nodes)
+        return Estimate(_onset(fault_model, run, share), size, outcome_probability)
 
-    return Weight(found.log_evidence, by_movement, settled, estimate)
+    return MarginalLikelihood(found.log_evidence, by_movement, settled, estimate)
 
 
 def _of_run(values: FloatArray, run: int) -> FloatArray:
@@ -213,9 +226,9 @@ def _of_run(values: FloatArray, run: int) -> FloatArray:
     return np.asarray(values[run if len(values) > 1 else 0])
 
 
-def _onset(law: Law, run: int, share: FloatArray) -> Weighted:
+def _onset(fault_model: FaultModel, run: int, share: FloatArray) -> Weighted:
     """Return the distribution of the onset of a run [s]."""
-    onset, part = law.onsets(run)
+    onset, part = fault_model.onsets(run)
     if onset.shape[1] == 1:
         share = share.sum(axis=1, keepdims=True)
     weight = share[..., None] * part
@@ -250,25 +263,31 @@ def _rms(exists: BoolArray, nodes: FloatArray, share: FloatArray, offset: FloatA
 
 
 def _became(
-    profile: MotorProfile, law: Law, run: int, share: FloatArray, nodes: FloatArray
+    profile: JointLikelihood,
+    fault_model: FaultModel,
+    run: int,
+    share: FloatArray,
+    nodes: FloatArray,
 ) -> FloatArray:
-    """Return the probability of each alternative at the most probable nodes of a run.
+    """Return the probability of each outcome at the most probable nodes of a run.
 
     Args:
         profile: What each movement says of the motor.
-        law: The fault.
+        fault_model: The fault.
         run: Index of the run.
         share: Posterior of first movement and cell, (movement, cell).
         nodes: Posterior of each node, (movement, node).
 
     Returns:
-        (movement, alternative).
+        (movement, outcome).
     """
-    angle = _of_run(law.angle, run)
+    angle = _of_run(fault_model.angle, run)
     shape = (*nodes.shape, angle.shape[-1])
     best = np.argmax(nodes, axis=1)
     angle = np.broadcast_to(angle, shape)[np.arange(len(best)), best]
     spoilt = np.cumsum(share.sum(axis=1))[:, None] > 0.5
     own = profile[run]
-    terms = np.where(spoilt, own.log_terms(angle, law.held), own.log_terms(own.expected, False))
+    terms = np.where(
+        spoilt, own.log_terms(angle, fault_model.held), own.log_terms(own.expected, False)
+    )
     return share_of(terms, profile.outlier, own.usable)

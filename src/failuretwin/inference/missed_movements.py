@@ -14,9 +14,9 @@ import numpy as np
 from failuretwin.core.numerics import Weighted, log_of, log_sum
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.failure_modes import magnitude_range
-from failuretwin.inference.marginal import Estimate, Weight
-from failuretwin.inference.onset import at_movement_starts
-from failuretwin.inference.run_likelihood import Scene
+from failuretwin.inference.marginal import Estimate, MarginalLikelihood
+from failuretwin.inference.onset import next_movement
+from failuretwin.inference.run_likelihood import RunLikelihood
 
 SHARES = 12
 """Shares of movements that are missed, to sum over."""
@@ -37,7 +37,7 @@ class Misses:
     midway: float
 
 
-MISSES = {
+MISSED_MOVEMENT_FAULTS = {
     "lost_commands": Misses(1.0, 0.0),
     # Held for 0.5 to 2 s at a time, uniformly: at the end of a movement of 2 s with a ramp of 0.6
     # to 1.0 s, a held motor was on the plateau when the episode began in 6 of 10 cases, on the
@@ -46,19 +46,21 @@ MISSES = {
 }
 
 
-def weigh_misses(scene: Scene, motor: int, mode: str, early: float) -> Weight:
+def missed_movements_likelihood(
+    likelihood: RunLikelihood, motor: int, mode: str, prior_before_run: float
+) -> MarginalLikelihood:
     """Return what the runs say of a motor that misses movements.
 
     Args:
-        scene: The runs.
+        likelihood: The runs.
         motor: Index of the motor.
-        mode: Id of the mode, one of `MISSES`.
-        early: Probability that the fault was there before the run.
+        mode: Id of the mode, one of `MISSED_MOVEMENT_FAULTS`.
+        prior_before_run: Probability that the fault was there before the run.
     """
     sizes = _sizes(mode)
-    stretches = at_movement_starts(scene.evidence.movements)
-    log_first = log_of(stretches.weights(early)) - np.log(SHARES)
-    after = log_densities(scene, motor, mode)
+    stretches = next_movement(likelihood.evidence.movements)
+    log_first = log_of(stretches.weights(prior_before_run)) - np.log(SHARES)
+    after = log_densities(likelihood, motor, mode)
     joint = after[:, -1] + log_first[..., None]
     log_evidence = log_sum(joint, axis=(1, 2))
     share = np.exp(joint - log_evidence[:, None, None])
@@ -66,28 +68,32 @@ def weigh_misses(scene: Scene, motor: int, mode: str, early: float) -> Weight:
     by_movement = np.diff(so_far, axis=1, prepend=log_sum(log_first, axis=1)[:, None] + 0.0)
 
     def estimate(run: int) -> Estimate:
-        onset, part = stretches.samples(early, run)
+        onset, part = stretches.samples(prior_before_run, run)
         when = (share[run].sum(axis=1)[:, None] * part).ravel()
         return Estimate(
             onset=Weighted(onset.ravel(), when),
             size=Weighted(sizes, share[run].sum(axis=0)),
-            became=scene.became[run],
+            outcome_probability=likelihood.outcome_probability[run],
         )
 
-    settled = by_movement - np.maximum(scene.on_way, scene.on_way_off(motor))
-    return Weight(log_evidence, by_movement.__getitem__, settled.__getitem__, estimate)
+    settled = by_movement - np.maximum(
+        likelihood.log_transient, likelihood.log_transient_offset(motor)
+    )
+    return MarginalLikelihood(log_evidence, by_movement.__getitem__, settled.__getitem__, estimate)
 
 
-def log_densities(scene: Scene, motor: int, mode: str) -> FloatArray:
+def log_densities(likelihood: RunLikelihood, motor: int, mode: str) -> FloatArray:
     """Return the log density of all movements up to each one, (run, movement, first, size).
 
     Args:
-        scene: The runs.
+        likelihood: The runs.
         motor: Index of the motor.
-        mode: Id of the mode, one of `MISSES`.
+        mode: Id of the mode, one of `MISSED_MOVEMENT_FAULTS`.
     """
-    healthy = scene.log_healthy + scene.on_way
-    return _chain(_densities(scene, motor), healthy, MISSES[mode], _sizes(mode))
+    healthy = likelihood.log_healthy + likelihood.log_transient
+    return _chain(
+        _densities(likelihood, motor), healthy, MISSED_MOVEMENT_FAULTS[mode], _sizes(mode)
+    )
 
 
 def _sizes(mode: str) -> FloatArray:
@@ -108,20 +114,20 @@ class _Places:
     way: FloatArray
 
 
-def _densities(scene: Scene, motor: int) -> _Places:
-    movements, profile = scene.evidence.movements, scene.profile(motor)
+def _densities(likelihood: RunLikelihood, motor: int) -> _Places:
+    movements, profile = likelihood.evidence.movements, likelihood.profile(motor)
     arrived = np.nan_to_num(profile.expected[..., 0])
     start = np.nan_to_num(movements.initial[:, motor])[:, None]
     places = np.concatenate([start, arrived], axis=1)  # (run, place)
     at = profile.log_density(places[:, None, :, None], False)
     way = places[:, None, :, None] + (arrived[:, :, None, None] - places[:, None, :, None]) * WAY
     runs, count, _, steps = way.shape
-    on_way = profile.log_density(way.reshape(runs, count, -1, 1), False)
-    on_way = log_sum(on_way.reshape(runs, count, -1, steps), axis=3) - np.log(steps)
+    log_transient = profile.log_density(way.reshape(runs, count, -1, 1), False)
+    log_transient = log_sum(log_transient.reshape(runs, count, -1, steps), axis=3) - np.log(steps)
     arrives = np.eye(count, count + 1, 1, dtype=bool)
-    held = scene.on_way_held(motor, places)
-    off = scene.on_way_off(motor)[..., None]
-    return _Places(at + np.where(arrives, off, held), on_way + held)
+    held = likelihood.log_transient_stuck(motor, places)
+    off = likelihood.log_transient_offset(motor)[..., None]
+    return _Places(at + np.where(arrives, off, held), log_transient + held)
 
 
 def _chain(

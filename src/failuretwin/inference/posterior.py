@@ -19,26 +19,34 @@ from failuretwin.core.hypothesis import (
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.data_knowledge.failure_modes import prior_odds
-from failuretwin.inference.double_faults import weigh_pair
+from failuretwin.inference.double_faults import double_fault_likelihood
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.explanation import explanation, verdict
 from failuretwin.inference.fault_models import (
     AMOUNTS,
     LOCAL_STEPS,
-    drift_law,
-    error_law,
-    lag_law,
-    lasting_law,
-    slow_law,
+    constant_fault_model,
+    drift_model,
+    lag_model,
+    slow_model,
+    steady_state_error_model,
 )
 from failuretwin.inference.log_quality import LogQuality
-from failuretwin.inference.marginal import Estimate, Law, Weight, weigh
-from failuretwin.inference.missed_movements import MISSES, weigh_misses
+from failuretwin.inference.marginal import (
+    Estimate,
+    FaultModel,
+    MarginalLikelihood,
+    marginal_likelihood,
+)
+from failuretwin.inference.missed_movements import (
+    MISSED_MOVEMENT_FAULTS,
+    missed_movements_likelihood,
+)
 from failuretwin.inference.priors import Priors
-from failuretwin.inference.run_likelihood import Scene
-from failuretwin.inference.stuck import stuck_law
-from failuretwin.inference.two_joint_likelihood import two_angles
-from failuretwin.inference.unknown import weigh_unknown
+from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.stuck import stuck_model
+from failuretwin.inference.two_joint_likelihood import two_joint_likelihood
+from failuretwin.inference.unknown import unknown_likelihood
 
 # From a hypothesis to what runs say of it: the one place that knows the law of each mode.
 
@@ -49,28 +57,33 @@ MOST_FAULTS = 2
 """Faults that can be weighed at once."""
 
 
-def _lasting(mode: str) -> Callable[[Scene, int, Priors], Law]:
-    return lambda scene, motor, priors: lasting_law(
-        scene, motor, mode, priors.onset.before_run(mode)
+def _lasting(mode: str) -> Callable[[RunLikelihood, int, Priors], FaultModel]:
+    return lambda likelihood, motor, priors: constant_fault_model(
+        likelihood, motor, mode, priors.onset.before_run(mode)
     )
 
 
-LAWS: Mapping[str, Callable[[Scene, int, Priors], Law]] = {
-    "stuck": lambda scene, motor, priors: stuck_law(scene, motor, priors.onset),
-    "steady_state_error": lambda scene, motor, priors: error_law(
-        scene, motor, priors.error_ranges, priors.onset.before_run("steady_state_error")
+FAULT_MODELS: Mapping[str, Callable[[RunLikelihood, int, Priors], FaultModel]] = {
+    "stuck": lambda likelihood, motor, priors: stuck_model(likelihood, motor, priors.onset),
+    "steady_state_error": lambda likelihood, motor, priors: steady_state_error_model(
+        likelihood, motor, priors.error_ranges, priors.onset.before_run("steady_state_error")
     ),
-    "drift": lambda scene, motor, priors: drift_law(scene, motor, priors.onset.before_run("drift")),
+    "drift": lambda likelihood, motor, priors: drift_model(
+        likelihood, motor, priors.onset.before_run("drift")
+    ),
     **{mode: _lasting(mode) for mode in AMOUNTS},
 }
-"""Law of each mode that makes a motor settle beside its target."""
-TIMED: Mapping[str, Callable[[Scene, int, float], Law]] = {"lag": lag_law, "slow": slow_law}
-"""Law of each mode that shows on the way."""
-WEIGHABLE = (*LAWS, *TIMED, *MISSES)
+"""Fault model of each mode that makes a motor settle beside its target."""
+TRANSIENT_FAULTS: Mapping[str, Callable[[RunLikelihood, int, float], FaultModel]] = {
+    "lag": lag_model,
+    "slow": slow_model,
+}
+"""Fault model of each mode that shows on the way."""
+DIAGNOSABLE_MODES = (*FAULT_MODELS, *TRANSIENT_FAULTS, *MISSED_MOVEMENT_FAULTS)
 """Modes that can be weighed."""
 
 
-def check_weighable(hypothesis: Hypothesis) -> None:
+def check_diagnosable(hypothesis: Hypothesis) -> None:
     """Refuse a hypothesis that cannot be weighed.
 
     Raises:
@@ -81,7 +94,7 @@ def check_weighable(hypothesis: Hypothesis) -> None:
             f"hypothesis '{hypothesis}' has {len(hypothesis.faults)} faults. Expected "
             f"{MOST_FAULTS} at most."
         )
-    known = WEIGHABLE if len(hypothesis.faults) == 1 else tuple(LAWS)
+    known = DIAGNOSABLE_MODES if len(hypothesis.faults) == 1 else tuple(FAULT_MODELS)
     for fault in hypothesis.faults:
         if fault.mode not in known:
             raise InputError(
@@ -90,9 +103,11 @@ def check_weighable(hypothesis: Hypothesis) -> None:
             )
 
 
-def shows_on_way(hypothesis: Hypothesis) -> bool:
+def shows_in_transients(hypothesis: Hypothesis) -> bool:
     """Return whether a hypothesis shows in how the motors move more than in where they settle."""
-    return not hypothesis.known or any(fault.mode in TIMED for fault in hypothesis.faults)
+    return not hypothesis.known or any(
+        fault.mode in TRANSIENT_FAULTS for fault in hypothesis.faults
+    )
 
 
 def log_prior(hypotheses: Sequence[Hypothesis], priors: Priors) -> FloatArray:
@@ -102,78 +117,91 @@ def log_prior(hypotheses: Sequence[Hypothesis], priors: Priors) -> FloatArray:
     return np.asarray(np.log(odds / odds.sum()))
 
 
-def weigh_all(scene: Scene, hypotheses: Sequence[Hypothesis], priors: Priors) -> list[Weight]:
+def marginal_likelihoods(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+) -> list[MarginalLikelihood]:
     """Return what runs say of each hypothesis, in their order."""
     known = [h for h in hypotheses if h.known]
-    weights = {h: weigh_hypothesis(scene, h, priors) for h in known}
+    weights = {h: marginal_likelihood_of(likelihood, h, priors) for h in known}
     if len(known) < len(hypotheses):
         others = [
-            (prior_odds(h), weigh_hypothesis(scene, h, priors)) for h in left_out(scene, known)
+            (prior_odds(h), marginal_likelihood_of(likelihood, h, priors))
+            for h in unlisted(likelihood, known)
         ]
-        weights[UNKNOWN] = weigh_unknown(scene, _weigh_healthy, others, known)
+        weights[UNKNOWN] = unknown_likelihood(likelihood, _healthy_likelihood, others, known)
     return [weights[h] for h in hypotheses]
 
 
-def left_out(scene: Scene, known: Sequence[Hypothesis]) -> list[Hypothesis]:
+def unlisted(likelihood: RunLikelihood, known: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Return the single faults that can be weighed but are not among the known hypotheses."""
-    names = scene.model.twin.robot.motor_names
-    return [h for h in single_faults(names, WEIGHABLE) if h.faults and h not in known]
+    names = likelihood.model.twin.robot.motor_names
+    return [h for h in single_faults(names, DIAGNOSABLE_MODES) if h.faults and h not in known]
 
 
-def weigh_hypothesis(scene: Scene, hypothesis: Hypothesis, priors: Priors) -> Weight:
+def marginal_likelihood_of(
+    likelihood: RunLikelihood, hypothesis: Hypothesis, priors: Priors
+) -> MarginalLikelihood:
     """Return what runs say of one known hypothesis."""
     if hypothesis.is_healthy:
-        return _weigh_healthy(scene)
+        return _healthy_likelihood(likelihood)
     if len(hypothesis.faults) == 2:
-        scenes = [scene[run] for run in range(len(scene.log_healthy))]
+        likelihoods = [likelihood[run] for run in range(len(likelihood.log_healthy))]
         one, two = hypothesis.faults
-        return weigh_pair(scenes, [_laws_of_two(alone, one, two, priors) for alone in scenes])
+        return double_fault_likelihood(
+            likelihoods, [_fault_models_of_two(alone, one, two, priors) for alone in likelihoods]
+        )
     fault = hypothesis.faults[0]
-    if fault.mode in MISSES:
-        early = priors.onset.before_run(fault.mode)
-        return weigh_misses(scene, motor_of(scene, fault), fault.mode, early)
-    return weigh(scene, law_of(scene, fault, priors))
+    if fault.mode in MISSED_MOVEMENT_FAULTS:
+        prior_before_run = priors.onset.before_run(fault.mode)
+        return missed_movements_likelihood(
+            likelihood, motor_of(likelihood, fault), fault.mode, prior_before_run
+        )
+    return marginal_likelihood(likelihood, fault_model_of(likelihood, fault, priors))
 
 
-def motor_of(scene: Scene, fault: Fault) -> int:
+def motor_of(likelihood: RunLikelihood, fault: Fault) -> int:
     """Return the index of the motor that has the fault."""
-    return scene.model.twin.robot.motor_names.index(fault.motor)
+    return likelihood.model.twin.robot.motor_names.index(fault.motor)
 
 
-def law_of(scene: Scene, fault: Fault, priors: Priors) -> Law:
-    """Return the law of a fault, of any mode but those of `MISSES`."""
-    motor = motor_of(scene, fault)
-    if fault.mode in TIMED:
-        return TIMED[fault.mode](scene, motor, priors.onset.before_run(fault.mode))
-    return LAWS[fault.mode](scene, motor, priors)
+def fault_model_of(likelihood: RunLikelihood, fault: Fault, priors: Priors) -> FaultModel:
+    """Return the fault model of a fault, of any mode but those of `MISSED_MOVEMENT_FAULTS`."""
+    motor = motor_of(likelihood, fault)
+    if fault.mode in TRANSIENT_FAULTS:
+        return TRANSIENT_FAULTS[fault.mode](likelihood, motor, priors.onset.before_run(fault.mode))
+    return FAULT_MODELS[fault.mode](likelihood, motor, priors)
 
 
-def _laws_of_two(scene: Scene, one: Fault, two: Fault, priors: Priors) -> tuple[Law, Law]:
-    """Return the laws of two faults that are there at once; those held look where both point."""
-    first, second = sorted((motor_of(scene, one), motor_of(scene, two)))
-    seen = two_angles(scene.evidence, scene.model, scene.alternatives, (first, second))
+def _fault_models_of_two(
+    likelihood: RunLikelihood, one: Fault, two: Fault, priors: Priors
+) -> tuple[FaultModel, FaultModel]:
+    """Return the fault models of two faults at once; those held look where both point."""
+    first, second = sorted((motor_of(likelihood, one), motor_of(likelihood, two)))
+    seen = two_joint_likelihood(
+        likelihood.evidence, likelihood.model, likelihood.outcomes, (first, second)
+    )
 
-    def law(fault: Fault) -> Law:
+    def fault_model(fault: Fault) -> FaultModel:
         if fault.mode != "stuck":
-            return law_of(scene, fault, priors)
-        motor = motor_of(scene, fault)
+            return fault_model_of(likelihood, fault, priors)
+        motor = motor_of(likelihood, fault)
         at = seen.pair.index(motor)
         width = np.sqrt(seen.covariance[..., at])
         nodes = seen.angle[..., at, None] + width[..., None] * LOCAL_STEPS
-        return stuck_law(scene, motor, priors.onset, nodes.reshape(len(nodes), -1))
+        return stuck_model(likelihood, motor, priors.onset, nodes.reshape(len(nodes), -1))
 
-    return law(one), law(two)
+    return fault_model(one), fault_model(two)
 
 
-def _weigh_healthy(scene: Scene) -> Weight:
+def _healthy_likelihood(likelihood: RunLikelihood) -> MarginalLikelihood:
     """Return what runs say of no motor being faulty."""
-    by_movement = scene.log_healthy + scene.on_way
+    by_movement = likelihood.log_healthy + likelihood.log_transient
 
     def estimate(run: int) -> Estimate:
-        return Estimate(None, None, scene.became[run])
+        return Estimate(None, None, likelihood.outcome_probability[run])
 
-    of_run, settled = by_movement.__getitem__, scene.log_healthy.__getitem__
-    return Weight(by_movement.sum(axis=1), of_run, settled, estimate)
+    of_run, settled = by_movement.__getitem__, likelihood.log_healthy.__getitem__
+    return MarginalLikelihood(by_movement.sum(axis=1), of_run, settled, estimate)
 
 
 # What keeps a run from being judged, and what happened in it besides any fault.
@@ -198,7 +226,7 @@ def unused_movements(evidence: SettledEvidence, run: int) -> list[str]:
     return lines
 
 
-def why_undecided(
+def abstention_reason(
     quality: LogQuality,
     evidence: SettledEvidence,
     run: int,
@@ -237,18 +265,18 @@ def why_undecided(
 
 
 def lost_commands(
-    became: FloatArray, lost: BoolArray, motors: Sequence[str], faulty: Sequence[str]
+    outcome_probability: FloatArray, lost: BoolArray, motors: Sequence[str], faulty: Sequence[str]
 ) -> list[str]:
     """Return the commands of a run that seem not to have arrived, a line each.
 
     Args:
-        became: Probability of each alternative, (movement, alternative).
-        lost: Motors that lose their command in it, (alternative, motor).
+        outcome_probability: Probability of each outcome, (movement, outcome).
+        lost: Motors that lose their command in it, (outcome, motor).
         motors: Names of the motors.
         faulty: Motors whose fault is told anyway.
     """
     lines = []
-    for movement, share in enumerate(became):
+    for movement, share in enumerate(outcome_probability):
         missing = share @ lost > LIKELY
         told = [m for m, gone in zip(motors, missing, strict=True) if gone and m not in faulty]
         if told:
@@ -262,7 +290,7 @@ LEVELS = (0.05, 0.5, 0.95)
 
 
 @dataclass(frozen=True)
-class Place:
+class StreamPosition:
     """Where a run lies in a stream.
 
     Attributes:
@@ -288,22 +316,22 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Posterior:
     """Some runs with every hypothesis weighed.
 
     Attributes:
-        scene: The runs.
+        likelihood: The runs.
         hypotheses: What may be the case.
         log_prior: (hypothesis,).
         log_posterior: (run, hypothesis).
         weights: What the runs say of each hypothesis, in their order.
     """
 
-    scene: Scene
+    likelihood: RunLikelihood
     hypotheses: Sequence[Hypothesis]
     log_prior: FloatArray
     log_posterior: FloatArray
-    weights: Sequence[Weight]
+    weights: Sequence[MarginalLikelihood]
 
     def undecided(self, run: int, quality: LogQuality) -> str:
         """Return why a run allows no verdict, empty if it does.
@@ -313,13 +341,13 @@ class Judgement:
             quality: Defects of its log.
         """
         best = int(np.argmax(self.log_posterior[run]))
-        return why_undecided(
+        return abstention_reason(
             quality,
-            self.scene.evidence,
+            self.likelihood.evidence,
             run,
             float(np.exp(self.log_posterior[run, best])),
             self.weights[best].settled(run),
-            self.scene.model.outlier_log_density,
+            self.likelihood.model.outlier_log_density,
         )
 
     def posterior(self, run: int, undecided: str) -> FloatArray:
@@ -331,13 +359,13 @@ class Judgement:
         """
         return np.exp(self.log_prior if undecided else self.log_posterior[run])
 
-    def conclude(
+    def to_diagnosis(
         self,
         run: int,
         name: str,
         quality: LogQuality,
         truth: str | None = None,
-        place: Place = Place(),
+        place: StreamPosition = StreamPosition(),
     ) -> Diagnosis:
         """Return the diagnosis of a run.
 
@@ -348,12 +376,12 @@ class Judgement:
             truth: What was wrong, where known; it is only passed on.
             place: Where it lies in a stream, whose times and movements are told.
         """
-        evidence, imperfections = self.scene.evidence, self.scene.model.imperfections
+        evidence, imperfections = self.likelihood.evidence, self.likelihood.model.imperfections
         order = np.argsort(-self.log_posterior[run], kind="stable")
         ranked = [self.hypotheses[i] for i in order]
         best, undecided = self.weights[order[0]], self.undecided(run, quality)
         posterior = self.posterior(run, undecided)
-        used = "settled poses" if self.scene.moving is None else "whole run"
+        used = "settled poses" if self.likelihood.moving is None else "whole run"
         diagnosis = Diagnosis(
             run=name,
             truth=truth,
@@ -375,12 +403,14 @@ class Judgement:
             explanation=explanation(diagnosis, ranked, losses),
         )
 
-    def _evidence(self, run: int, order: IntArray, place: Place) -> tuple[MovementEvidence, ...]:
+    def _evidence(
+        self, run: int, order: IntArray, place: StreamPosition
+    ) -> tuple[MovementEvidence, ...]:
         """Return what each usable movement says of the best hypothesis against the second."""
         if len(order) < 2:
             return ()
         best, second = (self.weights[i].by_movement(run) for i in order[:2])
-        usable = np.flatnonzero(self.scene.evidence.usable[run])
+        usable = np.flatnonzero(self.likelihood.evidence.usable[run])
         return tuple(
             MovementEvidence(place.movements + int(m) + 1, float(best[m] - second[m]))
             for m in usable
@@ -388,32 +418,39 @@ class Judgement:
 
     def _losses(self, estimate: Estimate, hypothesis: Hypothesis) -> list[str]:
         """Return the commands that seem not to have arrived if `hypothesis` is true."""
-        motors = self.scene.model.twin.robot.motor_names
+        motors = self.likelihood.model.twin.robot.motor_names
         faulty = [fault.motor for fault in hypothesis.faults]
-        return lost_commands(estimate.became, self.scene.alternatives.lost, motors, faulty)
+        return lost_commands(
+            estimate.outcome_probability, self.likelihood.outcomes.lost, motors, faulty
+        )
 
 
-def judge(scene: Scene, hypotheses: Sequence[Hypothesis], priors: Priors) -> Judgement:
+def compute_posterior(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+) -> Posterior:
     """Weigh every hypothesis by some runs.
 
     Args:
-        scene: The runs.
+        likelihood: The runs.
         hypotheses: What may be the case.
         priors: Beliefs about onset and size.
     """
-    weights, prior = weigh_all(scene, hypotheses, priors), log_prior(hypotheses, priors)
+    weights, prior = (
+        marginal_likelihoods(likelihood, hypotheses, priors),
+        log_prior(hypotheses, priors),
+    )
     log_joint = np.stack([weight.log_evidence for weight in weights], axis=1) + prior
     log_posterior = log_joint - log_sum(log_joint, axis=1)[:, None]
-    return Judgement(scene, hypotheses, prior, log_posterior, weights)
+    return Posterior(likelihood, hypotheses, prior, log_posterior, weights)
 
 
 def _with_estimate(
-    diagnosis: Diagnosis, hypothesis: Hypothesis, estimate: Estimate, place: Place
+    diagnosis: Diagnosis, hypothesis: Hypothesis, estimate: Estimate, place: StreamPosition
 ) -> Diagnosis:
     """Return the diagnosis with onset and magnitude of the fault that is most probable."""
     if estimate.onset is not None:
-        early, middle, late = (place.begin_s + estimate.onset.quantiles(LEVELS)).tolist()
-        diagnosis = replace(diagnosis, onset_s=middle, onset_90=(early, late))
+        prior_before_run, middle, late = (place.begin_s + estimate.onset.quantiles(LEVELS)).tolist()
+        diagnosis = replace(diagnosis, onset_s=middle, onset_90=(prior_before_run, late))
         known = place.known_onset(hypothesis)
         if known is not None:
             diagnosis = replace(diagnosis, onset_s=known.onset_s, onset_90=known.onset_90)

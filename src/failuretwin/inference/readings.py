@@ -43,7 +43,7 @@ SETTLED_S = 0.15
 
 
 @dataclass(frozen=True)
-class TrueReadings:
+class MeasuredSamples:
     """The readings behind the samples of many runs.
 
     Attributes:
@@ -61,7 +61,7 @@ class TrueReadings:
     filled: BoolArray
 
 
-def true_readings(runs: xr.Dataset) -> TrueReadings:
+def measured_samples(runs: xr.Dataset) -> MeasuredSamples:
     """Return the readings behind the samples of each run.
 
     Args:
@@ -73,7 +73,7 @@ def true_readings(runs: xr.Dataset) -> TrueReadings:
     assumed, filled = np.zeros_like(seen), np.zeros(len(seen), dtype=bool)
     every = grid_steps(runs)
     if every < 2:
-        return TrueReadings(point, seen, assumed, filled)
+        return MeasuredSamples(point, seen, assumed, filled)
     between = seen[:, 1:-1] & seen[:, :-2] & seen[:, 2:]
     dense = np.flatnonzero(between.any(axis=1))
     whole = np.where(seen[dense][..., None], point[dense], np.nan)
@@ -82,14 +82,14 @@ def true_readings(runs: xr.Dataset) -> TrueReadings:
     filled[dense] = ~lines & (2 * between[dense].sum(axis=1) >= seen.shape[1])
     dense, shapes = dense[lines], shapes[lines]
     if len(dense) == 0:
-        return TrueReadings(point, seen, assumed, filled)
+        return MeasuredSamples(point, seen, assumed, filled)
     rests, settle = _Rests.of(shapes), round(SETTLED_S / time_step(runs))
     head, tail = _held(rests, as_floats(runs["command"].values[dense]), every, settle)
     held = (rests.head & head[:, None]) | (rests.tail & tail[:, None])
     assumed[dense] = rests.readings(every) & ~held
     beside = shapes.on_line | shapes.beside_corner()
     seen[dense] &= ~(beside | (rests.inside & ~assumed[dense]))
-    return TrueReadings(np.where(seen[..., None], point, np.nan), seen, assumed, filled)
+    return MeasuredSamples(np.where(seen[..., None], point, np.nan), seen, assumed, filled)
 
 
 def grid_steps(runs: xr.Dataset) -> int:

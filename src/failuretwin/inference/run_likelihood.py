@@ -9,19 +9,23 @@ import numpy as np
 
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.inference.command_loss import Alternatives
-from failuretwin.inference.evidence import MovingEvidence, SettledEvidence
+from failuretwin.inference.command_loss import CommandOutcomes
+from failuretwin.inference.evidence import SettledEvidence, TransientSamples
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.joint_likelihood import Findings, MotorProfile, find
-from failuretwin.inference.transient_likelihood import RampModel
-from failuretwin.inference.transients import CourseJudge, Transients
+from failuretwin.inference.joint_likelihood import (
+    JointLikelihood,
+    MovementLikelihoods,
+    movement_likelihoods,
+)
+from failuretwin.inference.transient_likelihood import TransientLikelihood
+from failuretwin.inference.transients import TrajectoryLikelihood, TransientEvidence
 
 HELD_ANGLES = 25
 """Held angles at which the way is judged, over the range of a motor."""
 
 
 @dataclass(frozen=True)
-class Scene:
+class RunLikelihood:
     """Some runs, ready to be weighed: what was seen, and what a healthy robot would do.
 
     Attributes:
@@ -34,36 +38,36 @@ class Scene:
 
     evidence: SettledEvidence
     model: HealthyModel
-    moving: MovingEvidence | None = None
-    way_blur: float = 1.0
-    remembered: Findings | None = None
+    moving: TransientSamples | None = None
+    transient_scatter_factor: float = 1.0
+    remembered: MovementLikelihoods | None = None
     _off: dict[int, FloatArray] = field(default_factory=dict, init=False, compare=False, repr=False)
     _held: dict[int, FloatArray] = field(
         default_factory=dict, init=False, compare=False, repr=False
     )
 
-    def __getitem__(self, run: int) -> Scene:
+    def __getitem__(self, run: int) -> RunLikelihood:
         """Return the scene of one of the runs."""
         rows = slice(run, run + 1)
         moving = None if self.moving is None else self.moving[rows]
-        return Scene(self.evidence[rows], self.model, moving, self.way_blur)
+        return RunLikelihood(self.evidence[rows], self.model, moving, self.transient_scatter_factor)
 
     @cached_property
-    def findings(self) -> Findings:
+    def findings(self) -> MovementLikelihoods:
         """What every movement says by itself."""
         if self.remembered is not None and self.remembered.model is self.model:
             return self.remembered
-        return find(self.evidence, self.model)
+        return movement_likelihoods(self.evidence, self.model)
 
     @property
-    def alternatives(self) -> Alternatives:
+    def outcomes(self) -> CommandOutcomes:
         """What may have become of each movement."""
-        return self.findings.alternatives
+        return self.findings.outcomes
 
     @property
     def late(self) -> FloatArray:
         """Probability that each movement started late, (run, movement)."""
-        return self.model.late(self.evidence.movements, self.evidence.resumed)
+        return self.model.late(self.evidence.movements, self.evidence.first_reading_delay)
 
     @cached_property
     def start(self) -> FloatArray:
@@ -72,37 +76,41 @@ class Scene:
         return self.model.settle(initial, np.zeros_like(initial), self.model.none_held)
 
     @cached_property
-    def transients(self) -> Transients | None:
+    def transients(self) -> TransientEvidence | None:
         """What the readings on the way say; None where they are left aside."""
         if self.moving is None:
             return None
-        model = replace(self.model, blur=self.model.blur * self.way_blur)
-        ramps = RampModel(model, self.evidence, self.moving)
+        model = replace(
+            self.model, scatter_factor=self.model.scatter_factor * self.transient_scatter_factor
+        )
+        ramps = TransientLikelihood(model, self.evidence, self.moving)
         found = self.findings
-        return Transients(CourseJudge(ramps, found.alternatives), found.terms, found.poses)
+        return TransientEvidence(
+            TrajectoryLikelihood(ramps, found.outcomes), found.terms, found.poses
+        )
 
     @cached_property
-    def on_way(self) -> FloatArray:
+    def log_transient(self) -> FloatArray:
         """Log density of the readings on the way if no motor is faulty, (run, movement)."""
         return np.zeros(self.usable.shape) if self.transients is None else self.transients.healthy
 
-    def on_way_off(self, motor: int, gain: FloatArray | None = None) -> FloatArray:
+    def log_transient_offset(self, motor: int, gain: FloatArray | None = None) -> FloatArray:
         """Return the same with one motor that settles off its target, (run, movement).
 
         Args:
             motor: Index of the motor.
             gain: By how much it is off for each unit of an amount that holds for the run,
-                (run, movement, alternative) [rad]; None: other movements do not tell.
+                (run, movement, outcome) [rad]; None: other movements do not tell.
         """
         if self.transients is None:
-            return self.on_way
+            return self.log_transient
         if gain is not None:
-            return self.transients.off(motor, self.profile(motor), gain)
+            return self.transients.offset(motor, self.profile(motor), gain)
         if motor not in self._off:
-            self._off[motor] = self.transients.off(motor, self.profile(motor))
+            self._off[motor] = self.transients.offset(motor, self.profile(motor))
         return self._off[motor]
 
-    def on_way_held(self, motor: int, angle: FloatArray) -> FloatArray:
+    def log_transient_stuck(self, motor: int, angle: FloatArray) -> FloatArray:
         """Return the same with one motor that is held at some angle or gets stuck there.
 
         Args:
@@ -113,11 +121,11 @@ class Scene:
             (run, movement, node); between the angles that were computed, a straight line.
         """
         if self.transients is None:
-            return np.repeat(self.on_way[..., None], angle.shape[1], axis=2)
+            return np.repeat(self.log_transient[..., None], angle.shape[1], axis=2)
         low, high = self.held_range(motor)
         if motor not in self._held:
             grid = np.linspace(low, high, HELD_ANGLES)
-            self._held[motor] = self.transients.held(motor, self.profile(motor), grid)
+            self._held[motor] = self.transients.stuck(motor, self.profile(motor), grid)
         place = np.clip((angle - low) / (high - low) * (HELD_ANGLES - 1), 0, HELD_ANGLES - 1)
         left = np.minimum(place.astype(np.int64), HELD_ANGLES - 2)
         share = (place - left)[:, None]
@@ -140,8 +148,8 @@ class Scene:
         return with_outliers(self.findings.terms, self.model.outlier_log_density, self.usable)
 
     @cached_property
-    def became(self) -> FloatArray:
-        """Probability of each alternative if no motor is faulty, (run, movement, alternative)."""
+    def outcome_probability(self) -> FloatArray:
+        """Probability of each outcome if no motor is faulty, (run, movement, outcome)."""
         return share_of(self.findings.terms, self.model.outlier_log_density, self.usable)
 
     @property
@@ -149,7 +157,7 @@ class Scene:
         """Movements with evidence, (run, movement)."""
         return self.evidence.usable
 
-    def profile(self, motor: int) -> MotorProfile:
+    def profile(self, motor: int) -> JointLikelihood:
         """Return what each movement says of one motor."""
         return self.findings.profiles[motor]
 
@@ -158,7 +166,7 @@ def with_outliers(terms: FloatArray, outlier: float, usable: BoolArray) -> Float
     """Return the log density whatever became of the commands; 0 where there is no evidence.
 
     Args:
-        terms: Log weight times density of each alternative, (run, movement, alternative).
+        terms: Log weight times density of each outcome, (run, movement, outcome).
         outlier: The same of the tool being anywhere.
         usable: Movements with evidence, (run, movement).
     """
@@ -166,7 +174,7 @@ def with_outliers(terms: FloatArray, outlier: float, usable: BoolArray) -> Float
 
 
 def share_of(terms: FloatArray, outlier: float, usable: BoolArray) -> FloatArray:
-    """Return the probability of each alternative; 0 where there is no evidence.
+    """Return the probability of each outcome; 0 where there is no evidence.
 
     Arguments as for `with_outliers`.
     """

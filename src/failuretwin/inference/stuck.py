@@ -14,9 +14,9 @@ from failuretwin.core.numerics import log_of, log_sum, log_trapezoid_weights
 from failuretwin.core.types import FloatArray
 from failuretwin.inference.fault_models import nodes_around
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.marginal import Law
-from failuretwin.inference.onset import SHARES, OnsetPrior
-from failuretwin.inference.run_likelihood import Scene
+from failuretwin.inference.marginal import FaultModel
+from failuretwin.inference.onset import QUADRATURE, OnsetPrior
+from failuretwin.inference.run_likelihood import RunLikelihood
 
 COARSE_NODES = 49
 """Nodes spread evenly over the range of the held angle."""
@@ -27,83 +27,87 @@ SETTLED_SCALE, ON_THE_WAY_SCALE = 2.0, 8.0
 was at a known onset, in scatters of the motor."""
 LAG_STEPS_S = np.array([-0.03, -0.015, 0.0, 0.015, 0.03])
 """Steps by which the lag may differ from run to run [s]."""
-LATE_SHARES = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
+LATE_QUADRATURE = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
 """Points at which late starts are sampled, as shares of their range."""
 FREE_IF_KNOWN = 0.05
 """Probability that the held angle is unrelated to the commands where the onset is known."""
 
 
-def stuck_law(scene: Scene, motor: int, prior: OnsetPrior, likely: FloatArray | None = None) -> Law:
-    """Return the law of `motor` being stuck.
+def stuck_model(
+    likelihood: RunLikelihood, motor: int, prior: OnsetPrior, likely: FloatArray | None = None
+) -> FaultModel:
+    """Return the fault model of `motor` being stuck.
 
     Args:
-        scene: The runs.
+        likelihood: The runs.
         motor: Index of the motor.
         prior: When and where it may have got stuck.
         likely: Angles to integrate over besides those that movements point to if this motor alone
             is faulty, (run, node) [rad].
     """
-    angle = _angle_nodes(scene, motor, prior)
+    angle = _angle_nodes(likelihood, motor, prior)
     if likely is not None:
-        angle = np.sort(np.concatenate([angle, likely.clip(*scene.held_range(motor))], axis=1))
-    parts = _log_prior(scene, motor, angle, prior)  # (run, movement, plateau | ramp, node)
+        angle = np.sort(np.concatenate([angle, likely.clip(*likelihood.held_range(motor))], axis=1))
+    parts = _log_prior(likelihood, motor, angle, prior)  # (run, movement, plateau | ramp, node)
     log_prior = log_sum(parts, axis=2)
 
     def of_run(run: int) -> tuple[FloatArray, FloatArray]:
-        onset, share = _onsets(scene[run], motor, angle[run], prior.known_s)
+        onset, share = _onsets(likelihood[run], motor, angle[run], prior.known_s)
         whole = np.where(np.isfinite(log_prior[run]), log_prior[run], 0.0)
         of_part = np.exp(parts[run] - whole[:, None])
-        plateau = np.repeat(of_part[:, 0, :, None], len(SHARES), axis=-1)
-        ramp = np.repeat(of_part[:, 1, :, None], onset.shape[-1] - len(SHARES), axis=-1)
+        plateau = np.repeat(of_part[:, 0, :, None], len(QUADRATURE), axis=-1)
+        ramp = np.repeat(of_part[:, 1, :, None], onset.shape[-1] - len(QUADRATURE), axis=-1)
         return onset, share * np.concatenate([plateau, ramp], axis=-1)
 
-    return Law(
+    return FaultModel(
         motor=motor,
         held=True,
         angle=angle[:, None, :, None],
         log_prior=log_prior,
         size=angle,
         onsets=of_run,
-        on_way=scene.on_way_held(motor, angle),
+        log_transient=likelihood.log_transient_stuck(motor, angle),
     )
 
 
-def _angle_nodes(scene: Scene, motor: int, prior: OnsetPrior) -> FloatArray:
+def _angle_nodes(likelihood: RunLikelihood, motor: int, prior: OnsetPrior) -> FloatArray:
     """Return angles to integrate over, sorted, (run, node) [rad].
 
     They crowd where the likelihood or the prior may have a peak.
     """
-    low, high = scene.held_range(motor)
-    profile = scene.profile(motor)
-    runs = len(profile.best)
+    low, high = likelihood.held_range(motor)
+    profile = likelihood.profile(motor)
+    runs = len(profile.mode)
     width = np.sqrt(1.0 / np.maximum(profile.precision[..., 0], 1.0) + 1e-10)
-    local = nodes_around(profile.best[..., 0], width, profile.usable, low)
+    local = nodes_around(profile.mode[..., 0], width, profile.usable, low)
     coarse = np.broadcast_to(np.linspace(low, high, COARSE_NODES), (runs, COARSE_NODES))
-    origin, _ = _ends(scene, motor)
+    origin, _ = _ends(likelihood, motor)
     scale = max(profile.scatter, 1e-4)
     tied = [origin[..., None] + SETTLED_SCALE * scale * PRIOR_STEPS]
     if prior.known_s is not None:
-        way = _position_at(scene, motor, prior.known_s)
+        way = _position_at(likelihood, motor, prior.known_s)
         tied.append(way[..., None] + ON_THE_WAY_SCALE * scale * PRIOR_STEPS)
     # Padded movements favour no angle, so that a run is judged as it is on its own.
-    there = scene.evidence.movements.exists[..., None]
+    there = likelihood.evidence.movements.exists[..., None]
     peaks = [np.where(there, angles, low).reshape(runs, -1) for angles in tied]
     nodes = [coarse, local, *peaks]
     return np.sort(np.clip(np.concatenate(nodes, axis=1), low, high), axis=1)
 
 
-def _log_prior(scene: Scene, motor: int, angle: FloatArray, prior: OnsetPrior) -> FloatArray:
+def _log_prior(
+    likelihood: RunLikelihood, motor: int, angle: FloatArray, prior: OnsetPrior
+) -> FloatArray:
     """Return log prior masses, (run, movement first affected, plateau | ramp, node).
 
     Each stretch has its share of the prior; within it the nodes carry the density of the angle
     times the weights of the trapezoidal rule, normalised so that no mass is lost between nodes.
     """
-    origin, target = _ends(scene, motor)
-    scale = max(float(scene.model.scatter[motor]), 1e-4)
-    low, high = scene.held_range(motor)
+    origin, target = _ends(likelihood, motor)
+    scale = max(float(likelihood.model.scatter[motor]), 1e-4)
+    low, high = likelihood.held_range(motor)
     plateau = _student(angle[:, None] - origin[..., None], SETTLED_SCALE * scale, 4.0)
     if prior.known_s is not None:
-        way = _position_at(scene, motor, prior.known_s)
+        way = _position_at(likelihood, motor, prior.known_s)
         ramp = _student(angle[:, None] - way[..., None], ON_THE_WAY_SCALE * scale, 4.0)
     else:
         ramp = _between(angle[:, None], origin[..., None], target[..., None], 4.0 * scale)
@@ -112,7 +116,7 @@ def _log_prior(scene: Scene, motor: int, angle: FloatArray, prior: OnsetPrior) -
     mixed = np.logaddexp(np.log1p(-share) + tied, np.log(share) - np.log(high - low))
     mass = mixed + log_trapezoid_weights(angle)[:, None, None]
     mass -= log_sum(mass, axis=-1)[..., None]
-    return mass + log_of(_onset_weights(scene, motor, prior))[..., None]
+    return mass + log_of(_onset_weights(likelihood, motor, prior))[..., None]
 
 
 def _student(error: FloatArray, scale: float, dof: float) -> FloatArray:
@@ -126,46 +130,46 @@ def _between(x: FloatArray, a: FloatArray, b: FloatArray, margin: float) -> Floa
     return np.where((x >= low) & (x <= high), -np.log(high - low), -np.inf)
 
 
-def _position_at(scene: Scene, motor: int, onset_s: float) -> FloatArray:
+def _position_at(likelihood: RunLikelihood, motor: int, onset_s: float) -> FloatArray:
     """Return where each ramp has come to at `onset_s`, lag counted, (run, movement) [rad]."""
-    movements = scene.evidence.movements
-    origin, target = _ends(scene, motor)
+    movements = likelihood.evidence.movements
+    origin, target = _ends(likelihood, motor)
     duration = np.maximum(movements.ramp_duration[..., motor], 1e-6)
-    done = np.clip((onset_s - scene.model.lag_s - movements.start) / duration, 0.0, 1.0)
+    done = np.clip((onset_s - likelihood.model.lag_s - movements.start) / duration, 0.0, 1.0)
     return origin + (target - origin) * np.nan_to_num(done)
 
 
-def _ends(scene: Scene, motor: int) -> tuple[FloatArray, FloatArray]:
+def _ends(likelihood: RunLikelihood, motor: int) -> tuple[FloatArray, FloatArray]:
     """Return where each ramp of `motor` begins and ends, (run, movement) [rad]; padding is 0.
 
     These are the angles at which it settles, off its targets as it is when healthy.
     """
-    movements = scene.evidence.movements
-    settled = scene.profile(motor).expected[..., 0]
+    movements = likelihood.evidence.movements
+    settled = likelihood.profile(motor).expected[..., 0]
     off = np.nan_to_num(settled - movements.target[..., motor])
-    at_first = scene.start[:, motor] - movements.initial[:, motor]
+    at_first = likelihood.start[:, motor] - movements.initial[:, motor]
     before = np.concatenate([at_first[:, None], off[:, :-1]], axis=1)
     return np.nan_to_num(movements.origin()[..., motor]) + before, np.nan_to_num(settled)
 
 
-def _stretches(scene: Scene, motor: int) -> tuple[FloatArray, FloatArray]:
+def _stretches(likelihood: RunLikelihood, motor: int) -> tuple[FloatArray, FloatArray]:
     """Return begin and end of plateau and ramp of each movement, (run, movement, 2) [s].
 
     The plateau of the first movement is the time before it, from the start of the run. Movements
     that are likely to have started late count as begun by so much later.
     """
-    movements, model = scene.evidence.movements, scene.model
+    movements, model = likelihood.evidence.movements, likelihood.model
     late_s = float(np.mean(model.imperfections.timing.late_s))
-    start = movements.start + model.lag_s + scene.late * late_s
+    start = movements.start + model.lag_s + likelihood.late * late_s
     reached = start + movements.ramp_duration[..., motor] * (1.0 - model.shortening)
     plateau_begin = np.concatenate([np.zeros_like(start[:, :1]), reached[:, :-1]], axis=1)
     begin = np.stack([np.minimum(plateau_begin, start), start], axis=-1)
     return begin, np.stack([start, reached], axis=-1)
 
 
-def _onset_weights(scene: Scene, motor: int, prior: OnsetPrior) -> FloatArray:
+def _onset_weights(likelihood: RunLikelihood, motor: int, prior: OnsetPrior) -> FloatArray:
     """Return the prior probability of each stretch, (run, movement, plateau | ramp)."""
-    begin, end = _stretches(scene, motor)
+    begin, end = _stretches(likelihood, motor)
     length = np.nan_to_num(np.maximum(end - begin, 0.0))
     if prior.known_s is not None:
         inside = (begin <= prior.known_s) & (prior.known_s < end)
@@ -175,14 +179,14 @@ def _onset_weights(scene: Scene, motor: int, prior: OnsetPrior) -> FloatArray:
     later = length.copy()
     later[:, 0] = 0.0
     total = later.sum(axis=(1, 2), keepdims=True)
-    early = np.where(total > 0, prior.before_run("stuck"), 1.0)
-    weights = (1.0 - early) * later / np.where(total > 0, total, 1.0)
-    weights[:, 0] = 0.5 * early[:, 0]
+    prior_before_run = np.where(total > 0, prior.before_run("stuck"), 1.0)
+    weights = (1.0 - prior_before_run) * later / np.where(total > 0, total, 1.0)
+    weights[:, 0] = 0.5 * prior_before_run[:, 0]
     return weights
 
 
 def _onsets(
-    scene: Scene, motor: int, angle: FloatArray, known_s: float | None
+    likelihood: RunLikelihood, motor: int, angle: FloatArray, known_s: float | None
 ) -> tuple[FloatArray, FloatArray]:
     """Return onsets of one run [s] and their share of their stretch, (movement, node, sample).
 
@@ -191,26 +195,28 @@ def _onsets(
     the ramp, where the held angle says when.
 
     Args:
-        scene: A single run.
+        likelihood: A single run.
         motor: Index of the motor.
         angle: Held angles, (node,) [rad].
         known_s: The onset, where it is known [s].
     """
-    movements, model = scene.evidence.movements, scene.model
-    begin, end = (np.nan_to_num(x[0]) for x in _stretches(scene, motor))
-    origin, target = (x[0] for x in _ends(scene, motor))
+    movements, model = likelihood.evidence.movements, likelihood.model
+    begin, end = (np.nan_to_num(x[0]) for x in _stretches(likelihood, motor))
+    origin, target = (x[0] for x in _ends(likelihood, motor))
     travel = target - origin
     span = np.where(np.abs(travel) > 1e-6, travel, np.inf)
     done = np.clip((angle - origin[:, None]) / span[:, None], 0.0, 1.0)
-    shift, shift_share = _starts(model, scene.late[0])
+    shift, shift_share = _starts(model, likelihood.late[0])
     ramp = np.nan_to_num(movements.ramp_duration[0, :, motor]) * (1.0 - model.shortening)
     on_ramp = np.nan_to_num(movements.start[0])[:, None] + done * ramp[:, None]
     on_ramp = np.maximum(on_ramp[..., None] + shift, 0.0)
-    on_plateau = begin[:, 0, None] + SHARES * (end - begin)[:, 0, None]
+    on_plateau = begin[:, 0, None] + QUADRATURE * (end - begin)[:, 0, None]
     on_plateau[0, 0] = 0.0
-    plateau_share = np.full((len(begin), len(SHARES)), 1 / len(SHARES))
+    plateau_share = np.full((len(begin), len(QUADRATURE)), 1 / len(QUADRATURE))
     waits = end[0, 0] / max(float(end.max()), 1e-9)
-    plateau_share[0] = np.append(1.0 - waits, np.full(len(SHARES) - 1, waits / (len(SHARES) - 1)))
+    plateau_share[0] = np.append(
+        1.0 - waits, np.full(len(QUADRATURE) - 1, waits / (len(QUADRATURE) - 1))
+    )
     on_plateau = np.repeat(on_plateau[:, None], len(angle), axis=1)
     onset = np.concatenate([on_plateau, on_ramp], axis=-1)
     if known_s is not None:
@@ -229,7 +235,7 @@ def _starts(model: HealthyModel, late: FloatArray) -> tuple[FloatArray, FloatArr
         late: Probability that each movement starts late, (movement,).
     """
     low, high = model.imperfections.timing.late_s
-    shift = model.lag_s + np.concatenate([LAG_STEPS_S, low + LATE_SHARES * (high - low)])
+    shift = model.lag_s + np.concatenate([LAG_STEPS_S, low + LATE_QUADRATURE * (high - low)])
     punctual = np.repeat((1.0 - late)[:, None] / len(LAG_STEPS_S), len(LAG_STEPS_S), axis=1)
-    held_up = np.repeat(late[:, None] / len(LATE_SHARES), len(LATE_SHARES), axis=1)
+    held_up = np.repeat(late[:, None] / len(LATE_QUADRATURE), len(LATE_QUADRATURE), axis=1)
     return shift, np.concatenate([punctual, held_up], axis=1)

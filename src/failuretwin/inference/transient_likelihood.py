@@ -13,7 +13,7 @@ import numpy as np
 
 from failuretwin.core.numerics import log_norm, log_of, log_sum
 from failuretwin.core.types import FloatArray, IntArray
-from failuretwin.inference.evidence import MovingEvidence, SettledEvidence
+from failuretwin.inference.evidence import SettledEvidence, TransientSamples
 from failuretwin.inference.healthy_model import HealthyModel
 
 KNOTS = 11
@@ -39,7 +39,7 @@ GLITCH_RATE = 0.03
 
 
 @dataclass(frozen=True)
-class Ramps:
+class TransientHypothesis:
     """What motors do in some movements, for several cases at once.
 
     Attributes:
@@ -60,7 +60,7 @@ class Ramps:
     delay: FloatArray
     spread_m: float = 0.0
 
-    def __getitem__(self, some: IntArray) -> Ramps:
+    def __getitem__(self, some: IntArray) -> TransientHypothesis:
         """Return some of the movements."""
         return replace(
             self,
@@ -73,7 +73,7 @@ class Ramps:
 
 
 @dataclass(frozen=True)
-class RampModel:
+class TransientLikelihood:
     """Density of readings on the way.
 
     Attributes:
@@ -84,7 +84,7 @@ class RampModel:
 
     model: HealthyModel
     settled: SettledEvidence
-    moving: MovingEvidence
+    moving: TransientSamples
 
     @cached_property
     def _punctual(self) -> tuple[FloatArray, FloatArray]:
@@ -102,14 +102,14 @@ class RampModel:
     @cached_property
     def _late(self) -> FloatArray:
         """Log probability that each movement starts late, (run, movement)."""
-        return log_of(self.model.late(self.settled.movements, self.settled.resumed))
+        return log_of(self.model.late(self.settled.movements, self.settled.first_reading_delay))
 
     @cached_property
-    def anywhere(self) -> float:
+    def log_outlier(self) -> float:
         """Log density of a reading that is anywhere within reach, times the rate of glitches."""
         return float(np.log(GLITCH_RATE) - np.log(4.0 / 3.0 * np.pi * self.model.reach**3))
 
-    def log_density(self, ramps: Ramps) -> FloatArray:
+    def log_density(self, ramps: TransientHypothesis) -> FloatArray:
         """Return the log density of the readings of each movement, (item, case).
 
         Args:
@@ -128,7 +128,7 @@ class RampModel:
         return found
 
     def _of_starts(
-        self, ramps: Ramps, starts: tuple[FloatArray, FloatArray], step: float
+        self, ramps: TransientHypothesis, starts: tuple[FloatArray, FloatArray], step: float
     ) -> FloatArray:
         """Return the log density given that a movement begins at one of some times, (item, case).
 
@@ -152,11 +152,11 @@ class RampModel:
         square = np.maximum(error2 - along2, 0.0) / variance + along2 / stretched
         log_at = -0.5 * (DOF + 3.0) * np.log1p(square / DOF) - 0.5 * np.log(stretched)
         log_at += log_norm(DOF) - np.log(variance) + np.log1p(-GLITCH_RATE)
-        log_at = np.logaddexp(log_at, self.anywhere)
+        log_at = np.logaddexp(log_at, self.log_outlier)
         log_at *= self.moving.seen[item][:, None, :, None]
         return log_sum(log_at.sum(axis=2) + log_prior, axis=-1)
 
-    def _variance(self, ramps: Ramps) -> FloatArray:
+    def _variance(self, ramps: TransientHypothesis) -> FloatArray:
         """Return the variance of a reading on each axis, (item,) [m2]."""
         _, jacobian = self.model.twin.path_and_jacobian(ramps.destination[:, 0])
         scaled = np.sum((jacobian * self.model.scatter) ** 2, axis=(-1, -2)) / 3.0
@@ -170,7 +170,7 @@ class RampModel:
         seen[:, 1:] &= self.settled.usable[:, :-1]
         return np.where(seen, SEEN, UNSEEN)
 
-    def _path(self, ramps: Ramps) -> tuple[FloatArray, FloatArray]:
+    def _path(self, ramps: TransientHypothesis) -> tuple[FloatArray, FloatArray]:
         """Return the tool at each knot, (item, case, knot, axis), and its time at the last one.
 
         The latter is (item, case) [s].

@@ -14,9 +14,9 @@ import numpy as np
 
 from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.inference.command_loss import Alternatives
-from failuretwin.inference.joint_likelihood import LARGEST_OFFSET_RAD, MotorProfile
-from failuretwin.inference.transient_likelihood import RampModel, Ramps
+from failuretwin.inference.command_loss import CommandOutcomes
+from failuretwin.inference.joint_likelihood import LARGEST_OFFSET_RAD, JointLikelihood
+from failuretwin.inference.transient_likelihood import TransientHypothesis, TransientLikelihood
 
 # Where the movements of runs led, and how well the readings on the way agree with that.
 
@@ -27,14 +27,14 @@ RARELY_ELSEWHERE = 0.01
 
 
 @dataclass(frozen=True)
-class Course:
+class Trajectory:
     """Where the movements of some runs led.
 
     Attributes:
-        ends: Where each one led if this or that became of it, (run, movement, alternative, motor)
+        ends: Where each one led if this or that became of it, (run, movement, outcome, motor)
             [rad].
         chosen: What became of it, (run, movement).
-        lost: Motors that lose their command in each alternative, (alternative, motor).
+        lost: Motors that lose their command in each outcome, (outcome, motor).
         first: Pose before the first movement, (run, motor) [rad].
     """
 
@@ -58,16 +58,16 @@ class Course:
 
 
 @dataclass(frozen=True)
-class CourseJudge:
+class TrajectoryLikelihood:
     """Density of the readings on the way, given where the movements led.
 
     Attributes:
         ramps: Density of readings on the way.
-        alternatives: What may have become of each movement.
+        outcomes: What may have become of each movement.
     """
 
-    ramps: RampModel
-    alternatives: Alternatives
+    ramps: TransientLikelihood
+    outcomes: CommandOutcomes
 
     @property
     def usable(self) -> BoolArray:
@@ -80,7 +80,7 @@ class CourseJudge:
         return np.nan_to_num(self.ramps.settled.movements.ramp_duration)
 
     @cached_property
-    def items(self) -> tuple[IntArray, IntArray]:
+    def index(self) -> tuple[IntArray, IntArray]:
         """Run and movement of all movements with readings on the way."""
         some = np.asarray(self.ramps.moving.seen.any(axis=-1))
         run, movement = np.nonzero(some)
@@ -88,9 +88,9 @@ class CourseJudge:
 
     @cached_property
     def expected(self) -> FloatArray:
-        """Where a healthy arm settles, (run, movement, alternative, motor) [rad]."""
+        """Where a healthy arm settles, (run, movement, outcome, motor) [rad]."""
         model = self.ramps.model
-        return model.settle(self.alternatives.base, self.alternatives.direction, model.none_held)
+        return model.settle(self.outcomes.base, self.outcomes.direction, model.none_held)
 
     @cached_property
     def first(self) -> FloatArray:
@@ -98,31 +98,31 @@ class CourseJudge:
         start, model = self.ramps.settled.movements.initial, self.ramps.model
         return model.settle(start, np.zeros_like(start), model.none_held)
 
-    def settle(self, course: Course) -> tuple[Course, FloatArray]:
+    def settle(self, course: Trajectory) -> tuple[Trajectory, FloatArray]:
         """Find out what became of movements whose end was not seen.
 
         Returns:
-            The course with the most probable alternative for them, and the log of what all
-            alternatives together say over what that one says alone, (run, movement).
+            The course with the most probable outcome for them, and the log of what all
+            outcomes together say over what that one says alone, (run, movement).
         """
         chosen = np.where(self.usable, course.chosen, 0)
-        luck = np.zeros(self.usable.shape)
+        log_correction = np.zeros(self.usable.shape)
         course = replace(course, chosen=chosen)
         run, movement = np.nonzero(self.ramps.settled.movements.exists & ~self.usable)
         if len(run) == 0:
-            return course, luck
-        log_weight = self.alternatives.log_weight[run, movement]
+            return course, log_correction
+        log_weight = self.outcomes.log_weight[run, movement]
         item, case = np.nonzero(np.isfinite(log_weight))
         says = np.full(log_weight.shape, -np.inf)
         says[item, case] = self._way_and_next(course, run[item], movement[item], case)
         weighed = says + np.where(np.isfinite(says), log_weight, 0.0)
         best = np.argmax(weighed, axis=-1)
         chosen[run, movement] = best
-        luck[run, movement] = log_sum(weighed, axis=-1) - says[np.arange(len(best)), best]
-        return replace(course, chosen=chosen), luck
+        log_correction[run, movement] = log_sum(weighed, axis=-1) - says[np.arange(len(best)), best]
+        return replace(course, chosen=chosen), log_correction
 
     def _way_and_next(
-        self, course: Course, run: IntArray, movement: IntArray, became: IntArray
+        self, course: Trajectory, run: IntArray, movement: IntArray, outcome_probability: IntArray
     ) -> FloatArray:
         """Return log densities of some movements and of those that follow them, (item,).
 
@@ -130,11 +130,11 @@ class CourseJudge:
             course: Where all others led.
             run: Which run each movement belongs to, (item,).
             movement: Its number in the run, (item,).
-            became: What became of it, (item,).
+            outcome_probability: What became of it, (item,).
         """
         origin, destination = course.origin(), course.destination()
-        here = course.ends[run, movement, became]
-        begin = np.where(course.lost[became], here, origin[run, movement])
+        here = course.ends[run, movement, outcome_probability]
+        begin = np.where(course.lost[outcome_probability], here, origin[run, movement])
         says = self.weigh(run, movement, begin[:, None], here[:, None])[:, 0]
         follows = movement + 1 < self.usable.shape[1]
         after = np.where(follows, movement + 1, movement)
@@ -144,9 +144,9 @@ class CourseJudge:
             follows, self.weigh(run, after, begin[:, None], end[:, None])[:, 0], 0.0
         )
 
-    def log_density(self, course: Course, spread_m: float = 0.0) -> FloatArray:
+    def log_density(self, course: Trajectory, spread_m: float = 0.0) -> FloatArray:
         """Return log densities of all movements of a course, (run, movement)."""
-        item = self.items
+        item = self.index
         begin, end = (values[item][:, None] for values in (course.origin(), course.destination()))
         found = np.zeros(self.usable.shape)
         found[item] = self.weigh(*item, begin, end, spread_m=spread_m)[:, 0]
@@ -179,10 +179,12 @@ class CourseJudge:
             done = (destination - origin)[..., stops] / travel
             duration[..., stops] *= np.clip(done, 0.0, 1.0)
         still = np.zeros(origin.shape[1:])
-        ramps = Ramps(run, movement, origin, destination, duration, still, spread_m)
+        ramps = TransientHypothesis(run, movement, origin, destination, duration, still, spread_m)
         return self.ramps.log_density(ramps)
 
-    def from_anywhere(self, course: Course, says: FloatArray, off: int | None = None) -> FloatArray:
+    def marginalise_start(
+        self, course: Trajectory, says: FloatArray, off: int | None = None
+    ) -> FloatArray:
         """Return log densities if a motor may have stood elsewhere before the run.
 
         A healthy one does if it missed the command before.
@@ -193,7 +195,7 @@ class CourseJudge:
                 (run, movement, node).
             off: Motor that is as likely to have been off as not.
         """
-        chance = np.exp(self.alternatives.log_weight[:, 0]) @ self.alternatives.lost  # (run, motor)
+        chance = np.exp(self.outcomes.log_weight[:, 0]) @ self.outcomes.lost  # (run, motor)
         if off is not None:
             chance = 0.5 * chance
             chance[:, off] = 0.5
@@ -208,7 +210,7 @@ class CourseJudge:
         says[:, 0] = np.logaddexp.reduce(terms, axis=0)
         return says
 
-    def _elsewhere(self, course: Course, motor: int) -> FloatArray:
+    def _elsewhere(self, course: Trajectory, motor: int) -> FloatArray:
         """Return the log density of the first movement if a motor was off before it, (run,)."""
         run = np.flatnonzero(self.ramps.moving.seen[:, 0].any(axis=-1))
         begin, end = (
@@ -222,14 +224,14 @@ class CourseJudge:
         return found
 
 
-TRUST = 0.1
+TEMPERING = 0.1
 """Power to which what the way says is taken: its readings share errors of timing and of both ends
 that the model of the way does not know, so that all of a movement count for about one. Chosen on
 simulated runs of both engines."""
 
-ASTRAY = 0.1
+OUTLIER_PATH = 0.1
 """How far the tool strays from its way if nothing explains it, as a share of the arm's reach."""
-ASTRAY_RATE = 0.02
+OUTLIER_PATH_RATE = 0.02
 """Share of movements in which it does [-]."""
 LAST = 3
 """Movements, the last that tell, from which the size of a lasting fault is taken where the end of a
@@ -237,30 +239,30 @@ movement was not seen."""
 
 
 @dataclass(frozen=True)
-class Transients:
+class TransientEvidence:
     """Log densities of the readings on the way, for healthy robots and for faults of one motor.
 
     Attributes:
         judge: Density of readings on the way.
-        terms: Log weight times density of each alternative for a healthy robot,
-            (run, movement, alternative).
-        poses: Pose that explains the settled position then, (run, movement, alternative, motor)
+        terms: Log weight times density of each outcome for a healthy robot,
+            (run, movement, outcome).
+        poses: Pose that explains the settled position then, (run, movement, outcome, motor)
             [rad].
     """
 
-    judge: CourseJudge
+    judge: TrajectoryLikelihood
     terms: FloatArray
     poses: FloatArray
 
     @cached_property
     def healthy(self) -> FloatArray:
         """Log density if no motor is faulty, (run, movement)."""
-        course, luck = self._healthy
+        course, log_correction = self._healthy
         return self._trusted(
-            self.judge.from_anywhere(course, self.judge.log_density(course)) + luck
+            self.judge.marginalise_start(course, self.judge.log_density(course)) + log_correction
         )
 
-    def held(self, motor: int, profile: MotorProfile, angle: FloatArray) -> FloatArray:
+    def stuck(self, motor: int, profile: JointLikelihood, angle: FloatArray) -> FloatArray:
         """Return the log density if a motor is held all the way or gets stuck on it.
 
         Where the end of a movement was seen, the motor is taken to be held where that puts it.
@@ -273,46 +275,50 @@ class Transients:
         Returns:
             (run, movement, node).
         """
-        seen = np.argmax(profile.log_terms(profile.best, True), axis=-1)
-        nearest = self._nearest_seen(_at(profile.best, seen), motor)
-        ends = np.where(self.judge.usable[..., None, None], profile.pose, self.judge.expected)
+        seen = np.argmax(profile.log_terms(profile.mode, True), axis=-1)
+        nearest = self._nearest_seen(_at(profile.mode, seen), motor)
+        ends = np.where(self.judge.usable[..., None, None], profile.map_pose, self.judge.expected)
         ends[..., motor] = nearest[..., None]
-        lost = self.judge.alternatives.lost.copy()
+        lost = self.judge.outcomes.lost.copy()
         lost[:, motor] = True  # whatever becomes of its command
-        course, luck = self.judge.settle(Course(ends, seen, lost, self.judge.first))
-        item, cases = self.judge.items, len(angle)
+        course, log_correction = self.judge.settle(Trajectory(ends, seen, lost, self.judge.first))
+        item, cases = self.judge.index, len(angle)
         at = np.where(self.judge.usable[item][:, None], nearest[item][:, None], angle)
         end = np.repeat(course.destination()[item][:, None], cases, axis=1)
         end[..., motor] = at
         begin = np.repeat(course.origin()[item][:, None], cases, axis=1)
         begin[..., motor] = at
         stays = self.judge.weigh(*item, begin, end)
-        moving = replace(course, lost=self.judge.alternatives.lost).origin()
+        moving = replace(course, lost=self.judge.outcomes.lost).origin()
         begin[..., motor] = moving[item][:, None, motor]
         stops = self.judge.weigh(*item, begin, end, stops=motor)
         found = np.zeros((*self.judge.usable.shape, cases))
         found[item] = np.logaddexp(stays, stops) - np.log(2.0)
-        return self._trusted(self.judge.from_anywhere(course, found) + luck[..., None])
+        return self._trusted(
+            self.judge.marginalise_start(course, found) + log_correction[..., None]
+        )
 
-    def off(self, motor: int, profile: MotorProfile, gain: FloatArray | None = None) -> FloatArray:
+    def offset(
+        self, motor: int, profile: JointLikelihood, gain: FloatArray | None = None
+    ) -> FloatArray:
         """Return the log density if a motor goes to where it was seen to settle.
 
         Args:
             motor: Index of the motor.
             profile: What each movement says of it.
             gain: By how much it is off for each unit of an amount that holds for the run,
-                (run, movement, alternative) [rad]; None: other movements do not tell.
+                (run, movement, outcome) [rad]; None: other movements do not tell.
 
         Returns:
             (run, movement).
         """
         near = np.clip(
-            profile.best,
+            profile.mode,
             profile.expected - LARGEST_OFFSET_RAD,
             profile.expected + LARGEST_OFFSET_RAD,
         )
         seen = np.argmax(profile.log_terms(near, False), axis=-1)
-        ends = np.where(self.judge.usable[..., None, None], profile.pose, self.judge.expected)
+        ends = np.where(self.judge.usable[..., None, None], profile.map_pose, self.judge.expected)
         unseen = self.judge.expected[..., motor]
         if gain is not None:
             amount = self._amount(_at(near - profile.expected, seen), _at(gain, seen))
@@ -321,23 +327,24 @@ class Transients:
         ends[..., motor] = np.where(self.judge.usable[..., None], near, unseen)
         return self.toward(ends, seen, motor)
 
-    def toward(self, ends: FloatArray, became: IntArray, off: int) -> FloatArray:
+    def toward(self, ends: FloatArray, outcome_probability: IntArray, off: int) -> FloatArray:
         """Return the log density if the motors go from one given pose to the next.
 
         Args:
             ends: Where each movement led, for each that may have become of it,
-                (run, movement, alternative, motor) [rad].
-            became: What did, where its end was seen, (run, movement).
+                (run, movement, outcome, motor) [rad].
+            outcome_probability: What did, where its end was seen, (run, movement).
             off: Motor that may have been off before the run.
 
         Returns:
             (run, movement).
         """
-        course, luck = self.judge.settle(
-            Course(ends, became, self.judge.alternatives.lost, self.judge.first)
+        course, log_correction = self.judge.settle(
+            Trajectory(ends, outcome_probability, self.judge.outcomes.lost, self.judge.first)
         )
         return self._trusted(
-            self.judge.from_anywhere(course, self.judge.log_density(course), off) + luck
+            self.judge.marginalise_start(course, self.judge.log_density(course), off)
+            + log_correction
         )
 
     def _amount(self, offset: FloatArray, gain: FloatArray) -> FloatArray:
@@ -358,18 +365,20 @@ class Transients:
         return np.asarray(np.nanmedian(ratio, axis=1))
 
     @cached_property
-    def astray(self) -> FloatArray:
+    def outlier_path(self) -> FloatArray:
         """Log density if the tool strays from its way as no fault explains, (run, movement)."""
         course, _ = self._healthy
-        spread_m = ASTRAY * self.judge.ramps.model.reach
-        return TRUST * self.judge.log_density(course, spread_m)
+        spread_m = OUTLIER_PATH * self.judge.ramps.model.reach
+        return TEMPERING * self.judge.log_density(course, spread_m)
 
     def _trusted(self, says: FloatArray) -> FloatArray:
         """Return what the way says as far as it is trusted, (run, movement, ...)."""
-        astray = self.astray.reshape(self.astray.shape + (1,) * (says.ndim - 2))
-        return np.logaddexp(np.log1p(-ASTRAY_RATE) + TRUST * says, np.log(ASTRAY_RATE) + astray)
+        astray = self.outlier_path.reshape(self.outlier_path.shape + (1,) * (says.ndim - 2))
+        return np.logaddexp(
+            np.log1p(-OUTLIER_PATH_RATE) + TEMPERING * says, np.log(OUTLIER_PATH_RATE) + astray
+        )
 
-    def timed(
+    def delayed_or_slow(
         self, motor: int, factor: FloatArray, delay: FloatArray, begin: FloatArray | None = None
     ) -> FloatArray:
         """Return log densities if a motor takes longer or starts later, (run, movement, node).
@@ -381,8 +390,8 @@ class Transients:
             begin: Where it begins each movement if it has not reached its targets,
                 (run, movement, node) [rad]; None: it reaches them all.
         """
-        course, luck = self._healthy
-        items, cases = self.judge.items, len(factor)
+        course, log_correction = self._healthy
+        items, cases = self.judge.index, len(factor)
         origin, destination, duration = (
             np.repeat(values[items][:, None], cases, axis=1)
             for values in (course.origin(), course.destination(), self.judge.duration)
@@ -395,15 +404,15 @@ class Transients:
         late[:, motor] = delay
         found = np.zeros((*self.judge.usable.shape, cases))
         found[items] = self.judge.ramps.log_density(
-            Ramps(*items, origin, destination, duration, late)
+            TransientHypothesis(*items, origin, destination, duration, late)
         )
-        return self._trusted(found + luck[..., None])
+        return self._trusted(found + log_correction[..., None])
 
     @cached_property
-    def _healthy(self) -> tuple[Course, FloatArray]:
+    def _healthy(self) -> tuple[Trajectory, FloatArray]:
         seen = np.argmax(self.terms, axis=-1)
         ends = np.where(self.judge.usable[..., None, None], self.poses, self.judge.expected)
-        return self.judge.settle(Course(ends, seen, self.judge.alternatives.lost, self.judge.first))
+        return self.judge.settle(Trajectory(ends, seen, self.judge.outcomes.lost, self.judge.first))
 
     def _nearest_seen(self, angle: FloatArray, motor: int) -> FloatArray:
         """Return angles (run, movement) with those of unseen ends from the next movement seen.
@@ -421,5 +430,5 @@ class Transients:
 
 
 def _at(values: FloatArray, alternative: IntArray) -> FloatArray:
-    """Return the values (run, movement, alternative) of one alternative each."""
+    """Return the values (run, movement, outcome) of one outcome each."""
     return np.take_along_axis(values, alternative[..., None], axis=2)[..., 0]

@@ -12,14 +12,14 @@ import numpy as np
 
 from failuretwin.core.numerics import Ellipsoid
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.inference.command_loss import Alternatives
+from failuretwin.inference.command_loss import CommandOutcomes
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.joint_likelihood import nearest_on_circle
 
 SCANNED = 16
 """Angles of the first motor from which a way is looked for; more find no other ways."""
-WAYS = 2
+SOLUTIONS = 2
 """Ways to bring the tool somewhere that are followed."""
 STEPS = 6
 """Newton steps towards each."""
@@ -34,7 +34,7 @@ RARE = 0.002
 
 
 @dataclass(frozen=True)
-class TwoAngles:
+class TwoJointLikelihood:
     """What each movement says of the angles of two motors.
 
     The density of the settled place at angles x is, summed over the last axis, exp(log_weight)
@@ -47,7 +47,7 @@ class TwoAngles:
             [rad2].
         log_weight: (run, movement, way) [log rad2/m3].
         expected: Where they settle if they are well, (run, movement, motor of the pair) [rad].
-        became: Alternative that each way belongs to, (way,).
+        outcome_probability: Alternative that each way belongs to, (way,).
     """
 
     pair: tuple[int, int]
@@ -55,53 +55,53 @@ class TwoAngles:
     covariance: FloatArray
     log_weight: FloatArray
     expected: FloatArray
-    became: IntArray
+    outcome_probability: IntArray
 
 
-def two_angles(
+def two_joint_likelihood(
     evidence: SettledEvidence,
     model: HealthyModel,
-    alternatives: Alternatives,
+    outcomes: CommandOutcomes,
     pair: tuple[int, int],
-) -> TwoAngles:
+) -> TwoJointLikelihood:
     """Return what each movement says of the angles of two motors.
 
     Args:
         evidence: Settled positions.
         model: The healthy robot.
-        alternatives: What may have become of each movement; of those in which other motors lose
+        outcomes: What may have become of each movement; of those in which other motors lose
             their commands, the usual ones are followed.
         pair: Indices of the motors.
     """
-    kept = _kept(alternatives, pair)
+    kept = _kept(outcomes, pair)
     chosen = replace(
-        alternatives,
-        base=alternatives.base[:, :, kept],
-        direction=alternatives.direction[:, :, kept],
-        log_weight=alternatives.log_weight[:, :, kept],
+        outcomes,
+        base=outcomes.base[:, :, kept],
+        direction=outcomes.direction[:, :, kept],
+        log_weight=outcomes.log_weight[:, :, kept],
     )
     expected = model.settle(chosen.base, chosen.direction, model.none_held)
     angle = _starts(model, expected, pair, evidence.point)
     for _ in range(STEPS):
-        near = _near(evidence.point, model, chosen, pair, angle)
+        near = _laplace(evidence.point, model, chosen, pair, angle)
         angle = angle + near.step
     dof = model.settling.tail_dof
     log_weight = chosen.log_weight[..., None] + near.log_norm + _over_plane(near.square, dof)
     log_weight = np.where(_found(model, pair, angle, near.covariance), log_weight, -np.inf)
-    shape = (*evidence.usable.shape, len(kept) * WAYS)
-    return TwoAngles(
+    shape = (*evidence.usable.shape, len(kept) * SOLUTIONS)
+    return TwoJointLikelihood(
         pair,
         angle.reshape(*shape, 2),
         near.covariance.reshape(*shape, 3),
         log_weight.reshape(shape),
         expected[:, :, 0][..., list(pair)],
-        np.repeat(kept, WAYS),
+        np.repeat(kept, SOLUTIONS),
     )
 
 
 @dataclass(frozen=True)
-class _Near:
-    """The squared distance near two angles: a parabola, (run, movement, alternative, way) each.
+class _Laplace:
+    """The squared distance near two angles: a parabola, (run, movement, outcome, way) each.
 
     Attributes:
         step: From there to its lowest point, bounded, (..., motor) [rad].
@@ -116,27 +116,27 @@ class _Near:
     log_norm: FloatArray
 
 
-def _near(
+def _laplace(
     point: FloatArray,
     model: HealthyModel,
-    alternatives: Alternatives,
+    outcomes: CommandOutcomes,
     pair: tuple[int, int],
     angle: FloatArray,
-) -> _Near:
+) -> _Laplace:
     """Return the squared distance of the tool to where it was seen, near two angles.
 
     Args:
         point: Settled positions, (run, movement, axis) [m].
         model: The healthy robot.
-        alternatives: What may have become of each movement.
+        outcomes: What may have become of each movement.
         pair: Indices of the motors.
-        angle: Their angles, (run, movement, alternative, way, motor) [rad].
+        angle: Their angles, (run, movement, outcome, way, motor) [rad].
     """
     fixed, scale = model.none_held.copy(), model.scatter.copy()
     fixed[list(pair)], scale[list(pair)] = True, 0.0
-    pose = np.repeat(alternatives.base[..., None, :], WAYS, axis=-2)
+    pose = np.repeat(outcomes.base[..., None, :], SOLUTIONS, axis=-2)
     pose[..., list(pair)] = angle
-    settled = model.settle(pose, alternatives.direction[..., None, :], fixed)
+    settled = model.settle(pose, outcomes.direction[..., None, :], fixed)
     predicted, jacobian = model.twin.path_and_jacobian(settled)
     error = point[:, :, None, None] - predicted
     spread = Ellipsoid.of(jacobian * scale, model.path_noise**2)
@@ -150,7 +150,7 @@ def _near(
     step = np.clip(step * area[..., None], -LONGEST_STEP_RAD, LONGEST_STEP_RAD)
     a, b = step[..., 0], step[..., 1]
     gained = 2.0 * (a * slope_a + b * slope_b) - aa * a * a - bb * b * b - 2.0 * ab * a * b
-    return _Near(
+    return _Laplace(
         step,
         np.maximum(spread.product(error, error) - gained, 0.0),
         np.stack([bb, aa, -ab], axis=-1) * area[..., None],
@@ -158,10 +158,10 @@ def _near(
     )
 
 
-def _kept(alternatives: Alternatives, pair: tuple[int, int]) -> IntArray:
-    """Return the alternatives in which other motors alone lose commands, and not too rarely."""
-    most = np.exp(alternatives.log_weight.max(axis=(0, 1)))
-    others = ~alternatives.lost[:, list(pair)].any(axis=1)
+def _kept(outcomes: CommandOutcomes, pair: tuple[int, int]) -> IntArray:
+    """Return the outcomes in which other motors alone lose commands, and not too rarely."""
+    most = np.exp(outcomes.log_weight.max(axis=(0, 1)))
+    others = ~outcomes.lost[:, list(pair)].any(axis=1)
     kept = others & (most > RARE)
     kept[0] = True
     return np.flatnonzero(kept)
@@ -170,7 +170,7 @@ def _kept(alternatives: Alternatives, pair: tuple[int, int]) -> IntArray:
 def _starts(
     model: HealthyModel, pose: FloatArray, pair: tuple[int, int], point: FloatArray
 ) -> FloatArray:
-    """Return from where to look for each way, (run, movement, alternative, way, motor) [rad]."""
+    """Return from where to look for each way, (run, movement, outcome, way, motor) [rad]."""
     first, second = pair
     low, high = model.twin.robot.motors[first].movement_range
     grid = np.linspace(low, high, SCANNED)
@@ -184,7 +184,7 @@ def _starts(
     left = np.concatenate([wall, distance[..., :-1]], axis=-1)
     right = np.concatenate([distance[..., 1:], wall], axis=-1)
     valley = np.where((distance <= left) & (distance <= right), distance, 1.0 + distance)
-    order = np.argsort(valley, axis=-1)[..., :WAYS]
+    order = np.argsort(valley, axis=-1)[..., :SOLUTIONS]
     return np.stack([grid[order], np.take_along_axis(poses[..., second], order, axis=-1)], axis=-1)
 
 

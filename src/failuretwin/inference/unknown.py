@@ -16,16 +16,16 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.inference.marginal import Estimate, Weight
-from failuretwin.inference.run_likelihood import Scene
-from failuretwin.inference.two_joint_likelihood import TwoAngles, two_angles
-from failuretwin.inference.unmodelled_offsets import Course, Lines, follow
+from failuretwin.inference.marginal import Estimate, MarginalLikelihood
+from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.two_joint_likelihood import TwoJointLikelihood, two_joint_likelihood
+from failuretwin.inference.unmodelled_offsets import GreedyPath, LinearOffsets, greedy_map_path
 
 # One motor or two that are off, each in its own way, whatever may have done that.
 
 
 @dataclass(frozen=True)
-class Kind:
+class OffsetKind:
     """How a motor is off.
 
     Attributes:
@@ -47,16 +47,16 @@ class Kind:
         return self.spread > 0.0 and not self.redrawn
 
 
-WELL = Kind(0.0)
-OFF_AS: Mapping[str, Kind] = {
-    "stuck": Kind(0.4, held=True),
-    "encoder_bias": Kind(0.3),
-    "encoder_scale": Kind(0.4, by_angle=True),
-    "steady_state_error": Kind(0.4, redrawn=True),
+WELL = OffsetKind(0.0)
+OFFSET_KINDS: Mapping[str, OffsetKind] = {
+    "stuck": OffsetKind(0.4, held=True),
+    "encoder_bias": OffsetKind(0.3),
+    "encoder_scale": OffsetKind(0.4, by_angle=True),
+    "steady_state_error": OffsetKind(0.4, redrawn=True),
 }
 """Kinds, by the mode that is the simplest case of each. Spreads are wide enough for most of what a
 motor can do within its range."""
-OFF = tuple(OFF_AS.values())
+OFF = tuple(OFFSET_KINDS.values())
 ONE_OFF = (*product(OFF, (WELL,)), *product((WELL,), OFF))
 TWO_OFF = tuple(product(OFF, OFF))
 KINDS = (*ONE_OFF, *TWO_OFF)
@@ -64,22 +64,24 @@ LOG_CHANCE = -np.log([2 * len(ONE_OFF)] * len(ONE_OFF) + [2 * len(TWO_OFF)] * le
 """Log probability of each of `KINDS`: one motor as often as two."""
 
 
-def weigh_off_anyhow(scene: Scene, known: Sequence[Hypothesis] = ()) -> Weight | None:
+def unmodelled_offsets_likelihood(
+    likelihood: RunLikelihood, known: Sequence[Hypothesis] = ()
+) -> MarginalLikelihood | None:
     """Return what the runs say of one motor or two being off; None of an arm of a single motor.
 
     Args:
-        scene: The runs.
+        likelihood: The runs.
         known: Hypotheses; two motors that are off as one of them says are left out.
     """
-    pairs = list(combinations(range(len(scene.model.scatter)), 2))
+    pairs = list(combinations(range(len(likelihood.model.scatter)), 2))
     if not pairs:
         return None
-    settled, ways = zip(*(_weigh(scene, pair, known) for pair in pairs), strict=True)
+    settled, ways = zip(*(_weigh(likelihood, pair, known) for pair in pairs), strict=True)
     says = [one + way for one, way in zip(settled, ways, strict=True)]
     whole = np.stack([one.sum(axis=1) for one in says], axis=1)
     best = np.argmax(whole, axis=1)
-    none = np.zeros(scene.alternatives.log_weight.shape[1:])
-    return Weight(
+    none = np.zeros(likelihood.outcomes.log_weight.shape[1:])
+    return MarginalLikelihood(
         log_evidence=log_sum(whole, axis=1) - np.log(len(pairs)),
         by_movement=lambda run: says[best[run]][run],
         settled=lambda run: settled[best[run]][run],
@@ -87,62 +89,69 @@ def weigh_off_anyhow(scene: Scene, known: Sequence[Hypothesis] = ()) -> Weight |
     )
 
 
-def way_of_two(scene: Scene, pair: tuple[int, int]) -> FloatArray:
+def way_of_two(likelihood: RunLikelihood, pair: tuple[int, int]) -> FloatArray:
     """Return log densities of the way with two motors off, (run, movement)."""
-    if scene.transients is None:
-        return scene.on_way
-    return _weigh(scene, (min(pair), max(pair)))[1]
+    if likelihood.transients is None:
+        return likelihood.log_transient
+    return _weigh(likelihood, (min(pair), max(pair)))[1]
 
 
 def _weigh(
-    scene: Scene, pair: tuple[int, int], known: Sequence[Hypothesis] = ()
+    likelihood: RunLikelihood, pair: tuple[int, int], known: Sequence[Hypothesis] = ()
 ) -> tuple[FloatArray, FloatArray]:
     """Return log densities of settled positions and of the way, (run, movement) each."""
-    seen = two_angles(scene.evidence, scene.model, scene.alternatives, pair)
-    outlier = scene.model.outlier_log_density
-    course = follow(seen, _lines(scene, seen), scene.usable, outlier)
-    chance = np.where(_among(known, scene, pair), -np.inf, LOG_CHANCE)
+    seen = two_joint_likelihood(likelihood.evidence, likelihood.model, likelihood.outcomes, pair)
+    outlier = likelihood.model.outlier_log_density
+    course = greedy_map_path(seen, _lines(likelihood, seen), likelihood.usable, outlier)
+    chance = np.where(_among(known, likelihood, pair), -np.inf, LOG_CHANCE)
     total = course.says.sum(axis=-1) + chance  # (run, kind)
     best, run = np.argmax(total, axis=1), np.arange(len(total))
     says = course.says[run, best]
     # What chance and the other kinds add belongs to no movement more than to another.
     more = log_sum(total, axis=1) - says.sum(axis=1)
-    share = np.where(scene.usable, 1.0, 0.0) / np.maximum(scene.usable.sum(axis=1), 1)[:, None]
+    share = (
+        np.where(likelihood.usable, 1.0, 0.0)
+        / np.maximum(likelihood.usable.sum(axis=1), 1)[:, None]
+    )
     says = says + share * more[:, None]
-    if scene.transients is None:
+    if likelihood.transients is None:
         return says, np.zeros_like(says)
-    return says, _on_way(scene, seen, Course(says, course.way[run, best], course.angle[run, best]))
+    return says, _on_way(
+        likelihood, seen, GreedyPath(says, course.way[run, best], course.angle[run, best])
+    )
 
 
-def _among(known: Sequence[Hypothesis], scene: Scene, pair: tuple[int, int]) -> BoolArray:
+def _among(
+    known: Sequence[Hypothesis], likelihood: RunLikelihood, pair: tuple[int, int]
+) -> BoolArray:
     """Return which of `KINDS` of two motors are known hypotheses, (kind,)."""
-    names = [scene.model.twin.robot.motor_names[motor] for motor in pair]
-    said = [{fault.motor: OFF_AS.get(fault.mode) for fault in h.faults} for h in known]
+    names = [likelihood.model.twin.robot.motor_names[motor] for motor in pair]
+    said = [{fault.motor: OFFSET_KINDS.get(fault.mode) for fault in h.faults} for h in known]
     kinds = [tuple(one[name] for name in names) for one in said if set(one) == set(names)]
     return np.array([kind in kinds for kind in KINDS])
 
 
-def _on_way(scene: Scene, seen: TwoAngles, course: Course) -> FloatArray:
+def _on_way(likelihood: RunLikelihood, seen: TwoJointLikelihood, course: GreedyPath) -> FloatArray:
     """Return log densities of the way if the two motors went where they were seen to settle."""
-    transients, pair = scene.transients, list(seen.pair)
+    transients, pair = likelihood.transients, list(seen.pair)
     assert transients is not None
     followed = course.way >= 0
     way = np.maximum(course.way, 0)[..., None]
     at = np.take_along_axis(seen.angle, way[..., None], axis=2)[:, :, 0]
     ends = transients.judge.expected.copy()
     ends[..., pair] = np.where(followed[..., None], at, course.angle)[:, :, None]
-    became = np.where(followed, seen.became[way[..., 0]], 0)
-    return transients.toward(ends, became, seen.pair[0])
+    outcome_probability = np.where(followed, seen.outcome_probability[way[..., 0]], 0)
+    return transients.toward(ends, outcome_probability, seen.pair[0])
 
 
-def _lines(scene: Scene, seen: TwoAngles) -> Lines:
+def _lines(likelihood: RunLikelihood, seen: TwoJointLikelihood) -> LinearOffsets:
     """Return where two motors may stand, for each of `KINDS`."""
     pair = list(seen.pair)
-    motors = [scene.model.twin.robot.motors[motor] for motor in pair]
+    motors = [likelihood.model.twin.robot.motors[motor] for motor in pair]
     ends = np.array([motor.movement_range for motor in motors])
     middle, length = ends.mean(axis=1), ends[:, 1] - ends[:, 0]
-    target = np.nan_to_num(scene.evidence.movements.target[..., pair])
-    scatter = scene.model.scatter[pair] ** 2
+    target = np.nan_to_num(likelihood.evidence.movements.target[..., pair])
+    scatter = likelihood.model.scatter[pair] ** 2
     held, by_angle, redrawn, amount = (
         np.array([[bool(getattr(kind, name)) for kind in kinds] for kinds in KINDS])
         for name in ("held", "by_angle", "redrawn", "amount")
@@ -150,7 +159,7 @@ def _lines(scene: Scene, seen: TwoAngles) -> Lines:
     spread = np.array([[kind.spread for kind in kinds] for kinds in KINDS])
     slope = np.where(by_angle, target[:, :, None], 1.0)
     deviation = np.where(amount, spread * np.where(held, length, 1.0), 1.0)
-    return Lines(
+    return LinearOffsets(
         centre=np.where(held, 0.0, seen.expected[:, :, None]),
         slope=np.where(amount, slope, 0.0),
         noise=np.where(held, 0.0, scatter) + np.where(redrawn, spread**2, 0.0),
@@ -160,11 +169,11 @@ def _lines(scene: Scene, seen: TwoAngles) -> Lines:
     )
 
 
-BLURS = (3.0, 8.0, 25.0)
+SCATTER_FACTORS = (3.0, 8.0, 25.0)
 """Factors on the scatter: just more than tails allow, to anywhere near."""
-WAY_BLUR = 8.0
+TRANSIENT_SCATTER_FACTOR = 8.0
 """The same where the motors settle as they should, but get there in another way."""
-BLURRED_ODDS = 0.5
+SCATTER_ODDS = 0.5
 """Odds, against healthy, of far more scatter, in any of these ways."""
 OFF_ODDS = 1.0
 """The same of one motor or two being off anyhow."""
@@ -173,39 +182,44 @@ LEFT_OUT = 0.5
 for no more than 2 % of the known runs lost (docs/diagnosis.md)."""
 
 
-def weigh_unknown(
-    scene: Scene,
-    healthy: Callable[[Scene], Weight],
-    left_out: Sequence[tuple[float, Weight]],
+def unknown_likelihood(
+    likelihood: RunLikelihood,
+    healthy: Callable[[RunLikelihood], MarginalLikelihood],
+    unlisted: Sequence[tuple[float, MarginalLikelihood]],
     known: Sequence[Hypothesis],
-) -> Weight:
+) -> MarginalLikelihood:
     """Return what the runs say of a fault that is not among the known ones, times its odds.
 
     Args:
-        scene: The runs.
+        likelihood: The runs.
         healthy: What weighs a healthy robot.
-        left_out: Faults that are not among the known ones: their odds against healthy, and what
+        unlisted: Faults that are not among the known ones: their odds against healthy, and what
             the runs say of them.
         known: The known hypotheses; two motors that are off as one of them says are no unknown.
     """
-    found = [(LEFT_OUT * odds, weight) for odds, weight in left_out]
-    blurred = _blurred(scene)
-    found += [(BLURRED_ODDS / len(blurred), healthy(other)) for other in blurred]
-    anyhow = weigh_off_anyhow(scene, known)
+    found = [(LEFT_OUT * odds, weight) for odds, weight in unlisted]
+    inflated = _inflated(likelihood)
+    found += [(SCATTER_ODDS / len(inflated), healthy(other)) for other in inflated]
+    anyhow = unmodelled_offsets_likelihood(likelihood, known)
     if anyhow is not None:
         found.append((OFF_ODDS, anyhow))
-    return _best([weight for _, weight in found], np.log([odds for odds, _ in found]))
+    return _max_evidence([weight for _, weight in found], np.log([odds for odds, _ in found]))
 
 
-def _blurred(scene: Scene) -> list[Scene]:
+def _inflated(likelihood: RunLikelihood) -> list[RunLikelihood]:
     """Return the runs as they look to who expects far more scatter, settled or moving."""
-    blurred = [replace(scene, model=replace(scene.model, blur=blur)) for blur in BLURS]
-    if scene.moving is not None:
-        blurred.append(replace(scene, way_blur=WAY_BLUR))
-    return blurred
+    inflated = [
+        replace(likelihood, model=replace(likelihood.model, scatter_factor=scatter_factor))
+        for scatter_factor in SCATTER_FACTORS
+    ]
+    if likelihood.moving is not None:
+        inflated.append(replace(likelihood, transient_scatter_factor=TRANSIENT_SCATTER_FACTOR))
+    return inflated
 
 
-def _best(weights: Sequence[Weight], log_prior: FloatArray) -> Weight:
+def _max_evidence(
+    weights: Sequence[MarginalLikelihood], log_prior: FloatArray
+) -> MarginalLikelihood:
     """Return what the runs say of the best explanation of each, without a size."""
     joint = np.stack([weight.log_evidence for weight in weights], axis=1) + log_prior
     best = np.argmax(joint, axis=1)
@@ -213,7 +227,7 @@ def _best(weights: Sequence[Weight], log_prior: FloatArray) -> Weight:
     def estimate(run: int) -> Estimate:
         return replace(weights[best[run]].estimate(run), size=None)
 
-    return Weight(
+    return MarginalLikelihood(
         log_evidence=joint[np.arange(len(best)), best],
         by_movement=lambda run: weights[best[run]].by_movement(run),
         settled=lambda run: weights[best[run]].settled(run),

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.inference.two_joint_likelihood import WAYS, TwoAngles
+from failuretwin.inference.two_joint_likelihood import SOLUTIONS, TwoJointLikelihood
 
 # Where two motors stand if each is off by some amount, and what movements say of the amounts.
 
 
 @dataclass(frozen=True)
-class Lines:
+class LinearOffsets:
     """Where two motors stand after each movement: centre + slope * amount, give or take noise.
 
     Attributes:
@@ -35,7 +35,7 @@ class Lines:
 
 
 @dataclass(frozen=True)
-class Belief:
+class GaussianBelief:
     """Normal belief about the amounts by which two motors are off.
 
     Attributes:
@@ -52,7 +52,7 @@ class Belief:
         a, b = slope[..., 0], slope[..., 1]
         return np.stack([a * a, b * b, a * b], axis=-1) * spread
 
-    def after(self, slope: FloatArray, error: FloatArray, spread: FloatArray) -> Belief:
+    def after(self, slope: FloatArray, error: FloatArray, spread: FloatArray) -> GaussianBelief:
         """Return the belief once angles were off by `error`, of covariance `spread` in all."""
         a, b = slope[..., 0], slope[..., 1]
         own_a, own_b, both = (self.spread[..., k] for k in range(3))
@@ -68,11 +68,11 @@ class Belief:
         mean = self.mean + np.einsum("rkij,rkj->rki", gain, pull)
         less = np.einsum("rkai,rkij,rkbj->rkab", gain, inverse, gain)
         less = np.stack([less[..., 0, 0], less[..., 1, 1], less[..., 0, 1]], axis=-1)
-        return Belief(mean, self.spread - less)
+        return GaussianBelief(mean, self.spread - less)
 
-    def where(self, some: BoolArray, other: Belief) -> Belief:
+    def where(self, some: BoolArray, other: GaussianBelief) -> GaussianBelief:
         """Return this belief for some of the (run, kind), the other for the rest."""
-        return Belief(
+        return GaussianBelief(
             np.where(some[..., None], self.mean, other.mean),
             np.where(some[..., None], self.spread, other.spread),
         )
@@ -94,12 +94,12 @@ SEEDS = 6
 
 
 @dataclass(frozen=True)
-class Course:
+class GreedyPath:
     """What became of the movements of each run, and what that says.
 
     Attributes:
         says: Log density of each movement given those met before it, (run, kind, movement).
-        way: Which way of `TwoAngles` each one took, (run, kind, movement); -1: none.
+        way: Which way of `TwoJointLikelihood` each one took, (run, kind, movement); -1: none.
         angle: Where the two motors stand by the amounts learnt, (run, kind, movement, motor)
             [rad].
     """
@@ -109,7 +109,9 @@ class Course:
     angle: FloatArray
 
 
-def follow(seen: TwoAngles, lines: Lines, usable: BoolArray, outlier: float) -> Course:
+def greedy_map_path(
+    seen: TwoJointLikelihood, lines: LinearOffsets, usable: BoolArray, outlier: float
+) -> GreedyPath:
     """Return the most probable course of each run among those begun at different movements.
 
     Args:
@@ -120,34 +122,34 @@ def follow(seen: TwoAngles, lines: Lines, usable: BoolArray, outlier: float) -> 
     """
     count = usable.shape[1]
     starts = np.unique(np.linspace(0, count - 1, min(SEEDS, count)).astype(np.int64))
-    found: Course | None = None
+    found: GreedyPath | None = None
     for start in starts.tolist():
         order = [start, *(m for m in range(count) if m != start)]
-        for way in range(WAYS):
-            course = _follow(seen, lines, usable, outlier, order, way)
+        for way in range(SOLUTIONS):
+            course = _greedy_path(seen, lines, usable, outlier, order, way)
             found = course if found is None else _better(course, found)
     assert found is not None
     return found
 
 
-def _better(one: Course, other: Course) -> Course:
+def _better(one: GreedyPath, other: GreedyPath) -> GreedyPath:
     """Return the more probable course of each run and kind."""
     ahead = one.says.sum(axis=-1) > other.says.sum(axis=-1)
-    return Course(
+    return GreedyPath(
         np.where(ahead[..., None], one.says, other.says),
         np.where(ahead[..., None], one.way, other.way),
         np.where(ahead[..., None, None], one.angle, other.angle),
     )
 
 
-def _follow(
-    seen: TwoAngles,
-    lines: Lines,
+def _greedy_path(
+    seen: TwoJointLikelihood,
+    lines: LinearOffsets,
     usable: BoolArray,
     outlier: float,
     order: Sequence[int],
     way: int,
-) -> Course:
+) -> GreedyPath:
     """Return the course that begins with one way of one movement and goes on as is best each time.
 
     Args:
@@ -160,7 +162,7 @@ def _follow(
     """
     runs, movements, kinds, _ = lines.slope.shape
     mean, variance = (np.broadcast_to(v, (runs, kinds, 2)) for v in lines.amount)
-    belief = Belief(mean, np.concatenate([variance, np.zeros((runs, kinds, 1))], axis=-1))
+    belief = GaussianBelief(mean, np.concatenate([variance, np.zeros((runs, kinds, 1))], axis=-1))
     says = np.zeros((runs, kinds, movements))
     taken = np.full((runs, kinds, movements), -1)
     for met, m in enumerate(order):
@@ -170,20 +172,20 @@ def _follow(
             best = np.full((runs, kinds), np.argmax(only))
         else:
             best = np.argmax(log_at, axis=-1)
-        at = _pick(log_at, best)
+        at = _select(log_at, best)
         here = usable[:, m, None] & (at > outlier)
-        learnt = belief.after(_pick(slope, best), _pick(error, best), _pick(spread, best))
+        learnt = belief.after(_select(slope, best), _select(error, best), _select(spread, best))
         belief = learnt.where(here, belief)
         says[:, :, m] = np.where(usable[:, m, None], np.maximum(at, outlier), 0.0)
         taken[:, :, m] = np.where(here, best % seen.log_weight.shape[-1], -1)
     angle = (
         np.moveaxis(lines.centre, 1, 2) + np.moveaxis(lines.slope, 1, 2) * belief.mean[:, :, None]
     )
-    return Course(says, taken, angle)
+    return GreedyPath(says, taken, angle)
 
 
 def _options(
-    seen: TwoAngles, lines: Lines, belief: Belief, m: int
+    seen: TwoJointLikelihood, lines: LinearOffsets, belief: GaussianBelief, m: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return what may have become of a movement, by state of the faults and way of the tool.
 
@@ -215,7 +217,7 @@ def _options(
     )
 
 
-def _pick(values: FloatArray, option: IntArray) -> FloatArray:
+def _select(values: FloatArray, option: IntArray) -> FloatArray:
     """Return the values (run, kind, option, ...) of one option each."""
     index = option.reshape(*option.shape, *(1,) * (values.ndim - 2))
     return np.take_along_axis(values, index, axis=2)[:, :, 0]

@@ -54,16 +54,16 @@ whole, and logs are refused. Of ten healthy runs three look faulty in one sessio
 
 
 def untrusted(
-    names: Sequence[str], sessions: Sequence[str], suspicion: FloatArray
+    names: Sequence[str], sessions: Sequence[str], fault_probability: FloatArray
 ) -> list[LeftOut]:
     """Return the runs that look faulty, and those of sessions that do.
 
     Args:
         names: Names of the runs.
         sessions: The session of each run.
-        suspicion: Probability that each run is faulty, (run,).
+        fault_probability: Probability that each run is faulty, (run,).
     """
-    suspect, of = suspicion >= SUSPECT, np.asarray(sessions)
+    suspect, of = fault_probability >= SUSPECT, np.asarray(sessions)
     found = []
     for i, name in enumerate(names):
         inside = of == of[i]
@@ -85,7 +85,7 @@ def calibrate(
     name: str,
     source: str,
     *,
-    suspicion: FloatArray | None = None,
+    fault_probability: FloatArray | None = None,
     use_readings: bool = True,
     judged: xr.Dataset | None = None,
     thorough: bool = True,
@@ -97,8 +97,8 @@ def calibrate(
         robot: The robot.
         name: What to call the imperfections in results.
         source: Which logs they come from.
-        suspicion: Probability that each run is faulty, (run,); runs and sessions that look so are
-            left out. None: all count.
+        fault_probability: Probability that each run is faulty, (run,); runs and sessions that look
+            so are left out. None: all count.
         use_readings: Whether to look at the motors' own readings, where the runs have them.
         judged: Healthy runs of sessions that only say how good the fit is; None: each session is
             left out once and judged by a fit to the others.
@@ -109,7 +109,7 @@ def calibrate(
         InputError: If too few movements come to rest near their targets.
     """
     names = [str(run) for run in runs["run"].values]
-    doubt = np.zeros(len(names)) if suspicion is None else suspicion
+    doubt = np.zeros(len(names)) if fault_probability is None else fault_probability
     left_out = untrusted(names, session_names(runs), doubt)
     out = {entry.run for entry in left_out}
     kept = runs.isel(run=[i for i, run in enumerate(names) if run not in out])

@@ -22,7 +22,7 @@ from failuretwin.digital_model.disturbances import lagged
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, sag
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.inference.readings import true_readings
+from failuretwin.inference.readings import measured_samples
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -287,7 +287,7 @@ def lateness(movements: Movements) -> Lateness:
 def gap_starts(runs: xr.Dataset, movements: Movements, late: FloatArray) -> FloatArray:
     """Return when readings stop before late starts, after the movement before, (gap,) [s]."""
     time, rate = as_floats(runs["time"].values), measured_rate(runs)
-    seen = true_readings(runs).seen
+    seen = measured_samples(runs).seen
     found = []
     for run, movement in np.argwhere(np.nan_to_num(late) > 0.0):
         if movement == 0:
@@ -332,7 +332,7 @@ def transients(
     time = as_floats(runs["time"].values)
     used = _on_time(movements, late, part, time)
     of_motors = part.observations.position is not None
-    reading = as_floats(runs["position"].values) if of_motors else true_readings(runs).point
+    reading = as_floats(runs["position"].values) if of_motors else measured_samples(runs).point
     free = unloaded_movements(movements, settling)
     if of_motors:
         pose = np.nan_to_num(reading)

@@ -13,7 +13,7 @@ from failuretwin.core.runs import truth_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.data_knowledge.failure_modes import failure_modes, plain_name
 from failuretwin.inference.explanation import percent, possible_hypotheses
-from failuretwin.inference.log_quality import LogQuality, log_quality, without_spoilt
+from failuretwin.inference.log_quality import LogQuality, drop_invalid, log_quality
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -34,7 +34,7 @@ def tell(
         about: Protocol and method, as results name them.
     """
     quality = log_quality(runs)
-    chances = judge(without_spoilt(runs, quality))
+    chances = judge(drop_invalid(runs, quality))
     faults = truth_of(runs)
     truth: list[str | None] = [None] * len(chances) if faults is None else list(faults)
     return [

@@ -17,18 +17,24 @@ from numpy.typing import ArrayLike
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
-from failuretwin.decision.streaming.samples import KEEP_S, Stillness
-from failuretwin.decision.streaming.tracking import Following, Starts
+from failuretwin.decision.streaming.samples import KEEP_S, FrozenSensorDetector
+from failuretwin.decision.streaming.tracking import MovementTracker, Starts
 from failuretwin.decision.streaming.window import Arrays, arrays_of, put_arrays
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.evidence import SETTLING_S
 from failuretwin.inference.log_quality import LogQuality
-from failuretwin.inference.posterior import Judgement, Place, judge, log_prior, shows_on_way
-from failuretwin.inference.run_likelihood import Scene
+from failuretwin.inference.posterior import (
+    Posterior,
+    StreamPosition,
+    compute_posterior,
+    log_prior,
+    shows_in_transients,
+)
+from failuretwin.inference.run_likelihood import RunLikelihood
 
 MOVEMENTS = 5
 """Movements that are remembered, the present one included: as many as a run of the paper has."""
-NEWS_M = 0.0005
+UPDATE_THRESHOLD_M = 0.0005
 """A tool that rests this near to where it was judged to rest is not judged anew [m]: a tenth of
 what a healthy one scatters."""
 SILENCE_S = 5.0
@@ -40,7 +46,7 @@ DEAD = LogQuality(
 
 
 @dataclass
-class Beliefs:
+class FleetPosterior:
     """What is believed of each robot.
 
     Attributes:
@@ -68,8 +74,8 @@ class _Latest:
     """
 
     robots: IntArray
-    judgement: Judgement | None
-    places: list[Place]
+    posterior_of_runs: Posterior | None
+    places: list[StreamPosition]
 
 
 class StreamingFleet:
@@ -104,23 +110,23 @@ class StreamingFleet:
                 "robot and one movement at least, and a rate above 0 or None."
             )
         self.diagnoser = diagnoser
-        self.hypotheses = [str(hypothesis) for hypothesis in diagnoser.considered]
+        self.hypotheses = [str(hypothesis) for hypothesis in diagnoser.hypothesis_set]
         self.robots, self.rate_hz, self.movements = robots, rate_hz, movements
         self._zero: float | None = None
         self._now = -np.inf
         model = diagnoser.healthy_model
         latest_s = model.imperfections.timing.late_s[1] + model.lag_s + SETTLING_S
         starts = Starts(latest_s, model.lost_commands.late_after_s)
-        self._following = Following(robots, diagnoser.twin, movements, rate_hz, starts)
-        self._stillness = Stillness.unknown(robots, motors)
-        self._prior = np.exp(log_prior(diagnoser.considered, diagnoser.priors))
-        self._beliefs = Beliefs(
+        self._following = MovementTracker(robots, diagnoser.twin, movements, rate_hz, starts)
+        self._stillness = FrozenSensorDetector.unknown(robots, motors)
+        self._prior = np.exp(log_prior(diagnoser.hypothesis_set, diagnoser.priors))
+        self._beliefs = FleetPosterior(
             posterior=np.tile(self._prior, (robots, 1)),
             judged=np.zeros(robots, dtype=bool),
             point=np.full((robots, 3), np.nan),
             dead=np.zeros(robots, dtype=bool),
         )
-        self._everything_counts = any(shows_on_way(h) for h in diagnoser.considered)
+        self._everything_counts = any(shows_in_transients(h) for h in diagnoser.hypothesis_set)
         self._latest = _Latest(np.array([], dtype=np.int64), None, [])
 
     @property
@@ -189,23 +195,23 @@ class StreamingFleet:
         known = beliefs.judged[robot] or beliefs.dead[robot]
         if not known or windows.count[robot] == 0:
             return None
-        if robot not in self._latest.robots or self._latest.judgement is None:
+        if robot not in self._latest.robots or self._latest.posterior_of_runs is None:
             self._remember(np.array([robot]), self._judgement(np.array([robot])))
         latest = self._latest
         at = int(np.flatnonzero(latest.robots == robot)[0])
         quality = DEAD if beliefs.dead[robot] else LogQuality()
-        assert latest.judgement is not None
+        assert latest.posterior_of_runs is not None
         place = replace(latest.places[at], before=before)
-        return latest.judgement.conclude(at, f"robot {robot}", quality, place=place)
+        return latest.posterior_of_runs.to_diagnosis(at, f"robot {robot}", quality, place=place)
 
-    def _remember(self, robots: IntArray, judgement: Judgement) -> None:
+    def _remember(self, robots: IntArray, posterior_of_runs: Posterior) -> None:
         """Keep a judgement for whoever asks for it in words."""
         windows, zero = self._following.windows, self._zero or 0.0
         places = [
-            Place(float(windows.zero_s[robot]) + zero, int(windows.forgotten[robot]))
+            StreamPosition(float(windows.zero_s[robot]) + zero, int(windows.forgotten[robot]))
             for robot in robots
         ]
-        self._latest = _Latest(robots, judgement, places)
+        self._latest = _Latest(robots, posterior_of_runs, places)
 
     def _by_own_clock(self, time: float) -> float:
         """Return the time since the first sample [s]; small numbers are exact."""
@@ -297,7 +303,7 @@ class StreamingFleet:
         """Return the robots whose tools rest elsewhere than they were judged to."""
         windows = self._following.windows
         now = windows.point[robots, windows.count[robots] - 1]
-        near = (np.abs(now - self._beliefs.point[robots]) < NEWS_M).all(axis=1)
+        near = (np.abs(now - self._beliefs.point[robots]) < UPDATE_THRESHOLD_M).all(axis=1)
         return robots[~near]
 
     def _judge(self, robots: IntArray) -> IntArray:
@@ -306,15 +312,15 @@ class StreamingFleet:
         for robot in robots:
             self._following.see_on_way(int(robot), int(windows.count[robot]) - 1)
         # The way takes long to judge, so that robots of which it does not count are apart.
-        on_way = self._on_way(robots)
-        for group in (robots[on_way], robots[~on_way]):
+        log_transient = self._on_way(robots)
+        for group in (robots[log_transient], robots[~log_transient]):
             if len(group) == 0:
                 continue
-            judgement = self._judgement(group)
+            posterior_of_runs = self._judgement(group)
             for at, robot in enumerate(group):
-                undecided = judgement.undecided(at, LogQuality())
-                beliefs.posterior[robot] = judgement.posterior(at, undecided)
-            self._remember(group, judgement)
+                undecided = posterior_of_runs.undecided(at, LogQuality())
+                beliefs.posterior[robot] = posterior_of_runs.posterior(at, undecided)
+            self._remember(group, posterior_of_runs)
         beliefs.judged[robots] = True
         beliefs.point[robots] = windows.point[robots, windows.count[robots] - 1]
         return robots
@@ -324,14 +330,14 @@ class StreamingFleet:
         windows = self._following.windows
         there = np.arange(self.movements) < windows.count[robots, None]
         unseen = (there & ~windows.usable[robots]).any(axis=1)
-        return np.asarray(self.diagnoser.looks_on_way & (unseen | self._everything_counts))
+        return np.asarray(self.diagnoser.uses_transients & (unseen | self._everything_counts))
 
-    def _judgement(self, robots: IntArray) -> Judgement:
+    def _judgement(self, robots: IntArray) -> Posterior:
         diagnoser, windows = self.diagnoser, self._following.windows
         evidence, moving = windows.evidence(robots), None
         if self._on_way(robots).any():
-            moving = windows.on_way(robots).where(diagnoser.on_way(evidence.usable))
+            moving = windows.log_transient(robots).where(diagnoser.transient_mask(evidence.usable))
         model = diagnoser.healthy_model
         findings = self._following.memory.findings(robots, evidence, model)
-        scene = Scene(evidence, model, moving, remembered=findings)
-        return judge(scene, diagnoser.considered, diagnoser.priors)
+        likelihood = RunLikelihood(evidence, model, moving, remembered=findings)
+        return compute_posterior(likelihood, diagnoser.hypothesis_set, diagnoser.priors)

@@ -22,7 +22,7 @@ FIRST_ROOM = 64
 """Samples that there is room for at first."""
 
 
-class Samples:
+class SampleBuffer:
     """Commands and readings of the last seconds, in the order of their times.
 
     Args:
@@ -107,7 +107,7 @@ def _fill(old: FloatArray, new: FloatArray) -> None:
 
 
 @dataclass
-class _Watch:
+class _StuckValue:
     """Since when values have not moved, and how far motors were told to travel meanwhile.
 
     Attributes:
@@ -123,7 +123,7 @@ class _Watch:
     high: FloatArray
 
     @classmethod
-    def empty(cls, robots: int, values: int, motors: int) -> _Watch:
+    def empty(cls, robots: int, values: int, motors: int) -> _StuckValue:
         none = np.full((robots, values), np.nan)
         travel = np.full((robots, values, motors), np.nan)
         return cls(none.copy(), none.copy(), travel.copy(), travel.copy())
@@ -147,7 +147,7 @@ class _Watch:
 
 
 @dataclass
-class Stillness:
+class FrozenSensorDetector:
     """Watches the tools of many robots, by the same rules as `log_quality`.
 
     Attributes:
@@ -156,15 +156,15 @@ class Stillness:
         place: That place, (robot, axis) [m].
     """
 
-    channels: _Watch
-    tools: _Watch
+    channels: _StuckValue
+    tools: _StuckValue
     place: FloatArray
 
     @classmethod
-    def unknown(cls, robots: int, motors: int) -> Stillness:
+    def unknown(cls, robots: int, motors: int) -> FrozenSensorDetector:
         """Return a watch over tools that were never seen."""
-        tools = _Watch.empty(robots, 1, motors)
-        return cls(_Watch.empty(robots, 3, motors), tools, np.full((robots, 3), np.nan))
+        tools = _StuckValue.empty(robots, 1, motors)
+        return cls(_StuckValue.empty(robots, 3, motors), tools, np.full((robots, 3), np.nan))
 
     def since_s(self, robot: int) -> float:
         """Return since when the tool of a robot has stood where it stands [s]."""

@@ -8,14 +8,14 @@ import numpy as np
 
 from failuretwin.core.movements import Movements, find_movements, simplify
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.decision.streaming.samples import Samples
-from failuretwin.decision.streaming.window import Memory, Windows
+from failuretwin.decision.streaming.samples import SampleBuffer
+from failuretwin.decision.streaming.window import LikelihoodCache, MovementWindow
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.evidence import (
     JUST_AFTER_S,
     SETTLING_S,
     Rest,
-    rest,
+    estimate_rest,
     rest_begin,
     spread_out,
 )
@@ -96,7 +96,7 @@ class References:
         self.last[known], self.last_s[known] = command[known], time
         return np.flatnonzero(known & self.moved & (self.still >= STILL_STEPS))
 
-    def movements(self, robot: int, samples: Samples) -> Movements:
+    def movements(self, robot: int, samples: SampleBuffer) -> Movements:
         """Return what a robot was told to do since it was last at rest, as one run.
 
         Args:
@@ -164,7 +164,7 @@ class Starts:
     late_after_s: float
 
 
-class Following:
+class MovementTracker:
     """What is known of the last movements of many robots.
 
     Args:
@@ -184,10 +184,10 @@ class Following:
         starts: Starts,
     ) -> None:
         motors = len(twin.robot.motors)
-        self.samples = Samples(robots, motors)
+        self.samples = SampleBuffer(robots, motors)
         self.references = References.unknown(robots, motors)
-        self.windows = Windows.empty(robots, movements, motors)
-        self.memory = Memory.empty(robots, movements)
+        self.windows = MovementWindow.empty(robots, movements, motors)
+        self.memory = LikelihoodCache.empty(robots, movements)
         self.read_s = np.full(robots, -np.inf)
         self._twin, self._starts = twin, starts
         self._least_step = 0.0 if rate_hz is None else 0.9 / rate_hz
@@ -241,7 +241,7 @@ class Following:
         if len(robots) == 0:
             return robots
         samples, time, inside = self._readings(robots, begin, end)
-        found = rest(samples, _since_rest(samples, time, inside))
+        found = estimate_rest(samples, _since_rest(samples, time, inside))
         waits = self._under_way(robots, place) | self._may_start_late(robots, place, found.point)
         found = replace(found, usable=found.usable & ~waits)
         self.windows.settle(robots, place, end, found)
@@ -291,7 +291,7 @@ class Following:
         robots, place, begin, end = self._due(robots, place, end)
         if len(robots):
             samples, _, inside = self._readings(robots, begin, end)
-            found = rest(samples, inside)
+            found = estimate_rest(samples, inside)
             self.windows.settle(robots, place, end, found)
 
     def _due(
@@ -317,22 +317,25 @@ class Following:
     def _under_way(self, robots: IntArray, place: IntArray) -> BoolArray:
         """Return which movements must still be on their way, as readings came back late."""
         windows, at = self.windows, (robots, place)
-        for k in np.flatnonzero(np.isnan(windows.resumed[at])):
+        for k in np.flatnonzero(np.isnan(windows.first_reading_delay[at])):
             self._resume(int(robots[k]), int(place[k]))
-        resumed, ramp = windows.resumed[at], windows.ramp_duration[at].max(axis=-1)
-        over = self.read_s[robots] - windows.start[at] > resumed + ramp + SETTLING_S
-        return np.asarray((resumed > self._starts.late_after_s) & ~over)
+        first_reading_delay, ramp = (
+            windows.first_reading_delay[at],
+            windows.ramp_duration[at].max(axis=-1),
+        )
+        over = self.read_s[robots] - windows.start[at] > first_reading_delay + ramp + SETTLING_S
+        return np.asarray((first_reading_delay > self._starts.late_after_s) & ~over)
 
     def _resume(self, robot: int, place: int) -> None:
         """Note when readings came back after the command of a movement."""
         windows, samples = self.windows, self.samples
-        if np.isfinite(windows.resumed[robot, place]):
+        if np.isfinite(windows.first_reading_delay[robot, place]):
             return
         start = float(windows.start[robot, place])
         some = samples.since(start)
         there = np.isfinite(samples.measured[some, robot]).all(axis=1)
         if there.any():
-            windows.resumed[robot, place] = samples.time[some][np.argmax(there)] - start
+            windows.first_reading_delay[robot, place] = samples.time[some][np.argmax(there)] - start
 
     def _may_start_late(self, robots: IntArray, place: IntArray, point: FloatArray) -> BoolArray:
         """Return which tools still rest where they did before, and may yet set out, (robot,)."""

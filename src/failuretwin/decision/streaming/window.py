@@ -11,21 +11,21 @@ import numpy as np
 
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.inference.command_loss import Alternatives
-from failuretwin.inference.evidence import MOST_READINGS, MovingEvidence, Rest, SettledEvidence
+from failuretwin.inference.command_loss import CommandOutcomes
+from failuretwin.inference.evidence import MOST_READINGS, Rest, SettledEvidence, TransientSamples
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.joint_likelihood import (
-    Findings,
-    MotorProfile,
-    explained,
-    find,
-    given_before,
-    motor_profiles,
+    JointLikelihood,
+    MovementLikelihoods,
+    filtered_outcomes,
+    joint_likelihoods,
+    likelihood_given_outcome,
+    movement_likelihoods,
 )
 
 
 @dataclass
-class Windows:
+class MovementWindow:
     """The last movements of each robot, oldest first; times are those of the stream.
 
     Attributes:
@@ -39,8 +39,8 @@ class Windows:
         start: (robot, movement) [s].
         begin: When the readings that count begin, (robot, movement) [s].
         end: End of each plateau, (robot, movement) [s].
-        resumed: Time from each command to the first reading after it, (robot, movement) [s]; NaN
-            where there was none yet.
+        first_reading_delay: Time from each command to the first reading after it, (robot,
+            movement) [s]; NaN where there was none yet.
         point: Where the tool rests, (robot, movement, axis) [m]; 0 where that is not known.
         usable: Movements after which it rests, (robot, movement).
         moving: Movements whose readings do not come to rest, (robot, movement).
@@ -58,7 +58,7 @@ class Windows:
     start: FloatArray
     begin: FloatArray
     end: FloatArray
-    resumed: FloatArray
+    first_reading_delay: FloatArray
     point: FloatArray
     usable: BoolArray
     moving: BoolArray
@@ -67,7 +67,7 @@ class Windows:
     seen: BoolArray
 
     @classmethod
-    def empty(cls, robots: int, movements: int, motors: int) -> Windows:
+    def empty(cls, robots: int, movements: int, motors: int) -> MovementWindow:
         """Return windows of so many movements at most, without any yet."""
         shape = (robots, movements)
         return cls(
@@ -80,7 +80,7 @@ class Windows:
             start=np.full(shape, np.nan),
             begin=np.full(shape, np.nan),
             end=np.full(shape, np.nan),
-            resumed=np.full(shape, np.nan),
+            first_reading_delay=np.full(shape, np.nan),
             point=np.zeros((*shape, 3)),
             usable=np.zeros(shape, dtype=bool),
             moving=np.zeros(shape, dtype=bool),
@@ -120,7 +120,11 @@ class Windows:
         """
         at = robot, place
         self.end[at] = end
-        self.point[at], self.usable[at], self.moving[at] = rest.point, rest.usable, rest.moving
+        self.point[at], self.usable[at], self.moving[at] = (
+            rest.point,
+            rest.usable,
+            rest.moving,
+        )
 
     def see_on_way(self, robot: int, place: int, time: FloatArray, point: FloatArray) -> None:
         """Say what was read on the way of a movement.
@@ -152,13 +156,13 @@ class Windows:
             self.moving[robots, some],
             self.begin[robots, some] - zero,
             self.end[robots, some] - zero,
-            self.resumed[robots, some],
+            self.first_reading_delay[robots, some],
         )
 
-    def on_way(self, robots: IntArray) -> MovingEvidence:
+    def log_transient(self, robots: IntArray) -> TransientSamples:
         """Return what was read on the way of the same movements."""
         some = slice(0, int(self.count[robots].max(initial=0)))
-        return MovingEvidence(
+        return TransientSamples(
             self.since[robots, some], self.way[robots, some], self.seen[robots, some]
         )
 
@@ -166,7 +170,7 @@ class Windows:
         """Drop the oldest movement of a robot."""
         if self.count[robot] > 1:
             self.initial[robot] = self.evidence(np.array([robot])).movements.origin()[0, 1]
-        times = (self.start, self.begin, self.end, self.resumed)
+        times = (self.start, self.begin, self.end, self.first_reading_delay)
         for values in (self.target, self.ramp_duration, *times,
                        self.point, self.usable, self.moving, self.since, self.way,
                        self.seen):  # fmt: skip
@@ -231,7 +235,7 @@ PER_MOVEMENT = ("base", "direction", "chance", "density", "poses")
 
 
 @dataclass
-class Memory:
+class LikelihoodCache:
     """Findings of the last movements of many robots.
 
     Attributes:
@@ -243,10 +247,10 @@ class Memory:
 
     fresh: BoolArray
     arrays: dict[str, FloatArray] = field(default_factory=dict)
-    like: Findings | None = field(default=None, metadata={"saved": False})
+    like: MovementLikelihoods | None = field(default=None, metadata={"saved": False})
 
     @classmethod
-    def empty(cls, robots: int, movements: int) -> Memory:
+    def empty(cls, robots: int, movements: int) -> LikelihoodCache:
         """Return a memory of nothing yet."""
         return cls(np.zeros((robots, movements), dtype=bool))
 
@@ -265,7 +269,7 @@ class Memory:
 
     def findings(
         self, robots: IntArray, evidence: SettledEvidence, model: HealthyModel
-    ) -> Findings:
+    ) -> MovementLikelihoods:
         """Return what the last movements of some robots say, looking at what is not fresh.
 
         Args:
@@ -273,20 +277,20 @@ class Memory:
             evidence: Where their tools settled.
             model: The healthy robot.
         """
-        usual = model.alternatives(evidence.movements)
+        usual = model.outcomes(evidence.movements)
         exists = evidence.movements.exists
         stale = np.nonzero(exists & ~self.fresh[robots, : exists.shape[1]])
         at = robots[stale[0]], stale[1]
         if len(stale[0]):
             single, alone = _of_items(evidence, usual, stale)
-            density, poses = explained(single, model, alone)
+            density, poses = likelihood_given_outcome(single, model, alone)
             self._put(at, density=density, poses=poses, base=alone.base, direction=alone.direction)
             known = self.arrays["density"][robots, : exists.shape[1]]
-            weighed = given_before(evidence, model, usual, known)
+            weighed = filtered_outcomes(evidence, model, usual, known)
             alone = replace(alone, log_weight=weighed.log_weight[stale][:, None])
-            profiles = motor_profiles(single, model, alone, range(len(model.scatter)))
+            profiles = joint_likelihoods(single, model, alone, range(len(model.scatter)))
             self._put(at, chance=alone.log_weight, **_together(profiles))
-            self.like = Findings(model, alone, density, poses, profiles)
+            self.like = MovementLikelihoods(model, alone, density, poses, profiles)
             self.fresh[at] = True
         return self._recall(robots, evidence, model)
 
@@ -297,40 +301,44 @@ class Memory:
                 self.arrays[name] = np.zeros((*self.fresh.shape, *value.shape[2:]))
             self.arrays[name][at] = value[:, 0]
 
-    def _recall(self, robots: IntArray, evidence: SettledEvidence, model: HealthyModel) -> Findings:
+    def _recall(
+        self, robots: IntArray, evidence: SettledEvidence, model: HealthyModel
+    ) -> MovementLikelihoods:
         some = robots, slice(0, evidence.usable.shape[1])
         recalled = {name: values[some] for name, values in self.arrays.items()}
-        like = self.like = self.like or find(evidence[:0], model)
+        like = self.like = self.like or movement_likelihoods(evidence[:0], model)
         profiles = [
             _profile(profile, {n: recalled[n][:, :, motor] for n in PER_MOTOR}, evidence.usable)
             for motor, profile in enumerate(like.profiles)
         ]
-        alternatives = replace(
-            like.alternatives,
+        outcomes = replace(
+            like.outcomes,
             base=recalled["base"],
             direction=recalled["direction"],
             log_weight=recalled["chance"],
         )
-        return Findings(model, alternatives, recalled["density"], recalled["poses"], profiles)
+        return MovementLikelihoods(
+            model, outcomes, recalled["density"], recalled["poses"], profiles
+        )
 
 
 def _profile(
-    like: MotorProfile, recalled: Mapping[str, FloatArray], usable: BoolArray
-) -> MotorProfile:
+    like: JointLikelihood, recalled: Mapping[str, FloatArray], usable: BoolArray
+) -> JointLikelihood:
     return replace(
         like,
-        best=recalled["best"],
+        mode=recalled["best"],
         precision=recalled["precision"],
-        square=recalled["square"],
+        min_distance2=recalled["square"],
         log_weight=recalled["log_weight"],
         expected=recalled["expected"],
-        pose=recalled["pose"],
-        beside=recalled["beside"],
+        map_pose=recalled["pose"],
+        faulty_baseline=recalled["beside"],
         usable=usable,
     )
 
 
-def _together(profiles: Sequence[MotorProfile]) -> dict[str, FloatArray]:
+def _together(profiles: Sequence[JointLikelihood]) -> dict[str, FloatArray]:
     """Return what is kept of profiles, (item, 1, motor, ...), by name."""
     return {
         name: np.stack([getattr(profile, name) for profile in profiles], axis=2)
@@ -339,8 +347,8 @@ def _together(profiles: Sequence[MotorProfile]) -> dict[str, FloatArray]:
 
 
 def _of_items(
-    evidence: SettledEvidence, alternatives: Alternatives, item: tuple[IntArray, ...]
-) -> tuple[SettledEvidence, Alternatives]:
+    evidence: SettledEvidence, outcomes: CommandOutcomes, item: tuple[IntArray, ...]
+) -> tuple[SettledEvidence, CommandOutcomes]:
     """Return single movements as runs of one movement each."""
     single = replace(
         evidence,
@@ -348,9 +356,9 @@ def _of_items(
         usable=evidence.usable[item][:, None],
     )
     alone = replace(
-        alternatives,
-        base=alternatives.base[item][:, None],
-        direction=alternatives.direction[item][:, None],
-        log_weight=alternatives.log_weight[item][:, None],
+        outcomes,
+        base=outcomes.base[item][:, None],
+        direction=outcomes.direction[item][:, None],
+        log_weight=outcomes.log_weight[item][:, None],
     )
     return single, alone
