@@ -84,7 +84,7 @@ def test_posterior_of_an_error_is_that_of_brute_force(twin, run_of, motor, off):
     runs = run_of(TARGETS, points, MOTORS)
     fault = Hypothesis.parse(f"motor_{motor + 1}:steady_state_error", MOTORS)
     priors = priors_of(twin.robot, (10.0, 50.0), None)
-    priors = replace(priors, onset=OnsetPrior(early=1.0))
+    priors = replace(priors, onset=OnsetPrior(prior_before_run=1.0))
     imperfections = Imperfections("made up", "test", settling=SETTLING)
 
     (diagnosis,) = BayesDiagnoser(twin, imperfections, (Hypothesis(), fault), priors).diagnose(runs)

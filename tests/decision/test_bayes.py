@@ -201,7 +201,7 @@ def test_finer_quadrature_changes_no_posterior(monkeypatch, twin, few, onset_s):
     diagnoser = BayesDiagnoser(twin, priors=priors_of(twin.robot, None, onset_s))
     coarse = posteriors(diagnoser.diagnose(few))
     monkeypatch.setattr(stuck, "COARSE_NODES", 601)
-    monkeypatch.setattr(steady_state_error, "NODES", 150)
+    monkeypatch.setattr(steady_state_error, "ERROR_NODES", 150)
     monkeypatch.setattr(bayes, "CHUNK_RUNS", 3)
     np.testing.assert_allclose(posteriors(diagnoser.diagnose(few)), coarse, atol=0.02)
 

@@ -73,7 +73,7 @@ def blind(twin, runs):
 
 
 @pytest.mark.parametrize("early", [0.0, 0.3, 1.0])
-@pytest.mark.parametrize("law", FAULT_MODELS)
+@pytest.mark.parametrize("fault_model", FAULT_MODELS)
 def test_prior_mass_of_a_law_is_one(likelihood, fault_model, early):
     """Over all onsets and nodes, or groups of nodes, and within each group."""
     found = FAULT_MODELS[fault_model](likelihood, early)
@@ -83,7 +83,7 @@ def test_prior_mass_of_a_law_is_one(likelihood, fault_model, early):
         np.testing.assert_allclose(np.exp(found.redrawn).sum(axis=1), 1.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("law", FAULT_MODELS)
+@pytest.mark.parametrize("fault_model", FAULT_MODELS)
 def test_no_fault_begins_with_a_movement_that_is_not_there(likelihood, fault_model):
     found = FAULT_MODELS[fault_model](likelihood, 0.3)
     mass = np.exp(found.log_prior).sum(axis=2)
@@ -91,7 +91,7 @@ def test_no_fault_begins_with_a_movement_that_is_not_there(likelihood, fault_mod
     np.testing.assert_array_equal(mass[~likelihood.evidence.movements.exists], 0.0)
 
 
-@pytest.mark.parametrize("law", FAULT_MODELS)
+@pytest.mark.parametrize("fault_model", FAULT_MODELS)
 def test_onsets_lie_in_the_run(likelihood, fault_model):
     """No later than the end of the last movement; of a stuck motor, of its ramp if that is late."""
     found, evidence = FAULT_MODELS[fault_model](likelihood, 0.3), likelihood.evidence

@@ -70,7 +70,7 @@ def test_a_run_has_the_onsets_that_it_has_among_longer_ones():
 
 def test_modes_have_their_own_share_before_the_run():
     """What wears out was there before; a motor may well get stuck in the run."""
-    usual, told = OnsetPrior(), OnsetPrior(early=0.25)
+    usual, told = OnsetPrior(), OnsetPrior(prior_before_run=0.25)
     assert usual.before_run("backlash") > usual.before_run("stuck")
     assert {told.before_run(mode) for mode in ("backlash", "stuck")} == {0.25}
 
@@ -80,7 +80,7 @@ def test_modes_have_their_own_share_before_the_run():
     [
         (OnsetPrior, {"known_s": -1.0}, "known_s is -1, expected 0 or more"),
         (OnsetPrior, {"known_s": np.nan}, "known_s is nan"),
-        (OnsetPrior, {"early": 1.5}, "expected a probability"),
+        (OnsetPrior, {"prior_before_run": 1.5}, "expected a probability"),
         (OnsetPrior, {"free": -0.1}, "expected a probability"),
         (Priors, {"error_ranges": ()}, "expected pairs 0 <= low < high"),
         (Priors, {"error_ranges": ((0.2, 0.1),)}, "expected pairs"),

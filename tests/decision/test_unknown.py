@@ -84,7 +84,7 @@ def test_modes_that_are_not_offered_are_unknown(diagnoser, foreign):
 
 def test_modes_without_a_law_are_unknown(twin, armpi, foreign, monkeypatch):
     """Wrong scales, as if nobody had ever thought of them, nor of anything like them."""
-    monkeypatch.setattr(weighing, "WEIGHABLE", ("stuck", "steady_state_error"))
+    monkeypatch.setattr(weighing, "DIAGNOSABLE_MODES", ("stuck", "steady_state_error"))
     scales = np.char.endswith(foreign["fault"].values.astype(str), "encoder_scale")
     offered = (*paper_hypotheses(armpi.motor_names), UNKNOWN)
     found = BayesDiagnoser(twin, hypotheses=offered).diagnose(foreign.isel(run=scales))

@@ -163,7 +163,7 @@ def stream(run, make):
         answer = diagnoser.update(float(time[i]), command[i], measured[i])
         if i % 100 == 99:
             answers[f"{time[i]:.2f} s"] = said(answer.diagnosis) | {"state": str(answer.state)}
-    return answers | {"end": said(diagnoser.to_diagnosis().diagnosis)}
+    return answers | {"end": said(diagnoser.conclude().diagnosis)}
 
 
 def plain_stream():
@@ -189,7 +189,7 @@ def fleet():
         robots.update(float(time[i]), command[:, i], measured[:, i])
         if i % 125 == 124:
             found[f"{time[i]:.2f} s"] = robots.posterior
-    robots.to_diagnosis()
+    robots.conclude()
     return found | {
         "end": robots.posterior,
         "verdicts": [said(robots.diagnosis(k)) for k in (0, 2)],
