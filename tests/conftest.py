@@ -23,6 +23,16 @@ settings.register_profile("steady", deadline=None, derandomize=True)
 settings.register_profile("search", deadline=None, max_examples=2000)
 settings.load_profile("steady")
 
+SLOW_S = 3600.0
+"""Time limit of a test that is marked as slow [s]; that of the others is in pyproject.toml."""
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if item.get_closest_marker("slow"):
+            item.add_marker(pytest.mark.timeout(SLOW_S))
+
+
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
