@@ -11,7 +11,7 @@ from hypothesis import settings
 from failuretwin import DigitalTwin, load_robot
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from roscores import Roscore, need_ros
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -64,7 +64,7 @@ def measured_file():
 
 @pytest.fixture(scope="session")
 def measured_armpi(armpi, measured_file):
-    return load_imperfections(str(measured_file), armpi)
+    return load_calibration(str(measured_file), armpi).imperfections
 
 
 @pytest.fixture(scope="session")

@@ -33,7 +33,8 @@ from failuretwin.connection.wear import (
 from failuretwin.connection.wear_tracker import DECLARED_NATS, DELAY, MOST_SCORE
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.read import read_runs
-from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from failuretwin.inference.healthy_model import PATH_NOISE_M
 
 STATIC = WearLimits(rate=0.0, reach=1e3, limit=1e3)
@@ -341,7 +342,7 @@ def test_healthy_sessions_of_a_real_arm_raise_no_alarm(armpi, data, readings):
     """Fifty runs of one day: the arm stays what its calibration says, within a count."""
     folders = [data / "real_robot_b_20241003" / f"label_{k}" for k in range(5)]
     seen = observe(read_runs(folders, armpi), use_readings=readings)
-    known = load_imperfections("armpi_fpv", armpi)
+    known = load_calibration("armpi_fpv", armpi).imperfections
     tracker = fresh(armpi, replace(known, variation=DOUBT))
     evidence = run_evidence(seen, armpi, tracker.settling, range(len(seen.runs)))
     tracker, steps = follow_all(tracker, evidence)

@@ -20,7 +20,7 @@ from failuretwin.data_knowledge import workers as workforce
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.resumable import produce
 from failuretwin.data_knowledge.workers import Workforce
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from waiting import WAIT_S, workers_of
 
 PIECE = 4
@@ -29,7 +29,7 @@ NOBODY = "tcp://127.0.0.1:1"
 
 @pytest.fixture
 def plan(armpi):
-    known = load_imperfections("armpi_fpv", armpi)
+    known = load_calibration("armpi_fpv", armpi).imperfections
     return Plan(armpi, paper_hypotheses(armpi.motor_names), 20, 5, known)
 
 
@@ -235,9 +235,9 @@ from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan
 from failuretwin.data_knowledge.resumable import produce
 from failuretwin.data_knowledge.workers import Workforce
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 robot = load_robot("armpi_fpv")
-known = load_imperfections("armpi_fpv", robot)
+known = load_calibration("armpi_fpv", robot).imperfections
 plan = Plan(robot, paper_hypotheses(robot.motor_names), 20, 5, known)
 produce(plan, Path(sys.argv[1]), Workforce(2), piece_runs=4)
 """

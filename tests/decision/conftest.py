@@ -5,13 +5,13 @@ import pytest
 from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 
 
 @pytest.fixture(scope="session")
 def imperfect(armpi):
     """Twenty runs of each of the paper's classes, with the imperfections of the real robot."""
-    known = load_imperfections("armpi_fpv", armpi)
+    known = load_calibration("armpi_fpv", armpi).imperfections
     return simulate(Plan(armpi, paper_hypotheses(armpi.motor_names), 20, 5, known))
 
 

@@ -10,7 +10,7 @@ from failuretwin import BayesDiagnoser, DigitalTwin
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.digital_model.nonidealities import default_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.inference import diagnoser as bayes
 from failuretwin.inference import fault_models as steady_state_error
 from failuretwin.inference import stuck
@@ -326,7 +326,7 @@ def test_robot_of_which_nothing_is_known_is_judged_with_wide_offsets(armpi, impe
     unknown = dataclasses.replace(
         armpi, profile=dataclasses.replace(armpi.profile, imperfections=None)
     )
-    assert default_imperfections(unknown).protocol == "P0"
+    assert load_calibration(None, unknown).imperfections.protocol == "P0"
     found = BayesDiagnoser(DigitalTwin(unknown)).diagnose(imperfect)
     assert {d.protocol for d in found} == {"P0"}
     assert "not calibrated" in found[0].method

@@ -6,7 +6,7 @@ import pytest
 from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.onset import OnsetPrior
 from failuretwin.inference.posterior import marginal_likelihood_of
@@ -31,7 +31,7 @@ RUNS = 2
 
 @pytest.fixture(scope="module")
 def runs(armpi):
-    known = load_imperfections("armpi_fpv", armpi)
+    known = load_calibration("armpi_fpv", armpi).imperfections
     return simulate(Plan(armpi, PAIRS, RUNS, 4, known))
 
 

@@ -13,7 +13,8 @@ from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
 from failuretwin.data_knowledge.failure_modes import magnitude_range
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.digital_model.nonidealities import Imperfections, load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.failure_behavior.fault import STEP
 from failuretwin.failure_behavior.modes import MODES
 
@@ -71,7 +72,7 @@ class Study:
 
 @pytest.fixture(scope="module")
 def imperfections(armpi) -> Imperfections:
-    return load_imperfections("armpi_fpv", armpi)
+    return load_calibration("armpi_fpv", armpi).imperfections
 
 
 @pytest.fixture(scope="module", params=RIGHT)

@@ -14,7 +14,7 @@ from failuretwin.core.hypothesis import (
     single_faults,
 )
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.inference import posterior as weighing
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.expected_bayes_factors import expected_log_bayes_factors
@@ -39,7 +39,7 @@ def thrown_off(armpi):
     """Two motors at once miss every target by 8 to 12 degrees."""
     from failuretwin.failure_behavior.modes import MODES, SteadyStateError
 
-    known = load_imperfections("armpi_fpv", armpi)
+    known = load_calibration("armpi_fpv", armpi).imperfections
     error = SteadyStateError(magnitude=(0.14, 0.21), onset_s=(0.0, 0.0))
     modes = {**MODES, "steady_state_error": error}
     return simulate(Plan(armpi, TWO_AT_ONCE, 8, 6, known, modes=modes))
@@ -67,7 +67,7 @@ FOREIGN = ("encoder_scale", "drift", "lag", "lost_commands")
 @pytest.fixture(scope="module")
 def foreign(twin, armpi):
     """Faults of modes that are not offered, clearly apart from everything that is."""
-    known = load_imperfections("armpi_fpv", armpi)
+    known = load_calibration("armpi_fpv", armpi).imperfections
     faults = [h for h in single_faults(armpi.motor_names, FOREIGN) if h.faults]
     runs = simulate(Plan(armpi, faults, 5, 9, known))
     nearest = expected_log_bayes_factors(
