@@ -8,17 +8,12 @@ import pytest
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.decision.learned.features import (
-    DISTANCE_M,
-    PER_MOTOR,
-    TURN_RAD,
-    Encoder,
-    expectation_of,
-    joint_frames,
-    signals_of,
-)
+from failuretwin.decision.learned.features import Encoder, expectation_of, joint_frames, signals_of
 from failuretwin.digital_model.nonidealities import Imperfections, Readings
 from failuretwin.digital_model.settling import Settling
+
+PER_MOTOR = ("turn", "misfit", "angle", "command")
+TURN_RAD, DISTANCE_M = 0.01, 0.002
 
 SAGGING = Imperfections(
     "sags",
