@@ -18,7 +18,7 @@ from slide_runs import (
 )
 
 from failuretwin.digital_model.nonidealities import Timing
-from failuretwin.inference.marginal import weigh
+from failuretwin.inference.marginal import marginal_likelihood
 from failuretwin.inference.onset import OnsetPrior
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.stuck import stuck_model
@@ -82,7 +82,7 @@ HELD = {
 def test_a_stuck_motor_has_the_evidence_of_all_angles_and_onsets(run_on, stands):
     """Half of the probability is before the first plateau or on the first ramp, a fifth free."""
     likelihood, brute = run_on(TARGETS, stands)
-    found = told(weigh(likelihood, stuck_model(likelihood, 0, OnsetPrior())))
+    found = told(marginal_likelihood(likelihood, stuck_model(likelihood, 0, OnsetPrior())))
     assert found == pytest.approx(np.log(stuck_by_force(brute).sum()), abs=0.05)
 
 
@@ -93,14 +93,16 @@ def test_a_stuck_motor_stands_where_a_healthy_one_settles(run_on, from_start):
     likelihood, brute = run_on(TARGETS, np.full(4, from_start), replace(PLAIN, settling=biased))
     np.testing.assert_allclose(likelihood.start, [[0.012]])
     brute = replace(brute, targets=np.add(TARGETS, 0.012) - 0.005 * np.array([1, -1, 1, -1]))
-    found = told(weigh(likelihood, stuck_model(likelihood, 0, OnsetPrior())))
+    found = told(marginal_likelihood(likelihood, stuck_model(likelihood, 0, OnsetPrior())))
     assert found == pytest.approx(np.log(stuck_by_force(brute, start=0.012).sum()), abs=0.05)
 
 
 @pytest.mark.parametrize(("early", "free"), [(0.1, 0.2), (1.0, 0.2), (0.5, 0.6)])
 def test_beliefs_of_a_stuck_motor_count_as_told(run_on, early, free):
     likelihood, brute = run_on(TARGETS, HELD["on the third ramp"])
-    found = told(weigh(likelihood, stuck_model(likelihood, 0, OnsetPrior(early, free))))
+    found = told(
+        marginal_likelihood(likelihood, stuck_model(likelihood, 0, OnsetPrior(early, free)))
+    )
     expected = np.log(stuck_by_force(brute, early, free).sum())
     assert found == pytest.approx(expected, abs=0.05)
 
@@ -111,7 +113,9 @@ def test_at_a_known_time_the_angle_is_tied_to_where_the_ramp_was(run_on, off):
     known_s, halfway = 4.0 + LAG_S + 0.5 * RAMP_S, 0.5 * (-0.15 + 0.1)
     stands = [0.2, -0.15, halfway + off, halfway + off]
     likelihood, brute = run_on(TARGETS, stands)
-    found = told(weigh(likelihood, stuck_model(likelihood, 0, OnsetPrior(known_s=known_s))))
+    found = told(
+        marginal_likelihood(likelihood, stuck_model(likelihood, 0, OnsetPrior(known_s=known_s)))
+    )
     prior = mixed(student(ANGLES - halfway, 8 * SCATTER_M) / (8 * SCATTER_M), 0.05)
     held = brute.from_on(2, np.broadcast_to(ANGLES, (4, len(ANGLES))), 0.0)
     total = brute.before(2) * integrate.trapezoid(prior * held, ANGLES)
@@ -127,7 +131,9 @@ def onset_of(weight):
 def test_a_motor_stuck_halfway_got_stuck_when_it_was_halfway(run_on):
     """At 4 s + lag + half a ramp of 0.8 s; the lag is known to 15 or 30 ms."""
     likelihood, _ = run_on(TARGETS, [0.2, -0.15, -0.025, -0.025])
-    when, share = onset_of(weigh(likelihood, stuck_model(likelihood, 0, OnsetPrior(free=1e-6))))
+    when, share = onset_of(
+        marginal_likelihood(likelihood, stuck_model(likelihood, 0, OnsetPrior(free=1e-6)))
+    )
     since = when - (4.0 + LAG_S + 0.5 * RAMP_S)
     near = np.abs(since) < 0.2
     assert share[near].sum() > 0.97
@@ -142,7 +148,9 @@ def test_a_ramp_that_may_have_begun_late_ends_late(run_on, late_rate):
     likelihood, _ = run_on(TARGETS, [0.2, -0.15, 0.1, -0.075], replace(PLAIN, timing=timing))
     unheard = replace(likelihood.evidence, first_reading_delay=np.full((1, 4), np.nan))
     likelihood = RunLikelihood(unheard, likelihood.model)
-    when, share = onset_of(weigh(likelihood, stuck_model(likelihood, 0, OnsetPrior(free=1e-6))))
+    when, share = onset_of(
+        marginal_likelihood(likelihood, stuck_model(likelihood, 0, OnsetPrior(free=1e-6)))
+    )
     since = when - (6.0 + LAG_S + 0.5 * RAMP_S)
     ramp = since > -0.1
     share = share[ramp] / share[ramp].sum()
@@ -156,7 +164,9 @@ def test_a_ramp_that_may_have_begun_late_ends_late(run_on, late_rate):
 def test_a_motor_stuck_on_a_plateau_may_have_got_stuck_any_time_on_it(run_on):
     """Between the end of the third ramp and the start of the fourth: 4.825 s to 6.025 s."""
     likelihood, brute = run_on(TARGETS, [0.2, -0.15, 0.1, 0.1])
-    when, share = onset_of(weigh(likelihood, stuck_model(likelihood, 0, OnsetPrior())))
+    when, share = onset_of(
+        marginal_likelihood(likelihood, stuck_model(likelihood, 0, OnsetPrior()))
+    )
     begin, end = 4.0 + LAG_S + RAMP_S, 6.0 + LAG_S
     on = (when > begin + 0.05) & (when < end - 0.05)
     density = stuck_by_force(brute)
@@ -170,7 +180,9 @@ def test_a_motor_stuck_on_a_plateau_may_have_got_stuck_any_time_on_it(run_on):
 def test_a_motor_that_was_stuck_may_have_been_so_before_the_run(run_on):
     """What is stuck before its first ramp was so at 0 s, but for that time's share of the run."""
     likelihood, brute = run_on(TARGETS, [0.012, 0.012, 0.012, 0.012])
-    when, share = onset_of(weigh(likelihood, stuck_model(likelihood, 0, OnsetPrior())))
+    when, share = onset_of(
+        marginal_likelihood(likelihood, stuck_model(likelihood, 0, OnsetPrior()))
+    )
     density = stuck_by_force(brute)
     waits = LAG_S / (6.0 + LAG_S + RAMP_S)
     expected = (1.0 - waits) * density[0, 0] / density.sum()

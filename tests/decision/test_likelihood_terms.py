@@ -29,7 +29,7 @@ from failuretwin.inference.fault_models import (
     slow_model,
     steady_state_error_model,
 )
-from failuretwin.inference.marginal import weigh
+from failuretwin.inference.marginal import marginal_likelihood
 from failuretwin.inference.missed_movements import missed_movements_likelihood
 
 
@@ -68,7 +68,9 @@ def test_errors_drawn_anew_have_the_evidence_of_all_sizes(run_on, off):
         ]
         for first, chance in enumerate(first_affected(STARTS_S)):
             total += chance / 3 * brute.before(first) * np.prod(each[first:])
-    found = told(weigh(likelihood, steady_state_error_model(likelihood, 0, USUAL_RANGES, 0.9)))
+    found = told(
+        marginal_likelihood(likelihood, steady_state_error_model(likelihood, 0, USUAL_RANGES, 0.9))
+    )
     assert found == pytest.approx(np.log(total), abs=0.05)
 
 
@@ -81,7 +83,9 @@ def test_the_size_of_errors_has_the_quantiles_of_their_rms(run_on, count):
     off = rng.choice([-1.0, 1.0], count) * rng.uniform(0.045, 0.075, count)
     likelihood, _ = run_on(targets, targets + off, normal)
     size = (
-        weigh(likelihood, steady_state_error_model(likelihood, 0, [(0.01, 0.12)], 1.0))
+        marginal_likelihood(
+            likelihood, steady_state_error_model(likelihood, 0, [(0.01, 0.12)], 1.0)
+        )
         .estimate(0)
         .size
     )
@@ -125,7 +129,9 @@ def test_a_constant_error_has_the_evidence_of_all_sizes(run_on, bias, first):
     stands += [0.002, -0.003, 0.001, 0.0]
     likelihood, brute = run_on(TARGETS, stands)
     size, chance = uniform(0.02, 0.85, signed=True)
-    found = told(weigh(likelihood, constant_fault_model(likelihood, 0, "encoder_bias", 0.9)))
+    found = told(
+        marginal_likelihood(likelihood, constant_fault_model(likelihood, 0, "encoder_bias", 0.9))
+    )
     expected = lasting_by_force(brute, np.tile(size, (4, 1)), chance)
     assert found == pytest.approx(expected, abs=0.06)
 
@@ -135,7 +141,9 @@ def test_a_wrong_scale_has_the_evidence_of_all_sizes(run_on, scale):
     """0.03 to 0.75 of the angle, with either sign."""
     likelihood, brute = run_on(TARGETS, np.multiply(TARGETS, 1.0 + scale))
     size, chance = uniform(0.03, 0.75, signed=True)
-    found = told(weigh(likelihood, constant_fault_model(likelihood, 0, "encoder_scale", 0.9)))
+    found = told(
+        marginal_likelihood(likelihood, constant_fault_model(likelihood, 0, "encoder_scale", 0.9))
+    )
     assert found == pytest.approx(
         lasting_by_force(brute, np.multiply.outer(TARGETS, size), chance), abs=0.03
     )
@@ -148,7 +156,9 @@ def test_play_has_the_evidence_of_all_sizes(run_on, play):
     likelihood, brute = run_on(TARGETS, TARGETS - 0.5 * play * direction)
     size, chance = uniform(0.02, 0.15, signed=False)
     offsets = np.multiply.outer(-0.5 * direction, size)
-    found = told(weigh(likelihood, constant_fault_model(likelihood, 0, "backlash", 0.9)))
+    found = told(
+        marginal_likelihood(likelihood, constant_fault_model(likelihood, 0, "backlash", 0.9))
+    )
     assert found == pytest.approx(lasting_by_force(brute, offsets, chance), abs=0.03)
 
 
@@ -170,7 +180,7 @@ def test_a_drift_has_the_evidence_of_all_rates_and_onsets(run_on, rate, onset_s)
             places = brute.targets[:, None] + np.multiply.outer(since, size[::20])
             says = brute.from_on(first, places) @ chance[::20] * 20
             total += weight * brute.before(first) * says
-    found = told(weigh(likelihood, drift_model(likelihood, 0, 0.9)))
+    found = told(marginal_likelihood(likelihood, drift_model(likelihood, 0, 0.9)))
     assert found == pytest.approx(np.log(total), abs=0.1 if onset_s == 0.0 else 0.7)
 
 
@@ -196,7 +206,7 @@ def test_a_slow_motor_gets_as_far_as_its_time_goes(run_on, share, done):
         here += done * (target - here)
         stands.append(here)
     likelihood, brute = run_on(TARGETS, stands)
-    size = weigh(likelihood, slow_model(likelihood, 0, 0.9)).estimate(0).size
+    size = marginal_likelihood(likelihood, slow_model(likelihood, 0, 0.9)).estimate(0).size
     sizes = np.linspace(0.15, 0.85, 12)
     np.testing.assert_allclose(np.unique(size.values), sizes)
     expected = np.zeros(12)
@@ -207,7 +217,7 @@ def test_a_slow_motor_gets_as_far_as_its_time_goes(run_on, share, done):
             places.append(here)
         for first, chance in enumerate(first_affected(STARTS_S)):
             expected[k] += chance * brute.before(first) * brute.from_on(first, np.array(places))
-    found = told(weigh(likelihood, slow_model(likelihood, 0, 0.9)))
+    found = told(marginal_likelihood(likelihood, slow_model(likelihood, 0, 0.9)))
     assert found == pytest.approx(np.log(expected.mean()), abs=1e-3)
     np.testing.assert_allclose(
         size.weights / size.weights.sum(), expected / expected.sum(), atol=1e-4
