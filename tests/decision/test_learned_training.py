@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from failuretwin.core.errors import InputError
-from failuretwin.decision.learned.data import VARIANTS, Recipe, widened
-from failuretwin.decision.learned.features import Encoder, expectation_of
+from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of
 from failuretwin.decision.learned.networks import (
     NETWORKS,
     Pace,
@@ -17,6 +16,7 @@ from failuretwin.decision.learned.networks import (
     shuffled_batches,
     training,
 )
+from failuretwin.decision.learned.training_data import VARIANTS, TrainingData, widened
 
 SHAPE = Shape(channels=10, classes=3, motors=2, shared=2)
 ALL = pytest.mark.parametrize("name", list(NETWORKS))
@@ -111,23 +111,25 @@ def test_standardised_channels_have_unit_spread():
 
 
 @pytest.fixture(scope="module")
-def recipe(armpi, measured_armpi):
-    return Recipe(armpi, measured_armpi, seed=4)
+def training_data(armpi, measured_armpi):
+    return TrainingData(armpi, measured_armpi, seed=4)
 
 
-def test_chunks_depend_on_seed_and_number_alone(armpi, measured_armpi, recipe):
-    encoder = Encoder("robust", armpi, expectation_of(armpi, measured_armpi))
-    first, classes = recipe.chunk(0, 12, encoder)
-    again, same = Recipe(armpi, measured_armpi, seed=4).chunk(0, 12, encoder)
+def test_chunks_depend_on_seed_and_number_alone(armpi, measured_armpi, training_data):
+    encoder = FeatureEncoder("robust", armpi, expectation_of(armpi, measured_armpi))
+    first, classes = training_data.chunk(0, 12, encoder)
+    again, same = TrainingData(armpi, measured_armpi, seed=4).chunk(0, 12, encoder)
     np.testing.assert_array_equal(first, again)
     np.testing.assert_array_equal(classes, same)
-    assert not np.array_equal(first, recipe.chunk(1, 12, encoder)[0])
-    assert not np.array_equal(first, Recipe(armpi, measured_armpi, 5).chunk(0, 12, encoder)[0])
+    assert not np.array_equal(first, training_data.chunk(1, 12, encoder)[0])
+    assert not np.array_equal(
+        first, TrainingData(armpi, measured_armpi, 5).chunk(0, 12, encoder)[0]
+    )
 
 
-def test_classes_stay_with_their_runs(armpi, recipe):
+def test_classes_stay_with_their_runs(armpi, training_data):
     """A stuck motor 1 is seen in plain features: its angle at the tool never changes."""
-    features, classes = recipe.chunk(0, 180, Encoder("original", armpi))
+    features, classes = training_data.chunk(0, 180, FeatureEncoder("original", armpi))
     late = features[:, 30:, 4:]
     azimuth = np.arctan2(late[..., 0], -late[..., 1])
     # On a line through the axis: the azimuth is one angle or the one opposite.

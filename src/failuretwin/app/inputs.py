@@ -24,10 +24,11 @@ from failuretwin.data_knowledge.raw_sessions import SESSION_FILES, As
 from failuretwin.data_knowledge.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.step_tests import find_step_tests, read_step_test
 from failuretwin.data_knowledge.store import replacing
-from failuretwin.decision.learned.diagnoser import Diagnoser, HybridDiagnoser
+from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.digital_model.nonidealities import GENERIC_NAME
 from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.protocol import Diagnoser
 
 if TYPE_CHECKING:
     import xarray as xr
