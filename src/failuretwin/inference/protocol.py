@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from failuretwin.core.errors import InputError, unknown_name
-from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis
+from failuretwin.core.runs import truth_of
 from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.explanation import worded
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -18,8 +22,8 @@ if TYPE_CHECKING:
 class Diagnoser(Protocol):
     """Whatever diagnoses runs: the Bayesian diagnoser, a network, both, or a class of the user.
 
-    One method is all there is to write. A `Diagnosis` needs a name and a posterior; what else it
-    holds, such as onset, size and words, is shown where it is there.
+    One method is all there is to write. A `Diagnosis` needs a run and a posterior; what else it
+    holds, such as onset and size, is shown where it is there.
     """
 
     def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
@@ -35,7 +39,8 @@ class Diagnoser(Protocol):
 def diagnoser_from_text(text: str, twin: DigitalTwin) -> Diagnoser:
     """Return a diagnoser of the user's own, such as ``my_methods:Guess`` in ``my_methods.py``.
 
-    Modules are looked for in the current folder and where Python finds its packages.
+    Modules are looked for in the current folder and where Python finds its packages. Verdicts in
+    words and the truth of the runs, for scores, are filled in where the class leaves them empty.
 
     Args:
         text: ``module:Class``; the class is called with the twin.
@@ -55,7 +60,29 @@ def diagnoser_from_text(text: str, twin: DigitalTwin) -> Diagnoser:
             f"{text}: has no method `diagnose`. Expected a class with diagnose(runs) that returns "
             "a Diagnosis for each run."
         )
-    return diagnoser
+    return _Completed(diagnoser, text)
+
+
+@dataclass(frozen=True)
+class _Completed:
+    """A diagnoser of the user's own, checked and with words and truth filled in."""
+
+    diagnoser: Diagnoser
+    name: str
+
+    def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
+        """Return the diagnosis of each run.
+
+        Raises:
+            InputError: If that is not what the class returns.
+        """
+        found, faults = self.diagnoser.diagnose(runs), truth_of(runs)
+        count = runs.sizes["run"]
+        if len(found) != count or not all(isinstance(d, Diagnosis) for d in found):
+            raise InputError(f"{self.name}: diagnose(runs) gave no Diagnosis for each of {count}.")
+        truth: Sequence[str | None] = [None] * count if faults is None else faults
+        made = [replace(d, truth=true) for d, true in zip(found, truth, strict=True)]
+        return [d if d.verdict else worded(d, list(map(Hypothesis.parse, d.ranked))) for d in made]
 
 
 def _imported(name: str, text: str) -> Any:
