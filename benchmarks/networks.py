@@ -59,7 +59,7 @@ def judged(diagnoses: Sequence[Diagnosis]) -> tuple[float, float, float]:
 
 
 def nats_of(diagnoses: Sequence[Diagnosis]) -> FloatArray:
-    """Return the surprise at the truth of each run [nats]."""
+    """Return the log score of each run [nats]."""
     truth = [str(d.truth) for d in diagnoses]
     return log_score(truth, [d.posterior for d in diagnoses]).nats
 
