@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from failuretwin.app.commands.train import train as command
 from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of
+from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.decision.learned.networks import (
     NETWORKS,
     Pace,
@@ -17,6 +21,7 @@ from failuretwin.decision.learned.networks import (
     training,
 )
 from failuretwin.decision.learned.training_data import VARIANTS, TrainingData, widened
+from failuretwin.decision.training import TrainingPlan, train
 
 SHAPE = Shape(channels=10, classes=3, motors=2, shared=2)
 ALL = pytest.mark.parametrize("name", list(NETWORKS))
@@ -153,3 +158,19 @@ def test_widened_robots_differ_more(armpi):
     np.testing.assert_allclose(wide.variation.bias, 3.0 * np.array(known.variation.bias))
     assert wide.settling == known.settling
     assert widened(wide, 1.0) == wide
+
+
+def test_a_network_is_trained_and_pooled_with_bayes_in_one_call(armpi, measured_armpi):
+    plan = TrainingPlan(iterations=2, validation_runs=36)
+    both = train(armpi, measured_armpi, plan, with_bayes=True)
+    assert isinstance(both, HybridDiagnoser)
+    assert both.weights == both.network.weights_
+    runs = simulate(Plan(armpi, paper_hypotheses(armpi.motor_names)[:1], 1, 2, measured_armpi))
+    (diagnosis,) = both.diagnose(runs)
+    assert diagnosis.method.startswith("blended: bayes")
+
+
+def test_the_command_trains_as_much_as_python_does():
+    given = {option.name: option.default for option in command.params}
+    assert (given["network"], given["iterations"]) == ("cnn", 6000)
+    assert (TrainingPlan().network, TrainingPlan().iterations) == ("cnn", 6000)

@@ -72,7 +72,7 @@ def train(
     """Return a network trained on the twin, alone or together with the Bayesian diagnosis.
 
     Other processes make the runs: guard scripts by ``if __name__ == "__main__":``. Keep a network
-    with `save_network`; of a hybrid one, its `network`.
+    with `save_network`.
 
     Args:
         robot: The robot.

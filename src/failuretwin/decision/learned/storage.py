@@ -60,13 +60,14 @@ def check_network_file(path: Path) -> None:
         raise InputError(f"{path}: a network file ends in {SUFFIX}.")
 
 
-def save_network(diagnoser: LearnedDiagnoser, path: Path) -> None:
+def save_network(diagnoser: LearnedDiagnoser, path: str | Path) -> None:
     """Write a trained network; a file of that name is replaced at the end, all at once.
 
     Raises:
         InputError: If the suffix is not .npz.
         OutputError: If it cannot be written.
     """
+    path = Path(path)
     check_network_file(path)
     configuration = json.dumps(_configuration(diagnoser)).encode()
     arrays: Arrays = {

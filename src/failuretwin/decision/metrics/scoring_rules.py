@@ -186,15 +186,11 @@ def calibrated_error(
         Expected calibration error of each set, (draws,).
     """
     _check_confidence(confidence)
-    inside = _bin_of(confidence, edges)
+    inside, runs = _bin_of(confidence, edges), len(confidence)
     order = np.argsort(inside, kind="stable")
-    first = np.flatnonzero(np.diff(inside[order], prepend=-1))
-    sorted_confidence = confidence[order]
-    errors = np.empty(draws)
-    for i in range(draws):
-        surplus = (rng.random(len(confidence)) < sorted_confidence) - sorted_confidence
-        errors[i] = np.abs(np.add.reduceat(surplus, first)).sum() / len(confidence)
-    return errors
+    first, stated = np.flatnonzero(np.diff(inside[order], prepend=-1)), confidence[order]
+    surplus = ((rng.random(runs) < stated) - stated for _ in range(draws))
+    return np.array([np.abs(np.add.reduceat(s, first)).sum() / runs for s in surplus])
 
 
 def _bin_of(confidence: FloatArray, edges: FloatArray) -> IntArray:
@@ -413,7 +409,7 @@ def log_score_gain(
     lost_first, lost_second = np.isinf(first), np.isinf(second)
     with np.errstate(invalid="ignore"):  # infinities on both sides leave no mean
         gain = np.where(lost_first & lost_second, 0.0, first - second)
-        mean = float(gain.mean())
+        mean = float(np.mean(gain))
     finite = gain[~(lost_first | lost_second)]
     return LogScoreGain(
         mean=mean,
