@@ -29,7 +29,7 @@ from failuretwin.decision.metrics import (
     rank_of_truth,
     reliability,
 )
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.failure_behavior.fault import FaultValue
 from failuretwin.failure_behavior.modes import MODES, SteadyStateError, Stuck
 from failuretwin.inference.evidence import settled_evidence, transient_samples
@@ -90,9 +90,9 @@ def main() -> None:
     parser.add_argument("--robot", default="armpi_fpv")
     parser.add_argument("--imperfections", default="armpi_fpv")
     options = parser.parse_args()
-    robot = ft.load_robot(options.robot)
-    imperfections = load_imperfections(options.imperfections, robot)
-    diagnoser = ft.BayesDiagnoser(ft.DigitalTwin(robot), imperfections, priors=PRIORS)
+    known = load_calibration(options.imperfections, ft.load_robot(options.robot))
+    robot, imperfections = known.robot, known.imperfections
+    diagnoser = ft.BayesDiagnoser(known.twin, imperfections, priors=PRIORS)
     hypotheses = paper_hypotheses(robot.motor_names)
     modes = {**MODES, "stuck": PriorStuck(), "steady_state_error": PriorError()}
     per_class = -(-options.runs // (len(hypotheses) * max(1, options.runs // CHUNK)))

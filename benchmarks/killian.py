@@ -25,7 +25,8 @@ from failuretwin.connection.calibrating import learn_robot
 from failuretwin.core.hypothesis import Hypothesis, single_faults
 from failuretwin.decision.metrics import wilson_interval
 from failuretwin.decision.results import Record, score_line, score_records, write_json_lines
-from failuretwin.digital_model.nonidealities import Imperfections, load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def main() -> None:
     runs = read_campaign(options.folder, listed, robot)
     known = runs.drop_vars("position")
     for name in bundled():
-        imperfections = load_imperfections(name, robot)
+        imperfections = load_calibration(name, robot).imperfections
         report(name, listed, diagnose(known, robot, imperfections, hypotheses))
     records = with_own_calibration(runs, robot, hypotheses)
     report("learned from the healthy runs of the campaign", listed, records)

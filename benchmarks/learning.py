@@ -29,7 +29,7 @@ from failuretwin.decision.learned.networks import (
 )
 from failuretwin.decision.learned.storage import export_numpy, export_onnx
 from failuretwin.decision.learned.training_data import CHUNK_RUNS, Chunk, Stream, TrainingData
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 
 PAPER_ITERATIONS, PAPER_JOBS = 5050, 20
 STREAMED = 324
@@ -120,7 +120,7 @@ def main() -> None:
     """Time everything and print a table."""
     torch.set_num_threads(1)
     robot = load_robot("armpi_fpv")
-    imperfect = load_imperfections("armpi_fpv", robot)
+    imperfect = load_calibration("armpi_fpv", robot).imperfections
     encoder = FeatureEncoder("robust", robot, expectation_of(robot, imperfect))
     data = TrainingData(robot, imperfect)
     one, two = paper_training(1), paper_training(2)

@@ -27,7 +27,7 @@ from failuretwin.connection.links.ros_messages import RosTopics
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.diagnoser import monitor
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.injection import ScheduledFault
 
@@ -92,7 +92,8 @@ def watch_state(robot: Robot, state: str, speed: float, seconds: float, seed: in
 def first_shown(robot: Robot, state: str, seconds: float, seed: int) -> int:
     """Return the first movement after the onset that can show a fault, from 1."""
     fault = ScheduledFault.parse(f"{state}@{ONSET_S}", robot.motor_names)
-    emulation = Emulation(robot, load_imperfections(robot.name, robot), (fault,), seed)
+    known = load_calibration(robot.name, robot)
+    emulation = Emulation(known.robot, known.imperfections, (fault,), seed)
     shown = CanShow(emulation, seconds).movement(fault)
     if shown is None:
         raise RuntimeError(f"{state}, seed {seed}: no movement can show it")

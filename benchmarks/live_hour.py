@@ -25,7 +25,7 @@ from failuretwin.connection.links.base import Pace
 from failuretwin.connection.links.diagnostics import SURE
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.decision.streaming.diagnoser import monitor
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.failure_behavior.injection import ScheduledFault, state_at
 
 PERIOD_S, BEGIN_S, END_S = 120.0, 40.0, 100.0
@@ -93,7 +93,8 @@ def main() -> None:
     schedule = schedule_of(motors, 3600.0 * hours, int(seed))
     said, commands, memory = live(schedule, speed, 3600.0 * hours, int(seed))
     robot = load_robot("armpi_fpv")
-    emulation = Emulation(robot, load_imperfections(robot.name, robot), tuple(schedule), int(seed))
+    known = load_calibration(robot.name, robot)
+    emulation = Emulation(known.robot, known.imperfections, tuple(schedule), int(seed))
     can_show = CanShow(emulation, 3600.0 * hours)
     sure = [s for s in said if s.sure]
     delays, first_named, repairs = [], [], []

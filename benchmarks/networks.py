@@ -27,7 +27,7 @@ from failuretwin.decision.metrics import (
     reliability,
 )
 from failuretwin.decision.training import TrainingPlan, train_network
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
 
 PER_CLASS = 223
@@ -37,7 +37,7 @@ PER_CLASS = 223
 def train_missing(folder: Path, robot: Robot, seeds: int, iterations: int) -> None:
     """Train every network for every seed that has no file yet."""
     folder.mkdir(parents=True, exist_ok=True)
-    imperfections = load_imperfections(robot.name, robot)
+    imperfections = load_calibration(robot.name, robot).imperfections
     for seed in range(seeds):
         for name in NETWORKS:
             path = folder / f"{name}_{seed}.npz"
@@ -101,7 +101,7 @@ def main() -> None:
     parser.add_argument("--real", type=Path, help="real runs whose folders end in _label_K")
     arguments = parser.parse_args()
     robot = load_robot("armpi_fpv")
-    imperfections = load_imperfections(robot.name, robot)
+    imperfections = load_calibration(robot.name, robot).imperfections
     train_missing(arguments.folder, robot, arguments.seeds, arguments.iterations)
     networks = {
         path.stem: load_network(path, robot) for path in sorted(arguments.folder.glob("*.npz"))

@@ -25,7 +25,7 @@ from failuretwin.connection.calibration.timing import movements_of
 from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.digital_model.nonidealities import default_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.evidence import settled_evidence
@@ -141,7 +141,7 @@ def main() -> None:
     options = parser.parse_args()
     robot = ft.load_robot(options.robot)
     real = ft.read_runs(options.logs, robot)
-    imperfections = default_imperfections(robot)
+    imperfections = load_calibration(None, robot).imperfections
     simulated = simulate(Plan(robot, [HEALTHY], options.runs, 0, imperfections))
     table(real, simulated, robot)
     print()

@@ -27,12 +27,8 @@ from failuretwin.connection.calibration.settling import (
 )
 from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.decision.metrics import wilson_interval
-from failuretwin.digital_model.nonidealities import (
-    Imperfections,
-    Variation,
-    load_imperfections,
-    vary,
-)
+from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.nonidealities import Imperfections, Variation, vary
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling
 
@@ -49,7 +45,7 @@ SPREAD = Variation(
 def random_robot(robot: Robot, seed: int) -> Imperfections:
     """Return the imperfections of a robot drawn around those of the bundled one."""
     rng = np.random.default_rng([seed, 1])
-    known = load_imperfections(robot.name, robot)
+    known = load_calibration(robot.name, robot).imperfections
     drawn = vary(replace(known, variation=SPREAD), rng)
     assert drawn.settling is not None
     settling = replace(drawn.settling, tail_dof=float(rng.uniform(3.5, 8.0)))
@@ -103,9 +99,8 @@ def try_robot(name: str, runs: int, seed: int) -> dict[Key, tuple[bool, bool]]:
 
 def on_physics(robot: Robot, runs: int) -> None:
     """Print the scatter on unseen movements of the physics engine against the best possible."""
-    quiet = replace(
-        load_imperfections(robot.name, robot), settling=Settling.ideal(len(robot.motors))
-    )
+    known = load_calibration(robot.name, robot).imperfections
+    quiet = replace(known, settling=Settling.ideal(len(robot.motors)))
     sets = [
         ft.simulate(ft.Plan(robot, [HEALTHY], runs, seed, quiet, engine="physics"))
         for seed in (1, 2)

@@ -19,7 +19,7 @@ from failuretwin import load_robot
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, iterate
 from failuretwin.data_knowledge.resumable import produce
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 
 SIZES = (1_000, 10_000, 100_000)
 CLASSES = 9
@@ -33,9 +33,9 @@ def measure(imperfections: str, runs: int, folder: str) -> None:
         runs: Number of runs, rounded to whole classes.
         folder: Where to store them; empty: they are drawn and thrown away.
     """
-    robot = load_robot("armpi_fpv")
-    known = load_imperfections(imperfections, robot)
-    plan = Plan(robot, paper_hypotheses(robot.motor_names), runs // CLASSES, 0, known)
+    known = load_calibration(imperfections, load_robot("armpi_fpv"))
+    hypotheses = paper_hypotheses(known.robot.motor_names)
+    plan = Plan(known.robot, hypotheses, runs // CLASSES, 0, known.imperfections)
     next(iterate(plan, 1))  # imports belong to no run
     clock, processor = time.perf_counter(), time.process_time()
     if folder:

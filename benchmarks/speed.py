@@ -19,7 +19,8 @@ import numpy as np
 from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 
 PUBLISHED_GENERATION_S = 8.0 * 3600.0
 """Time that the authors' generation of 3600 runs took [s]."""
@@ -63,7 +64,7 @@ def main() -> None:
     """Time everything and print a table."""
     robot = load_robot("armpi_fpv")
     twin = DigitalTwin(robot)
-    imperfect = load_imperfections("armpi_fpv", robot)
+    imperfect = load_calibration("armpi_fpv", robot).imperfections
     rng = np.random.default_rng(0)
     poses = rng.uniform(-1.5, 1.5, (3_600_000, 4))
     classes = paper_hypotheses(robot.motor_names)

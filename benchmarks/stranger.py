@@ -23,7 +23,8 @@ import failuretwin as ft
 from failuretwin.core.hypothesis import HEALTHY, Diagnosis, Hypothesis, paper_hypotheses
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.metrics import IntervalCase, coverage_by_mode
-from failuretwin.digital_model.nonidealities import Imperfections, load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import FaultMode
 from failuretwin.failure_behavior.modes import MODES
@@ -77,7 +78,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     robot = ft.load_robot("armpi_fpv")
-    imperfections = load_imperfections("armpi_fpv", robot)
+    imperfections = load_calibration("armpi_fpv", robot).imperfections
     diagnoser = ft.BayesDiagnoser(ft.DigitalTwin(robot), imperfections)
     stranger = Stranger(robot, imperfections, diagnoser)
     nine = paper_hypotheses(robot.motor_names)

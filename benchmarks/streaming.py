@@ -15,7 +15,7 @@ from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.generate import simulate
 from failuretwin.decision.streaming.fleet import StreamingFleet
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
 
 RATE_HZ = 10.0
@@ -31,7 +31,7 @@ Samples = list[tuple[float, FloatArray, FloatArray]]
 def samples_of(robot: Robot) -> Samples:
     """Return what a thousand robots say, ten times a second."""
     classes = paper_hypotheses(robot.motor_names)
-    imperfect = load_imperfections(robot.name, robot)
+    imperfect = load_calibration(robot.name, robot).imperfections
     plan = Plan(robot, classes, -(-ROBOTS // len(classes)), imperfections=imperfect)
     order = np.random.default_rng(0).permutation(plan.size)[:ROBOTS]
     runs = simulate(plan).isel(run=order)

@@ -38,7 +38,8 @@ from failuretwin.core.hypothesis import (
 )
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.decision.metrics import log_score_gain
-from failuretwin.digital_model.nonidealities import Imperfections, load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.fault import FaultGroup
 from failuretwin.failure_behavior.mode import Range, SizedMode
@@ -112,7 +113,7 @@ def main() -> None:
     register(Eccentric(), "rad")
     register(EndStop(), "ratio")
     robot = ft.load_robot("armpi_fpv")
-    healthy = load_imperfections("armpi_fpv", robot)
+    healthy = load_calibration("armpi_fpv", robot).imperfections
     twin, nine = ft.DigitalTwin(robot), paper_hypotheses(robot.motor_names)
     diagnoser = ft.BayesDiagnoser(twin, healthy, [*nine, UNKNOWN])
     print(f"{'left out':24s} {'foreign':>8s}   of the foreign: called unknown; others: {OTHERS}")

@@ -23,7 +23,8 @@ from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import concatenate
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.generate import Plan, simulate, simulate_runs
-from failuretwin.digital_model.nonidealities import Imperfections, load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import loads_in_range
 from failuretwin.failure_behavior.modes import MODES, SteadyStateError
@@ -242,7 +243,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=WEAR_RUNS, help="runs of wear")
     options = parser.parse_args()
     robot = load_robot("armpi_fpv")
-    world = World(robot, load_imperfections("armpi_fpv", robot))
+    world = World(robot, load_calibration("armpi_fpv", robot).imperfections)
     healthy = Plan(robot, [Hypothesis()], CALIBRATION_RUNS, SEED + 1, world.fresh)
     learned = calibrate(
         simulate(healthy), robot, "fresh", "simulated", use_readings=False, thorough=False

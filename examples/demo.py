@@ -14,7 +14,7 @@ from failuretwin.app.plots import run_figure
 from failuretwin.app.tables import print_diagnoses, print_scores, progress_bar
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 
 RUNS_PER_CLASS = 10
 PICTURE = Path(sys.argv[1] if len(sys.argv) > 1 else "demo.png")
@@ -25,7 +25,7 @@ plan = Plan(
     hypotheses=paper_hypotheses(robot.motor_names),
     runs_per_class=RUNS_PER_CLASS,
     seed=3,
-    imperfections=load_imperfections("armpi_fpv", robot),
+    imperfections=load_calibration("armpi_fpv", robot).imperfections,
 )
 with progress_bar("simulating", plan.size) as advance:
     runs = simulate(plan, on_progress=advance)

@@ -11,7 +11,7 @@ from hypothesis import settings
 from failuretwin import DigitalTwin, load_robot
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from roscores import Roscore, need_ros
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -22,6 +22,16 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 settings.register_profile("steady", deadline=None, derandomize=True)
 settings.register_profile("search", deadline=None, max_examples=2000)
 settings.load_profile("steady")
+
+SLOW_S = 3600.0
+"""Time limit of a test that is marked as slow [s]; that of the others is in pyproject.toml."""
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if item.get_closest_marker("slow"):
+            item.add_marker(pytest.mark.timeout(SLOW_S))
+
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
@@ -54,7 +64,7 @@ def measured_file():
 
 @pytest.fixture(scope="session")
 def measured_armpi(armpi, measured_file):
-    return load_imperfections(str(measured_file), armpi)
+    return load_calibration(str(measured_file), armpi).imperfections
 
 
 @pytest.fixture(scope="session")

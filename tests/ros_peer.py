@@ -63,7 +63,7 @@ def _main():
             | {"values": {v.key: v.value for v in s.values}}
             for s in message.status
         ]
-        heard[topic].append({"at": time.time(), "stamp": stamp, "statuses": statuses})
+        heard[topic].append({"stamp": stamp, "statuses": statuses})
 
     def advertise(call):
         topic, classes[topic] = call["topic"], class_of(call)

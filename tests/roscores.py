@@ -7,11 +7,12 @@ import shutil
 import signal
 import socket
 import subprocess
-import time
 from pathlib import Path
 from xmlrpc.client import ServerProxy
 
 import pytest
+
+from waiting import WAIT_S, wait_for
 
 REQUIRE = "FAILURETWIN_REQUIRE_ROS"
 """Environment variable under which a missing ROS is a failure, as in the full test run."""
@@ -55,11 +56,7 @@ class Roscore:
             stderr=subprocess.DEVNULL,
             start_new_session=True,
         )
-        deadline = time.monotonic() + 30.0
-        while not self._answers():
-            if time.monotonic() > deadline:
-                raise RuntimeError("roscore does not come up")
-            time.sleep(0.1)
+        wait_for(self._answers)
 
     def kill(self):
         """Kill it with all that it has started, without a goodbye."""
@@ -70,7 +67,7 @@ class Roscore:
     def stop(self):
         """Stop it as a user does."""
         self._process.terminate()
-        self._process.wait(20)
+        self._process.wait(WAIT_S)
 
     def _children(self):
         """Return the processes of the master and of the logger, each in a group of its own."""

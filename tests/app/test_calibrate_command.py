@@ -24,13 +24,13 @@ from failuretwin.connection.calibration.result import (
     HeldOut,
     LeftOut,
     Parameter,
-    load_calibration,
+    read_calibration,
     save_calibration,
 )
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.data_knowledge.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import save_run_set
-from failuretwin.digital_model.nonidealities import generic_imperfections, load_imperfections
+from failuretwin.digital_model.nonidealities import generic_imperfections
 
 COUNT = np.deg2rad(0.24)
 REPORT = "report"
@@ -79,7 +79,7 @@ def small(armpi):
 
 def test_a_real_robot_is_learned(learned, armpi):
     folder, told = learned
-    found = load_calibration(folder / "twin.toml", armpi)
+    found = read_calibration(folder / "twin.toml", armpi)
     assert found.sessions == ("20241003_220728_label_0",)
     assert [entry.session for entry in found.held_out] == ["20241003_222107_label_1"]
     assert found.used_readings
@@ -127,7 +127,7 @@ def test_a_faulty_session_among_healthy_ones_is_left_out(failuretwin, data, armp
     logs = [data / "real_robot_b_20241003" / label for label in labels]
     answer = failuretwin("calibrate", *logs, "--out", "twin.toml", folder=tmp_path)
     assert answer.returncode == 0, answer.stderr
-    found = load_calibration(tmp_path / "twin.toml", armpi)
+    found = read_calibration(tmp_path / "twin.toml", armpi)
     runs = [entry.run for entry in found.left_out if entry.movement == 0]
     assert len(runs) >= 8
     assert all("label_6" in run for run in runs)
@@ -174,7 +174,7 @@ def test_the_report_is_one_page_that_needs_nothing_else(learned, listing):
 def test_the_page_says_what_an_engineer_asks(learned, armpi):
     folder, _ = learned
     words = " ".join(Page((folder / REPORT / "index.html").read_text()).words)
-    found = load_calibration(folder / "twin.toml", armpi)
+    found = read_calibration(folder / "twin.toml", armpi)
     assert "On unseen sessions the calibrated twin beats the uncalibrated one" in words
     assert found.imperfections.source in words
     assert "20241003_222107_label_1" in words
@@ -357,15 +357,15 @@ def test_a_robot_has_its_own_calibration(failuretwin, learned, two_days, small, 
     answer = failuretwin("diagnose", two_days, "--calibration", path)
     refused(answer, "is a calibration of robot 'armpi_two', not of 'armpi_fpv'", "--robot")
     with pytest.raises(InputError, match="calibration of robot 'armpi_two'"):
-        load_calibration(path, armpi)
+        read_calibration(path, armpi)
 
 
 def test_imperfections_are_no_calibration(armpi, tmp_path):
     path = tmp_path / "typed.toml"
     path.write_text('name = "typed"\nsource = "by hand"\n')
-    assert load_imperfections(str(path), armpi).name == "typed"
+    assert read_calibration(str(path), armpi).imperfections.name == "typed"
     with pytest.raises(InputError, match="holds imperfections without a calibration"):
-        load_calibration(path, armpi)
+        read_calibration(path, armpi)
 
 
 # The file
@@ -375,14 +375,14 @@ def test_a_file_holds_what_was_learned_and_is_read_as_imperfections(small, armpi
     entries = (LeftOut("a", 1, "motor_1", "did not get its command"),)
     full = replace(small, held_out=(held_out(1.0, 0.1),), left_out=entries, remarks=("a remark",))
     save_calibration(full, armpi, tmp_path / "twin.toml")
-    found = load_calibration(tmp_path / "twin.toml", armpi)
+    found = read_calibration(tmp_path / "twin.toml", armpi)
     for before, after in zip(full.parameters, found.parameters, strict=True):
         assert after.value == pytest.approx(before.value, rel=1e-5)
         assert replace(after, value=0.0, low=0.0, high=0.0) == replace(
             before, value=0.0, low=0.0, high=0.0
         )
     assert replace(found, parameters=()) == replace(full, parameters=())
-    assert load_imperfections(str(tmp_path / "twin.toml"), armpi) == found.imperfections
+    assert read_calibration(str(tmp_path / "twin.toml"), armpi).imperfections == found.imperfections
 
 
 def test_a_write_that_dies_leaves_the_old_file(small, armpi, tmp_path, listing, monkeypatch):
@@ -419,7 +419,7 @@ def test_a_process_killed_while_writing_leaves_the_old_file(small, armpi, tmp_pa
         os._exit(0)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
     assert path.read_bytes() == before
-    assert load_calibration(path, armpi).runs == 4
+    assert read_calibration(path, armpi).runs == 4
 
 
 def test_a_full_disk_leaves_the_old_file(failuretwin, two_days, small, armpi, tmp_path, listing):

@@ -3,12 +3,13 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+
+from waiting import WAIT_S
 
 
 def failuretwin(*arguments, cwd):
@@ -77,18 +78,29 @@ def test_exported_csv_is_read_back(log):
     assert "healthy" in result.stdout
 
 
+TELL_PROGRESS = """
+from contextlib import contextmanager
+from failuretwin.app import cli, progress
+@contextmanager
+def telling(*_):
+    yield lambda runs: print(runs, flush=True)
+progress.progress_bar = telling
+cli.main()
+"""
+
+
 def test_an_interrupt_ends_the_workers_and_leaves_no_netcdf(tmp_path):
-    command = [sys.executable, "-m", "failuretwin", "simulate", "--runs-per-class", "600"]
+    command = [sys.executable, "-c", TELL_PROGRESS, "simulate", "--runs-per-class", "600"]
     process = subprocess.Popen(
         [*command, "--workers", "2", "--out", "runs.nc"],
         cwd=tmp_path,
-        stdout=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         start_new_session=True,
     )
-    time.sleep(3.0)
+    assert process.stdout.readline() == b"100\n"  # the first piece is done
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=WAIT_S)
 
     assert process.returncode != 0
     assert b"Traceback" not in errors

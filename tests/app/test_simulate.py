@@ -11,6 +11,7 @@ import time
 import pytest
 
 from failuretwin.data_knowledge.store import load_run_set
+from waiting import WAIT_S
 
 COMMAND = ("simulate", "--runs-per-class", 40, "--imperfections", "armpi_fpv", "--out")
 
@@ -50,7 +51,7 @@ def test_interrupted_work_is_kept_and_continued(failuretwin, tmp_path, workers):
         # As a terminal does: to the whole group, workers included; the group is this process's own.
         assert os.getpgid(process.pid) == process.pid
         os.killpg(process.pid, signal.SIGINT)
-        assert process.wait(30) == 1
+        assert process.wait(WAIT_S) == 1
         told, _, rest = process.stderr.read().partition("\n")
     assert "of 900 runs are kept in" in told
     assert rest.split() == ["interrupted"]
@@ -62,10 +63,8 @@ def test_interrupted_work_is_kept_and_continued(failuretwin, tmp_path, workers):
     assert [path.name for path in tmp_path.iterdir()] == ["runs.zarr"]
 
 
-def test_wrong_scheduler_is_refused_soon(failuretwin, tmp_path):
-    start = time.monotonic()
+def test_wrong_scheduler_is_refused(failuretwin, tmp_path):
     answer = failuretwin(*COMMAND, tmp_path / "x.zarr", "--scheduler", "tcp://127.0.0.1:1")
-    assert time.monotonic() - start < 15.0
     assert answer.returncode == 2
     assert answer.stderr.startswith("error: scheduler 'tcp://127.0.0.1:1' does not answer")
     assert len(answer.stderr.splitlines()) == 1

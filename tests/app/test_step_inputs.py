@@ -4,9 +4,15 @@ import tomllib
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
-from failuretwin.app.inputs import learn_loops, split_step_tests
+from failuretwin.app.cli import cli
+from failuretwin.app.inputs import learn_loops, split_step_tests, with_step_tests
+from failuretwin.connection.calibration.calibrate import calibrate
+from failuretwin.connection.calibration.result import save_calibration
 from failuretwin.core.errors import InputError
+from failuretwin.data_knowledge.read import read_runs
+from failuretwin.inference.diagnoser import BayesDiagnoser
 from step_writers import step_rows, write_step_test
 
 LOOP = (0.1, 20.0, 0.011, 1050.0)
@@ -75,3 +81,63 @@ def test_step_tests_alone_end_with_one_message(tmp_path, write_tests, failuretwi
     assert done.returncode == 2
     assert "1 step tests and no other log" in done.stderr
     assert not out.exists()
+
+
+# The loops of a calibration in use
+
+
+SLOW_LOOPS = """
+name = "slow"
+source = "made up"
+[timing]
+delay_s = [0.004, 0.008]
+lag_s = [0.003, 0.003]
+[calibration]
+robot = "armpi_fpv"
+"""
+LOOP_TABLE = """
+[[calibration.loops]]
+motor = "motor_{}"
+P = 0.1
+I = 20.0
+filter_s = 0.01
+speed_limit = 4.0
+"""
+
+
+@pytest.fixture
+def expected_lag(monkeypatch):
+    """Run a command and return the lag [s] that its diagnoser expects of a healthy robot."""
+    used = []
+    check = BayesDiagnoser.__post_init__
+    monkeypatch.setattr(BayesDiagnoser, "__post_init__", lambda d: (used.append(d), check(d))[1])
+
+    def run(*arguments):
+        CliRunner().invoke(cli, [str(a) for a in arguments], catch_exceptions=False)
+        (lag,) = {diagnoser.healthy_model.lag_s for diagnoser in used}
+        return lag
+
+    return run
+
+
+@pytest.mark.parametrize("command", [("diagnose",), ("watch", "--speed", "0")], ids=lambda c: c[0])
+def test_what_a_command_expects_has_the_loops_of_the_calibration(
+    tmp_path, write_session, expected_lag, command
+):
+    file = tmp_path / "slow.toml"
+    file.write_text(SLOW_LOOPS + "".join(LOOP_TABLE.format(k) for k in (1, 2, 3, 4)))
+    session = write_session(tmp_path / "s")
+    lag = expected_lag(*command, session, "--calibration", file)
+    assert lag == pytest.approx(1.0 / 20.0 + 0.006 + 0.003)
+
+
+def test_diagnose_expects_the_loops_of_real_step_tests(tmp_path, data, armpi, expected_lag):
+    """With the loops of the profile under the file's timing it would expect 0.024 s."""
+    folder = data / "real_robot_b_20241003"
+    tests, _ = split_step_tests([data / "motor_step_tests", folder], None)
+    steps = learn_loops(tests, armpi)
+    runs = read_runs([folder / f"label_{k}" for k in range(3)], steps.robot)
+    found = calibrate(runs, steps.robot, "own", "labels 0 to 2 and step tests", thorough=False)
+    save_calibration(with_step_tests(found, steps), armpi, tmp_path / "own.toml")
+    lag = expected_lag("diagnose", folder / "label_0", "--calibration", tmp_path / "own.toml")
+    assert lag == pytest.approx(0.059, abs=0.002)

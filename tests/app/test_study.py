@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -26,6 +25,7 @@ from failuretwin.app.study.trainings import (
     stand_in_test_set,
 )
 from failuretwin.core.errors import InputError
+from waiting import WAIT_S, wait_for, workers_of
 
 TINY = StudyPlan(0, 3, (2, 4), 1, 1)
 
@@ -162,13 +162,10 @@ def test_an_interrupt_ends_the_trainings_and_what_was_begun_goes_on(tmp_path):
     folder = tmp_path / "study"
     command = [sys.executable, "-m", "failuretwin", "study", "--quick", "--out", str(folder)]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
-    deadline = time.monotonic() + 100.0
-    while not (folder / PLAN_FILE).exists():
-        assert time.monotonic() < deadline
-        time.sleep(0.2)
-    time.sleep(6.0)  # until trainings go on
+    wait_for(lambda: any(one.cpu_times().user > 2.0 for one in workers_of(process.pid)))
     os.killpg(process.pid, signal.SIGINT)
-    assert process.wait(10.0) == 1
+    assert process.wait(WAIT_S) == 1
+    assert list((folder / WORK).glob("*.json")) == []  # none was waited for
     (folder / PLAN_FILE).unlink()  # as if it had been interrupted a little earlier
     for arrays in (folder / WORK).iterdir():
         arrays.unlink()

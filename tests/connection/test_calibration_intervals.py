@@ -15,10 +15,12 @@ from failuretwin.connection.calibration.parameters import (
 )
 from failuretwin.connection.calibration.rates import Rate
 from failuretwin.connection.calibration.settling import SettledFit
-from failuretwin.connection.calibration.timing import LAGS_S, joint_doubt
+from failuretwin.connection.calibration.timing import joint_doubt
 from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.nonidealities import Timing
+
+LAGS_S = np.linspace(0.0, 0.08, 11)
 
 COUNT = np.deg2rad(0.24)
 

@@ -32,9 +32,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
 from failuretwin.digital_model.disturbances import lagged
-from failuretwin.digital_model.nonidealities import GENERIC_SCATTER_RAD
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.healthy_model import PATH_NOISE_M
 
 COUNT = np.deg2rad(0.24)
 NAMES = ["motor_1", "motor_2", "motor_3", "motor_4"]
@@ -453,7 +451,7 @@ def test_gain_is_the_mean_difference_of_log_densities(settle, armpi, twin):
     part = fit_settled_part(settle(TYPICAL, seed=12), armpi)
     seen = settle(TYPICAL, seed=13, movements=40)
     entry = judge(seen, part, armpi, "other day")
-    generic = Settling((0.0,) * 4, (0.0,) * 4, (0.0,) * 4, (GENERIC_SCATTER_RAD,) * 4, 4.0, "")
+    generic = Settling((0.0,) * 4, (0.0,) * 4, (0.0,) * 4, (0.01,) * 4, 4.0, "")
     gain = log_densities(seen, part.settling, armpi, twin) - log_densities(
         seen, generic, armpi, twin
     )
@@ -468,7 +466,7 @@ def log_densities(seen, settling, robot, twin):
     pose = seen.target + settling.offset(robot, near, direction)
     mean, jacobian = twin.path_and_jacobian(pose)
     spread = jacobian @ np.diag(np.square(settling.scatter)) @ jacobian.transpose(0, 2, 1)
-    spread += PATH_NOISE_M**2 * np.eye(3)
+    spread += 0.001**2 * np.eye(3)
     return np.array(
         [
             stats.multivariate_t(m, s, df=settling.tail_dof).logpdf(x)

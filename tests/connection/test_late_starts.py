@@ -9,8 +9,9 @@ from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import HEALTHY, paper_hypotheses
 from failuretwin.core.movements import Movements
 from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.disturbances import draw_disturbances
-from failuretwin.digital_model.nonidealities import LostCommand, Timing, load_imperfections
+from failuretwin.digital_model.nonidealities import LostCommand, Timing
 from failuretwin.inference.command_loss import LostCommands
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.run_likelihood import RunLikelihood
@@ -21,7 +22,7 @@ MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 
 @pytest.fixture(scope="module")
 def known(armpi):
-    return load_imperfections("armpi_fpv", armpi)
+    return load_calibration("armpi_fpv", armpi).imperfections
 
 
 def late_movements(imperfections, plan, run):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -71,9 +70,7 @@ def test_a_queue_of_commands_alone_stays_bounded():
 def test_a_queue_wakes_who_waits():
     queue = EventQueue()
     threading.Timer(0.1, queue.put, [reading(1.0)]).start()
-    began = time.monotonic()
-    assert queue.get(10.0).time == 1.0
-    assert time.monotonic() - began < 5.0
+    assert queue.get(threading.TIMEOUT_MAX).time == 1.0  # never, if nobody wakes it
 
 
 @pytest.mark.parametrize("jump", [YEAR_S, -YEAR_S, 3600.0, -30.0])

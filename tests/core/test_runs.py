@@ -15,6 +15,7 @@ from failuretwin.core.runs import (
     check_runs,
     concatenate,
     measured_rate,
+    run_set,
     time_step,
     truth_of,
 )
@@ -255,3 +256,33 @@ def test_parts_of_different_kinds_cannot_be_joined(runs, changes, message):
     with pytest.raises(InputError) as error:
         concatenate([runs, other])
     assert str(error.value) == message
+
+
+def test_plain_arrays_become_a_run_set_in_one_call():
+    time = np.arange(4) * 0.1
+    runs = run_set(time, np.arange(8.0).reshape(4, 2), np.zeros((4, 3)))
+    assert runs["run"].values.tolist() == ["run_1"]
+    assert runs["motor"].values.tolist() == ["motor_1", "motor_2"]
+    assert runs["command"].values[0, 2].tolist() == [4.0, 5.0]
+    assert runs.attrs["measured_rate_hz"] == pytest.approx(10.0)
+    assert runs["duration"].values.tolist() == [pytest.approx(0.3)]
+
+
+def test_plain_arrays_keep_their_names_and_rate():
+    shape = (2, 4)
+    runs = run_set(
+        np.arange(4) * 0.1,
+        np.zeros((*shape, 1)),
+        np.zeros((*shape, 3)),
+        motors=["shoulder"],
+        names=["a", "b"],
+        measured_rate_hz=5.0,
+    )
+    assert runs["motor"].values.tolist() == ["shoulder"]
+    assert runs["run"].values.tolist() == ["a", "b"]
+    assert runs.attrs["measured_rate_hz"] == 5.0
+
+
+def test_plain_arrays_of_other_shapes_are_refused():
+    with pytest.raises(InputError, match=r"\(4, 2\) \(command\).*Expected \(time,\)"):
+        run_set(np.arange(4) * 0.1, np.zeros((4, 2)), np.zeros((1, 4, 3)))

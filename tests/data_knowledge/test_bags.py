@@ -15,7 +15,7 @@ from failuretwin.data_knowledge.bags.read import BagTopics, is_bag, read_bag
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.raw_sessions import read_session
 from failuretwin.data_knowledge.timed_log import Targets, timed_run
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 
 pytest.importorskip("rosbags", reason="needs rosbags")
 
@@ -245,7 +245,7 @@ def reference_entries(runs, run):
 @pytest.mark.parametrize("fault", ["healthy", "motor_2:stuck", "motor_3:steady_state_error"])
 def test_a_simulated_run_gets_the_same_diagnosis_from_a_bag(read, armpi, twin, fault):
     hypothesis = Hypothesis.parse(fault, armpi.motor_names)
-    known = load_imperfections("none", armpi)
+    known = load_calibration("none", armpi).imperfections
     runs = simulate(Plan(armpi, [hypothesis], 1, 3, known)).isel(run=[0])
     time = runs["time"].values
     entries = list(reference_entries(runs, 0))

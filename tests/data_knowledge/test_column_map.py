@@ -10,7 +10,7 @@ from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.column_guess import column_map_text, guess_columns
 from failuretwin.data_knowledge.csv_log import read_column_map
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 
 ARMS = ("armpi_fpv", "ur5e", "panda", "so101")
 MAP = """
@@ -52,7 +52,8 @@ def test_a_foreign_log_gets_the_diagnosis_of_the_direct_way(tmp_path, name):
     robot = load_robot(name)
     own = "none" if robot.imperfections_file is None else name
     hypotheses = paper_hypotheses(robot.motor_names)
-    plan = Plan(robot, hypotheses, 1, seed=2, imperfections=load_imperfections(own, robot))
+    known = load_calibration(own, robot).imperfections
+    plan = Plan(robot, hypotheses, 1, seed=2, imperfections=known)
     runs, log = simulate(plan), tmp_path / "log.csv"
     foreign_table(runs).to_csv(log, index=False)
     mapping = tmp_path / "map.toml"

@@ -19,7 +19,7 @@ from failuretwin.core.hypothesis import (
 from failuretwin.core.runs import check_runs
 from failuretwin.data_knowledge import generate as generation
 from failuretwin.data_knowledge.generate import Plan, iterate, simulate, simulate_runs
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.failure_behavior.modes import MODES
 
 BOTH = pytest.mark.parametrize("imperfections", ["none", "armpi_fpv"])
@@ -29,7 +29,7 @@ VALUES = ("command", "measured", "position")
 @pytest.fixture
 def plan_of(armpi):
     def plan(imperfections="armpi_fpv", runs_per_class=2, seed=0, hypotheses=None):
-        known = load_imperfections(imperfections, armpi)
+        known = load_calibration(imperfections, armpi).imperfections
         classes = hypotheses or paper_hypotheses(armpi.motor_names)
         return Plan(armpi, classes, runs_per_class, seed, known)
 
@@ -192,7 +192,7 @@ def test_no_runs_at_a_time_are_refused(plan_of):
         lambda plan: {"seed": 1},
         lambda plan: {"runs_per_class": 3},
         lambda plan: {"hypotheses": plan.hypotheses[:-1]},
-        lambda plan: {"imperfections": load_imperfections("none", plan.robot)},
+        lambda plan: {"imperfections": load_calibration("none", plan.robot).imperfections},
         lambda plan: {"movements": replace(plan.movements, period_s=1.9)},
         lambda plan: {
             "modes": {**plan.modes, "stuck": replace(plan.modes["stuck"], onset_s=(1.0, 2.0))}

@@ -10,7 +10,8 @@ import pytest
 from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.digital_model.nonidealities import Readings, load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.nonidealities import Readings
 from failuretwin.inference.log_quality import log_quality
 
 
@@ -18,7 +19,7 @@ from failuretwin.inference.log_quality import log_quality
 def clean(armpi):
     """One run of a healthy arm, read ten times a second without any defect."""
     imperfections = replace(
-        load_imperfections("armpi_fpv", armpi),
+        load_calibration("armpi_fpv", armpi).imperfections,
         readings=Readings(rate_hz=10.0, whole_counts=True),
         lost_commands=(),
     )

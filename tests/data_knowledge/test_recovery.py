@@ -19,7 +19,7 @@ from failuretwin.data_knowledge.recovery.commands import (
 )
 from failuretwin.data_knowledge.recovery.fit import Free, PathPart, Ramps, fit_ramps
 from failuretwin.data_knowledge.recovery.inverse_kinematics import plane_arm
-from failuretwin.digital_model.nonidealities import default_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 
 FROM_ZERO = np.linspace(0.0, 10.0, 1000)
 FROM_FIRST_STEP = np.arange(1, 1001) * 0.01
@@ -56,7 +56,7 @@ def simulated(armpi):
         [Hypothesis.parse("healthy", armpi.motor_names)],
         12,
         seed=3,
-        imperfections=default_imperfections(armpi),
+        imperfections=load_calibration(None, armpi).imperfections,
     )
     return simulate_runs(plan, range(12)).movements
 

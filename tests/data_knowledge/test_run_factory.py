@@ -22,7 +22,7 @@ from failuretwin.data_knowledge import resumable as run_pieces
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.resumable import produce
 from failuretwin.data_knowledge.store import load_run_set, save_run_set, sole_writer
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 
 RUNS_PER_CLASS = 2
 PIECE = 4
@@ -32,13 +32,13 @@ PIECES = 5
 
 @pytest.fixture(scope="module", params=["none", "armpi_fpv"])
 def plan(request, armpi):
-    known = load_imperfections(request.param, armpi)
+    known = load_calibration(request.param, armpi).imperfections
     return Plan(armpi, paper_hypotheses(armpi.motor_names), RUNS_PER_CLASS, 5, known)
 
 
 @pytest.fixture(scope="module")
 def imperfect(armpi):
-    known = load_imperfections("armpi_fpv", armpi)
+    known = load_calibration("armpi_fpv", armpi).imperfections
     return Plan(armpi, paper_hypotheses(armpi.motor_names), RUNS_PER_CLASS, 5, known)
 
 
@@ -329,9 +329,9 @@ from failuretwin import load_robot
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan
 from failuretwin.data_knowledge.resumable import produce
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 robot = load_robot("armpi_fpv")
-known = load_imperfections("armpi_fpv", robot)
+known = load_calibration("armpi_fpv", robot).imperfections
 plan = Plan(robot, paper_hypotheses(robot.motor_names), 20, 5, known)
 produce(plan, Path(sys.argv[1]), piece_runs=4)
 """

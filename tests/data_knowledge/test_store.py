@@ -16,7 +16,7 @@ from failuretwin.core.runs import RunTable, Truth
 from failuretwin.data_knowledge import store as swap
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 
 SUFFIXES = pytest.mark.parametrize("suffix", [".nc", ".zarr"])
 names = st.text(st.characters(codec="utf-8", exclude_categories=["C"]), min_size=1, max_size=20)
@@ -68,7 +68,7 @@ def test_what_is_written_is_read_back(tmp_path_factory, suffix, runs):
 @SUFFIXES
 @pytest.mark.parametrize("imperfections", ["none", "armpi_fpv"])
 def test_simulated_runs_are_read_back(tmp_path, armpi, suffix, imperfections):
-    known = load_imperfections(imperfections, armpi)
+    known = load_calibration(imperfections, armpi).imperfections
     runs = simulate(Plan(armpi, paper_hypotheses(armpi.motor_names), 1, imperfections=known))
     save_run_set(runs, tmp_path / f"runs{suffix}")
     xr.testing.assert_identical(read_runs(tmp_path / f"runs{suffix}"), runs)

@@ -5,12 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 import xarray as xr
+from scipy import stats
 
 from failuretwin import BayesDiagnoser, DigitalTwin
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.digital_model.nonidealities import default_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.inference import diagnoser as bayes
 from failuretwin.inference import fault_models as steady_state_error
 from failuretwin.inference import stuck
@@ -112,6 +113,12 @@ def test_runs_are_left_as_they_are(twin, few):
     xr.testing.assert_identical(few, before)
 
 
+def assert_nine_in_ten(inside):
+    """Fewer or more would be a chance of one in a thousand each."""
+    low, high = stats.binom.interval(0.998, len(inside), 0.9)
+    assert low <= np.sum(inside) <= high
+
+
 def test_stuck_angle_is_found(imperfect, diagnoses):
     rows = known(diagnoses, "stuck")
     truth = imperfect["magnitude"].values[rows]
@@ -201,7 +208,7 @@ def test_finer_quadrature_changes_no_posterior(monkeypatch, twin, few, onset_s):
     diagnoser = BayesDiagnoser(twin, priors=priors_of(twin.robot, None, onset_s))
     coarse = posteriors(diagnoser.diagnose(few))
     monkeypatch.setattr(stuck, "COARSE_NODES", 601)
-    monkeypatch.setattr(steady_state_error, "NODES", 150)
+    monkeypatch.setattr(steady_state_error, "ERROR_NODES", 150)
     monkeypatch.setattr(bayes, "CHUNK_RUNS", 3)
     np.testing.assert_allclose(posteriors(diagnoser.diagnose(few)), coarse, atol=0.02)
 
@@ -326,7 +333,7 @@ def test_robot_of_which_nothing_is_known_is_judged_with_wide_offsets(armpi, impe
     unknown = dataclasses.replace(
         armpi, profile=dataclasses.replace(armpi.profile, imperfections=None)
     )
-    assert default_imperfections(unknown).protocol == "P0"
+    assert load_calibration(None, unknown).imperfections.protocol == "P0"
     found = BayesDiagnoser(DigitalTwin(unknown)).diagnose(imperfect)
     assert {d.protocol for d in found} == {"P0"}
     assert "not calibrated" in found[0].method

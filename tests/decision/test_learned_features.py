@@ -9,9 +9,6 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.decision.learned.feature_encoder import (
-    DISTANCE_M,
-    PER_MOTOR,
-    TURN_RAD,
     FeatureEncoder,
     expectation_of,
     joint_frames,
@@ -19,6 +16,9 @@ from failuretwin.decision.learned.feature_encoder import (
 )
 from failuretwin.digital_model.nonidealities import Imperfections, Readings
 from failuretwin.digital_model.settling import Settling
+
+PER_MOTOR = ("turn", "misfit", "angle", "command")
+TURN_RAD, DISTANCE_M = 0.01, 0.002
 
 SAGGING = Imperfections(
     "sags",

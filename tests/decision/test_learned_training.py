@@ -151,9 +151,9 @@ def test_small_errors_come_most_often():
 
 
 def test_widened_robots_differ_more(armpi):
-    from failuretwin.digital_model.nonidealities import load_imperfections
+    from failuretwin.digital_model.calibrated_robot import load_calibration
 
-    known = load_imperfections("armpi_fpv", armpi)
+    known = load_calibration("armpi_fpv", armpi).imperfections
     wide = widened(known, 3.0)
     np.testing.assert_allclose(wide.variation.bias, 3.0 * np.array(known.variation.bias))
     assert wide.settling == known.settling

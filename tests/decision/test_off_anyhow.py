@@ -173,6 +173,16 @@ def test_two_slides_that_are_off_are_a_closed_form(tmp_path, run_of):
         assert found > healthy + 20.0
 
 
+@pytest.mark.parametrize(("stands", "found"), [(0.28, True), (0.41, True), (0.43, False)])
+def test_two_motors_stand_a_fifth_beyond_their_range_at_most(tmp_path, run_of, stands, found):
+    """A slide from -0.3 m to 0.3 m: no further than 0.42 m."""
+    twin = small_twin(tmp_path, "gantry", GANTRY)
+    names = tuple(motor.name for motor in twin.robot.motors)
+    runs = run_of([[0.1, 0.1, 0.2]], twin.path(np.array([[stands, 0.0, 0.2]])), names)
+    likelihood = RunLikelihood(settled_evidence(runs), HealthyModel(twin, NO_IMPERFECTIONS))
+    assert np.isfinite(found_angles(likelihood, (0, 1)).log_weight).any() == found
+
+
 def test_an_arm_of_one_motor_has_no_pair(tmp_path, run_of):
     twin = small_twin(tmp_path, "slide", GANTRY[:1])
     runs = run_of([[0.1], [0.2]], twin.path(np.array([[0.1], [0.2]])), ("motor_1",))

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
 from failuretwin.inference.onset import OnsetIntervals, OnsetPrior, next_movement
-from failuretwin.inference.priors import Priors
+from failuretwin.inference.priors import MONITORING, Priors
 
 lengths = st.lists(st.floats(0.0, 5.0), min_size=1, max_size=8)
 earlies = st.floats(0.0, 1.0)
@@ -70,9 +70,18 @@ def test_a_run_has_the_onsets_that_it_has_among_longer_ones():
 
 def test_modes_have_their_own_share_before_the_run():
     """What wears out was there before; a motor may well get stuck in the run."""
-    usual, told = OnsetPrior(), OnsetPrior(early=0.25)
-    assert usual.before_run("backlash") > usual.before_run("stuck")
+    usual, told = OnsetPrior(), OnsetPrior(prior_before_run=0.25)
+    assert (usual.before_run("backlash"), usual.before_run("stuck")) == (0.9, 0.5)
     assert {told.before_run(mode) for mode in ("backlash", "stuck")} == {0.25}
+
+
+def test_usual_beliefs():
+    """Counts of 0.24 deg: 4 to 20, 7 to 35, 10 to 50."""
+    count = np.deg2rad(0.24)
+    expected = [(4 * count, 20 * count), (7 * count, 35 * count), (10 * count, 50 * count)]
+    np.testing.assert_allclose(Priors().error_ranges, expected)
+    assert (Priors().healthy_odds, MONITORING.healthy_odds) == (1.0, 30.0)
+    assert (Priors().onset.free, Priors().onset.known_s) == (0.2, None)
 
 
 @pytest.mark.parametrize(
@@ -80,7 +89,7 @@ def test_modes_have_their_own_share_before_the_run():
     [
         (OnsetPrior, {"known_s": -1.0}, "known_s is -1, expected 0 or more"),
         (OnsetPrior, {"known_s": np.nan}, "known_s is nan"),
-        (OnsetPrior, {"early": 1.5}, "expected a probability"),
+        (OnsetPrior, {"prior_before_run": 1.5}, "expected a probability"),
         (OnsetPrior, {"free": -0.1}, "expected a probability"),
         (Priors, {"error_ranges": ()}, "expected pairs 0 <= low < high"),
         (Priors, {"error_ranges": ((0.2, 0.1),)}, "expected pairs"),

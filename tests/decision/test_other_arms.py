@@ -11,10 +11,10 @@ from small_arms import GANTRY, SCARA, small_twin
 from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
 from failuretwin.core.hypothesis import UNKNOWN, paper_hypotheses, single_faults
 from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import (
     NO_IMPERFECTIONS,
     Readings,
-    default_imperfections,
     generic_imperfections,
 )
 from failuretwin.failure_behavior.modes import MODES, SteadyStateError
@@ -28,7 +28,7 @@ from failuretwin.inference.run_likelihood import RunLikelihood
 KINDS = {
     "none": lambda robot: NO_IMPERFECTIONS,
     "generic": generic_imperfections,
-    "own": default_imperfections,
+    "own": lambda robot: load_calibration(None, robot).imperfections,
 }
 
 
@@ -71,7 +71,7 @@ def test_any_mode_can_be_weighed_in_short_runs(armpi, twin, kind, count):
 
 def test_runs_of_sixty_movements_are_diagnosed(armpi, twin):
     """Faults for sure; of a healthy run, a motor may always have got stuck at the very end."""
-    known = default_imperfections(armpi)
+    known = load_calibration(None, armpi).imperfections
     faults = paper_hypotheses(armpi.motor_names)[::4]
     runs = simulate(Plan(armpi, faults, 1, 3, known, RandomMovements(count=60)))
     found = BayesDiagnoser(twin, known).diagnose(runs)

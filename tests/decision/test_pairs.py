@@ -6,7 +6,7 @@ import pytest
 from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.onset import OnsetPrior
 from failuretwin.inference.posterior import marginal_likelihood_of
@@ -31,7 +31,7 @@ RUNS = 2
 
 @pytest.fixture(scope="module")
 def runs(armpi):
-    known = load_imperfections("armpi_fpv", armpi)
+    known = load_calibration("armpi_fpv", armpi).imperfections
     return simulate(Plan(armpi, PAIRS, RUNS, 4, known))
 
 
@@ -93,9 +93,9 @@ def test_a_second_fault_that_cannot_show_changes_nothing(twin, imperfect, monkey
 
     runs = imperfect.isel(run=[5, 105])
     likelihood = RunLikelihood(settled_evidence(runs), BayesDiagnoser(twin).healthy_model)
-    priors = Priors(onset=OnsetPrior(early=0.5))
+    priors = Priors(onset=OnsetPrior(prior_before_run=0.5))
     single = marginal_likelihood_of(likelihood, Hypothesis.parse(f"motor_1:{one}"), priors)
-    monkeypatch.setattr(weighing, "LAWS", {**weighing.FAULT_MODELS, other: nothing})
+    monkeypatch.setattr(weighing, "FAULT_MODELS", {**weighing.FAULT_MODELS, other: nothing})
     both = Hypothesis.parse(f"motor_1:{one}+motor_4:{other}")
     pair = marginal_likelihood_of(likelihood, both, priors)
     # Scales do not explain the errors of the second run: in far tails a parabola is a rough one.

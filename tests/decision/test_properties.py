@@ -14,14 +14,14 @@ from scipy.spatial.transform import Rotation
 from failuretwin import BayesDiagnoser, DigitalTwin
 from failuretwin.core.hypothesis import paper_hypotheses, single_faults
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.digital_model.nonidealities import default_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 
 MODES = ("stuck", "steady_state_error", "encoder_bias", "lost_commands")
 
 
 @pytest.fixture(scope="module")
 def known(armpi):
-    return default_imperfections(armpi)
+    return load_calibration(None, armpi).imperfections
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
 from failuretwin.data_knowledge.generate import Plan, simulate, without_chance
-from failuretwin.digital_model.nonidealities import default_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.failure_behavior.modes import MODES
 from failuretwin.inference.expected_bayes_factors import (
     ExpectedLogBayesFactor,
@@ -110,7 +110,7 @@ def test_a_law_puts_the_tool_where_the_simulator_does(twin, armpi, measured_armp
 
 
 def test_without_losses_scatter_alone_counts(twin, armpi, imperfect):
-    known = default_imperfections(armpi)
+    known = load_calibration(None, armpi).imperfections
     stuck = imperfect.isel(run=range(20, 100))
     lossy = expected_log_bayes_factors(twin, stuck).nats[:, 0]
     sound = expected_log_bayes_factors(

@@ -14,14 +14,14 @@ from failuretwin.core.hypothesis import (
     single_faults,
 )
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.inference import posterior as weighing
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.expected_bayes_factors import expected_log_bayes_factors
 from failuretwin.inference.marginal import MarginalLikelihood
 from failuretwin.inference.posterior import marginal_likelihoods
 from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.unknown import LEFT_OUT, unknown_likelihood
+from failuretwin.inference.unknown import unknown_likelihood
 
 TWO_AT_ONCE = (
     Hypothesis.parse("motor_1:steady_state_error+motor_3:steady_state_error"),
@@ -39,7 +39,7 @@ def thrown_off(armpi):
     """Two motors at once miss every target by 8 to 12 degrees."""
     from failuretwin.failure_behavior.modes import MODES, SteadyStateError
 
-    known = load_imperfections("armpi_fpv", armpi)
+    known = load_calibration("armpi_fpv", armpi).imperfections
     error = SteadyStateError(magnitude=(0.14, 0.21), onset_s=(0.0, 0.0))
     modes = {**MODES, "steady_state_error": error}
     return simulate(Plan(armpi, TWO_AT_ONCE, 8, 6, known, modes=modes))
@@ -67,7 +67,7 @@ FOREIGN = ("encoder_scale", "drift", "lag", "lost_commands")
 @pytest.fixture(scope="module")
 def foreign(twin, armpi):
     """Faults of modes that are not offered, clearly apart from everything that is."""
-    known = load_imperfections("armpi_fpv", armpi)
+    known = load_calibration("armpi_fpv", armpi).imperfections
     faults = [h for h in single_faults(armpi.motor_names, FOREIGN) if h.faults]
     runs = simulate(Plan(armpi, faults, 5, 9, known))
     nearest = expected_log_bayes_factors(
@@ -84,7 +84,7 @@ def test_modes_that_are_not_offered_are_unknown(diagnoser, foreign):
 
 def test_modes_without_a_law_are_unknown(twin, armpi, foreign, monkeypatch):
     """Wrong scales, as if nobody had ever thought of them, nor of anything like them."""
-    monkeypatch.setattr(weighing, "WEIGHABLE", ("stuck", "steady_state_error"))
+    monkeypatch.setattr(weighing, "DIAGNOSABLE_MODES", ("stuck", "steady_state_error"))
     scales = np.char.endswith(foreign["fault"].values.astype(str), "encoder_scale")
     offered = (*paper_hypotheses(armpi.motor_names), UNKNOWN)
     found = BayesDiagnoser(twin, hypotheses=offered).diagnose(foreign.isel(run=scales))
@@ -122,7 +122,7 @@ def test_unknown_counts_its_best_explanation_alone(diagnoser, imperfect):
         return unknown_likelihood(likelihood, lambda other: sure, unlisted, []).log_evidence
 
     good = replace(sure, log_evidence=np.full(2, 600.0))
-    expected = np.log(0.3 * LEFT_OUT) + 600.0
+    expected = np.log(0.3 * 0.5) + 600.0
     np.testing.assert_allclose(says([(0.3, good)]), expected)
     np.testing.assert_allclose(says([(0.3, good), *[(0.3, sure)] * 20]), expected)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from failuretwin.core.errors import InputError
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 
 HEAD = 'name = "own"\nsource = "test"\n'
 NONSENSE = {
@@ -34,7 +34,7 @@ def load(armpi, tmp_path):
     def loaded(text):
         path = tmp_path / "own.toml"
         path.write_text(HEAD + text + "\n")
-        return load_imperfections(str(path), armpi)
+        return load_calibration(path, armpi).imperfections
 
     return loaded
 
@@ -49,7 +49,7 @@ def test_unknown_protocol_is_refused(armpi, tmp_path):
     path = tmp_path / "own.toml"
     path.write_text(HEAD + 'protocol = "P9"\n')
     with pytest.raises(InputError, match=r"own.toml: .*protocol 'P9'"):
-        load_imperfections(str(path), armpi)
+        load_calibration(path, armpi)
 
 
 def test_rates_of_losses_are_shares_together(load):

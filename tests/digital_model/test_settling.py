@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.settling import Settling
 
 RAD_PER_COUNT = np.deg2rad(0.24)
@@ -11,7 +11,7 @@ RAD_PER_COUNT = np.deg2rad(0.24)
 
 @pytest.fixture(scope="module")
 def settling(armpi):
-    return load_imperfections("armpi_fpv", armpi).settling
+    return load_calibration("armpi_fpv", armpi).imperfections.settling
 
 
 def published_sag_counts(pose):

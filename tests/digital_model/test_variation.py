@@ -7,8 +7,9 @@ import pytest
 from scipy import stats
 
 from failuretwin.core.errors import InputError
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.disturbances import draw_disturbances, lagged, stack
-from failuretwin.digital_model.nonidealities import Variation, load_imperfections, vary
+from failuretwin.digital_model.nonidealities import Variation, vary
 
 SURE = 1e-3
 RUNS = 2000
@@ -101,7 +102,7 @@ def test_variation_that_does_not_fit_the_robot_is_refused(armpi, tmp_path):
     file = tmp_path / "odd.toml"
     file.write_text('name = "odd"\nsource = "test"\n[variation]\nbias = [0.1, 0.2]\n')
     with pytest.raises(InputError, match="variation: bias has 2 values, expected 4"):
-        load_imperfections(str(file), armpi)
+        load_calibration(file, armpi)
 
 
 def test_lag_follows_a_ramp_as_the_closed_form_says():

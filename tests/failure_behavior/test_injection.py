@@ -8,7 +8,8 @@ import pytest
 from failuretwin.core.hypothesis import Fault, Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.data_knowledge.generate import Plan, simulate_runs
-from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from failuretwin.failure_behavior.fault import Course, FaultValue
 from failuretwin.failure_behavior.injection import Injection
 from failuretwin.failure_behavior.modes import MODES, SteadyStateError, Stuck
@@ -122,7 +123,7 @@ def test_what_only_the_motion_tells_joins_the_truth(injection, movements, positi
 @pytest.mark.parametrize("imperfections", ["none", "armpi_fpv"])
 @pytest.mark.parametrize("motor", range(1, 5))
 def test_an_error_of_no_size_is_healthy_bit_for_bit(armpi, imperfections, motor):
-    known = load_imperfections(imperfections, armpi)
+    known = load_calibration(imperfections, armpi).imperfections
     state = Hypothesis((Fault(f"motor_{motor}", "steady_state_error"),))
     modes = {"steady_state_error": SteadyStateError(magnitude=(0.0, 0.0))}
     healthy = Plan(armpi, [Hypothesis()], 3, seed=7, imperfections=known)
@@ -144,7 +145,7 @@ def test_a_motor_stuck_at_the_end_of_the_run_is_healthy_bit_for_bit(armpi):
 
 @pytest.mark.parametrize("imperfections", ["none", "armpi_fpv"])
 def test_a_stuck_motor_stands_still_and_the_others_do_not_notice(armpi, imperfections):
-    known = replace(load_imperfections(imperfections, armpi), readings=None)
+    known = replace(load_calibration(imperfections, armpi).imperfections, readings=None)
     hypotheses = [Hypothesis((Fault("motor_1", "stuck"),))]
     stuck = simulate_runs(Plan(armpi, hypotheses, 3, seed=5, imperfections=known), range(3))
     healthy = simulate_runs(Plan(armpi, [Hypothesis()], 3, seed=5, imperfections=known), range(3))

@@ -122,6 +122,20 @@ def spoilt(runs):
     return changed.assign_coords(run=np.array(names, dtype=object))
 
 
+def astray(runs):
+    """Return one healthy run whose tool rests beside where it should, or strays on its way."""
+    one = runs.isel(run=[1] * 5)
+    time, path = one["time"].values, one["measured"].values.copy()
+    movement = np.minimum(time // 2.0, 4).astype(int)
+    beside = np.random.default_rng(3).normal(size=(5, 3))
+    for run, far in enumerate((0.0025, 0.005, 0.03, 0.1)):
+        path[run] += far * beside[movement]
+    path[4, :, 2] += np.where(time % 2.0 < 0.9, 0.04 * np.sin(7.0 * time), 0.0)
+    names = ["2.5 mm", "5 mm", "30 mm", "100 mm", "on the way"]
+    changed = one.assign(measured=(one["measured"].dims, path))
+    return changed.assign_coords(run=np.array(names, dtype=object))
+
+
 def defects():
     quality = log_quality(spoilt(load("nine")))
     return {
@@ -163,7 +177,7 @@ def stream(run, make):
         answer = diagnoser.update(float(time[i]), command[i], measured[i])
         if i % 100 == 99:
             answers[f"{time[i]:.2f} s"] = said(answer.diagnosis) | {"state": str(answer.state)}
-    return answers | {"end": said(diagnoser.to_diagnosis().diagnosis)}
+    return answers | {"end": said(diagnoser.conclude().diagnosis)}
 
 
 def plain_stream():
@@ -189,7 +203,7 @@ def fleet():
         robots.update(float(time[i]), command[:, i], measured[:, i])
         if i % 125 == 124:
             found[f"{time[i]:.2f} s"] = robots.posterior
-    robots.to_diagnosis()
+    robots.conclude()
     return found | {
         "end": robots.posterior,
         "verdicts": [said(robots.diagnosis(k)) for k in (0, 2)],
@@ -310,6 +324,7 @@ CASES = {
     "nine, errors known": Case(lambda: diagnosed("nine", one_of_each, priors=errors_known())),
     "nine, monitoring": Case(partial(diagnosed, "nine", one_of_each, priors=MONITORING)),
     "nine, unknown": Case(partial(diagnosed, "nine", one_of_each, **_in_unknown())),
+    "nine, astray": Case(partial(diagnosed, "nine", astray, **_in_unknown())),
     "nine, no rate": Case(partial(diagnosed, "nine", without_rate)),
     "nine, spoilt": Case(partial(diagnosed, "nine", spoilt)),
     "ideal": Case(partial(diagnosed, "ideal", known="none")),

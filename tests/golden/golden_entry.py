@@ -24,13 +24,8 @@ from failuretwin.decision.learned.feature_encoder import (
 )
 from failuretwin.decision.streaming.diagnoser import monitor
 from failuretwin.decision.streaming.fleet import StreamingFleet
-from failuretwin.digital_model.nonidealities import (
-    LostCommand,
-    Readings,
-    default_imperfections,
-    generic_imperfections,
-    load_imperfections,
-)
+from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.nonidealities import LostCommand, Readings, generic_imperfections
 from failuretwin.failure_behavior.modes import MODES
 from failuretwin.inference import diagnoser as bayes
 from failuretwin.inference import posterior as posterior
@@ -74,10 +69,10 @@ def twin(name="armpi_fpv"):
 def healthy(which, robot):
     """Return imperfections by name: `own`, `generic`, `none`, `measured` or a bundled one."""
     if which == "own":
-        return default_imperfections(robot)
+        return load_calibration(None, robot).imperfections
     if which == "generic":
         return generic_imperfections(robot)
-    return load_imperfections(str(MEASURED) if which == "measured" else which, robot)
+    return load_calibration(str(MEASURED) if which == "measured" else which, robot).imperfections
 
 
 def robust_features(robot, imperfections, runs):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, cast
 import click
 
 from failuretwin.app.commands.options import LogOptions
-from failuretwin.connection.calibration.result import Calibration, LeftOut, with_loops
+from failuretwin.connection.calibration.result import Calibration, LeftOut
 from failuretwin.connection.calibration.step_parameters import StepFit, fit_steps
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
@@ -25,6 +25,7 @@ from failuretwin.data_knowledge.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.step_tests import find_step_tests, read_step_test
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
+from failuretwin.digital_model.calibrated_robot import with_loops
 from failuretwin.digital_model.nonidealities import GENERIC_NAME
 from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.diagnoser import BayesDiagnoser

@@ -32,7 +32,7 @@ from failuretwin.connection.links.diagnostics import (
 from failuretwin.connection.links.ros_messages import RosTopics, load_topics
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.bags.messages import BagTopics
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.injection import ScheduledFault
 
@@ -73,9 +73,10 @@ def emulated_robot(
     from failuretwin.connection.emulated_arm import Emulation, emulated
 
     own = "none" if robot.imperfections_file is None else robot.name
+    known = load_calibration(options.imperfections or own, robot)
     emulation = Emulation(
-        robot=robot,
-        imperfections=load_imperfections(options.imperfections or own, robot),
+        robot=known.robot,
+        imperfections=known.imperfections,
         schedule=tuple(ScheduledFault.parse(text, robot.motor_names) for text in options.faults),
         seed=options.seed,
     )

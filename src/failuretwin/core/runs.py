@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
@@ -129,6 +130,49 @@ class RunTable:
         for name in runs.data_vars:
             runs[name].attrs["units"] = VARIABLES[str(name)][1]
         return check_runs(runs, "the run set")
+
+
+def run_set(
+    time: ArrayLike,
+    command: ArrayLike,
+    measured: ArrayLike,
+    *,
+    motors: Sequence[str] | None = None,
+    names: Sequence[str] | None = None,
+    measured_rate_hz: float | None = None,
+) -> xr.Dataset:
+    """Return a run set from plain arrays.
+
+    Args:
+        time: Uniform grid from 0, (time,) [s].
+        command: Reference of each motor, (run, time, motor), or (time, motor) of one run [rad].
+        measured: Path of the tool in the base frame, (run, time, axis), or (time, axis) of one
+            run [m]; NaN = no sample.
+        motors: Names of the motors in chain order; None: ``motor_1``, ``motor_2``, ...
+        names: Unique name of each run; None: ``run_1``, ``run_2``, ...
+        measured_rate_hz: True rate of the tool sensor [Hz]; None: every sample of the grid is a
+            reading of its own.
+
+    Raises:
+        InputError: If shapes do not fit together, or the grid is not uniform from 0.
+    """
+    grid, reference, path = as_floats(time), as_floats(command), as_floats(measured)
+    if reference.ndim == 2 and path.ndim == 2:
+        reference, path = reference[None], path[None]
+    if grid.ndim != 1 or len(grid) < 2 or reference.ndim != 3 or path.ndim != 3:
+        raise InputError(
+            f"the arrays have shapes {grid.shape} (time), {reference.shape} (command) and "
+            f"{path.shape} (measured). Expected (time,), (run, time, motor) and (run, time, 3)."
+        )
+    rate = (len(grid) - 1) / (grid[-1] - grid[0]) if measured_rate_hz is None else measured_rate_hz
+    return RunTable(
+        run=names or [f"run_{k + 1}" for k in range(len(reference))],
+        motor=motors or [f"motor_{k + 1}" for k in range(reference.shape[2])],
+        time=grid,
+        command=reference,
+        measured=path,
+        measured_rate_hz=float(rate),
+    ).to_dataset()
 
 
 def check_runs(runs: xr.Dataset, where: str) -> xr.Dataset:

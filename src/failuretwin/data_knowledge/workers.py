@@ -10,6 +10,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from itertools import islice
+from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, TypeVar
 
 from failuretwin.core.errors import FailureTwinError, InputError
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 ANSWER_S = 5.0
 """Time that a scheduler has to answer [s]."""
 FIRST_WORKER_S = 30.0
-"""Time that a scheduler's first worker has to come [s]."""
+"""Time that a first worker has to come, also after all have gone [s]."""
 NEVER = logging.CRITICAL + 1
 IGNORE_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 """What our own workers run first: an interrupt is for the parent, which then ends them."""
@@ -120,6 +121,10 @@ Result = TypeVar("Result")
 
 TASKS_PER_THREAD = 2
 """Tasks given out at a time: one to do, one that waits, so that no worker is ever idle."""
+LOOK_S = 30.0
+"""Time without a result after which it is looked whether there are workers at all [s]."""
+LONGEST_WAIT_S = 1800.0
+"""Longest wait for the next result [s]: many times what a piece takes on a slow machine."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +165,8 @@ class Workforce:
         Raises:
             InputError: If Dask is not installed, or the scheduler or its workers do not answer
                 or cannot run the work.
-            FailureTwinError: If workers keep dying.
+            FailureTwinError: If workers keep dying, are gone for `FIRST_WORKER_S`, or finish
+                nothing for `LONGEST_WAIT_S`.
         """
         if self.workers == 1 and self.scheduler is None:
             yield ((item, work(item)) for item in items)
@@ -179,31 +185,61 @@ def _spread(
     client: Client, work: Callable[[Item], Result], items: Iterable[Item]
 ) -> Generator[tuple[Item, Result]]:
     """Give items with their results; only as many are given out as workers can do soon."""
-    from distributed import as_completed
-
     waiting = iter(items)
     given: dict[Future[Result], Item] = {}
+    done: SimpleQueue[Future[Result]] = SimpleQueue()
 
-    def give_out() -> list[Future[Result]]:
+    def give_out() -> None:
         threads = max(1, sum(client.nthreads().values()))
-        futures = []
         for item in islice(waiting, max(0, TASKS_PER_THREAD * threads - len(given))):
             future = client.submit(work, item, pure=False)
             given[future] = item
-            futures.append(future)
-        return futures
+            future.add_done_callback(done.put)
 
-    running = as_completed(give_out(), loop=client.loop)
-    for future in running:
+    give_out()
+    while given:
+        future = _next_done(client, done)
         yield given.pop(future), _result(future)
-        running.update(give_out())
+        give_out()
+
+
+def _next_done(client: Client, done: SimpleQueue[Future[Result]]) -> Future[Result]:
+    """Wait for the next future that is done, but not for ever."""
+    for _ in range(round(LONGEST_WAIT_S / LOOK_S)):
+        try:
+            return done.get(timeout=LOOK_S)
+        except Empty:
+            _check_workers(client)
+    raise _nothing_done()
+
+
+def _check_workers(client: Client) -> None:
+    try:
+        client.wait_for_workers(1, timeout=FIRST_WORKER_S)
+    except TimeoutError as error:
+        raise FailureTwinError(
+            f"all workers have gone, and none came back within {FIRST_WORKER_S:g} s. Look for what "
+            "ended them, such as too little memory; start those of a scheduler again; and run the "
+            "same command again."
+        ) from error
+
+
+def _nothing_done() -> FailureTwinError:
+    return FailureTwinError(
+        f"workers are there, but finished nothing for {LONGEST_WAIT_S / 60:g} minutes. Look at "
+        "what they do, end them or start the scheduler again, and run the same command again."
+    )
 
 
 def _result(future: Future[Result]) -> Result:
     from distributed import CancelledError, KilledWorker
 
     try:
-        return future.result()
+        return future.result(timeout=LONGEST_WAIT_S)
+    except TimeoutError as error:
+        if future.status == "error":  # that of the work itself
+            raise
+        raise _nothing_done() from error  # it was lost with its worker, and is made again
     except KilledWorker as error:
         raise FailureTwinError(
             "workers died again and again over the same piece. Look for what ends them, such as "

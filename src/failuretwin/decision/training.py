@@ -14,7 +14,8 @@ from failuretwin.decision.learned.log_pool import HybridDiagnoser, fit_pool_weig
 from failuretwin.decision.learned.networks import Standard
 from failuretwin.decision.learned.training_data import Stream, TrainingData, widened
 from failuretwin.decision.metrics import log_score
-from failuretwin.digital_model.nonidealities import Imperfections, default_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.diagnoser import BayesDiagnoser
@@ -81,7 +82,8 @@ def train(
         with_bayes: Whether to pool the network with the Bayesian diagnosis, by fitted weights.
     """
     if imperfections is None:
-        imperfections = default_imperfections(robot)
+        known = load_calibration(None, robot)
+        robot, imperfections = known.robot, known.imperfections
     network, _, _ = train_network(plan, robot, imperfections)
     if not with_bayes:
         return network

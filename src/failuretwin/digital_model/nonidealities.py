@@ -1,17 +1,16 @@
 """What a healthy robot does that its twin does not: one value, every part switchable.
 
-Figures of a real robot live in TOML files beside the robot's profile, with their source. Ranges
-are drawn anew for each run, rates apply to each movement or reading.
+Figures of a real robot live in TOML files beside the robot's profile, with their source; the way to
+read one is `calibrated_robot.load_calibration`. Ranges are drawn anew for each run, rates apply to
+each movement or reading.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 
-from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, check_number, check_range, check_share, unknown_name
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.robot import Robot
@@ -192,8 +191,6 @@ class Imperfections:
 
 NO_IMPERFECTIONS = Imperfections("none", "the published twin")
 
-CALIBRATION_TABLE = "calibration"
-"""Table of such a file that says of which robot and how the figures were found."""
 GENERIC_NAME = "generic, not calibrated"
 """What results say of a robot whose healthy behaviour has not been measured."""
 GENERIC_SCATTER_RAD = 0.01
@@ -206,109 +203,6 @@ def generic_imperfections(robot: Robot) -> Imperfections:
     scatter = (GENERIC_SCATTER_RAD,) * len(robot.motors)
     settling = Settling(zero, zero, zero, scatter, 4.0, "assumed, no calibration")
     return Imperfections(GENERIC_NAME, "assumed", settling=settling)
-
-
-def default_imperfections(robot: Robot) -> Imperfections:
-    """Return those that the robot's profile names, or generic ones."""
-    if robot.imperfections_file is None:
-        return generic_imperfections(robot)
-    return load_imperfections(robot.name, robot)
-
-
-def load_imperfections(name_or_path: str, robot: Robot) -> Imperfections:
-    """Load imperfections.
-
-    Args:
-        name_or_path: ``none``, the name of `robot` for those of its profile, the name of another
-            file beside those, or a TOML file.
-        robot: The robot they are for.
-
-    Raises:
-        InputError: If there are none under this name, or they belong to another robot or do not fit
-            its motors.
-    """
-    if name_or_path == "none":
-        return NO_IMPERFECTIONS
-    path, known = Path(name_or_path), _known_files(robot)
-    if name_or_path in known:
-        path = known[name_or_path]
-    elif path.suffix != ".toml" and not path.exists():
-        names = ", ".join(repr(name) for name in ("none", *known))
-        raise InputError(
-            f"no imperfections {name_or_path!r} of robot {robot.name!r}. Expected {names} or a "
-            "TOML file, such as `failuretwin calibrate` writes."
-        )
-    table = read_toml(path)
-    _check_robot(table.pop(CALIBRATION_TABLE, None), robot, path)
-    try:
-        imperfections = from_table(Imperfections, table, str(path))
-    except InputError as error:
-        where = "" if str(error).startswith(str(path)) else f"{path}: "
-        raise InputError(f"{where}{error}") from error
-    imperfections = _completed(imperfections, len(robot.motors))
-    _check_fit(imperfections, robot, path)
-    return imperfections
-
-
-def _known_files(robot: Robot) -> dict[str, Path]:
-    """Return the files that go by a name: that of the profile, and those that lie beside it."""
-    own = robot.imperfections_file
-    if own is None:
-        return {}
-    return {robot.name: own} | {path.stem: path for path in sorted(own.parent.glob("*.toml"))}
-
-
-def _completed(imperfections: Imperfections, motors: int) -> Imperfections:
-    """Return the imperfections with zeros for what is left out of the settling."""
-    settling = imperfections.settling
-    if settling is None:
-        return imperfections
-    zero = (0.0,) * motors
-    whole = replace(
-        settling,
-        bias=settling.bias or zero,
-        compliance=settling.compliance or zero,
-        friction=settling.friction or zero,
-        scatter=settling.scatter or zero,
-    )
-    return replace(imperfections, settling=whole)
-
-
-def _check_robot(calibration: object, robot: Robot, path: Path) -> None:
-    owner = calibration.get("robot") if isinstance(calibration, dict) else None
-    if owner not in (None, robot.name):
-        raise InputError(
-            f"{path}: is a calibration of robot {owner!r}, not of {robot.name!r}. Name the right "
-            "robot (--robot) or calibrate this one."
-        )
-
-
-def _check_fit(imperfections: Imperfections, robot: Robot, path: Path) -> None:
-    count = len(robot.motors)
-    for name, values in _motor_lists(imperfections).items():
-        if len(values) not in (0, count):
-            raise InputError(
-                f"{path}: {name} has {len(values)} values, expected {count}, one for each motor "
-                f"of {robot.name!r}."
-            )
-    for lost in imperfections.lost_commands:
-        for motor in lost.motors:
-            if motor not in robot.motor_names:
-                raise InputError(
-                    f"{path}: lost_commands: {unknown_name('motor', motor, robot.motor_names)}"
-                )
-
-
-def _motor_lists(imperfections: Imperfections) -> dict[str, tuple[float, ...]]:
-    """Return every figure that has one value for each motor, by the name of its key."""
-    lists: dict[str, tuple[float, ...]] = {}
-    for table in ("settling", "variation"):
-        value = getattr(imperfections, table)
-        if value is not None:
-            lists |= {f"{table}: {name}": getattr(value, name) for name in SETTLING_LISTS}
-    if imperfections.readings is not None:
-        lists["readings: glitch_rate"] = imperfections.readings.glitch_rate
-    return lists
 
 
 # Robots of a kind: imperfections drawn around given ones, for training and for honest doubt.

@@ -13,7 +13,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis, paper_hypotheses, parse_hypotheses
 from failuretwin.core.runs import check_motors, check_runs, truth_of
 from failuretwin.core.types import BoolArray
-from failuretwin.digital_model.nonidealities import Imperfections, default_imperfections
+from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.evidence import settled_evidence, transient_samples
 from failuretwin.inference.healthy_model import HealthyModel
@@ -73,8 +73,7 @@ class BayesDiagnoser:
     @cached_property
     def healthy_model(self) -> HealthyModel:
         """What a healthy run looks like."""
-        imperfections = self.imperfections or default_imperfections(self.twin.robot)
-        return HealthyModel(self.twin, imperfections)
+        return HealthyModel.of(self.twin, self.imperfections)
 
     @cached_property
     def uses_transients(self) -> bool:

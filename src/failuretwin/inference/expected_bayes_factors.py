@@ -21,7 +21,7 @@ from failuretwin.core.numerics import log_of
 from failuretwin.core.runs import check_motors, check_runs
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.data_knowledge.generate import noise_free_path
-from failuretwin.digital_model.nonidealities import Imperfections, default_imperfections
+from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.fault import FaultValue
 from failuretwin.failure_behavior.injection import Injection, replayed
@@ -295,7 +295,7 @@ def expected_log_bayes_factors(
     truth, faults = truth_and_faults(runs)
     motors = twin.robot.motor_names
     asked = paper_hypotheses(motors) if hypotheses is None else parse_hypotheses(hypotheses, motors)
-    model = HealthyModel(twin, imperfections or default_imperfections(twin.robot))
+    model = HealthyModel.of(twin, imperfections)
     everything = tuple(dict.fromkeys((*asked, *truth)))
     judge = ExpectedLogBayesFactor(model, everything, priors or Priors())
     fit = judge.fits(runs, faults, as_floats(runs["onset"].values))

@@ -25,7 +25,6 @@ from failuretwin.digital_model.nonidealities import (
     GENERIC_SCATTER_RAD,
     Imperfections,
     LostCommand,
-    default_imperfections,
 )
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
@@ -232,7 +231,7 @@ def isolability(
     """
     motors = twin.robot.motor_names
     asked = paper_hypotheses(motors) if hypotheses is None else parse_hypotheses(hypotheses, motors)
-    model = HealthyModel(twin, imperfections or default_imperfections(twin.robot))
+    model = HealthyModel.of(twin, imperfections)
     judge = ExpectedLogBayesFactor(
         model, tuple(dict.fromkeys((HEALTHY, *asked))), priors or Priors()
     )

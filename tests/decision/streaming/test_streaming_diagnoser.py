@@ -18,7 +18,8 @@ from failuretwin.decision.streaming.diagnoser import (
     save_fleet,
 )
 from failuretwin.decision.streaming.fleet import StreamingFleet
-from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 
 PERIOD_S = 2.04
 STEP_S = 0.1
@@ -245,7 +246,7 @@ def test_a_stream_of_nothing_is_refused(twin, kwargs):
 def test_other_arms_are_streamed_as_they_are_recorded(name, rate_hz):
     robot = load_robot(name)
     hypotheses = paper_hypotheses(robot.motor_names)
-    generic = load_imperfections("none", robot)
+    generic = load_calibration("none", robot).imperfections
     runs = simulate(Plan(robot, hypotheses, 1, 3, generic)).isel(run=[0, 2])
     method = BayesDiagnoser(DigitalTwin(robot), whole_run=False)
     fleet = StreamingFleet(method, 2, rate_hz)

@@ -121,21 +121,20 @@ def simulate(
     with what is missing. Up to a few thousand can be written to .nc.
     """
     from failuretwin.app.tables import progress_bar
-    from failuretwin.connection.calibration.result import robot_as_calibrated
     from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
     from failuretwin.data_knowledge.generate import Plan
     from failuretwin.data_knowledge.resumable import produce
     from failuretwin.data_knowledge.store import check_destination
     from failuretwin.data_knowledge.workers import Workforce
-    from failuretwin.digital_model.nonidealities import load_imperfections
+    from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.failure_behavior.modes import MODES, load_modes
 
     check_destination(out)
-    model = robot_as_calibrated(load_robot(robot), imperfections)
-    names = model.motor_names
+    known = load_calibration(imperfections, load_robot(robot))
+    names = known.robot.motor_names
     plan = Plan(
-        robot=model,
+        robot=known.robot,
         hypotheses=(
             parse_hypotheses(hypotheses.split(","), names)
             if hypotheses is not None
@@ -143,7 +142,7 @@ def simulate(
         ),
         runs_per_class=runs_per_class,
         seed=seed,
-        imperfections=load_imperfections(imperfections, model),
+        imperfections=known.imperfections,
         engine=engine,
         modes=MODES if faults is None else load_modes(faults),
     )

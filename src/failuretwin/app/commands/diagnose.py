@@ -97,17 +97,16 @@ def diagnose(
         tracking_line,
     )
     from failuretwin.decision.results import write_csv, write_json_lines
-    from failuretwin.digital_model.nonidealities import load_imperfections
+    from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
-    from failuretwin.digital_model.twin import DigitalTwin
     from failuretwin.inference.diagnoser import BayesDiagnoser
     from failuretwin.inference.priors import priors_of
 
     model = load_robot(robot)
-    twin = DigitalTwin(model)
+    known = load_calibration(calibration, model)
     bayes = BayesDiagnoser(
-        twin,
-        imperfections=None if calibration is None else load_imperfections(str(calibration), model),
+        known.twin,
+        imperfections=known.imperfections,
         hypotheses=told_hypotheses(hypotheses, model),
         priors=priors_of(model, sse_range, onset),
     )
@@ -137,7 +136,7 @@ def diagnose(
         from failuretwin.data_knowledge.store import filling
 
         with filling(plot) as folder:
-            pictures = plot_runs(runs, diagnoses, twin, folder)
+            pictures = plot_runs(runs, diagnoses, known.twin, folder)
             write_page(diagnoses, pictures, model.name, folder / "index.html")
     if tracked is not None:
         keep_history(tracked)

@@ -55,14 +55,12 @@ def watch(
     from failuretwin.connection.links.diagnostics import statuses
     from failuretwin.connection.links.recording import Recorder
     from failuretwin.decision.streaming.diagnoser import monitor
-    from failuretwin.digital_model.nonidealities import load_imperfections
+    from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
-    from failuretwin.digital_model.twin import DigitalTwin
 
     model, names = load_robot(robot), topics_of(live.topics)
-    twin = DigitalTwin(model)
-    healthy = None if calibration is None else load_imperfections(str(calibration), model)
-    diagnoser = monitor(twin, healthy)
+    known = load_calibration(calibration, model)
+    diagnoser = monitor(known.twin, known.imperfections)
     length = math.inf if live.duration is None else live.duration
     options = EmulationOptions(live.faults, live.imperfections, length, seed)
     with ExitStack() as stack:
@@ -70,7 +68,7 @@ def watch(
         sinks = list(connections.sinks)
         if record is not None:
             sinks.append(stack.enter_context(Recorder(record, model)))
-        shadow = Shadow(connections.source, diagnoser, twin, sinks, names.wait_s)
+        shadow = Shadow(connections.source, diagnoser, known.twin, sinks, names.wait_s)
         try:
             # An emulated robot ends by itself, a log when it is over.
             until = time.monotonic() + (length if source != "emulated" else math.inf)

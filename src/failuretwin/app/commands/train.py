@@ -42,9 +42,8 @@ def train(
     """
     from failuretwin.app.inputs import check_learning
     from failuretwin.app.tables import progress_bar
-    from failuretwin.connection.calibration.result import robot_as_calibrated
     from failuretwin.data_knowledge.store import check_writable
-    from failuretwin.digital_model.nonidealities import default_imperfections, load_imperfections
+    from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
 
     check_learning()
@@ -54,14 +53,12 @@ def train(
     check_network_file(out)
     check_writable(out)
     model = load_robot(robot)
-    if calibration is None:
-        imperfections = default_imperfections(model)
-    else:
-        model = robot_as_calibrated(model, str(calibration))
-        imperfections = load_imperfections(str(calibration), model)
+    known = load_calibration(calibration, model)
     plan = TrainingPlan(network, iterations, seed)
     with progress_bar("training", iterations) as advance:
-        diagnoser, alone, both = train_network(plan, model, imperfections, lambda done: advance(1))
+        diagnoser, alone, both = train_network(
+            plan, known.robot, known.imperfections, lambda done: advance(1)
+        )
     save_network(diagnoser, out)
     click.echo(
         f"of {alone.runs} simulated runs of the physics engine {100.0 * alone.right:.1f} % right, "

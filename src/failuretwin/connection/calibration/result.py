@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 from failuretwin import __version__
 from failuretwin.core.config import from_table, read_toml
-from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.store import check_writable, replacing
-from failuretwin.digital_model.nonidealities import (
+from failuretwin.digital_model.calibrated_robot import (
     CALIBRATION_TABLE,
-    Imperfections,
-    load_imperfections,
+    CalibratedLoop,
+    CalibratedRobot,
+    load_calibration,
+    with_loops,
 )
+from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
-from failuretwin.digital_model.servo import ServoLoop
 
 
 @dataclass(frozen=True)
@@ -43,25 +44,6 @@ class Parameter:
     high: float
     identified: bool = True
     note: str = ""
-
-
-@dataclass(frozen=True)
-class LoopFit:
-    """Servo loop of a motor as its step tests speak for it.
-
-    Attributes:
-        motor: Its name.
-        P: Proportional gain [-].
-        I: Integral gain [1/s].
-        filter_s: Time constant of the input filter [s].
-        speed_limit: Largest speed [rad/s].
-    """
-
-    motor: str
-    P: float
-    I: float  # noqa: E741 - the field's name for an integral gain
-    filter_s: float
-    speed_limit: float
 
 
 @dataclass(frozen=True)
@@ -131,7 +113,15 @@ class Calibration:
     left_out: tuple[LeftOut, ...] = ()
     held_out: tuple[HeldOut, ...] = ()
     remarks: tuple[str, ...] = ()
-    loops: tuple[LoopFit, ...] = ()
+    loops: tuple[CalibratedLoop, ...] = ()
+
+    def applied_to(self, robot: Robot) -> CalibratedRobot:
+        """Return a robot with these loops and imperfections, as from the file of this calibration.
+
+        Raises:
+            InputError: If the calibration names a motor that the robot does not have.
+        """
+        return CalibratedRobot(with_loops(robot, self.loops), self.imperfections)
 
 
 # Calibrations as TOML files: the imperfections, which the twin reads, and how they were found.
@@ -151,7 +141,7 @@ class _Record:
     left_out: tuple[LeftOut, ...] = ()
     held_out: tuple[HeldOut, ...] = ()
     remarks: tuple[str, ...] = ()
-    loops: tuple[LoopFit, ...] = ()
+    loops: tuple[CalibratedLoop, ...] = ()
 
 
 def save_calibration(calibration: Calibration, robot: Robot, path: Path) -> None:
@@ -192,13 +182,13 @@ def check_calibration_file(path: Path) -> None:
     check_writable(path)
 
 
-def load_calibration(path: Path, robot: Robot) -> Calibration:
-    """Read what `save_calibration` wrote.
+def read_calibration(path: Path, robot: Robot) -> Calibration:
+    """Read all that `save_calibration` wrote, to look at; `load_calibration` is to work with it.
 
     Raises:
         InputError: If the file is no calibration, or one of another robot.
     """
-    imperfections = load_imperfections(str(path), robot)
+    imperfections = load_calibration(path, robot).imperfections
     table = read_toml(path).get(CALIBRATION_TABLE)
     if not isinstance(table, dict):
         raise InputError(
@@ -230,54 +220,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float):
         return float(f"{value:.6g}")
     return value
-
-
-# A robot with the servo loops that its own step tests speak for.
-
-
-def calibrated_robot(robot: Robot, calibration: Calibration) -> Robot:
-    """Return the robot with the loops and speed limits of a calibration; others stay.
-
-    Raises:
-        InputError: If the calibration names a motor that the robot does not have.
-    """
-    return with_loops(robot, calibration.loops)
-
-
-def with_loops(robot: Robot, loops: Sequence[LoopFit]) -> Robot:
-    """Return the robot with other loops and speed limits for some of its motors.
-
-    Raises:
-        InputError: If the robot does not have such a motor.
-    """
-    found = {loop.motor: loop for loop in loops}
-    for name in found:
-        if name not in robot.motor_names:
-            raise unknown_name("motor", name, robot.motor_names)
-    motors = tuple(
-        replace(
-            motor,
-            loop=ServoLoop(fit.P, fit.I, fit.filter_s),
-            speed_limit=fit.speed_limit,
-        )
-        if (fit := found.get(motor.name))
-        else motor
-        for motor in robot.motors
-    )
-    return replace(robot, profile=replace(robot.profile, motors=motors))
-
-
-def robot_as_calibrated(robot: Robot, name_or_path: str) -> Robot:
-    """Return the robot that goes with imperfections, whose timing is on top of their own loops.
-
-    Args:
-        robot: The robot as its profile has it.
-        name_or_path: What `load_imperfections` takes; only calibration files bring loops.
-
-    Raises:
-        InputError: If the file is a calibration that cannot be read or of another robot.
-    """
-    path = Path(name_or_path)
-    if path.suffix != ".toml" or CALIBRATION_TABLE not in read_toml(path):
-        return robot
-    return calibrated_robot(robot, load_calibration(path, robot))

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from failuretwin.connection.calibration.parameters import LEARNED, Z_95
-from failuretwin.connection.calibration.result import LeftOut, LoopFit, Parameter
+from failuretwin.connection.calibration.result import LeftOut, Parameter
 from failuretwin.connection.calibration.servo_loops import (
     PRIOR_DEVIATION,
     SharedFit,
@@ -17,6 +17,7 @@ from failuretwin.connection.calibration.servo_loops import (
     sizes_differ,
 )
 from failuretwin.data_knowledge.step_tests import StepTest
+from failuretwin.digital_model.calibrated_robot import CalibratedLoop
 from failuretwin.digital_model.robot import Motor, Robot
 
 # What step tests show without any model: how far a motor overshoots and when it has settled.
@@ -83,7 +84,7 @@ class StepFit:
 
     motor: str
     steps: int
-    loop: LoopFit
+    loop: CalibratedLoop
     parameters: tuple[Parameter, ...]
     residual: float
 
@@ -117,7 +118,7 @@ def _fit_motor(steps: list[StepTest], motor: Motor, robot: Robot) -> StepFit:
     return StepFit(
         motor=motor.name,
         steps=len(steps),
-        loop=LoopFit(motor.name, P, I, tau, limit),
+        loop=CalibratedLoop(motor.name, P, I, tau, limit),
         parameters=(
             *(_shared_parameter(k, fit, steps, motor.name) for k in range(len(NAMES))),
             _overshoot(steps, motor.name, quantum),

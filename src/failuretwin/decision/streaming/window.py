@@ -226,7 +226,10 @@ def _alike(value: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:
 
 # What past movements were found to say, kept so that only the present one is looked at anew.
 
-PER_MOTOR = ("best", "precision", "square", "log_weight", "expected", "pose", "beside")
+PER_MOTOR = (
+    *("mode", "precision", "min_distance2", "log_weight", "expected", "map_pose"),
+    "faulty_baseline",
+)
 """What is kept of each motor's profile."""
 
 
@@ -327,13 +330,13 @@ def _profile(
 ) -> JointLikelihood:
     return replace(
         like,
-        mode=recalled["best"],
+        mode=recalled["mode"],
         precision=recalled["precision"],
-        min_distance2=recalled["square"],
+        min_distance2=recalled["min_distance2"],
         log_weight=recalled["log_weight"],
         expected=recalled["expected"],
-        map_pose=recalled["pose"],
-        faulty_baseline=recalled["beside"],
+        map_pose=recalled["map_pose"],
+        faulty_baseline=recalled["faulty_baseline"],
         usable=usable,
     )
 

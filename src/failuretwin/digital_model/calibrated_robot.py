@@ -1,0 +1,204 @@
+"""A robot as a calibration knows it: its own servo loops, and what it does that its twin does not.
+
+A calibration file holds imperfections, whose timing is what is left on top of the servo loops, and
+may hold those loops. One without the other describes no robot, so both are read here, together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from failuretwin.core.config import from_table, read_toml
+from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.digital_model.nonidealities import (
+    NO_IMPERFECTIONS,
+    SETTLING_LISTS,
+    Imperfections,
+    generic_imperfections,
+)
+from failuretwin.digital_model.robot import Motor, Robot
+from failuretwin.digital_model.servo import ServoLoop
+from failuretwin.digital_model.twin import DigitalTwin
+
+CALIBRATION_TABLE = "calibration"
+"""Table of a calibration file that says of which robot and how the figures were found."""
+
+
+@dataclass(frozen=True)
+class CalibratedLoop:
+    """Servo loop of a motor as its step tests speak for it.
+
+    Attributes:
+        motor: Its name.
+        P: Proportional gain [-].
+        I: Integral gain [1/s].
+        filter_s: Time constant of the input filter [s].
+        speed_limit: Largest speed [rad/s].
+    """
+
+    motor: str
+    P: float
+    I: float  # noqa: E741 - the field's name for an integral gain
+    filter_s: float
+    speed_limit: float
+
+    def of(self, motor: Motor) -> Motor:
+        """Return a motor with this loop and speed limit."""
+        loop = ServoLoop(self.P, self.I, self.filter_s)
+        return replace(motor, loop=loop, speed_limit=self.speed_limit)
+
+
+@dataclass(frozen=True)
+class CalibratedRobot:
+    """A robot with its calibrated servo loops, and how it differs from their twin.
+
+    Attributes:
+        robot: The robot; motors without a calibrated loop have that of the profile.
+        imperfections: What it does that its twin does not; their timing is on top of these loops.
+            They have the name of the calibration and its protocol.
+    """
+
+    robot: Robot
+    imperfections: Imperfections
+
+    @property
+    def twin(self) -> DigitalTwin:
+        """Digital twin with the calibrated servo loops."""
+        return DigitalTwin(self.robot)
+
+
+def with_loops(robot: Robot, loops: Sequence[CalibratedLoop]) -> Robot:
+    """Return a robot with other servo loops and speed limits for some of its motors.
+
+    Raises:
+        InputError: If the robot does not have such a motor.
+    """
+    found = {loop.motor: loop for loop in loops}
+    for name in found:
+        if name not in robot.motor_names:
+            raise unknown_name("motor", name, robot.motor_names)
+    if not found:
+        return robot
+    motors = tuple(found[m.name].of(m) if m.name in found else m for m in robot.motors)
+    return replace(robot, profile=replace(robot.profile, motors=motors))
+
+
+def load_calibration(name_or_path: str | Path | None, robot: Robot) -> CalibratedRobot:
+    """Load a calibration, or imperfections typed by hand.
+
+    Args:
+        name_or_path: ``none``, the name of `robot` for the calibration of its profile, the name of
+            another file beside that, or a TOML file. None: the calibration of its profile, generic
+            imperfections if that names none.
+        robot: The robot it is for.
+
+    Raises:
+        InputError: If there is none under this name, or it belongs to another robot or does not fit
+            its motors.
+    """
+    if name_or_path is None and robot.imperfections_file is None:
+        return CalibratedRobot(robot, generic_imperfections(robot))
+    if name_or_path == "none":
+        return CalibratedRobot(robot, NO_IMPERFECTIONS)
+    path = _file_of(str(name_or_path or robot.name), robot)
+    table = read_toml(path)
+    record = _record(table.pop(CALIBRATION_TABLE, {}), path)
+    _check_robot(record.robot, robot, path)
+    try:
+        imperfections = from_table(Imperfections, table, str(path))
+    except InputError as error:
+        where = "" if str(error).startswith(str(path)) else f"{path}: "
+        raise InputError(f"{where}{error}") from error
+    imperfections = _completed(imperfections, len(robot.motors))
+    _check_fit(imperfections, robot, path)
+    return CalibratedRobot(with_loops(robot, record.loops), imperfections)
+
+
+def _file_of(name_or_path: str, robot: Robot) -> Path:
+    path, known = Path(name_or_path), _known_files(robot)
+    if name_or_path in known:
+        return known[name_or_path]
+    if path.suffix != ".toml" and not path.exists():
+        names = ", ".join(repr(name) for name in ("none", *known))
+        raise InputError(
+            f"no imperfections {name_or_path!r} of robot {robot.name!r}. Expected {names} or a "
+            "TOML file, such as `failuretwin calibrate` writes."
+        )
+    return path
+
+
+def _known_files(robot: Robot) -> dict[str, Path]:
+    """Return the files that go by a name: that of the profile, and those that lie beside it."""
+    own = robot.imperfections_file
+    if own is None:
+        return {}
+    return {robot.name: own} | {path.stem: path for path in sorted(own.parent.glob("*.toml"))}
+
+
+def _completed(imperfections: Imperfections, motors: int) -> Imperfections:
+    """Return the imperfections with zeros for what is left out of the settling."""
+    settling = imperfections.settling
+    if settling is None:
+        return imperfections
+    zero = (0.0,) * motors
+    whole = replace(
+        settling,
+        bias=settling.bias or zero,
+        compliance=settling.compliance or zero,
+        friction=settling.friction or zero,
+        scatter=settling.scatter or zero,
+    )
+    return replace(imperfections, settling=whole)
+
+
+@dataclass(frozen=True)
+class _Record:
+    """What of the calibration's own table matters to the robot."""
+
+    robot: str = ""
+    loops: tuple[CalibratedLoop, ...] = ()
+
+
+def _record(table: object, path: Path) -> _Record:
+    if not isinstance(table, dict):
+        raise InputError(f"{path}: {CALIBRATION_TABLE} is {table!r}, expected a table.")
+    known = {name: table[name] for name in ("robot", "loops") if name in table}
+    return from_table(_Record, known, f"{path}: {CALIBRATION_TABLE}")
+
+
+def _check_robot(owner: str, robot: Robot, path: Path) -> None:
+    if owner not in ("", robot.name):
+        raise InputError(
+            f"{path}: is a calibration of robot {owner!r}, not of {robot.name!r}. Name the right "
+            "robot (--robot) or calibrate this one."
+        )
+
+
+def _check_fit(imperfections: Imperfections, robot: Robot, path: Path) -> None:
+    count = len(robot.motors)
+    for name, values in _motor_lists(imperfections).items():
+        if len(values) not in (0, count):
+            raise InputError(
+                f"{path}: {name} has {len(values)} values, expected {count}, one for each motor "
+                f"of {robot.name!r}."
+            )
+    for lost in imperfections.lost_commands:
+        for motor in lost.motors:
+            if motor not in robot.motor_names:
+                raise InputError(
+                    f"{path}: lost_commands: {unknown_name('motor', motor, robot.motor_names)}"
+                )
+
+
+def _motor_lists(imperfections: Imperfections) -> dict[str, tuple[float, ...]]:
+    """Return every figure that has one value for each motor, by the name of its key."""
+    lists: dict[str, tuple[float, ...]] = {}
+    for table in ("settling", "variation"):
+        value = getattr(imperfections, table)
+        if value is not None:
+            lists |= {f"{table}: {name}": getattr(value, name) for name in SETTLING_LISTS}
+    if imperfections.readings is not None:
+        lists["readings: glitch_rate"] = imperfections.readings.glitch_rate
+    return lists
