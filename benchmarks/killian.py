@@ -23,7 +23,7 @@ from killian_truth import TrueRun, read_list
 import failuretwin as ft
 from failuretwin.connection.calibrating import learn_robot
 from failuretwin.core.hypothesis import Hypothesis, single_faults
-from failuretwin.decision.metrics.probability import wilson_interval
+from failuretwin.decision.metrics import wilson_interval
 from failuretwin.decision.results import Record, score_line, score_records, write_json_lines
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections

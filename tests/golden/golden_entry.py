@@ -15,7 +15,7 @@ from failuretwin.connection.wear import run_evidence
 from failuretwin.connection.wear_tracker import Tracker
 from failuretwin.core.hypothesis import parse_hypotheses
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
-from failuretwin.decision.learned.features import (
+from failuretwin.decision.learned.feature_encoder import (
     RobustFeatures,
     augmented_features,
     expectation_of,

@@ -35,9 +35,12 @@ def summary_rows(evaluation: Evaluation) -> list[tuple[str, str]]:
         ("macro-F1", f"{scores.macro_f1:.3f}, mean over the classes that were true of any run"),
         (
             "false-alarm rate",
-            percent_interval(alarms.false_alarms) + _untold(alarms.healthy_untold),
+            percent_interval(alarms.false_alarms) + _abstained(alarms.healthy_abstained),
         ),
-        ("missed-detection rate", percent_interval(alarms.missed) + _untold(alarms.faulty_untold)),
+        (
+            "missed-detection rate",
+            percent_interval(alarms.missed) + _abstained(alarms.faulty_abstained),
+        ),
         ("log score", f"{scores.log_score:.3f} nats a run"),
         ("Brier score", f"{evaluation.brier:.3f} (0 is perfect, 2 the worst)"),
     ]
@@ -46,7 +49,7 @@ def summary_rows(evaluation: Evaluation) -> list[tuple[str, str]]:
     return rows
 
 
-def _untold(count: int) -> str:
+def _abstained(count: int) -> str:
     return f", {count} without a verdict, which is no alarm" if count else ""
 
 

@@ -24,11 +24,12 @@ from failuretwin.data_knowledge.raw_sessions import SESSION_FILES, As
 from failuretwin.data_knowledge.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.step_tests import find_step_tests, read_step_test
 from failuretwin.data_knowledge.store import replacing
-from failuretwin.decision.learned.diagnoser import Diagnoser, HybridDiagnoser
+from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.digital_model.calibrated_robot import with_loops
 from failuretwin.digital_model.nonidealities import GENERIC_NAME
 from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.protocol import Diagnoser, diagnoser_from_text
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -166,43 +167,47 @@ def chosen_diagnoser(
     """Return the diagnoser that the user names.
 
     Args:
-        method: ``bayes``, the file of a network, or ``bayes+`` and that file.
+        method: ``bayes``, the file of a network, ``bayes+`` and that file, or ``module:Class`` of
+            the user's own.
         bayes: The Bayesian diagnoser.
         settings: Options by name that belong to it alone; None where not given.
 
     Raises:
-        InputError: If one of those is given with a network, the file is no network for this robot
-            or was never fitted to be blended, or the extra `learn` is missing.
+        InputError: If one of those is given with another method, the file is no network for this
+            robot or was never fitted to be blended, the extra `learn` is missing, or there is no
+            such class.
     """
     if method == BAYES:
         return bayes
-    network = _network(Path(method.removeprefix(BLEND)), bayes.twin.robot, settings)
-    if not method.startswith(BLEND):
-        return network
-    if network.weights_ is None:
+    path = Path(method.removeprefix(BLEND))
+    own = ":" in method and path.suffix != ".npz" and not path.exists()
+    if not own and not path.exists():
         raise InputError(
-            f"{method.removeprefix(BLEND)}: how it weighs beside Bayes was never fitted. Train it "
-            "with `failuretwin train`, or use it alone."
-        )
-    return HybridDiagnoser(bayes, network, network.weights_)
-
-
-def _network(path: Path, robot: Robot, settings: Mapping[str, object]) -> LearnedDiagnoser:
-    if not path.exists():
-        raise InputError(
-            f"--method {path}: is neither 'bayes' nor a file that exists. Train a network with "
-            f"`failuretwin train --out {path.with_suffix('.npz')}`."
+            f"--method {path}: is neither 'bayes', nor a file that exists, nor module:Class. Train "
+            f"a network with `failuretwin train --out {path.with_suffix('.npz')}`."
         )
     given = [name for name, value in settings.items() if value is not None]
     if given:
         raise InputError(
-            f"{', '.join(given)}: a network has learned what it knows, and cannot be told more. "
-            "Leave that out, or use --method bayes."
+            f"{', '.join(given)}: only the Bayesian diagnosis can be told that; a network has "
+            "learned what it knows. Leave that out, or use --method bayes."
         )
+    if own:
+        return diagnoser_from_text(method, bayes.twin)
     check_learning()
     from failuretwin.decision.learned.storage import load_network
 
-    return load_network(path, robot)
+    network = load_network(path, bayes.twin.robot)
+    return _pooled(network, bayes, path) if method.startswith(BLEND) else network
+
+
+def _pooled(network: LearnedDiagnoser, bayes: BayesDiagnoser, path: Path) -> HybridDiagnoser:
+    if network.weights_ is None:
+        raise InputError(
+            f"{path}: how it weighs beside Bayes was never fitted. Train it "
+            "with `failuretwin train`, or use it alone."
+        )
+    return HybridDiagnoser(bayes, network, network.weights_)
 
 
 def expected_name(diagnoser: Diagnoser, bayes: BayesDiagnoser) -> str:
@@ -210,11 +215,13 @@ def expected_name(diagnoser: Diagnoser, bayes: BayesDiagnoser) -> str:
 
     Args:
         diagnoser: As `chosen_diagnoser` gave it.
-        bayes: The Bayesian diagnoser, which is it or a part of it unless it is a network.
+        bayes: The Bayesian diagnoser, which is it or a part of it unless it is another method.
     """
+    if isinstance(diagnoser, BayesDiagnoser | HybridDiagnoser):
+        return bayes.healthy_model.imperfections.name
     encoder = getattr(diagnoser, "encoder", None)
     if encoder is None:
-        return bayes.healthy_model.imperfections.name
+        return GENERIC_NAME  # a class of the user's own: not known, so nothing to warn of
     return encoder.expected.name if encoder.expected else "none"
 
 

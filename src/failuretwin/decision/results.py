@@ -180,7 +180,7 @@ def score_line(records: Sequence[Record]) -> str:
     return (
         f"{scores.right} of {scores.runs} runs right: accuracy {100 * scores.accuracy:.1f} % "
         f"(95 % interval {100 * low:.1f} to {100 * high:.1f} %), protocol {protocol_of(records)}, "
-        f"log score {log_score_text(scores.surprise)}"
+        f"log score {log_score_text(scores.log_scores)}"
     )
 
 

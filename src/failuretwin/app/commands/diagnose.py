@@ -21,8 +21,9 @@ from failuretwin.app.commands.options import PATH, LogOptions, common_options, r
     "--method",
     default="bayes",
     show_default=True,
-    metavar="bayes|MODEL|bayes+MODEL",
-    help="How to diagnose: by Bayes' rule, by a network that `train` wrote, or by both.",
+    metavar="bayes|MODEL|bayes+MODEL|module:Class",
+    help="How to diagnose: by Bayes' rule, by a network that `train` wrote, by both, or by a class "
+    "of your own.",
 )
 @click.option(
     "--track",

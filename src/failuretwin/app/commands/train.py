@@ -62,8 +62,8 @@ def train(
     save_network(diagnoser, out)
     click.echo(
         f"of {alone.runs} simulated runs of the physics engine {100.0 * alone.right:.1f} % right, "
-        f"log score {alone.surprise:.3f} nats a run, temperature {diagnoser.temperature_:.2f}; "
-        f"blended with Bayes {100.0 * both.right:.1f} %, {both.surprise:.3f} nats"
+        f"log score {alone.log_score:.3f} nats a run, temperature {diagnoser.temperature_:.2f}; "
+        f"blended with Bayes {100.0 * both.right:.1f} %, {both.log_score:.3f} nats"
     )
     click.echo(f"written to {out}; use it with `failuretwin diagnose --method {out}`")
     click.echo(f"or together with Bayes: --method bayes+{out}")

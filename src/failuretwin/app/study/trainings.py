@@ -22,7 +22,7 @@ from failuretwin.core.types import IntArray
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import replacing
-from failuretwin.decision.learned.features import Encoder, Floats, signals_of
+from failuretwin.decision.learned.feature_encoder import FeatureEncoder, Floats, signals_of
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:
@@ -178,7 +178,7 @@ def make_arrays(plan: StudyPlan, robot: Robot, test: Exam, folder: Path) -> None
         Plan(robot, paper_hypotheses(robot.motor_names), plan.runs_per_class, plan.seed)
     )
     for features in FEATURES:
-        encoder = Encoder(features, robot)
+        encoder = FeatureEncoder(features, robot)
         with replacing(_data_file(folder, features)) as partial, partial.open("wb") as file:
             np.savez(
                 file,
@@ -267,7 +267,7 @@ def processes(jobs: int) -> int:
 
     if torch.cuda.is_available():
         return 1
-    from failuretwin.decision.learned.networks import cores
+    from failuretwin.decision.learned.training_data import cores
 
     return min(jobs, cores())
 

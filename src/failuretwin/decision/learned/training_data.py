@@ -1,20 +1,31 @@
-"""What a network is trained on: runs as various as a real robot may make them, without end."""
+"""What a network is trained on: runs as various as a real robot may make them, without end.
+
+Other processes make them while a network learns.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+import multiprocessing
+import os
+from collections import deque
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from failuretwin.core.hypothesis import Diagnosis, Hypothesis, paper_hypotheses
-from failuretwin.core.movements import find_movements
+from failuretwin.core.errors import FailureTwinError
+from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
 from failuretwin.core.runs import RunTable, concatenate
 from failuretwin.core.types import IntArray
 from failuretwin.data_knowledge.generate import Plan, simulate_runs
-from failuretwin.decision.learned.features import Encoder, Floats, signals_of, signals_of_table
-from failuretwin.digital_model.nonidealities import Imperfections, Variation
+from failuretwin.decision.learned.feature_encoder import FeatureEncoder, Floats, signals_of
+from failuretwin.decision.learned.networks import epoch
+from failuretwin.digital_model.nonidealities import SETTLING_LISTS, Imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import FaultMode
 from failuretwin.failure_behavior.modes import MODES, SteadyStateError, Stuck
@@ -59,7 +70,7 @@ VARIANTS = (
 
 
 @dataclass(frozen=True)
-class Recipe:
+class TrainingData:
     """An endless supply of labelled runs, the same for the same seed.
 
     Attributes:
@@ -75,10 +86,11 @@ class Recipe:
     seed: int = 0
     variants: tuple[Variant, ...] = VARIANTS
     engine: str = "servo"
-    hypotheses: tuple[Hypothesis, ...] = field(init=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "hypotheses", paper_hypotheses(self.robot.motor_names))
+    @cached_property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        """The classes: those of the paper."""
+        return paper_hypotheses(self.robot.motor_names)
 
     @property
     def movements(self) -> tuple[int, int]:
@@ -86,7 +98,7 @@ class Recipe:
         count = RandomMovements().count
         return count, count
 
-    def chunk(self, number: int, runs: int, encoder: Encoder) -> tuple[Floats, IntArray]:
+    def chunk(self, number: int, runs: int, encoder: FeatureEncoder) -> tuple[Floats, IntArray]:
         """Return some runs as features, with their classes, in random order.
 
         Args:
@@ -95,7 +107,7 @@ class Recipe:
             encoder: Makes the features.
         """
         made = [
-            (places, encoder.encode(signals_of_table(table)))
+            (places, encoder.encode(signals_of(table)))
             for places, table in self._made(number, runs)
         ]
         order = np.concatenate([places for places, _ in made])
@@ -163,56 +175,82 @@ def widened(imperfections: Imperfections, factor: float) -> Imperfections:
     variation = imperfections.variation
     if variation is None:
         return imperfections
-    wider = Variation(
-        bias=tuple(factor * value for value in variation.bias),
-        compliance=tuple(factor * value for value in variation.compliance),
-        friction=tuple(factor * value for value in variation.friction),
-        scatter=tuple(factor * value for value in variation.scatter),
-        rates=factor * variation.rates,
-        payload=variation.payload,
-    )
-    return replace(imperfections, variation=wider)
+    wider: dict[str, Any] = {
+        name: tuple(factor * value for value in getattr(variation, name)) for name in SETTLING_LISTS
+    }
+    wider["rates"] = factor * variation.rates
+    return replace(imperfections, variation=replace(variation, **wider))
 
 
-# What kind of runs a network has learned from, and what to say of others.
+# Training batches that never end, made by other processes while a network learns.
+
+CHUNK_RUNS = 576
+"""Runs made at a time."""
+AHEAD = 2
+"""Chunks made ahead for each process, so that none waits."""
+
+Chunk = tuple[Floats, IntArray]
 
 
-def movement_counts(runs: xr.Dataset) -> IntArray:
-    """Return the number of movements of each run, (run,)."""
-    signals = signals_of(runs)
-    return find_movements(signals.command, signals.time).exists.sum(axis=1)
+def cores() -> int:
+    """Return how many processes this machine can run at a time."""
+    return os.cpu_count() or 1
 
 
-def movement_range(runs: xr.Dataset) -> tuple[int, int]:
-    """Return the fewest and the most movements of a run."""
-    counts = movement_counts(runs)
-    return int(counts.min()), int(counts.max())
+@dataclass(frozen=True)
+class Stream:
+    """Batches of runs straight from the generator.
 
+    They depend on `data` alone, not on how many processes make the runs.
 
-def with_doubt(
-    diagnoses: Sequence[Diagnosis], movements: IntArray, known: tuple[int, int] | None
-) -> list[Diagnosis]:
-    """Return diagnoses with a remark on runs such as the network has not learned from.
-
-    Args:
-        diagnoses: Of each run.
-        movements: How many movements each run has, (run,).
-        known: Fewest and most movements of a run that it learned from; None: not known.
+    Attributes:
+        data: What runs are made.
+        encoder: What networks see of them.
+        batch_runs: Runs in a batch.
+        uses: Batches that a run is part of before it is thrown away; 1: none is seen twice.
     """
-    if known is None:
-        return list(diagnoses)
-    low, high = known
-    told = f"{low}" if low == high else f"{low} to {high}"
-    return [
-        diagnosis
-        if low <= count <= high
-        else replace(
-            diagnosis,
-            quality=(
-                *diagnosis.quality,
-                f"{count} movements, and the network learned from runs of {told}: its "
-                "probabilities mean little here",
-            ),
-        )
-        for diagnosis, count in zip(diagnoses, movements.tolist(), strict=True)
-    ]
+
+    data: TrainingData
+    encoder: FeatureEncoder
+    batch_runs: int = 64
+    uses: int = 6
+
+    @contextmanager
+    def chunks(self) -> Iterator[Iterator[Chunk]]:
+        """Give chunks of fresh runs without end; leaving the block ends the processes.
+
+        Scripts must be guarded by ``if __name__ == "__main__":``.
+        """
+        workers = max(1, cores() - 1)
+        pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
+        try:
+            yield self._in_order(pool, AHEAD * workers)
+        except BrokenProcessPool as error:
+            raise FailureTwinError(
+                "a process that makes runs has died. Look for what ended it, such as too little "
+                "memory, and start again."
+            ) from error
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+    def _in_order(self, pool: ProcessPoolExecutor, ahead: int) -> Iterator[Chunk]:
+        given: deque[Future[Chunk]] = deque()
+        number = 0
+        while True:
+            while len(given) <= ahead:
+                given.append(pool.submit(self.data.chunk, number, CHUNK_RUNS, self.encoder))
+                number += 1
+            yield given.popleft().result()
+
+    def batches(self, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
+        """Give batches from chunks: each fresh chunk is shuffled with those still in use.
+
+        Args:
+            chunks: Fresh runs, as `chunks` gives them.
+        """
+        rng = np.random.default_rng([self.data.seed, CHUNK_RUNS])
+        in_use: deque[Chunk] = deque(maxlen=self.uses)
+        for chunk in chunks:
+            in_use.append(chunk)
+            features, classes = (np.concatenate(parts) for parts in zip(*in_use, strict=True))
+            yield from epoch(features, classes, self.batch_runs, rng)

@@ -1,9 +1,11 @@
-"""Proper scores: what the stated probabilities are worth. Honest probabilities score best."""
+"""What the stated probabilities are worth: proper scoring rules, calibration, comparison.
+
+Honest probabilities score best.
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +19,7 @@ class LogScore:
     """Log score (Good, J. R. Stat. Soc. B 1952): minus the log probability of the truth.
 
     Attributes:
-        nats: Surprise at the truth of each run, (run,) [nats]; infinite where the truth was given
+        nats: Log score of each run, (run,) [nats]; infinite where the truth was given
             no probability at all. Nothing is floored.
     """
 
@@ -51,8 +53,8 @@ def log_score(truth: Sequence[str], posterior: Sequence[Mapping[str, float]]) ->
         posterior: Probabilities of each run; a truth that is not among them has none.
     """
     chance = np.array([p.get(t, 0.0) for p, t in zip(posterior, truth, strict=True)])
-    with np.errstate(divide="ignore"):  # no probability: an infinite surprise, as it should be
-        return LogScore(-np.log(chance) + 0.0)  # + 0.0: no surprise is 0, not -0
+    with np.errstate(divide="ignore"):  # no probability: an infinite score, as it should be
+        return LogScore(-np.log(chance) + 0.0)  # + 0.0: certainty is 0, not -0
 
 
 def brier_score(truth: Sequence[str], posterior: Sequence[Mapping[str, float]]) -> FloatArray:
@@ -184,15 +186,11 @@ def calibrated_error(
         Expected calibration error of each set, (draws,).
     """
     _check_confidence(confidence)
-    inside = _bin_of(confidence, edges)
+    inside, runs = _bin_of(confidence, edges), len(confidence)
     order = np.argsort(inside, kind="stable")
-    first = np.flatnonzero(np.diff(inside[order], prepend=-1))
-    sorted_confidence = confidence[order]
-    errors = np.empty(draws)
-    for i in range(draws):
-        surplus = (rng.random(len(confidence)) < sorted_confidence) - sorted_confidence
-        errors[i] = np.abs(np.add.reduceat(surplus, first)).sum() / len(confidence)
-    return errors
+    first, stated = np.flatnonzero(np.diff(inside[order], prepend=-1)), confidence[order]
+    surplus = ((rng.random(runs) < stated) - stated for _ in range(draws))
+    return np.array([np.abs(np.add.reduceat(s, first)).sum() / runs for s in surplus])
 
 
 def _bin_of(confidence: FloatArray, edges: FloatArray) -> IntArray:
@@ -204,109 +202,6 @@ def _check_confidence(confidence: FloatArray) -> None:
         raise InputError("there are no runs. Expected the confidence of one at least.")
     if not np.all((confidence >= 0.0) & (confidence <= 1.0)):
         raise InputError("confidence holds values outside 0 to 1. Expected probabilities.")
-
-
-# Shares of runs, with the interval that so few runs allow.
-
-Z_95 = 1.959963984540054
-"""Two-sided 95 % point of the normal distribution."""
-
-
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """Return the Wilson 95 % interval of a share (Wilson, JASA 1927)."""
-    if trials == 0:
-        return 0.0, 1.0
-    share, z2 = successes / trials, Z_95**2
-    centre = (share + z2 / (2 * trials)) / (1 + z2 / trials)
-    spread = math.sqrt(share * (1 - share) / trials + z2 / (4 * trials**2))
-    half = Z_95 * spread / (1 + z2 / trials)
-    return max(0.0, centre - half), min(1.0, centre + half)
-
-
-@dataclass(frozen=True)
-class Share:
-    """So many of so many.
-
-    Attributes:
-        count: How many.
-        total: Of how many.
-    """
-
-    count: int
-    total: int
-
-    @property
-    def value(self) -> float:
-        """The share; NaN of nothing."""
-        return self.count / self.total if self.total else math.nan
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Wilson 95 % interval; everything where there is nothing."""
-        return wilson_interval(self.count, self.total)
-
-
-# Do 90 % intervals hold the truth in 90 % of the runs?
-
-
-@dataclass(frozen=True)
-class IntervalCase:
-    """An interval and the truth that it should hold.
-
-    Attributes:
-        mode: Fault mode that it is about.
-        quantity: What is estimated, such as ``"onset"``.
-        low: Lower end, in the unit of the quantity.
-        high: Upper end, in the same unit.
-        truth: True value, in the same unit.
-    """
-
-    mode: str
-    quantity: str
-    low: float
-    high: float
-    truth: float
-
-
-@dataclass(frozen=True)
-class Coverage:
-    """How often the intervals of one quantity hold the truth; ends count as inside.
-
-    Attributes:
-        mode: Fault mode.
-        quantity: What is estimated.
-        inside: Intervals that hold the truth, of all.
-        below: Truths below their interval.
-        above: Truths above their interval.
-        points: Intervals without width: told or assumed rather than estimated.
-    """
-
-    mode: str
-    quantity: str
-    inside: Share
-    below: int
-    above: int
-    points: int
-
-
-def coverage_by_mode(cases: Iterable[IntervalCase]) -> list[Coverage]:
-    """Return the coverage of each quantity of each fault mode, in order of appearance.
-
-    Give the runs whose fault was diagnosed right: an interval says where the value lies *if* the
-    diagnosis holds, and choosing runs by what the data say does not change its coverage.
-    """
-    groups: dict[tuple[str, str], list[IntervalCase]] = {}
-    for case in cases:
-        groups.setdefault((case.mode, case.quantity), []).append(case)
-    return [_coverage(*key, group) for key, group in groups.items()]
-
-
-def _coverage(mode: str, quantity: str, cases: list[IntervalCase]) -> Coverage:
-    below = sum(case.truth < case.low for case in cases)
-    above = sum(case.truth > case.high for case in cases)
-    inside = Share(len(cases) - below - above, len(cases))
-    points = sum(case.low == case.high for case in cases)
-    return Coverage(mode, quantity, inside, below, above, points)
 
 
 # Simulation-based calibration: is the truth a typical draw from its posterior?
@@ -424,3 +319,130 @@ def _tail_table(runs: int, share: FloatArray) -> FloatArray:
     count = np.arange(runs + 1)[:, None]
     low, high = binom.cdf(count, runs, share), binom.sf(count - 1, runs, share)
     return np.minimum(1.0, 2.0 * np.minimum(low, high))
+
+
+# Which of two methods is better on the same runs?
+
+RESAMPLES = 10_000
+"""Bootstrap samples."""
+CHUNK = 1_000_000
+"""Runs drawn at a time, so that memory stays small."""
+
+
+@dataclass(frozen=True)
+class McNemar:
+    """Exact McNemar test of two methods on the same runs (McNemar, Psychometrika 1947).
+
+    Attributes:
+        both: Runs that both got right.
+        first_only: Runs that only the first got right.
+        second_only: Runs that only the second got right.
+        neither: Runs that both got wrong.
+        p: Two-sided chance of a split of the runs on which they differ at least as uneven, if both
+            methods were equally good (binomial with one half).
+    """
+
+    both: int
+    first_only: int
+    second_only: int
+    neither: int
+    p: float
+
+
+@dataclass(frozen=True)
+class LogScoreGain:
+    """Nats a run that the second method saves; positive: the second is better.
+
+    Attributes:
+        mean: Mean over all runs of first minus second [nats a run]; infinite where one method
+            alone ruled out a truth, NaN where each ruled out one that the other did not.
+        finite_mean: The same over the runs whose truth neither ruled out; NaN if there are none.
+        interval: 95 % bootstrap interval of `finite_mean` (percentiles; Efron 1979).
+        runs: Runs behind `finite_mean`.
+        first_impossible: Runs whose truth only the first method ruled out.
+        second_impossible: Runs whose truth only the second ruled out.
+        both_impossible: Runs whose truth both ruled out: no difference there.
+    """
+
+    mean: float
+    finite_mean: float
+    interval: tuple[float, float]
+    runs: int
+    first_impossible: int
+    second_impossible: int
+    both_impossible: int
+
+
+def mcnemar(first: BoolArray, second: BoolArray) -> McNemar:
+    """Compare which runs two methods got right.
+
+    Args:
+        first: Whether the first method was right, (run,).
+        second: The same of the second, on the same runs, (run,).
+
+    Raises:
+        InputError: If they do not have the same runs.
+    """
+    from scipy.stats import binomtest
+
+    _check_same_runs(first, second)
+    only = int((first & ~second).sum()), int((second & ~first).sum())
+    p = float(binomtest(only[0], sum(only)).pvalue) if sum(only) else 1.0
+    return McNemar(int((first & second).sum()), *only, int((~first & ~second).sum()), p)
+
+
+def log_score_gain(
+    first: FloatArray, second: FloatArray, rng: np.random.Generator, draws: int = RESAMPLES
+) -> LogScoreGain:
+    """Compare the log scores of two methods run by run.
+
+    Args:
+        first: Log score of each run by the first method, (run,) [nats]; may be infinite.
+        second: The same by the second method, on the same runs, (run,) [nats].
+        rng: Source of chance.
+        draws: Bootstrap samples.
+
+    Raises:
+        InputError: If they do not have the same runs.
+    """
+    _check_same_runs(first, second)
+    lost_first, lost_second = np.isinf(first), np.isinf(second)
+    with np.errstate(invalid="ignore"):  # infinities on both sides leave no mean
+        gain = np.where(lost_first & lost_second, 0.0, first - second)
+        mean = float(np.mean(gain))
+    finite = gain[~(lost_first | lost_second)]
+    return LogScoreGain(
+        mean=mean,
+        finite_mean=float(finite.mean()) if finite.size else float("nan"),
+        interval=_bootstrap_interval(finite, rng, draws),
+        runs=int(finite.size),
+        first_impossible=int((lost_first & ~lost_second).sum()),
+        second_impossible=int((lost_second & ~lost_first).sum()),
+        both_impossible=int((lost_first & lost_second).sum()),
+    )
+
+
+def _bootstrap_interval(
+    values: FloatArray, rng: np.random.Generator, draws: int
+) -> tuple[float, float]:
+    from scipy.stats import bootstrap
+
+    if values.size < 2:  # nothing to draw from
+        only = float(values[0]) if values.size else float("nan")
+        return only, only
+    found = bootstrap(
+        (values,),
+        np.mean,
+        n_resamples=draws,
+        batch=max(1, CHUNK // values.size),
+        method="percentile",
+        random_state=rng,
+    ).confidence_interval
+    return float(found.low), float(found.high)
+
+
+def _check_same_runs(first: BoolArray | FloatArray, second: BoolArray | FloatArray) -> None:
+    if first.shape != second.shape or first.ndim != 1 or first.size == 0:
+        raise InputError(
+            f"two methods are compared on the same runs; got {first.shape} and {second.shape}."
+        )

@@ -58,25 +58,13 @@ class Signals:
         return float((self.time[-1] - self.time[0]) / (len(self.time) - 1))
 
 
-def signals_of(runs: xr.Dataset) -> Signals:
-    """Return the signals of a run set; reads `command`, `measured` and `duration` alone."""
-    time = as_floats(runs["time"].values)
-    count = runs.sizes["run"]
-    duration = runs["duration"].values if "duration" in runs else np.full(count, time[-1])
-    return Signals(
-        time,
-        as_floats(runs["command"].values),
-        as_floats(runs["measured"].values),
-        as_floats(duration),
-    )
-
-
-def signals_of_table(table: RunTable) -> Signals:
-    """Return the signals of runs that have just been simulated."""
-    duration = table.duration
+def signals_of(runs: xr.Dataset | RunTable) -> Signals:
+    """Return the signals of runs; reads `time`, `command`, `measured` and `duration` alone."""
+    time, command = as_floats(runs.time), as_floats(runs.command)
+    duration = getattr(runs, "duration", None)
     if duration is None:
-        duration = np.full(len(table.run), table.time[-1])
-    return Signals(table.time, table.command, table.measured, duration)
+        duration = np.full(len(command), time[-1])
+    return Signals(time, command, as_floats(runs.measured), as_floats(duration))
 
 
 # The paper's two feature sets: every tenth of 1000 samples, over the first ten seconds.
@@ -303,7 +291,7 @@ Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Encoder:
+class FeatureEncoder:
     """Turns runs into arrays for a network.
 
     Attributes:
