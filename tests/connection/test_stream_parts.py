@@ -19,17 +19,18 @@ from failuretwin.connection.links.base import (
     Reading,
     StreamClock,
 )
-from failuretwin.connection.links.diagnostics import (
+from failuretwin.connection.links.live_events import ReorderBuffer
+from failuretwin.connection.links.ros_messages import (
     LEVEL_ERROR,
     LEVEL_OK,
     LEVEL_STALE,
     LEVEL_WARN,
-    Beat,
+    RateLimiter,
+    RosTopics,
     Status,
+    load_topics,
     statuses,
 )
-from failuretwin.connection.links.live_commands import Sequencer
-from failuretwin.connection.links.ros_messages import RosTopics, load_topics
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 
@@ -107,7 +108,7 @@ def test_without_events_the_stream_goes_on_by_our_own_clock():
 
 
 def test_commands_that_come_late_take_their_place():
-    sequencer = Sequencer(hold_s=2.0)
+    sequencer = ReorderBuffer(hold_s=2.0)
     for event in (reading(0.0), reading(1.0), reading(2.0), command(0.5), reading(3.0)):
         sequencer.add(event)
     assert [event.time for event in sequencer.ready(3.0)] == [0.0, 0.5, 1.0]
@@ -115,7 +116,7 @@ def test_commands_that_come_late_take_their_place():
 
 
 def test_a_command_goes_before_a_reading_of_its_time():
-    sequencer = Sequencer()
+    sequencer = ReorderBuffer()
     sequencer.add(reading(1.0))
     sequencer.add(command(1.0))
     assert [type(event) for event in sequencer.ready(1.0)] == [CommandSent, Reading]
@@ -182,7 +183,7 @@ def test_a_run_that_cannot_be_judged_is_a_warning():
 
 
 def test_reports_come_every_second_and_at_once_when_it_gets_worse():
-    beat = Beat()
+    beat = RateLimiter()
 
     def due(level, now_s):
         return beat.due([Status("arm", 0, "", {}), Status("motor_1", level, "", {})], now_s)

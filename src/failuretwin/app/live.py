@@ -21,15 +21,16 @@ from rich.text import Text
 
 from failuretwin.app.shadow import SILENCE_S, Change, Changes, Moment, Shadow
 from failuretwin.connection.links.base import LinkCounts, Pace, Sink, Source
-from failuretwin.connection.links.diagnostics import (
+from failuretwin.connection.links.ros_messages import (
     LEVEL_ERROR,
     LEVEL_NAMES,
     LEVEL_OK,
     LEVEL_STALE,
     LEVEL_WARN,
+    RosTopics,
+    load_topics,
     statuses,
 )
-from failuretwin.connection.links.ros_messages import RosTopics, load_topics
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.bags.messages import BagTopics
 from failuretwin.digital_model.calibrated_robot import load_calibration

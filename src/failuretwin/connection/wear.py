@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.connection.calibration.observations import Observations, stayed
+from failuretwin.connection.calibration.observations import Observations, lost_command
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model.nonidealities import Variation
 from failuretwin.digital_model.robot import Robot
@@ -63,7 +63,7 @@ def run_evidence(
     """
     wanted = observations[np.isin(observations.run, np.asarray(runs))]
     expected = wanted.target + settling.offset(robot, wanted.target, wanted.direction)
-    lost = stayed(wanted, robot, expected)
+    lost = lost_command(wanted, robot, expected)
     if wanted.position is None:
         error, design = _by_tool(wanted, robot, settling, expected)
         kept = np.asarray(~lost.any(axis=1, keepdims=True))
@@ -280,7 +280,7 @@ def information(axes: int, dof: float) -> float:
 
 # Have the latest runs changed as no wear does? Too fast, or too far from the calibration.
 
-FREE = 30.0
+WIDE_PRIOR = 30.0
 """How far a sudden change may go, a standard deviation in scatters: as good as anywhere."""
 CHANCE = 4.0
 """The latest runs may lie this many standard deviations off by chance."""
@@ -288,7 +288,7 @@ FEWEST = 5
 """Runs below which nothing is said of a sudden change."""
 
 
-def unlike_wear(
+def exceeds_wear_limits(
     window: Sequence[RunEvidence],
     references: Sequence[WearState],
     start: WearState,
@@ -345,7 +345,7 @@ def sudden_change(
     Returns:
         Difference to `state`, with the covariance that the scatter of the runs gives it.
     """
-    free = FREE * unit
+    free = WIDE_PRIOR * unit
     full = [run for run in window if run.error.size]
     if not full:
         return WearState(np.zeros_like(free), np.diag(free**2))

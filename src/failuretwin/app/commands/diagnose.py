@@ -89,7 +89,7 @@ def diagnose(
         print_scores,
         progress_bar,
     )
-    from failuretwin.connection.tracking import (
+    from failuretwin.connection.tracked_diagnosis import (
         diagnose_tracked,
         keep_history,
         open_history,

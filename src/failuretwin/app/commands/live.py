@@ -52,8 +52,8 @@ def watch(
     from failuretwin.app.shadow import Shadow
     from failuretwin.app.tables import console
     from failuretwin.connection.links.base import Pace
-    from failuretwin.connection.links.diagnostics import statuses
     from failuretwin.connection.links.recording import Recorder
+    from failuretwin.connection.links.ros_messages import statuses
     from failuretwin.decision.streaming.diagnoser import monitor
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot

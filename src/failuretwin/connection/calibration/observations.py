@@ -131,7 +131,7 @@ def _settled_position(
     return settled
 
 
-def follows_seen(observations: Observations) -> BoolArray:
+def has_known_origin(observations: Observations) -> BoolArray:
     """Return which movements follow one that was seen, or begin a run, (movement,).
 
     After an unseen movement it is not known where a motor came from.
@@ -142,7 +142,7 @@ def follows_seen(observations: Observations) -> BoolArray:
     return np.asarray(seen)
 
 
-def obeyed(observations: Observations, lost: BoolArray) -> Observations:
+def without_lost(observations: Observations, lost: BoolArray) -> Observations:
     """Return the observations with the origins of motors that had missed the command before.
 
     Args:
@@ -157,7 +157,7 @@ def obeyed(observations: Observations, lost: BoolArray) -> Observations:
     return replace(observations, origin=origin)
 
 
-def stayed(observations: Observations, robot: Robot, expected: FloatArray) -> BoolArray:
+def lost_command(observations: Observations, robot: Robot, expected: FloatArray) -> BoolArray:
     """Return which motors stayed where they were although told to move, (movement, motor).
 
     With readings each motor is looked at by itself; with the tool path alone, a set of motors
@@ -200,7 +200,7 @@ counts round off, ever heavier tails would fit ever better."""
 
 
 @dataclass(frozen=True)
-class SettledErrors:
+class SettlingRegression:
     """Settled errors as a linear model of bias, compliance and friction, with scatter.
 
     Attributes:
@@ -219,7 +219,7 @@ class SettledErrors:
     arrived: FloatArray
 
     def log_likelihood(self, parameters: FloatArray) -> float:
-        """Return the log likelihood of parameters as in `SettledFit.mode`.
+        """Return the log likelihood of parameters as in `SettlingPosterior.mode`.
 
         With the tool path alone, the logarithm of the tool sensor's noise [m] comes after them.
         """

@@ -25,15 +25,15 @@ from failuretwin.connection.links.base import (
     LinkCounts,
     Reading,
 )
+from failuretwin.connection.links.live_events import ReceiveBuffer
 from failuretwin.connection.links.ros1_import import Decoder, load_rospy, message_class
 from failuretwin.connection.links.ros_messages import (
     DIAGNOSTICS_TYPE,
-    Bulletin,
+    DiagnosticsPublisher,
     Outgoing,
     RosTopics,
     RosWriter,
 )
-from failuretwin.connection.links.ros_reading import Inbox
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.bags.messages import Role
 from failuretwin.digital_model.robot import Robot
@@ -182,7 +182,7 @@ class Ros1Source:
     ended = False
 
     def __init__(self, robot: Robot, topics: RosTopics, queue: EventQueue | None = None) -> None:
-        self._inbox = Inbox(robot, topics, queue)
+        self._inbox = ReceiveBuffer(robot, topics, queue)
         self._rospy = join()
         self._topics = topics
         self._decoder = Decoder()
@@ -329,7 +329,7 @@ class Ros1Diagnostics:
     name = "ROS 1 diagnostics"
 
     def __init__(self, robot: Robot, topics: RosTopics) -> None:
-        self._bulletin = Bulletin(robot, topics)
+        self._bulletin = DiagnosticsPublisher(robot, topics)
         self._publishers = _Publishers([(topics.diagnostics, DIAGNOSTICS_TYPE)])
 
     @property

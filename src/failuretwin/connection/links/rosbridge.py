@@ -8,13 +8,13 @@ from types import SimpleNamespace
 from typing import Any, Self
 
 from failuretwin.connection.links.base import Answer, Event, EventQueue, Item, LinkCounts
+from failuretwin.connection.links.live_events import ReceiveBuffer
 from failuretwin.connection.links.ros_messages import (
     DIAGNOSTICS_TYPE,
-    Bulletin,
+    DiagnosticsPublisher,
     RosTopics,
     kind_of_type,
 )
-from failuretwin.connection.links.ros_reading import Inbox
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.bags.messages import Kind, Role
 from failuretwin.digital_model.robot import Robot
@@ -84,7 +84,7 @@ class RosbridgeSource:
         names = [name for _, name, _ in topics.subscribed]
         self.name = f"rosbridge {ros.factory.url}: {', '.join(names)}"
         self._ros = ros
-        self._inbox = Inbox(robot, topics, queue)
+        self._inbox = ReceiveBuffer(robot, topics, queue)
         self._reconnects = -1
         self._topics = []
         self._count_connections(None)
@@ -135,7 +135,7 @@ class RosbridgeDiagnostics:
 
         self.name = f"rosbridge {ros.factory.url} diagnostics"
         self._ros = ros
-        self._bulletin = Bulletin(robot, topics)
+        self._bulletin = DiagnosticsPublisher(robot, topics)
         self._topic = roslibpy.Topic(ros, topics.diagnostics, DIAGNOSTICS_TYPE)
         self._topic.advertise()
 

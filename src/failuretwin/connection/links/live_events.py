@@ -1,20 +1,19 @@
-"""Messages of a live robot as readings and commands; what each field means is the bags' business.
-
-A message that makes no sense raises InputError; the link counts it and goes on.
-"""
+"""From what a live robot says to readings and commands in the order of their times."""
 
 from __future__ import annotations
 
+import heapq
 import time
+from bisect import insort
 from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import count
 from threading import Lock
 from typing import Any
 
 import numpy as np
 
 from failuretwin.connection.links.base import CommandSent, Event, EventQueue, LinkCounts, Reading
-from failuretwin.connection.links.live_commands import SampledCommands
-from failuretwin.connection.links.recording import motor_reading
 from failuretwin.connection.links.ros_messages import RosTopics
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
@@ -30,6 +29,175 @@ from failuretwin.data_knowledge.bags.messages import (
 from failuretwin.data_knowledge.bags.read import Track, motor_track
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
+
+# What was commanded, while a robot is at work.
+
+Corner = tuple[float, FloatArray]
+"""Time [s] and angles (motor,) [rad]."""
+
+
+@dataclass(frozen=True)
+class _Ramp:
+    """Straight lines of all motors from one pose to another."""
+
+    start: float
+    origin: FloatArray
+    target: FloatArray
+    duration: FloatArray
+
+    def at(self, time: float) -> FloatArray:
+        since = np.full_like(self.duration, time - self.start)
+        share = np.divide(since, self.duration, out=np.ones_like(since), where=self.duration > 0.0)
+        return np.asarray(self.origin + np.clip(share, 0.0, 1.0) * (self.target - self.origin))
+
+
+class LiveReference:
+    """Follows commands: where every motor's reference stands, and where its corners are.
+
+    A command that comes while another runs takes over from where the reference has come to. One
+    that is still to come is replaced by any that is sent for the same time or earlier.
+
+    Attributes:
+        late_s: The longest time by which a command came too late to begin when it should [s].
+    """
+
+    def __init__(self) -> None:
+        self.late_s = 0.0
+        self._ramp: _Ramp | None = None
+        self._pending: list[CommandSent] = []
+        self._known_until = -np.inf
+
+    def start_at(self, pose: FloatArray) -> None:
+        """Say where the arm stands before the first command, (motor,) [rad]; later: nothing."""
+        if self._ramp is None:
+            zero = np.zeros_like(pose)
+            self._ramp = _Ramp(-np.inf, pose, pose, zero)
+
+    def add(self, command: CommandSent) -> None:
+        """Take a command; its time may be now, to come, or a little in the past."""
+        self._pending = [one for one in self._pending if one.time < command.time]
+        insort(self._pending, command, key=lambda one: one.time)
+
+    def corners_to(self, time: float) -> list[Corner]:
+        """Return the corners since the last call, up to a time [s], and the reference then.
+
+        Nothing is returned before the first command or the first pose.
+        """
+        corners: list[Corner] = []
+        while self._pending and self._pending[0].time <= time:
+            self._begin(self._pending.pop(0), corners)
+        self._bends(time, corners)
+        if self._ramp is not None and time > self._known_until:
+            corners.append((time, self._ramp.at(time)))
+        self._known_until = max(self._known_until, time)
+        return corners
+
+    def _begin(self, command: CommandSent, corners: list[Corner]) -> None:
+        # What has been told cannot be taken back: a command that comes late starts late.
+        start = max(command.time, self._known_until)
+        self._bends(start, corners)
+        if self._ramp is None:
+            origin = command.target
+        else:
+            origin = self._ramp.at(start)
+            if start > self._known_until:
+                corners.append((start, origin))
+                self._known_until = start
+        lost = start - command.time
+        self.late_s = max(self.late_s, lost)
+        duration = np.maximum(command.duration - lost, 0.0)
+        self._ramp = _Ramp(start, origin, command.target, duration)
+
+    def _bends(self, time: float, corners: list[Corner]) -> None:
+        """Add the ends of the ramps that lie before a time [s]."""
+        if self._ramp is None:
+            return
+        for end in np.unique(self._ramp.start + self._ramp.duration):
+            if self._known_until < end < time:
+                corners.append((float(end), self._ramp.at(float(end))))
+                self._known_until = float(end)
+
+
+# Events in the order of their times, where commands may arrive later than readings.
+
+HELD_BACK = 10_000
+"""Events that are held back at most; beyond it the oldest go on without waiting."""
+
+
+class ReorderBuffer:
+    """Holds events back for a time, so that those that come late can take their place.
+
+    Args:
+        hold_s: How long an event waits for others [s]; 0: not at all.
+    """
+
+    def __init__(self, hold_s: float = 0.0) -> None:
+        self._hold_s = hold_s
+        self._waiting: list[tuple[float, bool, int, Event]] = []
+        self._number = count()
+
+    def add(self, event: Event) -> None:
+        """Take an event."""
+        entry = (event.time, not isinstance(event, CommandSent), next(self._number), event)
+        heapq.heappush(self._waiting, entry)
+
+    def ready(self, now: float) -> list[Event]:
+        """Return the events that have waited for long enough at a time [s] of the stream."""
+        events = []
+        while self._waiting and (
+            self._waiting[0][0] <= now - self._hold_s or len(self._waiting) > HELD_BACK
+        ):
+            events.append(heapq.heappop(self._waiting)[-1])
+        return events
+
+
+# Commands out of references that are only known as samples, as controllers stream them.
+
+STILL_RAD = 1e-9
+"""Samples closer than this are the same [rad]."""
+FIRST_S = 0.0
+"""Time that the first sample gives to get there [s]: it only says where the reference stands."""
+
+
+class SampledCommands:
+    """Turns samples of a reference into commands that draw the same line.
+
+    Between two samples the reference runs straight, which is known only when the second has come:
+    each command bears the time of the sample before it.
+    """
+
+    def __init__(self) -> None:
+        self._before: tuple[float, FloatArray] | None = None
+
+    def add(self, time: float, value: FloatArray) -> CommandSent | None:
+        """Return the command that a sample completes, None while the reference stands still.
+
+        Args:
+            time: Time of the sample [s].
+            value: The reference, (motor,) [rad].
+        """
+        before, self._before = self._before, (time, value)
+        if before is None:
+            return CommandSent(time, value, np.full(len(value), FIRST_S))
+        if time <= before[0] or np.abs(value - before[1]).max() < STILL_RAD:
+            return None
+        return CommandSent(before[0], value, np.full(len(value), time - before[0]))
+
+
+# Messages of a live robot as readings and commands; what each field means is the bags' business.
+
+
+def motor_reading(time: float, angle: FloatArray, twin: DigitalTwin) -> Reading:
+    """Return motor readings as the reading of a virtual tool sensor, as published.
+
+    Args:
+        time: By the robot's clock [s].
+        angle: (motor,) [rad], NaN where one is missing; then there is no tool position.
+        twin: Kinematics of the robot.
+    """
+    sound = bool(np.isfinite(angle).all())
+    return Reading(time, twin.path(angle) if sound else np.full(3, np.nan), angle)
+
 
 LARGEST_RAD = 100.0
 """Angles beyond this make no sense [rad]."""
@@ -139,7 +307,7 @@ Decode = Callable[[], tuple[Any, Kind]]
 """Returns a message as an object with the fields of its kind, and its kind."""
 
 
-class Inbox:
+class ReceiveBuffer:
     """Takes messages from any thread; what makes no sense is counted and left out.
 
     Args:
