@@ -11,12 +11,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.connection.calibration.observations import Observations, lost_command
+from failuretwin.connection.calibration.observations import (
+    LEAST_SCATTER_RAD,
+    Observations,
+    SettlingRegression,
+    lost_command,
+)
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model.nonidealities import Variation
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, largest_load
-from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.healthy_model import PATH_NOISE_M
 
 # What one run says of the wear of the motors: a linear model with unit scatter.
@@ -24,8 +28,6 @@ from failuretwin.inference.healthy_model import PATH_NOISE_M
 DECIMALS = 6
 """Errors and designs are rounded to this many decimals of the scatter: short in a file, and a run
 read back from it is the run that was written."""
-LEAST_SCATTER_RAD = 1e-5
-"""Scatter assumed of motors that are said to have none [rad]; no reading is as fine."""
 KEY_DIGITS = 16
 
 
@@ -63,49 +65,13 @@ def run_evidence(
     """
     wanted = observations[np.isin(observations.run, np.asarray(runs))]
     expected = wanted.target + settling.offset(robot, wanted.target, wanted.direction)
-    lost = lost_command(wanted, robot, expected)
+    kept = ~lost_command(wanted, robot, expected)
     if wanted.position is None:
-        error, design = _by_tool(wanted, robot, settling, expected)
-        kept = np.asarray(~lost.any(axis=1, keepdims=True))
-    else:
-        error, design = _by_readings(wanted, wanted.position, robot, settling)
-        kept = ~lost
+        kept = np.asarray(kept.all(axis=1, keepdims=True))
+    everywhere = np.ones_like(wanted.target)
+    regression = SettlingRegression.of(wanted, robot, everywhere, settling)
+    error, design = regression.whitened(settling, PATH_NOISE_M)
     return [_of_run(wanted, error, design, kept, run) for run in runs]
-
-
-def _by_tool(
-    seen: Observations, robot: Robot, settling: Settling, expected: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return white errors (movement, 1, axis) and designs (movement, 1, axis, 2 motor)."""
-    point, jacobian = DigitalTwin(robot).path_and_jacobian(expected)
-    short = np.asarray(settling.friction) * seen.direction
-    away = expected - seen.target + short
-    error = seen.point - point + np.einsum("iak,ik->ia", jacobian, away)
-    torque = robot.sense * robot.loads.torque(expected * robot.sense, settling.payload)
-    design = np.concatenate([jacobian, jacobian * torque[:, None]], axis=2)
-    scaled = jacobian * np.asarray(settling.scatter)
-    spread = np.einsum("iak,ibk->iab", scaled, scaled) + PATH_NOISE_M**2 * np.eye(3)
-    root = np.linalg.cholesky(spread)
-    white = np.linalg.solve(root, np.concatenate([error[..., None], design], axis=2))
-    return white[:, None, :, 0], white[:, None, :, 1:]
-
-
-def _by_readings(
-    seen: Observations, position: FloatArray, robot: Robot, settling: Settling
-) -> tuple[FloatArray, FloatArray]:
-    """Return white errors (movement, motor, 1) and designs (movement, motor, 1, 2 motor)."""
-    count = 0.0
-    if robot.profile.servo_units is not None:
-        count = abs(robot.servo_units.rad_per_count) / np.sqrt(12.0)
-    scale = np.sqrt(np.asarray(settling.scatter) ** 2 + count**2)
-    scale = np.maximum(scale, LEAST_SCATTER_RAD)
-    torque = robot.sense * robot.loads.torque(position * robot.sense, settling.payload)
-    error = position - seen.target + np.asarray(settling.friction) * seen.direction
-    unit = np.eye(position.shape[1])
-    design = np.concatenate(
-        [np.broadcast_to(unit, (len(seen), *unit.shape)), unit * torque[:, :, None]], axis=2
-    )
-    return (error / scale)[..., None], (design / scale[:, None])[:, :, None]
 
 
 def _of_run(

@@ -11,7 +11,7 @@ from scipy.special import gammaln, stdtr
 from failuretwin.core.numerics import log_student
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.digital_model.robot import Robot
-from failuretwin.digital_model.settling import largest_load
+from failuretwin.digital_model.settling import Settling, largest_load
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.evidence import SettledEvidence, settled_evidence
 
@@ -194,6 +194,8 @@ def lost_command(observations: Observations, robot: Robot, expected: FloatArray)
 
 ROUNDING = float(1.0 / np.sqrt(12.0))
 """Standard deviation of what whole numbers round off."""
+LEAST_SCATTER_RAD = 1e-5
+"""Scatter assumed of motors that are said to have none [rad]; no reading is as fine."""
 LEAST_DOF = 1.0
 """Degrees of freedom below which tails grow no heavier: where every error is far smaller than what
 counts round off, ever heavier tails would fit ever better."""
@@ -201,7 +203,10 @@ counts round off, ever heavier tails would fit ever better."""
 
 @dataclass(frozen=True)
 class SettlingRegression:
-    """Settled errors as a linear model of bias, compliance and friction, with scatter.
+    """Settled errors, linear in bias, compliance and friction, with the scatter of a Student t.
+
+    error = bias + compliance * torque - friction * direction + scatter of each motor; where the
+    tool alone was seen, the Jacobian times that.
 
     Attributes:
         error: Settled minus commanded: angles (movement, motor) [rad] or tool (movement, axis) [m].
@@ -217,6 +222,61 @@ class SettlingRegression:
     jacobian: FloatArray | None
     count: float
     arrived: FloatArray
+
+    @classmethod
+    def of(
+        cls, observations: Observations, robot: Robot, arrived: FloatArray, settling: Settling
+    ) -> SettlingRegression:
+        """Return the regression of settled movements.
+
+        Args:
+            observations: Settled movements.
+            robot: The robot.
+            arrived: How probable it is that each motor got its command, (movement, motor).
+            settling: Where motors settle as far as is known: where the tool alone was seen, the
+                model is made linear there. Its payload is in the torques.
+        """
+        twin, direction = DigitalTwin(robot), observations.direction
+        base = np.where(arrived > 0, observations.target, observations.origin)
+        jacobian = None
+        if observations.position is not None:
+            pose, error = observations.position, observations.position - observations.target
+        else:
+            pose = base + settling.offset(robot, base, direction)
+            point, jacobian = twin.path_and_jacobian(pose)
+            error = observations.point - point + np.einsum("iak,ik->ia", jacobian, pose - base)
+        torque = robot.sense * robot.loads.torque(pose * robot.sense, settling.payload)
+        design = np.stack([np.ones_like(torque), torque, -direction])
+        return cls(error, design, jacobian, count_of(robot), arrived)
+
+    def whitened(self, settling: Settling, noise: float) -> tuple[FloatArray, FloatArray]:
+        """Return errors and their slopes by bias and compliance in units of the scatter.
+
+        Friction is taken off. What scatters together as one Student t is a group: the three axes
+        of a tool position, or the reading of one motor.
+
+        Args:
+            settling: Friction and scatter.
+            noise: Of the tool sensor [m].
+
+        Returns:
+            Errors, (movement, group, axis), and slopes, (movement, group, axis, 2 motor).
+        """
+        bias, torque, against = self.design
+        friction = against * np.asarray(settling.friction)
+        if self.jacobian is None:
+            scale = np.hypot(settling.scatter, self.count * ROUNDING)
+            scale = np.maximum(scale, LEAST_SCATTER_RAD)
+            unit = np.eye(len(scale)) / scale[:, None]
+            slope = np.concatenate([unit * bias[:, None], unit * torque[:, None]], axis=2)
+            return ((self.error - friction) / scale)[..., None], slope[:, :, None]
+        error = self.error - np.einsum("iak,ik->ia", self.jacobian, friction)
+        slope = np.concatenate([self.jacobian, self.jacobian * torque[:, None]], axis=2)
+        scaled = self.jacobian * np.asarray(settling.scatter)
+        spread = np.einsum("iak,ibk->iab", scaled, scaled) + noise**2 * np.eye(3)
+        both = np.concatenate([error[..., None], slope], axis=2)
+        white = np.linalg.solve(np.linalg.cholesky(spread), both)
+        return white[:, None, :, 0], white[:, None, :, 1:]
 
     def log_likelihood(self, parameters: FloatArray) -> float:
         """Return the log likelihood of parameters as in `SettlingPosterior.mode`.

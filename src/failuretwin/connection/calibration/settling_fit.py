@@ -12,7 +12,6 @@ from failuretwin.connection.calibration.observations import (
     Observations,
     SettlingPrior,
     SettlingRegression,
-    count_of,
     has_known_origin,
     lost_command,
     rounding,
@@ -84,41 +83,12 @@ def settling_posterior(
     """
     of_motors = observations.position is not None
     prior = SettlingPrior.of(robot, payload, of_motors)
-    fit, start = None, prior.mean
+    settling, start = replace(Settling.ideal(len(robot.motors)), payload=payload), prior.mean
     for _ in range(1 if of_motors else POSE_ROUNDS):
-        problem = _problem(observations, robot, arrived, payload, fit)
+        problem = SettlingRegression.of(observations, robot, arrived, settling)
         fit, start = _mode(problem, prior, start)
-    assert fit is not None
+        settling = replace(fit.settling("fit"), payload=payload)
     return fit
-
-
-def _problem(
-    observations: Observations,
-    robot: Robot,
-    arrived: FloatArray,
-    payload: float,
-    fit: SettlingPosterior | None,
-) -> SettlingRegression:
-    twin = DigitalTwin(robot)
-    base = np.where(arrived > 0, observations.target, observations.origin)
-    jacobian = None
-    if observations.position is not None:
-        pose, error = observations.position, observations.position - observations.target
-    else:
-        pose = base
-        if fit is not None:
-            known = replace(fit.settling("fit"), payload=payload)
-            pose = base + known.offset(robot, base, observations.direction)
-        point, jacobian = twin.path_and_jacobian(pose)
-        error = observations.point - point + np.einsum("iak,ik->ia", jacobian, pose - base)
-    torque = robot.sense * robot.loads.torque(pose * robot.sense, payload)
-    return SettlingRegression(
-        error=error,
-        design=np.stack([np.ones_like(torque), torque, -observations.direction]),
-        jacobian=jacobian,
-        count=count_of(robot),
-        arrived=arrived,
-    )
 
 
 def _mode(
