@@ -152,7 +152,7 @@ class Shadow:
         now_s = time.monotonic()
         for sink in self._sinks:
             sink.put(event)
-        at = self._clock.place(event.time, now_s)
+        at = self._clock.to_stream_time(event.time, now_s)
         self._newest = max(self._newest, at)
         self._sequencer.add(replace(event, time=at))
         self._feed_all(self._newest)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -50,18 +49,17 @@ class Tracked:
     known: int
 
 
-def open_history(diagnoser: BayesDiagnoser, calibration: Path | None) -> History:
-    """Return the history of the calibration that a diagnoser uses.
+def open_history(diagnoser: BayesDiagnoser, calibration: Path) -> History:
+    """Return the history of a calibration.
+
+    Args:
+        diagnoser: A diagnoser that uses the calibration.
+        calibration: Its file, beside which the history is kept.
 
     Raises:
-        InputError: If no calibration is named, or its history cannot be used.
-        OutputError: If a history cannot be written beside it.
+        InputError: If the history cannot be used.
+        OutputError: If a history cannot be written there.
     """
-    if calibration is None:
-        raise InputError(
-            "--track keeps its history beside the calibration: name one (--calibration FILE; "
-            "`failuretwin calibrate` makes it)."
-        )
     path = history_path(calibration)
     check_writable(path)
     start = Tracker.of(diagnoser.healthy_model.imperfections, diagnoser.twin.robot)
@@ -109,38 +107,6 @@ def keep_history(tracked: Tracked) -> None:
     """
     if tracked.steps:
         append_history(tracked.history, tracked.steps)
-
-
-def tracking_line(tracked: Tracked) -> str:
-    """Return what the tracker did with the runs, in one line."""
-    outcomes = Counter(outcome for step in tracked.steps for _, outcome in step.outcomes)
-    parts = [
-        f"{outcomes['learned']} runs learned",
-        f"{outcomes['discarded'] + outcomes['frozen']} left out",
-        f"{sum(run.open for run in tracked.tracker.window)} waiting",
-    ]
-    if tracked.known:
-        parts.append(f"{tracked.known} known already")
-    told = f"tracked: {', '.join(parts)}"
-    if outcomes["learned"]:
-        told += f"; {_largest_changes(tracked)}"
-    if tracked.tracker.alarm:
-        told += f"; learning is stopped: {tracked.tracker.alarm}"
-    return f"{told}; history: {tracked.history.path}"
-
-
-def _largest_changes(tracked: Tracked) -> str:
-    """Return the largest changes of bias and of sag, with their deviations."""
-    before, after = tracked.history.tracker, tracked.tracker
-    moved = np.split(after.in_angle(after.state.mean - before.state.mean), 2)
-    doubt = np.split(after.in_angle(after.state.deviation), 2)
-    told = []
-    for kind, change, deviation in zip(("bias", "sag"), moved, doubt, strict=True):
-        worst = int(np.argmax(np.abs(change)))
-        degrees, error = np.rad2deg(change[worst]), np.rad2deg(deviation[worst])
-        motor = after.robot.motor_names[worst]
-        told.append(f"{kind} of {motor} {degrees:+.2f} deg (deviation {error:.2f})")
-    return f"largest changes: {', '.join(told)}"
 
 
 def _fault_probability(diagnosis: Diagnosis) -> float:

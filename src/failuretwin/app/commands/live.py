@@ -43,7 +43,8 @@ def watch(
     """Watch a robot as a digital shadow: it listens, says what is wrong, and moves nothing.
 
     SOURCE is `ros1`, `rosbridge://HOST[:PORT]`, `emulated` (a robot that exists only as physics),
-    or a log to replay: a raw session, a bag, a recording. On a ROS network the diagnosis is
+    a log to replay (a raw session, a bag, a recording), or a source of your own, MODULE:CLASS, made
+    as failuretwin.connection.links.base.Source says. On a ROS network the diagnosis is
     published on /diagnostics. Stop with Ctrl-C.
     """
     from contextlib import ExitStack

@@ -27,7 +27,7 @@ from failuretwin.connection.calibration.timing_fit import (
 from failuretwin.core.errors import InputError
 from failuretwin.core.numerics import log_student
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
-from failuretwin.digital_model.nonidealities import Range, Timing, generic_imperfections
+from failuretwin.digital_model.nonidealities import Timing, generic_imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, largest_load
 from failuretwin.digital_model.twin import DigitalTwin
@@ -425,15 +425,11 @@ def _motion(ramps: Transients, twin: DigitalTwin, timing: Timing) -> FloatArray:
         ramps.movements,
         ramps.time,
         twin,
-        _middle(timing.delay_s) * ones,
-        _middle(timing.ramp_shortening) * ones,
-        _middle(timing.lag_s),
+        float(np.mean(timing.delay_s)) * ones,
+        float(np.mean(timing.ramp_shortening)) * ones,
+        float(np.mean(timing.lag_s)),
     )
     return free + ramps.yielding
-
-
-def _middle(values: Range) -> float:
-    return 0.5 * (values[0] + values[1])
 
 
 def _typical(ramps: Transients, told: FloatArray) -> tuple[int, int] | None:

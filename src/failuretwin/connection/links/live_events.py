@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
 from threading import Lock
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -307,17 +307,20 @@ Decode = Callable[[], tuple[Any, Kind]]
 """Returns a message as an object with the fields of its kind, and its kind."""
 
 
-class ReceiveBuffer:
-    """Takes messages from any thread; what makes no sense is counted and left out.
+class NetworkSource:
+    """A source that messages come to from any thread; what makes no sense is counted and left out.
 
     Args:
         robot: The robot.
         topics: Its topics.
-        queue: Where events wait.
+        queue: Where events wait to be fetched; None: a queue of its own.
 
     Raises:
         InputError: If messages hold servo counts and the robot has none.
     """
+
+    ended = False
+    name = ""
 
     def __init__(self, robot: Robot, topics: RosTopics, queue: EventQueue | None) -> None:
         topics.check_fits(robot)
@@ -325,6 +328,19 @@ class ReceiveBuffer:
         self._readers = {role: RosReader(robot, role, topics) for role, _, _ in topics.subscribed}
         self._lock = Lock()
         self._garbage, self._last_garbage = 0, ""
+
+    @property
+    def reconnects(self) -> int:
+        """How often the far side went away and came back."""
+        return 0
+
+    @property
+    def counts(self) -> LinkCounts:
+        """What it has seen so far."""
+        queue, garbage = self._queue, self._garbage
+        return LinkCounts(
+            queue.received, garbage, queue.dropped, self.reconnects, self._last_garbage
+        )
 
     def take(self, role: Role, decode: Decode) -> None:
         """Take a message of the topic that has a role."""
@@ -346,12 +362,11 @@ class ReceiveBuffer:
         """Return the next event; None if none came within `timeout_s` [s]."""
         return self._queue.get(timeout_s)
 
-    def counts(self, reconnects: int) -> LinkCounts:
-        """Return what has come so far over a link that was renewed so many times."""
-        return LinkCounts(
-            self._queue.received,
-            self._garbage,
-            self._queue.dropped,
-            reconnects,
-            self._last_garbage,
-        )
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop listening."""
