@@ -213,19 +213,27 @@ def learn(state: WearState, evidence: RunEvidence, dof: float) -> WearState:
     size = evidence.error.size
     if size == 0:
         return state
-    axes = evidence.error.shape[1]
-    design, error = evidence.design.reshape(size, -1), evidence.error.reshape(size)
-    cross = state.covariance @ design.T
-    spread = design @ cross
-    innovation, mean = error - design @ state.mean, state.mean
+    axes, root = evidence.error.shape[1], _root(state)
+    design = evidence.design.reshape(size, -1)
+    off, scaled = evidence.error.reshape(size) - design @ state.mean, design @ root
+    prior, change = np.eye(len(root)), np.zeros(len(root))
     for _ in range(ROUNDS):
-        weight = weights((error - design @ mean).reshape(-1, axes), dof)
-        mean = state.mean + cross @ np.linalg.solve(spread + np.diag(1.0 / weight), innovation)
+        weight = weights((off - scaled @ change).reshape(-1, axes), dof)[:, None]
+        known = (scaled * weight).T @ scaled + prior
+        change = as_floats(np.linalg.solve(known, (scaled * weight).T @ off))
         if np.isinf(dof):
             break
-    known = np.eye(size) / information(axes, dof)
-    covariance = state.covariance - cross @ np.linalg.solve(spread + known, cross.T)
-    return WearState(mean, 0.5 * (covariance + covariance.T))
+    spread = np.linalg.inv(information(axes, dof) * scaled.T @ scaled + prior)
+    covariance = root @ spread @ root.T
+    return WearState(state.mean + root @ change, 0.5 * (covariance + covariance.T))
+
+
+def _root(state: WearState) -> FloatArray:
+    """Return a root R of the covariance R R^T; entries that are known exactly have none."""
+    size = state.deviation
+    unit = np.where(size > 0.0, size, 1.0)
+    share = state.covariance / np.outer(unit, unit) + np.diag(size == 0.0)
+    return as_floats(size[:, None] * np.linalg.cholesky(share))
 
 
 def weights(residual: FloatArray, dof: float) -> FloatArray:
@@ -311,21 +319,11 @@ def sudden_change(
     Returns:
         Difference to `state`, with the covariance that the scatter of the runs gives it.
     """
-    free = WIDE_PRIOR * unit
+    anywhere = WearState(state.mean, np.diag((WIDE_PRIOR * unit) ** 2))
     full = [run for run in window if run.error.size]
     if not full:
-        return WearState(np.zeros_like(free), np.diag(free**2))
-    error, design = (
-        np.concatenate([r.error for r in full]),
-        np.concatenate([r.design for r in full]),
-    )
-    axes = error.shape[1]
-    design = design.reshape(error.size, -1)
-    off, scaled = error.reshape(-1) - design @ state.mean, design * free
-    change = np.zeros_like(free)
-    for _ in range(ROUNDS):
-        weight = weights((off - scaled @ change).reshape(-1, axes), dof)[:, None]
-        known = (scaled * weight).T @ scaled + np.eye(len(free))
-        change = as_floats(np.linalg.solve(known, (scaled * weight).T @ off))
-    known = information(axes, dof) * scaled.T @ scaled + np.eye(len(free))
-    return WearState(change * free, np.linalg.inv(known) * np.outer(free, free))
+        return WearState(np.zeros_like(unit), anywhere.covariance)
+    error = np.concatenate([run.error for run in full])
+    together = RunEvidence("", "", error, np.concatenate([run.design for run in full]))
+    found = learn(anywhere, together, dof)
+    return WearState(found.mean - state.mean, found.covariance)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import gammaln, stdtr
@@ -56,17 +56,9 @@ class Observations:
 
     def __getitem__(self, kept: BoolArray | IntArray) -> Observations:
         """Return some of the movements."""
-        return Observations(
-            self.run[kept],
-            self.session[kept],
-            self.number[kept],
-            self.origin[kept],
-            self.target[kept],
-            self.point[kept],
-            None if self.position is None else self.position[kept],
-            self.sessions,
-            self.runs,
-        )
+        named = {f.name: getattr(self, f.name) for f in fields(self)}
+        each: dict[str, Any] = {n: v[kept] for n, v in named.items() if isinstance(v, np.ndarray)}
+        return replace(self, **each)
 
     def __len__(self) -> int:
         """Return the number of movements."""
