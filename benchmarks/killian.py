@@ -21,7 +21,7 @@ import numpy as np
 from killian_truth import TrueRun, read_list
 
 import failuretwin as ft
-from failuretwin.connection.calibrating import learn_robot
+from failuretwin.connection.calibration.calibrate import calibrate
 from failuretwin.core.hypothesis import Hypothesis, single_faults
 from failuretwin.decision.metrics import wilson_interval
 from failuretwin.decision.results import Record, score_line, score_records, write_json_lines
@@ -86,7 +86,7 @@ def with_own_calibration(
     results: dict[int, Record] = {}
     for judged in (faulty, *(healthy[k : k + 1] for k in range(len(healthy)))):
         learning = runs.isel(run=np.setdiff1d(healthy, judged))
-        found = learn_robot(learning, robot, "campaign", "healthy runs of the campaign", None)[0]
+        found = calibrate(learning, robot, "campaign", "healthy runs of the campaign")
         blind = runs.isel(run=judged).drop_vars("position")
         records = diagnose(blind, robot, found.imperfections, hypotheses)
         results |= dict(zip(judged.tolist(), records, strict=True))

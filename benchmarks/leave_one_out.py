@@ -20,7 +20,7 @@ import numpy as np
 
 import failuretwin as ft
 from failuretwin.app.plots import plot_runs
-from failuretwin.connection.calibrating import learn_robot
+from failuretwin.connection.calibration.calibrate import calibrate
 from failuretwin.connection.calibration.result import Calibration
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.data_knowledge.raw_sessions import find_sessions
@@ -96,8 +96,7 @@ def main() -> None:
 
 def _learn(sessions: tuple[Path, ...], robot: Robot) -> Calibration:
     runs = ft.read_runs(list(sessions), robot)
-    found, _ = learn_robot(runs, robot, "held out", "sessions that are not judged", None)
-    return found
+    return calibrate(runs, robot, "held out", "sessions that are not judged")
 
 
 def _diagnose(

@@ -22,7 +22,7 @@ from failuretwin.app.live import EmulationOptions, emulated_robot
 from failuretwin.app.shadow import Shadow
 from failuretwin.connection.emulated_arm import Emulation
 from failuretwin.connection.links.base import Pace
-from failuretwin.connection.links.diagnostics import SURE
+from failuretwin.connection.links.ros_messages import SURE
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.decision.streaming.diagnoser import monitor
 from failuretwin.digital_model.calibrated_robot import load_calibration

@@ -12,7 +12,7 @@ from failuretwin.app import shadow as shadow_module
 from failuretwin.app.live import View, watch_until_end
 from failuretwin.app.shadow import Changes, Shadow
 from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, LinkCounts, Reading
-from failuretwin.connection.links.live_commands import SampledCommands
+from failuretwin.connection.links.live_events import SampledCommands
 from failuretwin.connection.links.ros_messages import RosTopics
 from failuretwin.core.hypothesis import Diagnosis
 

@@ -9,7 +9,7 @@ from unittest import mock
 import numpy as np
 
 import failuretwin as ft
-from failuretwin.connection.calibration.calibrate import calibrate
+from failuretwin.connection.calibration.calibrate import fit_calibration
 from failuretwin.connection.calibration.observations import observe
 from failuretwin.connection.wear import run_evidence
 from failuretwin.connection.wear_tracker import Tracker
@@ -42,8 +42,8 @@ __all__ = [
     "StreamingFleet",
     "Tracker",
     "augmented_features",
-    "calibrate",
     "expected_log_bayes_factors",
+    "fit_calibration",
     "generic_imperfections",
     "load_run_set",
     "log_quality",

@@ -20,9 +20,14 @@ from failuretwin.app.calibration_tables import (
     verdict_line,
 )
 from failuretwin.app.plots import BLUE, GREY, RED, clean, environment, figure_class
-from failuretwin.connection.calibration.example_transient import ExampleRamp, example_ramp
+from failuretwin.connection.calibration.cross_validation import (
+    ExampleTransient,
+    Predictions,
+    example_transient,
+    predict,
+    settling_of,
+)
 from failuretwin.connection.calibration.result import Calibration, HeldOut
-from failuretwin.connection.calibration.validation import Predictions, predict, settling_of
 from failuretwin.core.runs import AXES
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.robot import Robot, shown_unit
@@ -153,7 +158,7 @@ def quantile_figure(seen: Predictions, dof: float, robot: Robot) -> Figure:
     return figure
 
 
-def ramp_figure(ramp: ExampleRamp, robot: Robot) -> Figure:
+def ramp_figure(ramp: ExampleTransient, robot: Robot) -> Figure:
     """Return one movement: command, twin before and after calibration, and readings."""
     names, scale, unit = channels(robot, ramp.of_motors)
     figure, panels = _panels(len(names), 3.2)
@@ -314,7 +319,7 @@ def _pictures(found: Calibration, runs: xr.Dataset, robot: Robot) -> Iterator[tu
                 "bias.",
             ),
         )
-    ramp = example_ramp(found, runs, robot)
+    ramp = example_transient(found, runs, robot)
     if ramp is not None:
         yield (
             "ramp",

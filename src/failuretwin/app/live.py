@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+import sys
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -20,16 +22,17 @@ from rich.table import Table
 from rich.text import Text
 
 from failuretwin.app.shadow import SILENCE_S, Change, Changes, Moment, Shadow
-from failuretwin.connection.links.base import LinkCounts, Pace, Sink, Source
-from failuretwin.connection.links.diagnostics import (
+from failuretwin.connection.links.base import LinkCounts, Pace, Sink, Source, source_from_text
+from failuretwin.connection.links.ros_messages import (
     LEVEL_ERROR,
     LEVEL_NAMES,
     LEVEL_OK,
     LEVEL_STALE,
     LEVEL_WARN,
+    RosTopics,
+    load_topics,
     statuses,
 )
-from failuretwin.connection.links.ros_messages import RosTopics, load_topics
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.bags.messages import BagTopics
 from failuretwin.digital_model.calibrated_robot import load_calibration
@@ -39,7 +42,12 @@ from failuretwin.failure_behavior.injection import ScheduledFault
 EMULATED, ROS1, ROSBRIDGE = "emulated", "ros1", "rosbridge"
 ROSBRIDGE_PORT = 9090
 """Where rosbridge servers listen unless told otherwise."""
-SOURCES = f"{EMULATED}, {ROS1}, {ROSBRIDGE}://HOST[:PORT], or a log (raw session, bag, .mcap)"
+SOURCES = (
+    f"{EMULATED}, {ROS1}, {ROSBRIDGE}://HOST[:PORT], a log (raw session, bag, .mcap), or a source "
+    "of your own, MODULE:CLASS"
+)
+OWN_CLASS = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(:.*)?")
+"""How the class of a source of one's own is named, see `source_from_text`."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +145,9 @@ def connect(
     from failuretwin.connection.links.recording import replay
 
     path = Path(text)
+    if OWN_CLASS.fullmatch(text) and not path.exists():
+        sys.path.insert(0, "")  # the user's module may lie in the folder that the user is in
+        return Connections(stack.enter_context(source_from_text(text, robot)))
     if not path.exists():
         raise InputError(f"source {text!r} does not exist. Expected {SOURCES}.")
     named = None if topics == RosTopics() else _bag_topics(topics)

@@ -23,8 +23,8 @@ from failuretwin.connection.links.base import (
     Source,
     StreamClock,
 )
-from failuretwin.connection.links.diagnostics import SURE, statuses
-from failuretwin.connection.links.live_commands import LiveReference, Sequencer
+from failuretwin.connection.links.live_events import LiveReference, ReorderBuffer
+from failuretwin.connection.links.ros_messages import SURE, statuses
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.twin import DigitalTwin
@@ -112,7 +112,7 @@ class Shadow:
         self._twin = twin
         self._sinks = sinks
         self._clock = StreamClock()
-        self._sequencer = Sequencer(commands_late_s)
+        self._sequencer = ReorderBuffer(commands_late_s)
         self._reference = LiveReference()
         self._read_s = -np.inf
         self._fed_s = time.monotonic()
@@ -152,7 +152,7 @@ class Shadow:
         now_s = time.monotonic()
         for sink in self._sinks:
             sink.put(event)
-        at = self._clock.place(event.time, now_s)
+        at = self._clock.to_stream_time(event.time, now_s)
         self._newest = max(self._newest, at)
         self._sequencer.add(replace(event, time=at))
         self._feed_all(self._newest)

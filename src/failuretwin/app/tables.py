@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -13,6 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from failuretwin.connection.tracked_diagnosis import Tracked
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.failure_modes import plain_name
@@ -309,3 +311,38 @@ def _unit(joint: UrdfJoint) -> str:
 
 def _with_unit(value: float | None, unit: str) -> str:
     return "?" if value is None or math.isnan(value) else f"{value:.4g} {unit}"
+
+
+# What a tracked diagnosis did.
+
+
+def tracking_line(tracked: Tracked) -> str:
+    """Return what the tracker did with the runs, in one line."""
+    outcomes = Counter(outcome for step in tracked.steps for _, outcome in step.outcomes)
+    parts = [
+        f"{outcomes['learned']} runs learned",
+        f"{outcomes['discarded'] + outcomes['frozen']} left out",
+        f"{sum(run.open for run in tracked.tracker.window)} waiting",
+    ]
+    if tracked.known:
+        parts.append(f"{tracked.known} known already")
+    told = f"tracked: {', '.join(parts)}"
+    if outcomes["learned"]:
+        told += f"; {_largest_changes(tracked)}"
+    if tracked.tracker.alarm:
+        told += f"; learning is stopped: {tracked.tracker.alarm}"
+    return f"{told}; history: {tracked.history.path}"
+
+
+def _largest_changes(tracked: Tracked) -> str:
+    """Return the largest changes of bias and of sag, with their deviations."""
+    before, after = tracked.history.tracker, tracked.tracker
+    moved = np.split(after.in_angle(after.state.mean - before.state.mean), 2)
+    doubt = np.split(after.in_angle(after.state.deviation), 2)
+    told = []
+    for kind, change, deviation in zip(("bias", "sag"), moved, doubt, strict=True):
+        worst = int(np.argmax(np.abs(change)))
+        degrees, error = np.rad2deg(change[worst]), np.rad2deg(deviation[worst])
+        motor = after.robot.motor_names[worst]
+        told.append(f"{kind} of {motor} {degrees:+.2f} deg (deviation {error:.2f})")
+    return f"largest changes: {', '.join(told)}"

@@ -41,7 +41,7 @@ def calibrate(
     del seed  # nothing here depends on chance
     from failuretwin.app.calibration_tables import beats_uncalibrated, print_calibration
     from failuretwin.app.inputs import learn_loops, read_inputs, split_step_tests, with_step_tests
-    from failuretwin.connection.calibrating import learn_robot
+    from failuretwin.connection.calibration.calibrate import calibrate as learn
     from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
     from failuretwin.digital_model.robot import load_robot
 
@@ -51,14 +51,14 @@ def calibrate(
     model = steps.robot
     runs = read_inputs(others, model, reading)
     source = ", ".join(str(log) for log in logs)
-    found, judged = learn_robot(runs, model, name or out.stem, source, hold_out)
+    found = learn(runs, model, name or out.stem, source, hold_out)
     found = with_step_tests(found, steps)
     if report is not None:
         from failuretwin.app.calibration_report import write_calibration_page
         from failuretwin.data_knowledge.store import filling
 
         with filling(report) as folder:
-            write_calibration_page(found, judged, model, folder)
+            write_calibration_page(found, runs, model, folder)
     save_calibration(found, model, out)
     print_calibration(found, model)
     click.echo(f"written to {out}")

@@ -89,13 +89,14 @@ def diagnose(
         print_lines,
         print_scores,
         progress_bar,
+        tracking_line,
     )
-    from failuretwin.connection.tracking import (
+    from failuretwin.connection.tracked_diagnosis import (
         diagnose_tracked,
         keep_history,
         open_history,
-        tracking_line,
     )
+    from failuretwin.core.errors import InputError
     from failuretwin.decision.results import write_csv, write_json_lines
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
@@ -118,7 +119,14 @@ def diagnose(
         "--onset": onset,
     }
     diagnoser = chosen_diagnoser(method, bayes, settings)
-    history = open_history(bayes, calibration) if track else None
+    history = None
+    if track:
+        if calibration is None:
+            raise InputError(
+                "--track keeps its history beside the calibration: name one (--calibration FILE; "
+                "`failuretwin calibrate` makes it)."
+            )
+        history = open_history(bayes, calibration)
     runs = read_inputs(inputs, model, reading)
     tell_mismatch(runs, expected_name(diagnoser, bayes))
     tracked = None

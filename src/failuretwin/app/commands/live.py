@@ -43,7 +43,8 @@ def watch(
     """Watch a robot as a digital shadow: it listens, says what is wrong, and moves nothing.
 
     SOURCE is `ros1`, `rosbridge://HOST[:PORT]`, `emulated` (a robot that exists only as physics),
-    or a log to replay: a raw session, a bag, a recording. On a ROS network the diagnosis is
+    a log to replay (a raw session, a bag, a recording), or a source of your own, MODULE:CLASS, made
+    as failuretwin.connection.links.base.Source says. On a ROS network the diagnosis is
     published on /diagnostics. Stop with Ctrl-C.
     """
     from contextlib import ExitStack
@@ -52,8 +53,8 @@ def watch(
     from failuretwin.app.shadow import Shadow
     from failuretwin.app.tables import console
     from failuretwin.connection.links.base import Pace
-    from failuretwin.connection.links.diagnostics import statuses
     from failuretwin.connection.links.recording import Recorder
+    from failuretwin.connection.links.ros_messages import statuses
     from failuretwin.decision.streaming.diagnoser import monitor
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot

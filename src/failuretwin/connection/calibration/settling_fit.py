@@ -10,13 +10,12 @@ import numpy as np
 from failuretwin.connection.calibration.observations import (
     TRAVEL_RAD,
     Observations,
-    SettledErrors,
     SettlingPrior,
-    count_of,
-    follows_seen,
-    obeyed,
+    SettlingRegression,
+    has_known_origin,
+    lost_command,
     rounding,
-    stayed,
+    without_lost,
 )
 from failuretwin.connection.calibration.result import LeftOut
 from failuretwin.core.errors import InputError
@@ -32,7 +31,7 @@ POSE_ROUNDS = 3
 
 
 @dataclass(frozen=True)
-class SettledFit:
+class SettlingPosterior:
     """Posterior of all settling parameters of a robot.
 
     Attributes:
@@ -71,9 +70,9 @@ class SettledFit:
         )
 
 
-def fit_settling(
+def settling_posterior(
     observations: Observations, robot: Robot, arrived: FloatArray, payload: float = 0.0
-) -> SettledFit:
+) -> SettlingPosterior:
     """Fit where the motors of a healthy robot settle.
 
     Args:
@@ -84,46 +83,17 @@ def fit_settling(
     """
     of_motors = observations.position is not None
     prior = SettlingPrior.of(robot, payload, of_motors)
-    fit, start = None, prior.mean
+    settling, start = replace(Settling.ideal(len(robot.motors)), payload=payload), prior.mean
     for _ in range(1 if of_motors else POSE_ROUNDS):
-        problem = _problem(observations, robot, arrived, payload, fit)
+        problem = SettlingRegression.of(observations, robot, arrived, settling)
         fit, start = _mode(problem, prior, start)
-    assert fit is not None
+        settling = replace(fit.settling("fit"), payload=payload)
     return fit
 
 
-def _problem(
-    observations: Observations,
-    robot: Robot,
-    arrived: FloatArray,
-    payload: float,
-    fit: SettledFit | None,
-) -> SettledErrors:
-    twin = DigitalTwin(robot)
-    base = np.where(arrived > 0, observations.target, observations.origin)
-    jacobian = None
-    if observations.position is not None:
-        pose, error = observations.position, observations.position - observations.target
-    else:
-        pose = base
-        if fit is not None:
-            known = replace(fit.settling("fit"), payload=payload)
-            pose = base + known.offset(robot, base, observations.direction)
-        point, jacobian = twin.path_and_jacobian(pose)
-        error = observations.point - point + np.einsum("iak,ik->ia", jacobian, pose - base)
-    torque = robot.sense * robot.loads.torque(pose * robot.sense, payload)
-    return SettledErrors(
-        error=error,
-        design=np.stack([np.ones_like(torque), torque, -observations.direction]),
-        jacobian=jacobian,
-        count=count_of(robot),
-        arrived=arrived,
-    )
-
-
 def _mode(
-    problem: SettledErrors, prior: SettlingPrior, start: FloatArray
-) -> tuple[SettledFit, FloatArray]:
+    problem: SettlingRegression, prior: SettlingPrior, start: FloatArray
+) -> tuple[SettlingPosterior, FloatArray]:
     """Return the posterior mode and its curvature, found in units of the prior deviations.
 
     The noise of a tool sensor belongs to no motor: it is averaged out of the fit, and only the
@@ -144,7 +114,9 @@ def _mode(
     covariance = inverse * np.outer(unit, unit)
     own = slice(4 * problem.design.shape[2] + 1)
     mode = found.x * unit
-    fit = SettledFit(mode[own], covariance[own, own], prior.deviation[own], -float(found.fun))
+    fit = SettlingPosterior(
+        mode[own], covariance[own, own], prior.deviation[own], -float(found.fun)
+    )
     return fit, mode
 
 
@@ -174,7 +146,7 @@ ROUNDS = 2
 
 
 @dataclass(frozen=True)
-class SettledPart:
+class SettlingFit:
     """Settled movements of healthy logs and what was learned from them.
 
     Attributes:
@@ -192,7 +164,7 @@ class SettledPart:
     odd: BoolArray
     fitted: BoolArray
     arrived: FloatArray
-    fit: SettledFit
+    fit: SettlingPosterior
     payload: float = 0.0
 
     @property
@@ -224,7 +196,7 @@ class SettledPart:
         return tuple(found)
 
 
-def fit_settled_part(observations: Observations, robot: Robot, payload: float = 0.0) -> SettledPart:
+def sort_and_fit(observations: Observations, robot: Robot, payload: float = 0.0) -> SettlingFit:
     """Sort settled movements and fit where motors settle.
 
     Args:
@@ -240,7 +212,7 @@ def fit_settled_part(observations: Observations, robot: Robot, payload: float = 
     for _ in range(ROUNDS):
         lost, odd = sort_movements(observations, robot, settling)
         kept = ~odd
-        known = follows_seen(observations[kept])
+        known = has_known_origin(observations[kept])
         if known.sum() >= FEWEST_MOVEMENTS:
             kept[kept] = known
         if kept.sum() < FEWEST_MOVEMENTS:
@@ -248,10 +220,10 @@ def fit_settled_part(observations: Observations, robot: Robot, payload: float = 
                 f"only {int(kept.sum())} of {len(kept)} movements come to rest near their targets, "
                 f"expected {FEWEST_MOVEMENTS} at least. Give longer logs of a healthy robot."
             )
-        observations = obeyed(commanded, lost)
+        observations = without_lost(commanded, lost)
         arrived = probably_arrived(observations, robot, lost, settling)
-        fit = fit_settling(observations[kept], robot, arrived[kept], payload)
-        part = SettledPart(observations, lost, odd, kept, arrived, fit, payload)
+        fit = settling_posterior(observations[kept], robot, arrived[kept], payload)
+        part = SettlingFit(observations, lost, odd, kept, arrived, fit, payload)
         settling = part.settling
     return part
 
@@ -268,7 +240,7 @@ def sort_movements(
     """
     target, direction = observations.target, observations.direction
     expected = target + settling.offset(robot, target, direction)
-    lost = stayed(observations, robot, expected)
+    lost = lost_command(observations, robot, expected)
     return lost, _odd(observations, robot, np.where(lost, observations.origin, expected))
 
 

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.connection.calibration.rates import Rate
-from failuretwin.connection.calibration.settling import SettledPart
+from failuretwin.connection.calibration.settling_fit import SettlingFit
 from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.runs import measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
@@ -302,20 +301,11 @@ def gap_starts(runs: xr.Dataset, movements: Movements, late: FloatArray) -> Floa
     return np.array(found)
 
 
-def glitch_rates(runs: xr.Dataset) -> list[Rate] | None:
-    """Return the share of spoilt readings of each motor; None where motors were not read."""
-    if "position" not in runs:
-        return None
-    finite = np.isfinite(as_floats(runs["position"].values))
-    rows = int(finite.any(axis=2).sum())
-    return [Rate(rows - int(finite[..., motor].sum()), rows) for motor in range(finite.shape[2])]
-
-
 def transients(
     runs: xr.Dataset,
     movements: Movements,
     late: Lateness,
-    part: SettledPart,
+    part: SettlingFit,
     settling: Settling,
     robot: Robot,
 ) -> Transients:
@@ -350,7 +340,7 @@ def transients(
 
 
 def _on_time(
-    movements: Movements, late: Lateness, part: SettledPart, time: FloatArray
+    movements: Movements, late: Lateness, part: SettlingFit, time: FloatArray
 ) -> BoolArray:
     """Return which times belong to a ramp that began on time at a known place, (run, time)."""
     on_time = _sound(movements, part) & late.punctual
@@ -362,7 +352,7 @@ def _on_time(
     return used
 
 
-def _sound(movements: Movements, part: SettledPart) -> BoolArray:
+def _sound(movements: Movements, part: SettlingFit) -> BoolArray:
     """Return which movements began and ended where the fit says, (run, movement)."""
     good, seen = np.zeros(movements.start.shape, dtype=bool), part.observations
     fine = ~part.odd & (part.arrived > 0.5).all(axis=1)

@@ -10,16 +10,24 @@ import numpy as np
 
 from failuretwin.connection.calibration.observations import Observations, observe, rounding
 from failuretwin.connection.calibration.result import Calibration, HeldOut
-from failuretwin.connection.calibration.settling import (
-    SettledPart,
-    fit_settled_part,
-    fit_settling,
+from failuretwin.connection.calibration.settling_fit import (
+    SettlingFit,
+    settling_posterior,
+    sort_and_fit,
     sort_movements,
+)
+from failuretwin.connection.calibration.timing_fit import (
+    AFTER_RAMP_S,
+    Transients,
+    lateness,
+    motion,
+    movements_of,
+    transients,
 )
 from failuretwin.core.errors import InputError
 from failuretwin.core.numerics import log_student
-from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.digital_model.nonidealities import generic_imperfections
+from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.digital_model.nonidealities import Timing, generic_imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, largest_load
 from failuretwin.digital_model.twin import DigitalTwin
@@ -32,7 +40,7 @@ TO_DEVIATION = 1.4826
 """Median absolute deviation to standard deviation of a normal distribution."""
 
 
-def held_out_sessions(
+def cross_validate(
     observations: Observations, robot: Robot, payload: float = 0.0
 ) -> tuple[HeldOut, ...]:
     """Return how well the other sessions predict each session; empty with one session alone."""
@@ -42,7 +50,7 @@ def held_out_sessions(
         if not inside.any() or inside.all():
             continue
         try:
-            others = fit_settled_part(observations[~inside], robot, payload)
+            others = sort_and_fit(observations[~inside], robot, payload)
         except InputError:
             continue  # what is left is too little to learn from
         found.append(judge(observations[inside], others, robot, observations.sessions[index]))
@@ -50,7 +58,7 @@ def held_out_sessions(
 
 
 def judge(
-    observations: Observations, others: SettledPart, robot: Robot, session: str
+    observations: Observations, others: SettlingFit, robot: Robot, session: str
 ) -> HeldOut | None:
     """Return how well a fit predicts settled movements that it has not seen.
 
@@ -76,8 +84,8 @@ def judge(
     return HeldOut(
         session=session,
         movements=int(kept.sum()),
-        before=tuple(typical_size(plain[kept]).tolist()),
-        after=tuple(typical_size(told[kept]).tolist()),
+        before=tuple(robust_scale(plain[kept]).tolist()),
+        after=tuple(robust_scale(told[kept]).tolist()),
         gain=float(gain.mean()),
         gain_error=float(gain.std(ddof=1) / np.sqrt(len(gain))),
     )
@@ -89,7 +97,7 @@ def _healthy(plain: FloatArray, observations: Observations) -> BoolArray:
     return np.asarray((np.abs(plain) < limit).all(axis=1))
 
 
-def typical_size(errors: FloatArray) -> FloatArray:
+def robust_scale(errors: FloatArray) -> FloatArray:
     """Return 1.48 times the median size of the errors in each column.
 
     It is taken about zero: a shift of the whole session is an error too.
@@ -210,7 +218,7 @@ def _expected_by_others(seen: Observations, robot: Robot, payload: float) -> Flo
     for group in range(groups):
         inside = seen.session % groups == group
         try:
-            others = fit_settled_part(seen[~inside], robot, payload)
+            others = sort_and_fit(seen[~inside], robot, payload)
         except InputError:
             return None
         pose[inside] = expected_pose(seen[inside], robot, others.settling)
@@ -255,7 +263,7 @@ PAYLOADS_KG = (0.02, 0.1, 0.5, 2.0)
 """Masses at the tool point that are tried [kg]."""
 
 
-def sense_remarks(part: SettledPart, robot: Robot) -> list[str]:
+def sense_remarks(part: SettlingFit, robot: Robot) -> list[str]:
     """Return what the logs say of each motor's sense, in sentences.
 
     A motor that turns the other way sags the other way; where gravity hardly loads it, nothing can
@@ -282,7 +290,7 @@ def sense_remarks(part: SettledPart, robot: Robot) -> list[str]:
 
 
 def _best_senses(
-    part: SettledPart, robot: Robot, loaded: Sequence[int]
+    part: SettlingFit, robot: Robot, loaded: Sequence[int]
 ) -> tuple[Robot, dict[int, float]]:
     """Return the robot with the senses that fit best, and how much worse each other way is [nats].
 
@@ -306,7 +314,7 @@ def _with_turned(robot: Robot, index: int) -> Robot:
     return replace(robot, profile=replace(robot.profile, motors=motors))
 
 
-def best_payload(part: SettledPart, robot: Robot) -> tuple[float, str]:
+def best_payload(part: SettlingFit, robot: Robot) -> tuple[float, str]:
     """Return the payload that the logs speak for [kg] and a sentence about it.
 
     Compliance can take up most of what a payload does, so it is 0 unless the logs are sure.
@@ -326,7 +334,118 @@ def best_payload(part: SettledPart, robot: Robot) -> tuple[float, str]:
     )
 
 
-def _refit(part: SettledPart, robot: Robot, payload: float) -> float:
+def _refit(part: SettlingFit, robot: Robot, payload: float) -> float:
     """Return the log posterior of another description on the very same movements."""
     seen, arrived = part.observations[part.fitted], part.arrived[part.fitted]
-    return fit_settling(seen, robot, arrived, payload).log_posterior
+    return settling_posterior(seen, robot, arrived, payload).log_posterior
+
+
+# One movement of the logs as an example: command, twin before and after calibration, readings.
+
+BEFORE_S, AFTER_S = 0.2, 0.5
+"""What is shown before a movement and after its ramp [s]."""
+
+
+@dataclass(frozen=True)
+class ExampleTransient:
+    """One movement; a channel is a motor [rad] or an axis of the tool [m].
+
+    Attributes:
+        run: Name of the run.
+        movement: Its number in the run, from 1.
+        time: Time since the command, (time,) [s].
+        command: What is asked for, (time, channel).
+        plain: What the uncalibrated twin does, (time, channel).
+        calibrated: What the calibrated twin does, (time, channel).
+        reading: What was read, (time, channel); NaN where nothing was.
+        of_motors: Whether channels are motors.
+    """
+
+    run: str
+    movement: int
+    time: FloatArray
+    command: FloatArray
+    plain: FloatArray
+    calibrated: FloatArray
+    reading: FloatArray
+    of_motors: bool
+
+
+def example_transient(
+    found: Calibration, runs: xr.Dataset, robot: Robot
+) -> ExampleTransient | None:
+    """Return the movement that the calibrated twin fits neither well nor badly, but typically.
+
+    It is taken from the longer half of the movements that began on time at a known place; None if
+    there are none.
+
+    Args:
+        found: The calibration.
+        runs: The runs it was learned from or judged on.
+        robot: The robot.
+    """
+    runs = trusted_runs(found, runs)
+    settling = settling_of(found, robot)
+    seen = observe(runs, use_readings=found.used_readings)
+    part = sort_and_fit(seen, robot, settling.payload)
+    movements = movements_of(runs)
+    # What is shown is the calibration, which may have seen fewer sessions than this fit.
+    ramps = transients(runs, movements, lateness(movements), part, settling, robot)
+    twin = DigitalTwin(robot)
+    told = _motion(ramps, twin, found.imperfections.timing)
+    if not ramps.of_motors:
+        told = twin.path(told)
+    chosen = _typical(ramps, told)
+    if chosen is None:
+        return None
+    run, movement = chosen
+    begin = float(ramps.movements.start[run, movement])
+    end = begin + float(np.nanmax(ramps.movements.ramp_duration[run, movement]))
+    shown = (ramps.time >= begin - BEFORE_S) & (ramps.time <= end + AFTER_S)
+    command = as_floats(runs["command"].values[run])
+    plain = twin.respond(command, ramps.time)
+    if not ramps.of_motors:
+        command, plain = twin.path(command), twin.path(plain)
+    return ExampleTransient(
+        run=str(runs["run"].values[run]),
+        movement=movement + 1,
+        time=ramps.time[shown] - begin,
+        command=command[shown],
+        plain=plain[shown],
+        calibrated=told[run][shown],
+        reading=ramps.reading[run][shown],
+        of_motors=ramps.of_motors,
+    )
+
+
+def _motion(ramps: Transients, twin: DigitalTwin, timing: Timing) -> FloatArray:
+    """Return how the typical calibrated robot makes the movements, (run, time, motor) [rad]."""
+    ones = np.ones(len(ramps.movements.start))
+    free = motion(
+        ramps.movements,
+        ramps.time,
+        twin,
+        float(np.mean(timing.delay_s)) * ones,
+        float(np.mean(timing.ramp_shortening)) * ones,
+        float(np.mean(timing.lag_s)),
+    )
+    return free + ramps.yielding
+
+
+def _typical(ramps: Transients, told: FloatArray) -> tuple[int, int] | None:
+    movements = ramps.movements
+    travel = np.abs(movements.target - movements.origin()).min(axis=-1)
+    found = []
+    for run, movement in np.argwhere(movements.exists):
+        begin = movements.start[run, movement]
+        end = begin + np.nanmax(movements.ramp_duration[run, movement]) + AFTER_RAMP_S
+        inside = ramps.used[run] & (ramps.time >= begin) & (ramps.time < end)
+        if inside.any():
+            off = (told[run] - ramps.reading[run])[inside]
+            misfit = float(np.sqrt(np.mean(off**2)))
+            found.append((float(travel[run, movement]), misfit, int(run), int(movement)))
+    if not found:
+        return None
+    longer = sorted(found)[len(found) // 2 :]
+    _, _, run, movement = sorted(longer, key=lambda entry: entry[1])[len(longer) // 2]
+    return run, movement

@@ -1,25 +1,135 @@
-"""The tracker's history beside the calibration: a line a run, from which it goes on exactly.
-
-Lines are only ever added, many at a time and in one write. Each holds all that is needed to go on
-from it, so whatever a killed writer leaves behind is a shorter history.
-"""
+"""Diagnosis that keeps up with wear: runs are diagnosed in their order, then the tracker learns."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from failuretwin.connection.wear import RunEvidence, WearState
-from failuretwin.connection.wear_tracker import DELAY, Step, Tracker, Waiting
+from failuretwin.connection.calibration.observations import observe, session_names
+from failuretwin.connection.calibration.timing_fit import movements_of
+from failuretwin.connection.wear import RunEvidence, WearState, run_evidence
+from failuretwin.connection.wear_tracker import DELAY, PendingRun, Step, Tracker
 from failuretwin.core.config import fingerprint
 from failuretwin.core.errors import InputError, OutputError
+from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.data_knowledge.store import check_writable
+from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.log_quality import drop_invalid, log_quality
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+BATCH = 10
+"""Runs diagnosed with the same tracked figures; the tracker learns later than that anyway."""
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """What a diagnosis with the tracker gave.
+
+    Attributes:
+        diagnoses: One for each run.
+        history: The history before.
+        steps: What the runs changed; runs that the history knew are not among them.
+        tracker: The tracker after them.
+        known: Number of runs that the history knew.
+    """
+
+    diagnoses: list[Diagnosis]
+    history: History
+    steps: tuple[Step, ...]
+    tracker: Tracker
+    known: int
+
+
+def open_history(diagnoser: BayesDiagnoser, calibration: Path) -> History:
+    """Return the history of a calibration.
+
+    Args:
+        diagnoser: A diagnoser that uses the calibration.
+        calibration: Its file, beside which the history is kept.
+
+    Raises:
+        InputError: If the history cannot be used.
+        OutputError: If a history cannot be written there.
+    """
+    path = history_path(calibration)
+    check_writable(path)
+    start = Tracker.of(diagnoser.healthy_model.imperfections, diagnoser.twin.robot)
+    return read_history(path, start)
+
+
+def diagnose_tracked(
+    runs: xr.Dataset,
+    diagnoser: BayesDiagnoser,
+    history: History,
+    advance: Callable[[int], None] = lambda done: None,
+) -> Tracked:
+    """Diagnose runs in their order while the tracker follows the robot; writes nothing.
+
+    Args:
+        runs: The runs, oldest first.
+        diagnoser: How to diagnose; its imperfections are those of the calibration.
+        history: What the tracker has seen before.
+        advance: Called with the number of runs just diagnosed.
+    """
+    tracker, steps, known = history.tracker, list[Step](), set(history.keys)
+    seen = observe(drop_invalid(runs, log_quality(runs)))
+    found: list[Diagnosis] = []
+    for batch in _batches(runs):
+        now = replace(diagnoser, imperfections=tracker.imperfections)
+        told = now.diagnose(runs.isel(run=batch))
+        said = run_evidence(seen, diagnoser.twin.robot, tracker.tracked_settling, batch)
+        for diagnosis, evidence in zip(told, said, strict=True):
+            if evidence.key in known:
+                continue
+            known.add(evidence.key)
+            tracker, step = tracker.follow(evidence, _fault_probability(diagnosis))
+            steps.append(step)
+        found += told
+        advance(len(batch))
+    repeated = runs.sizes["run"] - len(steps)
+    return Tracked(found, history, tuple(steps), tracker, repeated)
+
+
+def keep_history(tracked: Tracked) -> None:
+    """Add the runs of a diagnosis to the history on disk.
+
+    Raises:
+        OutputError: If that fails; the history is as before.
+    """
+    if tracked.steps:
+        append_history(tracked.history, tracked.steps)
+
+
+def _fault_probability(diagnosis: Diagnosis) -> float:
+    """Return the probability that a run is faulty; NaN where there is no verdict."""
+    return np.nan if diagnosis.undecided else 1.0 - diagnosis.posterior["healthy"]
+
+
+def _batches(runs: xr.Dataset) -> Iterator[list[int]]:
+    """Yield the runs in their order, some of one session at a time, with a movement among them."""
+    sessions, moves = session_names(runs), np.asarray(movements_of(runs).exists.any(axis=1))
+    moving = np.flatnonzero(moves)
+    last = int(moving[-1]) if len(moving) else -1
+    batch: list[int] = []
+    for run, session in enumerate(sessions):
+        full = len(batch) >= BATCH or (batch and sessions[batch[-1]] != session)
+        if full and moves[batch].any() and run <= last:
+            yield batch
+            batch = []
+        batch.append(run)
+    yield batch
+
+
+# The tracker's history beside the calibration: a line a run, from which it goes on exactly.
 
 # Steps of the tracker as lines of JSON. Floats keep all their digits, so nothing is lost.
 
@@ -34,9 +144,9 @@ def row_of(step: Step) -> dict[str, Any]:
         "run": step.evidence.run,
         "key": step.evidence.key,
         "probability_faulty": None if np.isnan(step.fault_probability) else step.fault_probability,
-        "level": step.level,
+        "level": step.cusum,
         "alarm": step.alarm,
-        "fates": [list(fate) for fate in step.fates],
+        "fates": [list(outcome) for outcome in step.outcomes],
         "learned_at": step.learned_at,
         "bias": bias.tolist(),
         "bias_deviation": bias_deviation.tolist(),
@@ -67,9 +177,9 @@ def step_of(line: str, where: str) -> Step:
             number=int(row["number"]),
             evidence=RunEvidence(str(row["run"]), str(row["key"]), error, design),
             fault_probability=float("nan") if chance is None else float(chance),
-            level=float(row["level"]),
+            cusum=float(row["level"]),
             alarm=str(row["alarm"]),
-            fates=tuple((int(number), fate) for number, fate in row["fates"]),
+            outcomes=tuple((int(number), outcome) for number, outcome in row["fates"]),
             learned_at=int(row["learned_at"]),
             state=WearState(mean, _symmetric(as_floats(row["covariance"]), len(mean))),
         )
@@ -226,17 +336,17 @@ def _resumed(start: Tracker, steps: Sequence[Step]) -> Tracker:
     if not steps:
         return start
     last = steps[-1]
-    decided = {number for step in steps[-DELAY:] for number, _ in step.fates}
+    decided = {number for step in steps[-DELAY:] for number, _ in step.outcomes}
     snapshots = [step.state for step in steps if step.number % DELAY == 0]
     return replace(
         start,
         state=last.state,
         window=tuple(
-            Waiting(step.number, step.evidence, step.number not in decided)
+            PendingRun(step.number, step.evidence, step.number not in decided)
             for step in steps[-DELAY:]
         ),
         past=tuple(snapshots[-(start.limits.horizon // DELAY) :]),
-        level=last.level,
+        cusum=last.cusum,
         arrived=last.number,
         learned_at=last.learned_at,
         alarm=last.alarm,
