@@ -13,18 +13,21 @@ import pytest
 from click.testing import CliRunner
 
 from failuretwin.app.cli import cli
-from failuretwin.app.study.page import TABLE_2, TABLE_3, class_ratios, mean_confusion, spread_of
-from failuretwin.app.study.study import PLAN_FILE, WORK, check_folder, run_study
-from failuretwin.app.study.trainings import (
+from failuretwin.app.study import (
     FEATURES,
+    PLAN_FILE,
+    WORK,
     Checkpoint,
     Exam,
     Job,
     StudyPlan,
     Training,
+    check_folder,
     quick_plan,
+    run_study,
     stand_in_test_set,
 )
+from failuretwin.app.study_page import TABLE_2, TABLE_3, class_ratios, mean_confusion, spread_of
 from failuretwin.core.errors import InputError
 
 TINY = StudyPlan(0, 3, (2, 4), 1, 1)

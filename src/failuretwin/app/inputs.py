@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
 
-TOLD_ERROR_M = 1e-6
+REPORTED_ERROR_M = 1e-6
 """Error of recovered commands that the user is told of [m]; exact ones are below 1e-9."""
 
 
@@ -51,7 +51,7 @@ def read_inputs(
         options = _with_map(options, reading.columns, sources, robot)
     runs = read_runs(list(sources), robot, options)
     error = float(runs.attrs.get(RECOVERY_ERROR, 0.0))
-    if error > TOLD_ERROR_M:
+    if error > REPORTED_ERROR_M:
         click.echo(
             f"note: approximate commands miss the desired path by up to {1000 * error:.1f} mm "
             f"(worst: {runs.attrs[RECOVERY_WORST]}); a diagnosis can be no better than that",
@@ -60,7 +60,7 @@ def read_inputs(
     return runs
 
 
-def tell_mismatch(runs: xr.Dataset, expected: str) -> None:
+def warn_mismatch(runs: xr.Dataset, expected: str) -> None:
     """Tell the user where simulated runs lack the imperfections that a diagnoser expects.
 
     Args:
@@ -138,7 +138,7 @@ BLEND = f"{BAYES}+"
 """What stands before the file of a network that is blended with it."""
 
 
-def told_hypotheses(text: str | None, robot: Robot) -> tuple[Hypothesis, ...] | None:
+def parse_cli_hypotheses(text: str | None, robot: Robot) -> tuple[Hypothesis, ...] | None:
     """Return the hypotheses that the user names; None where none are named.
 
     Args:

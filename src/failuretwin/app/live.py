@@ -19,7 +19,8 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from failuretwin.app.shadow import SILENCE_S, Change, Changes, Moment, Shadow
+from failuretwin.app.commands.options import LiveOptions
+from failuretwin.app.shadow import SILENCE_S, Change, Changes, Shadow, Snapshot
 from failuretwin.connection.links.base import LinkCounts, Pace, Sink, Source
 from failuretwin.connection.links.diagnostics import (
     LEVEL_ERROR,
@@ -42,32 +43,17 @@ ROSBRIDGE_PORT = 9090
 SOURCES = f"{EMULATED}, {ROS1}, {ROSBRIDGE}://HOST[:PORT], or a log (raw session, bag, .mcap)"
 
 
-@dataclass(frozen=True)
-class EmulationOptions:
-    """What the command line says of an emulated robot.
-
-    Attributes:
-        faults: Faults in text form, such as ``motor_3:stuck@40-80``.
-        imperfections: Name or file; None: those of the robot's profile, if any.
-        duration_s: How long it works [s]; infinity: until it is interrupted.
-        seed: Seed of all chance.
-    """
-
-    faults: Sequence[str] = ()
-    imperfections: str | None = None
-    duration_s: float = math.inf
-    seed: int = 0
-
-
 def emulated_robot(
-    robot: Robot, options: EmulationOptions, pace: Pace, zero_s: float = 0.0
+    robot: Robot, live: LiveOptions, seed: int, pace: Pace, duration_s: float, zero_s: float = 0.0
 ) -> Source:
     """Return an emulated robot as a source.
 
     Args:
         robot: The robot.
-        options: What the command line says of it.
+        live: What the command line says of it.
+        seed: Seed of all chance.
         pace: How fast its time passes.
+        duration_s: How long it works [s].
         zero_s: What its clock says at the start [s].
     """
     from failuretwin.connection.emulated_arm import Emulation, emulated
@@ -75,11 +61,16 @@ def emulated_robot(
     own = "none" if robot.imperfections_file is None else robot.name
     emulation = Emulation(
         robot=robot,
-        imperfections=load_imperfections(options.imperfections or own, robot),
-        schedule=tuple(ScheduledFault.parse(text, robot.motor_names) for text in options.faults),
-        seed=options.seed,
+        imperfections=load_imperfections(live.imperfections or own, robot),
+        schedule=schedule_of(live, robot),
+        seed=seed,
     )
-    return emulated(emulation, pace, options.duration_s, zero_s)
+    return emulated(emulation, pace, duration_s, zero_s)
+
+
+def schedule_of(live: LiveOptions, robot: Robot) -> tuple[ScheduledFault, ...]:
+    """Return the faults of an emulated robot."""
+    return tuple(ScheduledFault.parse(text, robot.motor_names) for text in live.faults)
 
 
 def topics_of(path: Path | None) -> RosTopics:
@@ -100,31 +91,25 @@ class Connections:
     sinks: tuple[Sink, ...] = ()
 
 
-def connect(
-    text: str,
-    robot: Robot,
-    topics: RosTopics,
-    emulation: EmulationOptions,
-    pace: Pace,
-    stack: ExitStack,
-) -> Connections:
+def connect(text: str, robot: Robot, live: LiveOptions, seed: int, stack: ExitStack) -> Connections:
     """Return what a SOURCE on the command line stands for.
 
     Args:
         text: One of `SOURCES`.
         robot: The robot.
-        topics: Its topics on a network.
-        emulation: What an emulated robot is like.
-        pace: How fast time passes in logs and emulation.
+        live: Its topics on a network, what an emulated robot is like, and the pace of time.
+        seed: Seed of all chance of an emulated robot.
         stack: Closes everything in the end.
 
     Raises:
         InputError: If it does not exist, cannot be reached, is none of these, or is told what only
             an emulated robot does.
     """
+    topics, pace = topics_of(live.topics), Pace(live.speed)
     if text == EMULATED:
-        return Connections(stack.enter_context(emulated_robot(robot, emulation, pace)))
-    if emulation.faults or emulation.imperfections:
+        source = emulated_robot(robot, live, seed, pace, live.duration or math.inf)
+        return Connections(stack.enter_context(source))
+    if live.faults or live.imperfections:
         raise InputError(
             f"--fault and --imperfections are of an emulated robot, but the source is {text!r}. "
             f"Leave them out, or watch {EMULATED!r}."
@@ -205,56 +190,58 @@ class View:
         self._history: deque[dict[str, float]] = deque(maxlen=COLUMNS)
         self._next_s = -np.inf
 
-    def remember(self, moment: Moment) -> None:
-        """Take a moment into the posterior over time; time without any is a gap."""
-        now_s = moment.stream_time
+    def remember(self, snapshot: Snapshot) -> None:
+        """Take a snapshot into the posterior over time; time without any is a gap."""
+        now_s = snapshot.stream_time
         if now_s < self._next_s:
             return
         if np.isfinite(self._next_s):
             missing = int((now_s - self._next_s) / COLUMN_S)
             self._history.extend([{}] * min(missing, COLUMNS))
         self._next_s = now_s + COLUMN_S
-        diagnosis, stale = moment.answer.diagnosis, moment.answer.state != "OK"
+        diagnosis, stale = snapshot.answer.diagnosis, snapshot.answer.state != "OK"
         known = diagnosis is not None and not stale
         self._history.append(dict(diagnosis.posterior) if known and diagnosis else {})
 
-    def draw(self, moment: Moment, counts: LinkCounts, changes: Sequence[Change]) -> RenderableType:
-        """Return the view of a moment.
+    def draw(
+        self, snapshot: Snapshot, counts: LinkCounts, changes: Sequence[Change]
+    ) -> RenderableType:
+        """Return the view of what is known now.
 
         Args:
-            moment: What the shadow knows.
+            snapshot: What the shadow knows.
             counts: What the link has seen.
             changes: What has changed so far, the newest last.
         """
         lines = [Text(str(change)) for change in list(changes)[-SHOWN_CHANGES:]]
         return Group(
-            self._head(moment, counts),
-            self._motor_table(moment),
+            self._head(snapshot, counts),
+            self._motor_table(snapshot),
             Panel(self._posterior(), title=f"posterior, last {COLUMNS} s", title_align="left"),
             Panel(Group(*lines), title="what changed", title_align="left"),
         )
 
-    def _head(self, moment: Moment, counts: LinkCounts) -> Text:
-        arm = statuses(moment.answer, self._motors)[0]
+    def _head(self, snapshot: Snapshot, counts: LinkCounts) -> Text:
+        arm = statuses(snapshot.answer, self._motors)[0]
         head = Text(f"{LEVEL_NAMES[arm.level]:6s}", STYLES[arm.level])
         head.append(f" {arm.message}\n", "default")
-        off = float(np.linalg.norm(moment.residual)) * 1000.0
+        off = float(np.linalg.norm(snapshot.residual)) * 1000.0
         share = 0.0 if np.isnan(off) else min(1.0, off / RESIDUAL_MM)
         said = "no reading" if np.isnan(off) else f"{off:5.1f} mm off the reference"
         head.append(
-            f"{self._source}  {moment.stream_time:.1f} s  {counts.received} events, "
+            f"{self._source}  {snapshot.stream_time:.1f} s  {counts.received} events, "
             f"{counts.garbage} garbage, {counts.dropped} dropped, {counts.reconnects} reconnects, "
-            f"{1000 * moment.seconds:.1f} ms a sample\n",
+            f"{1000 * snapshot.seconds:.1f} ms a sample\n",
             "dim",
         )
         head.append(f"tool   {_bar(share)} {said}", "default")
         return head
 
-    def _motor_table(self, moment: Moment) -> Table:
+    def _motor_table(self, snapshot: Snapshot) -> Table:
         table = Table(box=None, pad_edge=False)
         for name in ("motor", "state", "faulty", "", "how"):
             table.add_column(name)
-        for status in statuses(moment.answer, self._motors)[1:]:
+        for status in statuses(snapshot.answer, self._motors)[1:]:
             probability = float(status.values.get("probability", 0.0))
             table.add_row(
                 status.name,
@@ -330,14 +317,14 @@ def watch_until_end(
         while going:
             going = shadow.step(POLL_S) and time.monotonic() < until_s
             troubles = _troubles(shadow, source, sinks, time.monotonic() - begun_s)
-            found = changes.notice(shadow.moment, source.counts, shadow.clock_jumps, troubles)
+            found = changes.notice(shadow.snapshot, source.counts, shadow.clock_jumps, troubles)
             if shown is None:
                 _print(found)
                 continue
-            view.remember(shadow.moment)
+            view.remember(shadow.snapshot)
             if not going or time.monotonic() >= drawn_s + REFRESH_S:
                 drawn_s = time.monotonic()
-                picture = view.draw(shadow.moment, source.counts, changes.lines)
+                picture = view.draw(shadow.snapshot, source.counts, changes.lines)
                 shown.update(picture, refresh=True)
     return changes
 

@@ -1,4 +1,4 @@
-"""Pictures of diagnosed runs that a technician understands. Needs the extra `plots`."""
+"""Pictures and the page of diagnosed runs, and what all pages share. Needs the extra `plots`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import base64
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,14 +19,12 @@ from failuretwin.core.runs import AXES, unique_names
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.failure_modes import plain_name
 from failuretwin.data_knowledge.store import filling
-from failuretwin.decision.evaluation import Evaluation
+from failuretwin.decision.evaluation import Evaluation, Judged, as_unknown_line, score_line
 from failuretwin.decision.metrics import Reliability, Share, judged_truth
-from failuretwin.decision.results import as_unknown_line, score_line
 from failuretwin.digital_model.twin import DigitalTwin
 
 if TYPE_CHECKING:
     import xarray as xr
-    from jinja2 import Environment
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -49,6 +47,13 @@ def figure_class() -> Any:
             f"pictures need matplotlib ({error}). Install it: pip install 'failuretwin[plots]'."
         ) from error
     return Figure
+
+
+def png(figure: Figure) -> str:
+    """Return a figure as a PNG file in base64, as pages hold it."""
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=130)
+    return base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
 def plot_runs(
@@ -80,7 +85,7 @@ def plot_runs(
 def run_figure(
     time: FloatArray, desired: FloatArray, measured: FloatArray, diagnosis: Diagnosis
 ) -> Figure:
-    """Return the picture of one run.
+    """Return the picture of one run: each axis, the distance, and the posterior.
 
     Args:
         time: (time,) [s].
@@ -91,17 +96,24 @@ def run_figure(
     figure = figure_class()(figsize=(11.0, 6.2), layout="constrained")
     seen = np.asarray(np.isfinite(measured).all(axis=1))
     shown = slice(0, len(time) - int(np.argmax(seen[::-1])) if seen.any() else len(time))
-    time, desired, measured, seen = time[shown], desired[shown], measured[shown], seen[shown]
+    time, desired, measured = time[shown], MM_PER_M * desired[shown], MM_PER_M * measured[shown]
+    dense = seen[shown].mean() > 0.95
+    style = {"ls": "-", "lw": 1.2} if dense else {"ls": "none", "marker": ".", "ms": 4}
     grid = figure.add_gridspec(4, 2, width_ratios=[2.1, 1.0])
-    style = {"ls": "-", "lw": 1.2} if seen.mean() > 0.95 else {"ls": "none", "marker": ".", "ms": 4}
-    for row, axis in enumerate(AXES):
-        panel = figure.add_subplot(grid[row, 0])
-        _plot_axis(panel, axis, time, desired[:, row], measured[:, row], style)
-        if row == 0:
-            panel.legend(
-                loc="lower right", bbox_to_anchor=(1.0, 0.98), fontsize=8, ncols=2, frameon=False
-            )
-    _plot_residual(figure.add_subplot(grid[3, 0]), time, desired, measured, diagnosis, style)
+    panels = [figure.add_subplot(grid[row, 0]) for row in range(4)]
+    for row, (panel, axis) in enumerate(zip(panels, AXES, strict=False)):
+        panel.plot(time, desired[:, row], color=GREY, lw=2.0, label="commanded")
+        panel.plot(time, measured[:, row], color=BLUE, label="measured", **style)
+        panel.set_ylabel(f"tool {axis} [mm]")
+        panel.tick_params(labelbottom=False)
+    panels[0].legend(
+        loc="lower right", bbox_to_anchor=(1.0, 0.98), fontsize=8, ncols=2, frameon=False
+    )
+    panels[3].plot(time, np.linalg.norm(measured - desired, axis=1), color=RED, **style)
+    _mark_onset(panels[3], diagnosis.onset_s)
+    for panel in panels:
+        panel.set_xlim(-0.02 * time[-1], 1.02 * time[-1])
+        clean(panel)
     _plot_posterior(figure.add_subplot(grid[:, 1]), diagnosis)
     truth = "" if diagnosis.truth is None else f"\n(truth: {_plain(diagnosis.truth)})"
     title = textwrap.fill(diagnosis.verdict, TITLE_COLUMNS) + truth
@@ -109,45 +121,14 @@ def run_figure(
     return figure
 
 
-def _plot_axis(
-    panel: Axes,
-    axis: str,
-    time: FloatArray,
-    desired: FloatArray,
-    measured: FloatArray,
-    style: Mapping[str, Any],
-) -> None:
-    panel.plot(time, MM_PER_M * desired, color=GREY, lw=2.0, label="commanded")
-    panel.set_xlim(*_span(time))
-    panel.plot(time, MM_PER_M * measured, color=BLUE, label="measured", **style)
-    panel.set_ylabel(f"tool {axis} [mm]")
-    panel.tick_params(labelbottom=False)
-    clean(panel)
-
-
-def _plot_residual(
-    panel: Axes,
-    time: FloatArray,
-    desired: FloatArray,
-    measured: FloatArray,
-    diagnosis: Diagnosis,
-    style: Mapping[str, Any],
-) -> None:
-    distance = MM_PER_M * np.linalg.norm(measured - desired, axis=1)
-    panel.plot(time, distance, color=RED, **style)
-    panel.set_xlim(*_span(time))
+def _mark_onset(panel: Axes, onset_s: float | None) -> None:
     panel.set_ylabel("off by [mm]")
     panel.set_xlabel("time [s]")
     panel.set_ylim(bottom=0.0)
-    if diagnosis.onset_s:
-        panel.axvline(diagnosis.onset_s, color="black", lw=1.0, ls="--")
-        panel.annotate(
-            " fault begins",
-            (diagnosis.onset_s, 0.85),
-            xycoords=("data", "axes fraction"),
-            fontsize=8,
-        )
-    clean(panel)
+    if onset_s:
+        panel.axvline(onset_s, color="black", lw=1.0, ls="--")
+        at = ("data", "axes fraction")
+        panel.annotate(" fault begins", (onset_s, 0.85), xycoords=at, fontsize=8)
 
 
 def _plot_posterior(panel: Axes, diagnosis: Diagnosis) -> None:
@@ -165,12 +146,6 @@ def _plot_posterior(panel: Axes, diagnosis: Diagnosis) -> None:
     clean(panel)
 
 
-def _span(time: FloatArray) -> tuple[float, float]:
-    """Return the limits of the time axis [s], the same for every panel."""
-    margin = 0.02 * float(time[-1])
-    return -margin, float(time[-1]) + margin
-
-
 def _plain(hypothesis: str) -> str:
     return plain_name(Hypothesis.parse(hypothesis))
 
@@ -180,13 +155,34 @@ def clean(panel: Axes) -> None:
     panel.spines[["top", "right"]].set_visible(False)
 
 
-# One self-contained HTML page for the runs of a folder. Needs the extra `plots`.
+# Self-contained HTML pages.
+
+
+def render_page(template: str, values: Mapping[str, Any]) -> str:
+    """Return a page; text in it is escaped.
+
+    Args:
+        template: File beside this module.
+        values: What its names stand for.
+
+    Raises:
+        InputError: If jinja2 is missing.
+    """
+    try:
+        from jinja2 import Environment, PackageLoader, StrictUndefined
+    except ImportError as error:
+        raise InputError(
+            f"pictures need jinja2 ({error}). Install it: pip install 'failuretwin[plots]'."
+        ) from error
+    loader = PackageLoader("failuretwin.app", "")
+    pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
+    return pages.get_template(template).render(values)
 
 
 def write_page(
     diagnoses: Sequence[Diagnosis], pictures: Sequence[Path], robot: str, path: Path
 ) -> None:
-    """Write the page; pictures are part of it.
+    """Write the page of some runs; pictures are part of it.
 
     Args:
         diagnoses: Diagnoses of the runs.
@@ -197,35 +193,18 @@ def write_page(
     Raises:
         InputError: If jinja2 is missing.
     """
-    template = (files("failuretwin.app") / "page.html.j2").read_text(encoding="utf-8")
-    page = environment().from_string(template)
-    records = [d.to_record() for d in diagnoses]
-    text = page.render(
-        runs=[_entry(d, picture) for d, picture in zip(diagnoses, pictures, strict=True)],
-        robot=robot,
-        method=diagnoses[0].method,
-        protocol=diagnoses[0].protocol,
-        version=__version__,
-        known=any(d.truth is not None for d in diagnoses),
-        score=score_line(records),
-        as_unknown=as_unknown_line(records),
-    )
-    path.write_text(text, encoding="utf-8")
-
-
-def environment() -> Environment:
-    """Return what renders the templates of pages; text in them is escaped.
-
-    Raises:
-        InputError: If jinja2 is missing.
-    """
-    try:
-        from jinja2 import Environment, StrictUndefined
-    except ImportError as error:
-        raise InputError(
-            f"pages need jinja2 ({error}). Install it: pip install 'failuretwin[plots]'."
-        ) from error
-    return Environment(autoescape=True, undefined=StrictUndefined)
+    judged = Judged.of(diagnoses)
+    values = {
+        "runs": [_entry(d, picture) for d, picture in zip(diagnoses, pictures, strict=True)],
+        "robot": robot,
+        "method": diagnoses[0].method,
+        "protocol": diagnoses[0].protocol,
+        "version": __version__,
+        "known": any(d.truth is not None for d in diagnoses),
+        "score": score_line(judged),
+        "as_unknown": as_unknown_line(judged),
+    }
+    path.write_text(render_page("diagnoses.html.j2", values), encoding="utf-8")
 
 
 def _entry(diagnosis: Diagnosis, picture: Path) -> dict[str, Any]:
@@ -233,7 +212,7 @@ def _entry(diagnosis: Diagnosis, picture: Path) -> dict[str, Any]:
     return {
         "name": diagnosis.run,
         "verdict": diagnosis.verdict,
-        "truth": "" if truth is None else plain_name(Hypothesis.parse(truth)),
+        "truth": "" if truth is None else _plain(truth),
         "wrong": truth is not None
         and judged_truth(truth, diagnosis.posterior) != diagnosis.diagnosis,
         "explanation": diagnosis.explanation,
@@ -242,7 +221,7 @@ def _entry(diagnosis: Diagnosis, picture: Path) -> dict[str, Any]:
     }
 
 
-# Picture of the reliability diagram. Needs the extra `plots`.
+# Picture of the reliability diagram.
 
 NAME = "reliability.png"
 """Name of the picture in its folder."""
@@ -256,7 +235,7 @@ def write_reliability(evaluation: Evaluation, folder: Path) -> None:
     """
     if evaluation.calibration is None:
         raise InputError("no run got a verdict, so there is no reliability to draw.")
-    title = f"{evaluation.scores.runs} runs, protocol {evaluation.protocol}"
+    title = f"{evaluation.scores.runs} runs, protocol {evaluation.judged.protocol}"
     figure = reliability_figure(evaluation.calibration.equal, title)
     with filling(folder) as partial:
         figure.savefig(partial / NAME, dpi=130)
@@ -280,8 +259,8 @@ def reliability_figure(bins: Reliability, title: str) -> Figure:
     lower.bar(bins.edges[:-1], bins.count, np.diff(bins.edges), align="edge", color=GREY, ec="w")
     lower.set_xlabel("stated probability of the verdict")
     lower.set_ylabel("runs")
-    for panel in (upper, lower):
-        panel.spines[["top", "right"]].set_visible(False)
+    clean(upper)
+    clean(lower)
     figure.suptitle(title, fontsize=11)
     return figure
 

@@ -36,7 +36,7 @@ def robot() -> None:
 @link_options
 def check(urdf: Path, base: str | None, tool: str | None) -> None:
     """Say whether a URDF can be used, which motors move the tool, and what is missing."""
-    from failuretwin.app.tables import print_report
+    from failuretwin.app.reports import print_report
     from failuretwin.digital_model.urdf_check import check_urdf
 
     report = check_urdf(urdf, base, tool)

@@ -1,12 +1,17 @@
-"""The study's trainings: each a job of its own, whose result is kept, several at a time."""
+"""The paper's study from end to end: its plan, its trainings, each kept, and the page.
+
+The networks learn from runs of the published twin alone and are tested on real runs. A study that
+was cut short goes on with the trainings that have no result yet.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import multiprocessing
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
@@ -15,18 +20,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from failuretwin.core.errors import FailureTwinError, InputError
+from failuretwin import __version__
+from failuretwin.core.config import fingerprint
+from failuretwin.core.errors import FailureTwinError, InputError, OutputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import IntArray
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.read import ReadOptions, read_runs
-from failuretwin.data_knowledge.store import replacing
-from failuretwin.decision.learned.features import Encoder, Floats, signals_of
+from failuretwin.data_knowledge.store import reason, replacing
+from failuretwin.decision.learned.features import Encoder, signals_of
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:
     import xarray as xr
+
+PLAN_FILE, WORK, PAGE = "study.json", "trainings", "index.html"
 
 # What the study does, to the letter of the paper; and a small version of it.
 
@@ -95,7 +104,7 @@ def quick_plan(seed: int) -> StudyPlan:
     return StudyPlan(seed, 60, (50, 100, 150, 200, 250), 2, 20)
 
 
-# The study's runs as features: simulated by the published twin, and a test set beside them.
+# The runs as features: simulated by the published twin, and a test set beside them.
 
 
 @dataclass(frozen=True)
@@ -111,23 +120,6 @@ class Exam:
     runs: xr.Dataset
     real: bool
     source: str
-
-
-@dataclass(frozen=True)
-class Arrays:
-    """Features and classes of the simulated runs and of the test set, by feature set.
-
-    Attributes:
-        simulated: (run, point, channel).
-        simulated_class: (run,).
-        test: (run, point, channel).
-        test_class: (run,).
-    """
-
-    simulated: Floats
-    simulated_class: IntArray
-    test: Floats
-    test_class: IntArray
 
 
 def class_names(robot: Robot) -> list[str]:
@@ -189,12 +181,6 @@ def make_arrays(plan: StudyPlan, robot: Robot, test: Exam, folder: Path) -> None
             )
 
 
-def load_arrays(folder: Path, features: str) -> Arrays:
-    """Return what `make_arrays` wrote."""
-    with np.load(_data_file(folder, features), allow_pickle=False) as stored:
-        return Arrays(**stored)
-
-
 def _data_file(folder: Path, features: str) -> Path:
     return folder / f"{features}.npz"
 
@@ -202,6 +188,8 @@ def _data_file(folder: Path, features: str) -> Path:
 def _classes(runs: xr.Dataset, names: list[str]) -> IntArray:
     return np.array([names.index(fault) for fault in truth_of(runs) or []], dtype=np.int64)
 
+
+# The trainings, each a process of its own.
 
 LOOK_S = 0.5
 """Time between two looks at how far the trainings are [s]."""
@@ -276,22 +264,20 @@ def _spread(
     plan: StudyPlan,
     folder: Path,
     classes: int,
-    jobs: Iterable[Job],
+    jobs: Sequence[Job],
     on_progress: Callable[[int], None],
 ) -> None:
     context = multiprocessing.get_context("spawn")
-    done = context.Value("q", 0)
-    waiting = list(jobs)
-    told = 0
+    done, reported = context.Value("q", 0), 0
     with ProcessPoolExecutor(
-        processes(len(waiting)), context, initializer=_begin, initargs=(done,)
+        processes(len(jobs)), context, initializer=_begin, initargs=(done,)
     ) as pool:
-        running = {pool.submit(train, plan, folder, classes, job) for job in waiting}
+        running = {pool.submit(train, plan, folder, classes, job) for job in jobs}
         try:
             while running:
                 finished, running = wait(running, LOOK_S, FIRST_COMPLETED)
-                on_progress(done.value - told)
-                told = done.value
+                on_progress(done.value - reported)
+                reported = done.value
                 for future in finished:
                     future.result()
         except BrokenProcessPool as error:
@@ -340,38 +326,34 @@ def train(plan: StudyPlan, folder: Path, classes: int, job: Job) -> None:
     )
 
     begun = time.perf_counter()
-    arrays = load_arrays(folder, job.features)
+    with np.load(_data_file(folder, job.features), allow_pickle=False) as stored:
+        arrays = dict(stored)
+    simulated, truth = arrays["simulated"], arrays["simulated_class"]
     rng = np.random.default_rng([plan.seed, job.repeat])
-    order = rng.permutation(len(arrays.simulated))
+    order = rng.permutation(len(simulated))
     held_out = round(VALIDATION_SHARE * len(order))
     validation, learning = order[:held_out], order[held_out:]
-    standard = Standard.of(arrays.simulated[learning])
+    standard = Standard.of(simulated[learning])
     sets = {
-        "training": (standard(arrays.simulated[learning]), arrays.simulated_class[learning]),
-        "validation": (standard(arrays.simulated[validation]), arrays.simulated_class[validation]),
-        "test": (standard(arrays.test), arrays.test_class),
+        "training": (standard(simulated[learning]), truth[learning]),
+        "validation": (standard(simulated[validation]), truth[validation]),
+        "test": (standard(arrays["test"]), arrays["test_class"]),
     }
     torch.manual_seed(int(rng.integers(2**31)))
-    network = build_network("lstm", Shape(arrays.simulated.shape[2], classes))
+    network = build_network("lstm", Shape(simulated.shape[2], classes))
     batches = shuffled_batches(*sets["training"], BATCH_RUNS, rng)
     checkpoints = []
-    said: IntArray = np.empty(0, dtype=np.int64)
+    verdicts: dict[str, IntArray] = {}
     for iteration in training(network, batches, Pace(plan.iterations, job.learning_rate)):
         _count()
         if iteration in plan.checkpoints:
-            right = {}
-            for name, (features, truth) in sets.items():
-                said = scores_of(network, features).argmax(axis=1)
-                right[name] = float(np.mean(said == truth))
+            verdicts = {name: scores_of(network, x).argmax(axis=1) for name, (x, _) in sets.items()}
+            right = {name: float(np.mean(verdicts[name] == sets[name][1])) for name in sets}
             checkpoints.append(Checkpoint(iteration, **right))
     confusion = np.zeros((classes, classes), dtype=np.int64)
-    np.add.at(confusion, (arrays.test_class, said), 1)
-    result = Training(
-        job,
-        tuple(checkpoints),
-        tuple(tuple(row) for row in confusion.tolist()),
-        time.perf_counter() - begun,
-    )
+    np.add.at(confusion, (arrays["test_class"], verdicts["test"]), 1)
+    counts = tuple(tuple(row) for row in confusion.tolist())
+    result = Training(job, tuple(checkpoints), counts, time.perf_counter() - begun)
     with replacing(_file(folder, job)) as partial:
         partial.write_text(json.dumps(asdict(result), indent=1), encoding="utf-8")
 
@@ -389,3 +371,98 @@ def read_training(path: Path) -> Training:
 
 def _file(folder: Path, job: Job) -> Path:
     return folder / f"{job.name}.json"
+
+
+# The study in one call: take up what is there, do what is missing, write the page.
+
+
+def check_folder(folder: Path, resume: bool) -> None:
+    """Refuse a folder that this study must not write to.
+
+    Raises:
+        InputError: If it holds anything and is not to be resumed, or is to be and is no study.
+    """
+    taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    if taken and not resume:
+        raise InputError(
+            f"{folder}: is there already. Go on with a study begun there (--resume), or choose "
+            "another folder."
+        )
+    names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
+    begun = names == [WORK]  # interrupted before it had a plan
+    if taken and not begun and not (folder / PLAN_FILE).is_file():
+        raise InputError(f"{folder}: holds no study to resume ({PLAN_FILE} is missing).")
+
+
+def run_study(
+    plan: StudyPlan,
+    robot: Robot,
+    test: Exam,
+    folder: Path,
+    on_progress: Callable[[int], None],
+) -> Path:
+    """Do the study in a folder that `check_folder` allowed; return its page.
+
+    Args:
+        plan: What to do.
+        robot: The robot.
+        test: What to test on.
+        folder: Where everything goes.
+        on_progress: Called with the number of iterations just done.
+
+    Raises:
+        InputError: If the folder holds a study with another plan, or an extra is missing.
+    """
+    manifest = _manifest(plan, robot, test)
+    stored = folder / PLAN_FILE
+    if stored.is_file():
+        _check_same(json.loads(stored.read_text(encoding="utf-8")), manifest, folder)
+    else:
+        _make(folder / WORK)
+        make_arrays(plan, robot, test, folder / WORK)
+        with replacing(stored) as partial:
+            partial.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+    trainings = run_all(plan, folder / WORK, len(class_names(robot)), on_progress)
+    from failuretwin.app.study_page import write_study_page
+
+    page = folder / PAGE
+    write_study_page(trainings, plan, robot, test, page)
+    return page
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be made ({reason(error)}).") from error
+
+
+def _manifest(plan: StudyPlan, robot: Robot, test: Exam) -> dict[str, Any]:
+    """Return what decides the study's figures."""
+    content = {
+        "seed": plan.seed,
+        "runs_per_class": plan.runs_per_class,
+        "checkpoints": list(plan.checkpoints),
+        "repeats": plan.repeats,
+        "robot": fingerprint(robot),
+        "test": test.source,
+        "test_sha256": _digest(test),
+    }
+    return {**content, "failuretwin_version": __version__}
+
+
+def _digest(test: Exam) -> str:
+    """Return a hash of all that networks see of the test set, and of its truth."""
+    digest = hashlib.sha256(json.dumps([str(f) for f in test.runs["fault"].values]).encode())
+    for name in ("command", "measured"):
+        digest.update(test.runs[name].values.tobytes())
+    return digest.hexdigest()
+
+
+def _check_same(stored: dict[str, Any], wanted: dict[str, Any], folder: Path) -> None:
+    for key, value in wanted.items():
+        if stored.get(key) != value:
+            raise InputError(
+                f"{folder}: the study begun there has {key} {stored.get(key)!r}, this one "
+                f"{value!r}. Give the same arguments again, or choose another folder."
+            )

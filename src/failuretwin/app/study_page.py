@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from failuretwin import __version__
-from failuretwin.app.calibration_report import png
-from failuretwin.app.plots import BLUE, GREY, MM_PER_M, RED, clean, environment, figure_class
-from failuretwin.app.study.trainings import (
+from failuretwin.app.plots import (
+    BLUE,
+    GREY,
+    MM_PER_M,
+    RED,
+    clean,
+    figure_class,
+    png,
+    render_page,
+)
+from failuretwin.app.study import (
     FEATURES,
     PRINTED_RATE,
     REPRODUCING_RATE,
@@ -24,6 +30,7 @@ from failuretwin.app.study.trainings import (
     Training,
     class_names,
 )
+from failuretwin.app.tables import Table
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.runs import AXES
 from failuretwin.core.types import FloatArray, IntArray, as_floats
@@ -138,15 +145,10 @@ def mean_confusion(repeats: Sequence[Training]) -> FloatArray:
 COLOURS = {"training": GREY, "validation": BLUE, "test": RED}
 
 
-def training_figure(
-    trainings: Sequence[Training], learning_rate: float, published: Mapping[str, float]
-) -> Figure:
+def training_figure(trainings: Sequence[Training], learning_rate: float) -> Figure:
     """Return accuracy by iterations, a panel for each feature set, with error bars of one sd.
 
-    Args:
-        trainings: All results.
-        learning_rate: Which of them to show.
-        published: Published accuracies by set, drawn as lines in the panel of augmented features.
+    The published accuracies are lines in the panel of augmented features.
     """
     figure = figure_class()(figsize=(11.0, 4.2), layout="constrained")
     panels = figure.subplots(1, len(FEATURES), sharey=True)
@@ -166,7 +168,7 @@ def training_figure(
                 label=name,
             )
             if features == "augmented":
-                panel.axhline(100.0 * published[name], color=COLOURS[name], lw=0.8, ls=":")
+                panel.axhline(100.0 * TABLE_2[name].mean, color=COLOURS[name], lw=0.8, ls=":")
         panel.set_title(f"{features} features", fontsize=10)
         panel.set_xlabel("iterations")
         panel.set_ylim(0.0, 102.0)
@@ -229,6 +231,8 @@ def confusion_figure(shares: Mapping[str, FloatArray], classes: Sequence[str]) -
     return figure
 
 
+# The page.
+
 RATES = (REPRODUCING_RATE, PRINTED_RATE)
 
 
@@ -247,71 +251,65 @@ def write_study_page(
     Raises:
         InputError: If jinja2 or matplotlib is missing.
     """
-    template = (files("failuretwin.app.study") / "study.html.j2").read_text(encoding="utf-8")
     names = class_names(robot)
-    text = (
-        environment()
-        .from_string(template)
-        .render(
-            plan=plan,
-            robot=robot.name,
-            version=__version__,
-            test=test,
-            full=plan == StudyPlan(plan.seed),
-            table_2=_table_2(trainings),
-            progress=_progress(trainings),
-            iterations=plan.checkpoints,
-            table_3={name: _table_3(trainings, name, names) for name in FEATURES},
-            ratios=RATIOS,
-            rates=RATES,
-            pictures=_pictures(trainings, robot, test, names),
-            minutes=sum(training.seconds for training in trainings) / 60.0,
-        )
-    )
+    values = {
+        "plan": plan,
+        "robot": robot.name,
+        "version": __version__,
+        "test": test,
+        "full": plan == StudyPlan(plan.seed),
+        "accuracies": _table_2(trainings, test),
+        "progress": _progress(trainings, plan),
+        "classes": [_table_3(trainings, features, names) for features in FEATURES],
+        "rates": RATES,
+        "pictures": _pictures(trainings, robot, test, names),
+        "minutes": sum(training.seconds for training in trainings) / 60.0,
+    }
     with replacing(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+        partial.write_text(render_page("study.html.j2", values), encoding="utf-8")
 
 
-def _table_2(trainings: Sequence[Training]) -> list[dict[str, Any]]:
-    """Return a row for each kind of training and one for the paper."""
-    rows = [{"name": "the paper", **{name: percent(TABLE_2[name]) for name in SETS}}]
+def _table_2(trainings: Sequence[Training], test: Exam) -> Table:
+    """Return a row for the paper and one for each kind of training."""
+    stand_in = "" if test.real else " (stand-in)"
+    rows = [("the paper", *(percent(TABLE_2[name]) for name in SETS))]
     for features in reversed(FEATURES):
         for rate in RATES:
             repeats = of_kind(trainings, features, rate)
-            last = {name: percent(accuracies(repeats, name)[-1]) for name in SETS}
-            rows.append({"name": f"{features} features, learning rate {rate:g}", **last})
-    return rows
+            *seen, tested = (percent(accuracies(repeats, name)[-1]) for name in SETS)
+            name = f"{features} features, learning rate {rate:g}"
+            rows.append((name, *seen, tested + stand_in))
+    return Table(("", *SETS), rows)
 
 
-def _progress(trainings: Sequence[Training]) -> list[dict[str, Any]]:
+def _progress(trainings: Sequence[Training], plan: StudyPlan) -> Table:
     """Return accuracies at every checkpoint, a row for each kind of training and set."""
-    return [
-        {
-            "name": f"{features} features, {rate:g}, {name}",
-            "cells": [percent(row) for row in accuracies(of_kind(trainings, features, rate), name)],
-        }
+    rows = [
+        (
+            f"{features} features, {rate:g}, {name}",
+            *map(percent, accuracies(of_kind(trainings, features, rate), name)),
+        )
         for features in FEATURES
         for rate in RATES
         for name in SETS
     ]
+    return Table(("features, learning rate, runs", *map(str, plan.checkpoints)), rows)
 
 
-def _table_3(
-    trainings: Sequence[Training], features: str, names: Sequence[str]
-) -> list[dict[str, Any]]:
+def _table_3(trainings: Sequence[Training], features: str, names: Sequence[str]) -> Table:
     """Return ratios of each class at the reproducing rate beside those of the paper."""
     ours = class_ratios(of_kind(trainings, features, REPRODUCING_RATE))
-    rows = []
-    for name, published in TABLE_3.items():
-        if name in names:
-            rows.append(
-                {
-                    "name": plain_name(Hypothesis.parse(name)),
-                    "ours": [share(value) for value in ours[names.index(name)]],
-                    "published": [share(value) for value in published],
-                }
-            )
-    return rows
+    rows = [
+        (_plain(name), *map(share, ours[names.index(name)]), *map(share, published))
+        for name, published in TABLE_3.items()
+        if name in names
+    ]
+    headings = ("", *RATIOS, *(f"{ratio}, the paper" for ratio in RATIOS))
+    return Table(headings, rows, title=f"{features.capitalize()} features")
+
+
+def _plain(name: str) -> str:
+    return plain_name(Hypothesis.parse(name))
 
 
 def percent(value: Spread) -> str:
@@ -333,13 +331,11 @@ def share(value: Spread) -> str:
 def _pictures(
     trainings: Sequence[Training], robot: Robot, test: Exam, names: Sequence[str]
 ) -> dict[str, str]:
-    published = {name: TABLE_2[name].mean for name in SETS}
     shares = {
         f"{features} features": mean_confusion(of_kind(trainings, features, REPRODUCING_RATE))
         for features in FEATURES
     }
-    plain = [plain_name(Hypothesis.parse(name)) for name in names]
-    figures = {f"training {rate:g}": training_figure(trainings, rate, published) for rate in RATES}
+    figures = {f"training {rate:g}": training_figure(trainings, rate) for rate in RATES}
     figures["path"] = path_figure(test.runs, 0, DigitalTwin(robot))
-    figures["confusion"] = confusion_figure(shares, plain)
-    return {name: base64.b64encode(png(figure)).decode("ascii") for name, figure in figures.items()}
+    figures["confusion"] = confusion_figure(shares, [_plain(name) for name in names])
+    return {name: png(figure) for name, figure in figures.items()}
