@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -201,31 +201,10 @@ def session_figure(held_out: Sequence[HeldOut], channels: Channels) -> Figure:
 # The page.
 
 
-@dataclass(frozen=True)
-class _Picture:
-    """A picture with its words.
-
-    Attributes:
-        title: Heading.
-        caption: How to read it.
-        data: PNG file in base64.
-    """
-
-    title: str
-    caption: str
-    data: str
-
-
 def write_calibration_page(
     found: Calibration, runs: xr.Dataset, robot: Robot, folder: Path
 ) -> None:
-    """Write `index.html` with tables and pictures into `folder`.
-
-    Args:
-        found: The calibration.
-        runs: The runs it was learned from or judged on.
-        robot: The robot.
-        folder: An existing folder.
+    """Write `index.html` into an existing folder; the runs are those learned from or judged on.
 
     Raises:
         InputError: If jinja2 or matplotlib is missing.
@@ -233,6 +212,8 @@ def write_calibration_page(
     channels = Channels.of(robot, found.used_readings)
     units, better = robot.profile.servo_units, beats_uncalibrated(found)
     left_out = [(e.run, str(e.movement or "all"), f"{e.motor} {e.reason}") for e in found.left_out]
+    seen, settling = predict(found, runs, robot), settling_of(found, robot)
+    ramp = example_ramp(found, runs, robot)
     text = render_page(
         "calibration.html.j2",
         {
@@ -240,14 +221,17 @@ def write_calibration_page(
             "robot": robot.name,
             "verdict": verdict_line(found).rstrip("."),
             "grade": "unknown" if better is None else "good" if better else "bad",
-            "facts": _facts(found, settling_of(found, robot)),
+            "facts": _facts(found, settling),
             "sessions": _sessions(found.held_out, channels),
             "unit": channels.unit,
             "groups": parameter_groups(found, robot),
             "count_deg": None if units is None else units.deg_per_count,
             "left_out": Table(("run", "movement", "why"), left_out),
             "left_out_line": left_out_line(found),
-            "pictures": dict(_pictures(found, runs, robot, channels)),
+            "pictures": _pictures(found, seen, settling, ramp, robot),
+            "unseen": seen.unseen,
+            "dof": settling.tail_dof,
+            "ramp": ramp,
         },
     )
     (folder / "index.html").write_text(text, encoding="utf-8")
@@ -278,63 +262,22 @@ def _sessions(held_out: Sequence[HeldOut], channels: Channels) -> Table:
 
 
 def _pictures(
-    found: Calibration, runs: xr.Dataset, robot: Robot, channels: Channels
-) -> Iterator[tuple[str, _Picture]]:
-    seen, settling = predict(found, runs, robot), settling_of(found, robot)
+    found: Calibration,
+    seen: Predictions,
+    settling: Settling,
+    ramp: ExampleRamp | None,
+    robot: Robot,
+) -> dict[str, str]:
+    """Return those pictures that there is something to show in, by name."""
+    figures = {}
     if found.held_out:
-        yield (
-            "sessions",
-            _Picture(
-                "Size of the settled error by session",
-                "1.48 times the median size of the error, the shorter the better.",
-                png(session_figure(found.held_out, channels)),
-            ),
-        )
+        channels = Channels.of(robot, found.used_readings)
+        figures["sessions"] = session_figure(found.held_out, channels)
     if seen.counts.any():
-        yield (
-            "expected",
-            _Picture(
-                "Settled error against prediction",
-                "The uncalibrated twin expects no error at all (grey line); a perfect calibration "
-                f"puts every point on the blue one. {_who_predicts(seen)} Above each panel: size "
-                "of the error before and after.",
-                png(expected_figure(seen, robot)),
-            ),
-        )
-        yield (
-            "quantiles",
-            _Picture(
-                "Distribution of what is left",
-                f"Against a Student t with {settling.tail_dof:.1f} degrees of freedom. Points that "
-                "leave the band upwards on the right or downwards on the left are larger errors "
-                f"than the calibration allows for. {_who_predicts(seen)}",
-                png(quantile_figure(seen, settling.tail_dof, robot)),
-            ),
-        )
-    if seen.of_motors and seen.counts.any():
-        yield (
-            "load",
-            _Picture(
-                "What the arm's weight and friction do",
-                "Settled error before calibration, one point a movement. The slope of the lines is "
-                "the compliance, half their distance the friction, and their middle at no load the "
-                "bias.",
-                png(load_figure(seen, settling, robot)),
-            ),
-        )
-    ramp = example_ramp(found, runs, robot)
+        figures["expected"] = expected_figure(seen, robot)
+        figures["quantiles"] = quantile_figure(seen, settling.tail_dof, robot)
+        if seen.of_motors:
+            figures["load"] = load_figure(seen, settling, robot)
     if ramp is not None:
-        yield (
-            "ramp",
-            _Picture(
-                f"A ramp: {ramp.run}, movement {ramp.movement}",
-                "The movement with the median misfit of the longer half of all that began on time.",
-                png(ramp_figure(ramp, robot)),
-            ),
-        )
-
-
-def _who_predicts(seen: Predictions) -> str:
-    if seen.unseen:
-        return "Each session is predicted by a fit that has not seen it."
-    return "These movements are those that the fit has seen: there is no other session."
+        figures["ramp"] = ramp_figure(ramp, robot)
+    return {name: png(figure) for name, figure in figures.items()}

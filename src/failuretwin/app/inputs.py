@@ -38,11 +38,7 @@ REPORTED_ERROR_M = 1e-6
 """Error of recovered commands that the user is told of [m]; exact ones are below 1e-9."""
 
 
-def read_inputs(
-    sources: Sequence[Path],
-    robot: Robot,
-    reading: LogOptions,
-) -> xr.Dataset:
+def read_inputs(sources: Sequence[Path], robot: Robot, reading: LogOptions) -> xr.Dataset:
     """Return the runs of all inputs as one run set."""
     options = ReadOptions(
         cast(As, reading.how), reading.published_labels, approximate=reading.approximate
@@ -61,12 +57,7 @@ def read_inputs(
 
 
 def warn_mismatch(runs: xr.Dataset, expected: str) -> None:
-    """Tell the user where simulated runs lack the imperfections that a diagnoser expects.
-
-    Args:
-        runs: The run set.
-        expected: Name of those imperfections.
-    """
+    """Tell the user where simulated runs lack the imperfections (by name) that are expected."""
     made_with = _made_with(runs)
     if made_with is not None and made_with != expected and expected != GENERIC_NAME:
         click.echo(
@@ -79,12 +70,9 @@ def warn_mismatch(runs: xr.Dataset, expected: str) -> None:
 def _made_with(runs: xr.Dataset) -> str | None:
     """Return the imperfections that runs were simulated with; None for any other run set."""
     try:
-        configuration = json.loads(runs.attrs.get("configuration", ""))
-    except (TypeError, ValueError):  # a run set of other people may say anything there
+        made_with = json.loads(runs.attrs["configuration"])["imperfections"]
+    except (KeyError, TypeError, ValueError):  # a run set of other people may say anything there
         return None
-    if not isinstance(configuration, dict):
-        return None
-    made_with = configuration.get("imperfections")
     return made_with if isinstance(made_with, str) else None
 
 
@@ -139,11 +127,7 @@ BLEND = f"{BAYES}+"
 
 
 def parse_cli_hypotheses(text: str | None, robot: Robot) -> tuple[Hypothesis, ...] | None:
-    """Return the hypotheses that the user names; None where none are named.
-
-    Args:
-        text: Hypotheses in their text form, separated by commas.
-        robot: The robot, for the names of its motors.
+    """Return the hypotheses that the user names, separated by commas; None where none are.
 
     Raises:
         InputError: If one cannot be read, or there is only one, which would always be certain.
@@ -205,12 +189,7 @@ def _network(path: Path, robot: Robot, settings: Mapping[str, object]) -> Learne
 
 
 def expected_name(diagnoser: Diagnoser, bayes: BayesDiagnoser) -> str:
-    """Return the name of the healthy behaviour that a diagnoser expects.
-
-    Args:
-        diagnoser: As `chosen_diagnoser` gave it.
-        bayes: The Bayesian diagnoser, which is it or a part of it unless it is a network.
-    """
+    """Return the name of the healthy behaviour that a diagnoser of `chosen_diagnoser` expects."""
     encoder = getattr(diagnoser, "encoder", None)
     if encoder is None:
         return bayes.healthy_model.imperfections.name

@@ -7,7 +7,6 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -46,16 +45,7 @@ SOURCES = f"{EMULATED}, {ROS1}, {ROSBRIDGE}://HOST[:PORT], or a log (raw session
 def emulated_robot(
     robot: Robot, live: LiveOptions, seed: int, pace: Pace, duration_s: float, zero_s: float = 0.0
 ) -> Source:
-    """Return an emulated robot as a source.
-
-    Args:
-        robot: The robot.
-        live: What the command line says of it.
-        seed: Seed of all chance.
-        pace: How fast its time passes.
-        duration_s: How long it works [s].
-        zero_s: What its clock says at the start [s].
-    """
+    """Return an emulated robot; it works for `duration_s` and its clock starts at `zero_s` [s]."""
     from failuretwin.connection.emulated_arm import Emulation, emulated
 
     own = "none" if robot.imperfections_file is None else robot.name
@@ -78,21 +68,10 @@ def topics_of(path: Path | None) -> RosTopics:
     return RosTopics() if path is None else load_topics(path)
 
 
-@dataclass(frozen=True)
-class Connections:
-    """A robot to be watched, and where its diagnosis is published.
-
-    Attributes:
-        source: The robot.
-        sinks: Its network, where it has one.
-    """
-
-    source: Source
-    sinks: tuple[Sink, ...] = ()
-
-
-def connect(text: str, robot: Robot, live: LiveOptions, seed: int, stack: ExitStack) -> Connections:
-    """Return what a SOURCE on the command line stands for.
+def connect(
+    text: str, robot: Robot, live: LiveOptions, seed: int, stack: ExitStack
+) -> tuple[Source, list[Sink]]:
+    """Return what a SOURCE on the command line stands for, and where its network publishes.
 
     Args:
         text: One of `SOURCES`.
@@ -108,7 +87,7 @@ def connect(text: str, robot: Robot, live: LiveOptions, seed: int, stack: ExitSt
     topics, pace = topics_of(live.topics), Pace(live.speed)
     if text == EMULATED:
         source = emulated_robot(robot, live, seed, pace, live.duration or math.inf)
-        return Connections(stack.enter_context(source))
+        return stack.enter_context(source), []
     if live.faults or live.imperfections:
         raise InputError(
             f"--fault and --imperfections are of an emulated robot, but the source is {text!r}. "
@@ -123,23 +102,21 @@ def connect(text: str, robot: Robot, live: LiveOptions, seed: int, stack: ExitSt
     path = Path(text)
     if not path.exists():
         raise InputError(f"source {text!r} does not exist. Expected {SOURCES}.")
-    named = None if topics == RosTopics() else _bag_topics(topics)
-    return Connections(stack.enter_context(replay(path, robot, pace, named)))
+    recorded = BagTopics(topics.command, topics.tool or None, topics.position or None)
+    named = None if topics == RosTopics() else recorded
+    return stack.enter_context(replay(path, robot, pace, named)), []
 
 
-def _bag_topics(topics: RosTopics) -> BagTopics:
-    """Return the topics of a network as those of a recording of it."""
-    return BagTopics(topics.command, topics.tool or None, topics.position or None)
-
-
-def _ros1(robot: Robot, topics: RosTopics, stack: ExitStack) -> Connections:
+def _ros1(robot: Robot, topics: RosTopics, stack: ExitStack) -> tuple[Source, list[Sink]]:
     from failuretwin.connection.links.ros1 import Ros1Diagnostics, Ros1Source
 
     source = stack.enter_context(Ros1Source(robot, topics))
-    return Connections(source, (stack.enter_context(Ros1Diagnostics(robot, topics)),))
+    return source, [stack.enter_context(Ros1Diagnostics(robot, topics))]
 
 
-def _rosbridge(text: str, robot: Robot, topics: RosTopics, stack: ExitStack) -> Connections:
+def _rosbridge(
+    text: str, robot: Robot, topics: RosTopics, stack: ExitStack
+) -> tuple[Source, list[Sink]]:
     from failuretwin.connection.links import rosbridge
 
     try:
@@ -153,7 +130,7 @@ def _rosbridge(text: str, robot: Robot, topics: RosTopics, stack: ExitStack) -> 
     stack.callback(rosbridge.disconnect, ros)
     source = stack.enter_context(rosbridge.RosbridgeSource(robot, topics, ros))
     sink = stack.enter_context(rosbridge.RosbridgeDiagnostics(robot, topics, ros))
-    return Connections(source, (sink,))
+    return source, [sink]
 
 
 # The live view on a terminal: motors, residual, posterior over time, what changed.
@@ -206,13 +183,7 @@ class View:
     def draw(
         self, snapshot: Snapshot, counts: LinkCounts, changes: Sequence[Change]
     ) -> RenderableType:
-        """Return the view of what is known now.
-
-        Args:
-            snapshot: What the shadow knows.
-            counts: What the link has seen.
-            changes: What has changed so far, the newest last.
-        """
+        """Return the view of what is known now; of the changes the newest is the last."""
         lines = [Text(str(change)) for change in list(changes)[-SHOWN_CHANGES:]]
         return Group(
             self._head(snapshot, counts),
@@ -332,14 +303,7 @@ def watch_until_end(
 def _troubles(
     shadow: Shadow, source: Source, sinks: Sequence[Sink], since_s: float
 ) -> tuple[str, ...]:
-    """Return what keeps the diagnosis from being made or told.
-
-    Args:
-        shadow: The shadow of the robot.
-        source: The robot.
-        sinks: Where the shadow tells what it knows.
-        since_s: For how long the robot has been listened to [s].
-    """
+    """Return what keeps the diagnosis from being made or told, after listening for so long [s]."""
     found = [sink.trouble for sink in sinks if sink.trouble]
     if source.counts.received == 0 and since_s > SILENCE_S:
         found.append(f"nothing comes from {source.name}")

@@ -59,13 +59,7 @@ def png(figure: Figure) -> str:
 def plot_runs(
     runs: xr.Dataset, diagnoses: Sequence[Diagnosis], twin: DigitalTwin, folder: Path
 ) -> list[Path]:
-    """Write a picture of each run into `folder`.
-
-    Args:
-        runs: The run set.
-        diagnoses: Diagnosis of each of its runs, in its order.
-        twin: Kinematics, for the path that the commands ask for.
-        folder: Where the pictures go.
+    """Write a picture of each run into `folder`; diagnoses are in the order of the runs.
 
     Raises:
         InputError: If matplotlib is missing.
@@ -159,11 +153,7 @@ def clean(panel: Axes) -> None:
 
 
 def render_page(template: str, values: Mapping[str, Any]) -> str:
-    """Return a page; text in it is escaped.
-
-    Args:
-        template: File beside this module.
-        values: What its names stand for.
+    """Return the page of a template beside this module; text in it is escaped.
 
     Raises:
         InputError: If jinja2 is missing.
@@ -182,20 +172,16 @@ def render_page(template: str, values: Mapping[str, Any]) -> str:
 def write_page(
     diagnoses: Sequence[Diagnosis], pictures: Sequence[Path], robot: str, path: Path
 ) -> None:
-    """Write the page of some runs; pictures are part of it.
-
-    Args:
-        diagnoses: Diagnoses of the runs.
-        pictures: PNG file of each run, in the same order.
-        robot: Name of the robot.
-        path: HTML file to write.
+    """Write the page of some runs, which holds the PNG file of each (in the same order).
 
     Raises:
         InputError: If jinja2 is missing.
     """
     judged = Judged.of(diagnoses)
     values = {
-        "runs": [_entry(d, picture) for d, picture in zip(diagnoses, pictures, strict=True)],
+        "runs": [
+            (d, *_truth_cell(d), _embedded(p)) for d, p in zip(diagnoses, pictures, strict=True)
+        ],
         "robot": robot,
         "method": diagnoses[0].method,
         "protocol": diagnoses[0].protocol,
@@ -207,18 +193,16 @@ def write_page(
     path.write_text(render_page("diagnoses.html.j2", values), encoding="utf-8")
 
 
-def _entry(diagnosis: Diagnosis, picture: Path) -> dict[str, Any]:
-    truth = diagnosis.truth
-    return {
-        "name": diagnosis.run,
-        "verdict": diagnosis.verdict,
-        "truth": "" if truth is None else _plain(truth),
-        "wrong": truth is not None
-        and judged_truth(truth, diagnosis.posterior) != diagnosis.diagnosis,
-        "explanation": diagnosis.explanation,
-        "quality": diagnosis.quality,
-        "picture": base64.b64encode(picture.read_bytes()).decode("ascii"),
-    }
+def _truth_cell(diagnosis: Diagnosis) -> tuple[str, bool]:
+    """Return the truth of a run in plain words, and whether the verdict is another."""
+    if diagnosis.truth is None:
+        return "", False
+    truth = judged_truth(diagnosis.truth, diagnosis.posterior)
+    return _plain(diagnosis.truth), truth != diagnosis.diagnosis
+
+
+def _embedded(picture: Path) -> str:
+    return base64.b64encode(picture.read_bytes()).decode("ascii")
 
 
 # Picture of the reliability diagram.
@@ -243,10 +227,6 @@ def write_reliability(evaluation: Evaluation, folder: Path) -> None:
 
 def reliability_figure(bins: Reliability, title: str) -> Figure:
     """Return how often verdicts are right by how sure they are, and how many there are.
-
-    Args:
-        bins: The reliability diagram.
-        title: What it is of.
 
     Raises:
         InputError: If matplotlib is missing.

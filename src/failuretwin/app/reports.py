@@ -106,12 +106,7 @@ def _confusion_table(scores: Scores) -> Table:
 
 
 def print_evaluation(evaluation: Evaluation, truth_given: bool) -> None:
-    """Print every score.
-
-    Args:
-        evaluation: The scores.
-        truth_given: Whether a run set could have known the true onsets and magnitudes.
-    """
+    """Print every score; without a run set given, no true onset or magnitude can be known."""
     print_scores(evaluation.judged)
     show(f"\n{_runs_and_protocol(evaluation, 'all ')}", summary_table(evaluation))
     if evaluation.calibration is not None:
@@ -267,12 +262,7 @@ MAX_COMPARED = 16
 
 
 def isolability_summary(runs: xr.Dataset, diagnoser: BayesDiagnoser) -> list[str]:
-    """Return which faults such motions cannot tell apart, and the smallest that they show.
-
-    Args:
-        runs: The runs that were diagnosed.
-        diagnoser: Who diagnosed them; of its hypotheses healthy and single faults count.
-    """
+    """Return which faults such motions cannot tell apart, and the smallest that they show."""
     single = [h for h in diagnoser.considered if h.known and len(h.faults) <= 1]
     left_out = _left_out_lines([h for h in diagnoser.considered if h not in single])
     if not any(h.faults for h in single):

@@ -15,13 +15,14 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from failuretwin import __version__
-from failuretwin.core.config import fingerprint
+from failuretwin.core.config import fingerprint, from_table
 from failuretwin.core.errors import FailureTwinError, InputError, OutputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.runs import check_motors, truth_of
@@ -154,13 +155,9 @@ def real_test_set(path: Path, robot: Robot, published_labels: bool) -> Exam:
 def stand_in_test_set(plan: StudyPlan, robot: Robot) -> Exam:
     """Simulate a test set with the physics engine, for want of a real one."""
     hypotheses = paper_hypotheses(robot.motor_names)
-    count = plan.stand_in_runs
-    runs = simulate(Plan(robot, hypotheses, count, plan.seed + 1, engine="physics"))
-    return Exam(
-        runs,
-        real=False,
-        source=f"{len(hypotheses) * count} runs of the physics engine, which stands in for a robot",
-    )
+    runs = simulate(Plan(robot, hypotheses, plan.stand_in_runs, plan.seed + 1, engine="physics"))
+    engine = "runs of the physics engine, which stands in for a robot"
+    return Exam(runs, real=False, source=f"{runs.sizes['run']} {engine}")
 
 
 def make_arrays(plan: StudyPlan, robot: Robot, test: Exam, folder: Path) -> None:
@@ -171,7 +168,7 @@ def make_arrays(plan: StudyPlan, robot: Robot, test: Exam, folder: Path) -> None
     )
     for features in FEATURES:
         encoder = Encoder(features, robot)
-        with replacing(_data_file(folder, features)) as partial, partial.open("wb") as file:
+        with replacing(_data_file(folder, features)) as new, new.open("wb") as file:
             np.savez(
                 file,
                 simulated=encoder.encode(signals_of(simulated)),
@@ -245,8 +242,9 @@ def run_all(
     missing = [job for job in jobs if not _file(folder, job).is_file()]
     on_progress((len(jobs) - len(missing)) * plan.iterations)
     if missing:
-        _spread(plan, folder, classes, missing, on_progress)
-    return [read_training(_file(folder, job)) for job in jobs]
+        _spread(partial(train, plan, folder, classes), missing, on_progress)
+    files = [_file(folder, job) for job in jobs]
+    return [from_table(Training, json.loads(f.read_text(encoding="utf-8")), str(f)) for f in files]
 
 
 def processes(jobs: int) -> int:
@@ -261,18 +259,14 @@ def processes(jobs: int) -> int:
 
 
 def _spread(
-    plan: StudyPlan,
-    folder: Path,
-    classes: int,
-    jobs: Sequence[Job],
-    on_progress: Callable[[int], None],
+    work: Callable[[Job], None], jobs: Sequence[Job], on_progress: Callable[[int], None]
 ) -> None:
     context = multiprocessing.get_context("spawn")
     done, reported = context.Value("q", 0), 0
     with ProcessPoolExecutor(
         processes(len(jobs)), context, initializer=_begin, initargs=(done,)
     ) as pool:
-        running = {pool.submit(train, plan, folder, classes, job) for job in jobs}
+        running = {pool.submit(work, job) for job in jobs}
         try:
             while running:
                 finished, running = wait(running, LOOK_S, FIRST_COMPLETED)
@@ -354,19 +348,8 @@ def train(plan: StudyPlan, folder: Path, classes: int, job: Job) -> None:
     np.add.at(confusion, (arrays["test_class"], verdicts["test"]), 1)
     counts = tuple(tuple(row) for row in confusion.tolist())
     result = Training(job, tuple(checkpoints), counts, time.perf_counter() - begun)
-    with replacing(_file(folder, job)) as partial:
-        partial.write_text(json.dumps(asdict(result), indent=1), encoding="utf-8")
-
-
-def read_training(path: Path) -> Training:
-    """Return the result that a job wrote."""
-    stored = json.loads(path.read_text(encoding="utf-8"))
-    return Training(
-        Job(**stored["job"]),
-        tuple(Checkpoint(**checkpoint) for checkpoint in stored["checkpoints"]),
-        tuple(tuple(row) for row in stored["confusion"]),
-        stored["seconds"],
-    )
+    with replacing(_file(folder, job)) as file:
+        file.write_text(json.dumps(asdict(result), indent=1), encoding="utf-8")
 
 
 def _file(folder: Path, job: Job) -> Path:
@@ -395,20 +378,9 @@ def check_folder(folder: Path, resume: bool) -> None:
 
 
 def run_study(
-    plan: StudyPlan,
-    robot: Robot,
-    test: Exam,
-    folder: Path,
-    on_progress: Callable[[int], None],
+    plan: StudyPlan, robot: Robot, test: Exam, folder: Path, on_progress: Callable[[int], None]
 ) -> Path:
     """Do the study in a folder that `check_folder` allowed; return its page.
-
-    Args:
-        plan: What to do.
-        robot: The robot.
-        test: What to test on.
-        folder: Where everything goes.
-        on_progress: Called with the number of iterations just done.
 
     Raises:
         InputError: If the folder holds a study with another plan, or an extra is missing.
@@ -420,8 +392,8 @@ def run_study(
     else:
         _make(folder / WORK)
         make_arrays(plan, robot, test, folder / WORK)
-        with replacing(stored) as partial:
-            partial.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+        with replacing(stored) as new:
+            new.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
     trainings = run_all(plan, folder / WORK, len(class_names(robot)), on_progress)
     from failuretwin.app.study_page import write_study_page
 
@@ -439,7 +411,7 @@ def _make(folder: Path) -> None:
 
 def _manifest(plan: StudyPlan, robot: Robot, test: Exam) -> dict[str, Any]:
     """Return what decides the study's figures."""
-    content = {
+    return {
         "seed": plan.seed,
         "runs_per_class": plan.runs_per_class,
         "checkpoints": list(plan.checkpoints),
@@ -447,8 +419,8 @@ def _manifest(plan: StudyPlan, robot: Robot, test: Exam) -> dict[str, Any]:
         "robot": fingerprint(robot),
         "test": test.source,
         "test_sha256": _digest(test),
+        "failuretwin_version": __version__,
     }
-    return {**content, "failuretwin_version": __version__}
 
 
 def _digest(test: Exam) -> str:

@@ -33,7 +33,7 @@ from failuretwin.app.study import (
 from failuretwin.app.tables import Table
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.runs import AXES
-from failuretwin.core.types import FloatArray, IntArray, as_floats
+from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.failure_modes import plain_name
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.digital_model.robot import Robot
@@ -107,27 +107,18 @@ def accuracies(repeats: Sequence[Training], name: str) -> list[Spread]:
     return [spread_of(column) for column in np.array(rows).T]
 
 
-def class_ratios(repeats: Sequence[Training]) -> list[tuple[Spread, Spread, Spread]]:
+def class_ratios(repeats: Sequence[Training]) -> list[tuple[Spread, ...]]:
     """Return precision, recall and F1 of each class on the test set.
 
     Precision and F1 are NaN in a repetition that never names the class, as in the paper.
     """
-    ratios = np.array([_ratios(np.array(training.confusion)) for training in repeats])
-    return [
-        (spread_of(rows[:, 0]), spread_of(rows[:, 1]), spread_of(rows[:, 2]))
-        for rows in np.moveaxis(ratios, 1, 0)
-    ]
-
-
-def _ratios(confusion: IntArray) -> FloatArray:
-    """Return (class, 3) ratios of one confusion matrix (truth, diagnosis)."""
-    hits = np.diag(confusion).astype(np.float64)
+    counts = np.array([training.confusion for training in repeats], dtype=np.float64)
+    hits = np.diagonal(counts, axis1=1, axis2=2)
+    true, named = counts.sum(axis=2), counts.sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        precision = hits / confusion.sum(axis=0)
-        recall = hits / confusion.sum(axis=1)
-        f1 = 2.0 * hits / (confusion.sum(axis=0) + confusion.sum(axis=1))
-    f1[np.isnan(precision)] = np.nan
-    return np.stack([precision, recall, f1], axis=1)
+        f1 = np.where(named > 0.0, 2.0 * hits / (named + true), np.nan)
+        ratios = np.stack([hits / named, hits / true, f1], axis=-1)  # (repeat, class, ratio)
+    return [tuple(spread_of(column) for column in rows.T) for rows in np.moveaxis(ratios, 1, 0)]
 
 
 def mean_confusion(repeats: Sequence[Training]) -> FloatArray:
@@ -179,13 +170,7 @@ def training_figure(trainings: Sequence[Training], learning_rate: float) -> Figu
 
 
 def path_figure(runs: xr.Dataset, run: int, twin: DigitalTwin) -> Figure:
-    """Return the simulated and the measured path of a run, and what lies between them.
-
-    Args:
-        runs: The test set.
-        run: Number of the run in it.
-        twin: The published twin.
-    """
+    """Return the simulated and the measured path of a run, and what lies between them."""
     time = as_floats(runs["time"].values)
     measured = as_floats(runs["measured"].values[run])
     simulated = twin.path(twin.respond(as_floats(runs["command"].values[run]), time))
@@ -241,13 +226,6 @@ def write_study_page(
 ) -> None:
     """Write tables and pictures of a finished study.
 
-    Args:
-        trainings: All results.
-        plan: What was done.
-        robot: The robot.
-        test: What was tested on.
-        path: HTML file to write.
-
     Raises:
         InputError: If jinja2 or matplotlib is missing.
     """
@@ -300,7 +278,7 @@ def _table_3(trainings: Sequence[Training], features: str, names: Sequence[str])
     """Return ratios of each class at the reproducing rate beside those of the paper."""
     ours = class_ratios(of_kind(trainings, features, REPRODUCING_RATE))
     rows = [
-        (_plain(name), *map(share, ours[names.index(name)]), *map(share, published))
+        (_plain(name), *map(text, ours[names.index(name)]), *map(text, published))
         for name, published in TABLE_3.items()
         if name in names
     ]
@@ -312,20 +290,17 @@ def _plain(name: str) -> str:
     return plain_name(Hypothesis.parse(name))
 
 
-def percent(value: Spread) -> str:
-    """Return an accuracy with its standard deviation in per cent."""
-    if math.isnan(value.deviation):
-        return f"{100.0 * value.mean:.2f}"
-    return f"{100.0 * value.mean:.2f} ± {100.0 * value.deviation:.2f}"
-
-
-def share(value: Spread) -> str:
-    """Return a ratio with its standard deviation, as the paper writes it."""
+def text(value: Spread, scale: float = 1.0) -> str:
+    """Return a mean with its standard deviation, as the paper writes it."""
     if math.isnan(value.mean):
         return "NaN"
-    if math.isnan(value.deviation):
-        return f"{value.mean:.2f}"
-    return f"{value.mean:.2f} ± {value.deviation:.2f}"
+    mean = f"{scale * value.mean:.2f}"
+    return mean if math.isnan(value.deviation) else f"{mean} ± {scale * value.deviation:.2f}"
+
+
+def percent(value: Spread) -> str:
+    """Return an accuracy in per cent."""
+    return text(value, 100.0)
 
 
 def _pictures(

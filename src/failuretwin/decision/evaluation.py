@@ -18,27 +18,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import truth_of
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.decision.metrics import (
-    Alarms,
-    Coverage,
-    IntervalCase,
-    LogScore,
-    LogScoreGain,
-    McNemar,
-    Reliability,
-    Scores,
-    adaptive_edges,
-    brier_score,
-    calibrated_error,
-    count_alarms,
-    coverage_by_mode,
-    equal_edges,
-    judged_truth,
-    log_score_gain,
-    mcnemar,
-    reliability,
-    score,
-)
+from failuretwin.decision import metrics
 from failuretwin.decision.results import Record, Results, some_names
 
 if TYPE_CHECKING:
@@ -141,7 +121,7 @@ class Judged:
         given = as_results(results).diagnoses
         known = [d.truth if truths is None else truths[d.run].fault for d in given]
         pairs = [(d, true) for d, true in zip(given, known, strict=True) if true]
-        truth = tuple(judged_truth(true, d.posterior) for d, true in pairs)
+        truth = tuple(metrics.judged_truth(true, d.posterior) for d, true in pairs)
         return cls(
             diagnoses=tuple(d for d, _ in pairs),
             truth=truth,
@@ -166,9 +146,9 @@ class Judged:
         return [d.posterior for d in self.diagnoses]
 
     @cached_property
-    def scores(self) -> Scores:
+    def scores(self) -> metrics.Scores:
         """Right, wrong and the log score; of one run at least."""
-        return score(self.truth, self.verdicts, self.posteriors)
+        return metrics.score(self.truth, self.verdicts, self.posteriors)
 
 
 def as_results(given: Given, name: str = "the results") -> Results:
@@ -189,7 +169,7 @@ def score_line(judged: Judged) -> str:
     )
 
 
-def _log_score_text(surprise: LogScore) -> str:
+def _log_score_text(surprise: metrics.LogScore) -> str:
     """Return the log score in words; says so where a truth was ruled out altogether."""
     text = f"{surprise.mean:.3f} nats a run"
     if not surprise.impossible:
@@ -225,8 +205,8 @@ class Calibration:
         by_chance: Errors that a perfectly calibrated method would show in `equal`, (draw,).
     """
 
-    equal: Reliability
-    adaptive: Reliability
+    equal: metrics.Reliability
+    adaptive: metrics.Reliability
     by_chance: FloatArray
 
 
@@ -243,13 +223,13 @@ class Evaluation:
     """
 
     judged: Judged
-    alarms: Alarms
+    alarms: metrics.Alarms
     brier: float
     calibration: Calibration | None
-    coverage: Sequence[Coverage]
+    coverage: Sequence[metrics.Coverage]
 
     @property
-    def scores(self) -> Scores:
+    def scores(self) -> metrics.Scores:
         """Right, wrong and the log score."""
         return self.judged.scores
 
@@ -277,10 +257,10 @@ def evaluate(
     intervals = () if truths is None else _intervals(judged, truths)
     return Evaluation(
         judged=judged,
-        alarms=count_alarms(judged.truth, judged.verdicts),
-        brier=float(brier_score(judged.truth, judged.posteriors).mean()),
+        alarms=metrics.count_alarms(judged.truth, judged.verdicts),
+        brier=float(metrics.brier_score(judged.truth, judged.posteriors).mean()),
         calibration=_calibration(judged, rng or np.random.default_rng(0)),
-        coverage=coverage_by_mode(intervals),
+        coverage=metrics.coverage_by_mode(intervals),
     )
 
 
@@ -301,15 +281,15 @@ def _calibration(judged: Judged, rng: np.random.Generator) -> Calibration | None
         return None
     chance = np.array([posterior[verdict] for verdict, posterior in pairs if verdict is not None])
     stated, right = np.minimum(chance, 1.0), judged.right[decided]  # sums may round above 1
-    equal = equal_edges()
+    equal = metrics.equal_edges()
     return Calibration(
-        equal=reliability(stated, right, equal),
-        adaptive=reliability(stated, right, adaptive_edges(stated)),
-        by_chance=calibrated_error(stated, equal, rng),
+        equal=metrics.reliability(stated, right, equal),
+        adaptive=metrics.reliability(stated, right, metrics.adaptive_edges(stated)),
+        by_chance=metrics.calibrated_error(stated, equal, rng),
     )
 
 
-def _intervals(judged: Judged, truths: Truths) -> Iterator[IntervalCase]:
+def _intervals(judged: Judged, truths: Truths) -> Iterator[metrics.IntervalCase]:
     """Yield the intervals of runs whose fault was found, with the values that they should hold."""
     for diagnosis, right in zip(judged.diagnoses, judged.truth, strict=True):
         if diagnosis.diagnosis != right:
@@ -321,7 +301,7 @@ def _intervals(judged: Judged, truths: Truths) -> Iterator[IntervalCase]:
             ("magnitude", diagnosis.magnitude_90, known.magnitude),
         ):
             if interval is not None and np.isfinite(true):
-                yield IntervalCase(mode, quantity, *interval, true)
+                yield metrics.IntervalCase(mode, quantity, *interval, true)
 
 
 # Two methods on the same runs: which is better?
@@ -342,8 +322,8 @@ class Comparison:
 
     first: str
     second: str
-    split: McNemar
-    gain: LogScoreGain
+    split: metrics.McNemar
+    gain: metrics.LogScoreGain
     as_unknown: tuple[int, int]
 
     @property
@@ -378,8 +358,8 @@ def compare(
     return Comparison(
         first=_named(one),
         second=_named(other),
-        split=mcnemar(ours.right, theirs.right),
-        gain=log_score_gain(
+        split=metrics.mcnemar(ours.right, theirs.right),
+        gain=metrics.log_score_gain(
             ours.scores.surprise.nats, theirs.scores.surprise.nats, rng or np.random.default_rng(0)
         ),
         as_unknown=(sum(ours.as_unknown.values()), sum(theirs.as_unknown.values())),

@@ -66,14 +66,13 @@ def watch(
     # An emulated robot ends by itself, a log when it is over.
     length = live.duration if live.duration and source != "emulated" else math.inf
     with ExitStack() as stack:
-        connections = connect(source, model, live, seed, stack)
-        sinks = list(connections.sinks)
+        link, sinks = connect(source, model, live, seed, stack)
         if record is not None:
             sinks.append(stack.enter_context(Recorder(record, model)))
-        shadow = Shadow(connections.source, diagnoser, twin, sinks, wait_s)
+        shadow = Shadow(link, diagnoser, twin, sinks, wait_s)
         try:
             until = time.monotonic() + length
-            watch_until_end(shadow, connections.source, sinks, motors, console(), until)
+            watch_until_end(shadow, link, sinks, motors, console(), until)
         except KeyboardInterrupt:
             click.echo("stopped")
     arm = statuses(shadow.snapshot.answer, motors)[0]

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
 
 import click
 
-from failuretwin.app.commands.options import PATH
-
-F = TypeVar("F", bound=Callable[..., Any])
+from failuretwin.app.commands.options import PATH, F
 
 
 def link_options(command: F) -> F:
