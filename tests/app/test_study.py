@@ -17,7 +17,6 @@ from failuretwin.app.study import (
     FEATURES,
     PLAN_FILE,
     WORK,
-    Checkpoint,
     Exam,
     Job,
     StudyPlan,
@@ -48,9 +47,7 @@ def studied(armpi, exam, tmp_path_factory):
 
 
 def result(confusion):
-    return Training(
-        Job("augmented", 1e-3, 0), (Checkpoint(1, 1.0, 1.0, 1.0),), tuple(map(tuple, confusion)), 1
-    )
+    return Training(Job("augmented", 1e-3, 0), {"test": (1.0,)}, tuple(map(tuple, confusion)), 1)
 
 
 def test_the_plan_is_the_papers():
@@ -116,7 +113,7 @@ def test_what_is_done_is_not_done_again(armpi, exam, studied):
     told = []
     run_study(TINY, armpi, exam, folder, told.append)
     again = json.loads(one.read_text())
-    assert again["checkpoints"] == before["checkpoints"]
+    assert again["accuracies"] == before["accuracies"]
     assert {path: path.stat().st_mtime_ns for path in others} == stamps
     assert told[0] == len(others) * TINY.iterations
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,19 +10,20 @@ import numpy as np
 
 from failuretwin import __version__
 from failuretwin.app.calibration_tables import (
+    Channels,
     beats_uncalibrated,
+    held_out_table,
     left_out_line,
     parameter_groups,
     verdict_line,
 )
 from failuretwin.app.plots import BLUE, GREY, RED, clean, figure_class, png, render_page
-from failuretwin.app.tables import Table, figures_table
+from failuretwin.app.tables import Table
 from failuretwin.connection.calibration.example_transient import ExampleRamp, example_ramp
 from failuretwin.connection.calibration.result import Calibration, HeldOut
 from failuretwin.connection.calibration.validation import Predictions, predict, settling_of
-from failuretwin.core.runs import AXES
 from failuretwin.core.types import FloatArray
-from failuretwin.digital_model.robot import Robot, shown_unit
+from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling
 
 if TYPE_CHECKING:
@@ -41,39 +41,16 @@ LOAD_FLOOR_NM = 1e-3
 """Load torque below which a motor counts as unloaded in the pictures [N m]."""
 
 
-@dataclass(frozen=True)
-class Channels:
-    """What is compared: the angles of the motors, or the axes of the tool.
-
-    Attributes:
-        names: As people say them.
-        scale: From SI to the unit that people read.
-        unit: That unit.
-    """
-
-    names: list[str]
-    scale: float
-    unit: str
-
-    @classmethod
-    def of(cls, robot: Robot, of_motors: bool) -> Channels:
-        """Return those of a robot."""
-        if not of_motors:
-            return cls([f"tool {axis}" for axis in AXES], 1e3, "mm")
-        return cls(
-            [name.replace("_", " ") for name in robot.motor_names], *shown_unit("rad", robot)
-        )
-
-    def panels(self) -> tuple[Figure, list[Axes]]:
-        """Return a figure with a panel for each, to be handed to `finish`."""
-        count = len(self.names)
-        columns = min(count, MOST_COLUMNS)
-        rows = -(-count // columns)
-        figure = figure_class()(figsize=(WIDTH_IN, PANEL_IN * rows + 0.4), layout="constrained")
-        panels = [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
-        for panel, name in zip(panels, self.names, strict=True):
-            panel.set_title(name, fontsize=10)
-        return figure, panels
+def _panels(channels: Channels) -> tuple[Figure, list[Axes]]:
+    """Return a figure with a panel for each channel, to be handed to `finish`."""
+    count = len(channels.names)
+    columns = min(count, MOST_COLUMNS)
+    rows = -(-count // columns)
+    figure = figure_class()(figsize=(WIDTH_IN, PANEL_IN * rows + 0.4), layout="constrained")
+    panels = [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
+    for panel, name in zip(panels, channels.names, strict=True):
+        panel.set_title(name, fontsize=10)
+    return figure, panels
 
 
 def finish(figure: Figure, panels: Sequence[Axes], below: str = "", beside: str = "") -> Figure:
@@ -95,7 +72,7 @@ def load_figure(seen: Predictions, settling: Settling, robot: Robot) -> Figure:
     """Return the settled error of each motor against its load, with the fitted lines."""
     channels = Channels.of(robot, True)
     scale = channels.scale
-    figure, panels = channels.panels()
+    figure, panels = _panels(channels)
     for k, panel in enumerate(panels):
         torque = seen.torque[:, k]
         loaded = bool(np.abs(torque).max(initial=0.0) > LOAD_FLOOR_NM)
@@ -116,7 +93,7 @@ def expected_figure(seen: Predictions, robot: Robot) -> Figure:
     """Return settled errors against what was expected of them, each channel a panel."""
     channels = Channels.of(robot, seen.of_motors)
     unit = channels.unit
-    figure, panels = channels.panels()
+    figure, panels = _panels(channels)
     for k, (panel, name) in enumerate(zip(panels, channels.names, strict=True)):
         kept = seen.counts[:, k]
         expected, error = (channels.scale * e[kept, k] for e in (seen.expected, seen.error))
@@ -145,7 +122,7 @@ def quantile_figure(seen: Predictions, dof: float, robot: Robot) -> Figure:
     """Return quantiles of what is left against those of the fitted Student t distribution."""
     from scipy.stats import beta, t
 
-    figure, panels = Channels.of(robot, seen.of_motors).panels()
+    figure, panels = _panels(Channels.of(robot, seen.of_motors))
     for k, panel in enumerate(panels):
         kept = seen.counts[:, k]
         left = np.sort((seen.error - seen.expected)[kept, k] / seen.scale[kept, k])
@@ -163,7 +140,7 @@ def quantile_figure(seen: Predictions, dof: float, robot: Robot) -> Figure:
 def ramp_figure(ramp: ExampleRamp, robot: Robot) -> Figure:
     """Return one movement: command, twin before and after calibration, and readings."""
     channels = Channels.of(robot, ramp.of_motors)
-    figure, panels = channels.panels()
+    figure, panels = _panels(channels)
     lines: tuple[tuple[FloatArray, dict[str, Any]], ...] = (
         (ramp.command, {"color": GREY, "lw": 2.2, "label": "command"}),
         (ramp.plain, {"color": RED, "lw": 1.2, "ls": "--", "label": "uncalibrated"}),
@@ -209,7 +186,6 @@ def write_calibration_page(
     Raises:
         InputError: If jinja2 or matplotlib is missing.
     """
-    channels = Channels.of(robot, found.used_readings)
     units, better = robot.profile.servo_units, beats_uncalibrated(found)
     left_out = [(e.run, str(e.movement or "all"), f"{e.motor} {e.reason}") for e in found.left_out]
     seen, settling = predict(found, runs, robot), settling_of(found, robot)
@@ -222,8 +198,7 @@ def write_calibration_page(
             "verdict": verdict_line(found).rstrip("."),
             "grade": "unknown" if better is None else "good" if better else "bad",
             "facts": _facts(found, settling),
-            "sessions": _sessions(found.held_out, channels),
-            "unit": channels.unit,
+            "sessions": held_out_table(found, robot),
             "groups": parameter_groups(found, robot),
             "count_deg": None if units is None else units.deg_per_count,
             "left_out": Table(("run", "movement", "why"), left_out),
@@ -249,16 +224,6 @@ def _facts(found: Calibration, settling: Settling) -> Table:
         ("made by", f"failuretwin {__version__}"),
     ]
     return Table(("", ""), rows, header=False)
-
-
-def _sessions(held_out: Sequence[HeldOut], channels: Channels) -> Table:
-    rows = []
-    for entry in held_out:
-        pairs = channels.scale * np.array([entry.before, entry.after]).T
-        sizes = (f"{before:.2f} \u2192 {after:.2f}" for before, after in pairs)
-        gain = f"{entry.gain:+.2f} \u00b1 {1.96 * entry.gain_error:.2f}"
-        rows.append((entry.session, str(entry.movements), *sizes, gain))
-    return figures_table(("session", "movements", *channels.names, "gain [nats]"), rows)
 
 
 def _pictures(

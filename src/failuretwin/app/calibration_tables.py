@@ -10,6 +10,7 @@ import numpy as np
 
 from failuretwin.app.tables import Table, show
 from failuretwin.connection.calibration.result import Calibration, HeldOut, Parameter
+from failuretwin.core.runs import AXES
 from failuretwin.digital_model.robot import Robot, shown_unit
 
 
@@ -24,7 +25,7 @@ def print_calibration(found: Calibration, robot: Robot) -> None:
         show(f"\nleft out: {left_out_line(found)}")
     if found.held_out:
         show("\nsessions predicted by what the others say (settled error)\n")
-        show(_held_out_table(found, robot))
+        show(held_out_table(found, robot))
     show(f"\n{verdict_line(found)}")
 
 
@@ -42,17 +43,40 @@ def _title(parameter: Parameter) -> str:
     return f"{parameter.name}, {parameter.motor}" if parameter.motor else parameter.name
 
 
-def _held_out_table(found: Calibration, robot: Robot) -> Table:
-    scale, unit = shown_unit("rad", robot) if found.used_readings else (1e3, "mm")
-    names = robot.motor_names if found.used_readings else ["x", "y", "z"]
-    rows = []
+@dataclass(frozen=True)
+class Channels:
+    """What is compared: the angles of the motors, or the axes of the tool.
+
+    Attributes:
+        names: As people say them.
+        scale: From SI to the unit that people read.
+        unit: That unit.
+    """
+
+    names: list[str]
+    scale: float
+    unit: str
+
+    @classmethod
+    def of(cls, robot: Robot, of_motors: bool) -> Channels:
+        """Return those of a robot."""
+        if not of_motors:
+            return cls([f"tool {axis}" for axis in AXES], 1e3, "mm")
+        return cls(
+            [name.replace("_", " ") for name in robot.motor_names], *shown_unit("rad", robot)
+        )
+
+
+def held_out_table(found: Calibration, robot: Robot) -> Table:
+    """Return the settled error of each unseen session, uncalibrated and predicted, and the gain."""
+    channels, rows = Channels.of(robot, found.used_readings), []
     for entry in found.held_out:
-        pairs = zip(entry.before, entry.after, strict=True)
-        cells = (f"{scale * before:.2f} -> {scale * after:.2f}" for before, after in pairs)
+        pairs = channels.scale * np.array([entry.before, entry.after]).T
+        cells = (f"{before:.2f} -> {after:.2f}" for before, after in pairs)
         gain = f"{entry.gain:+.2f} +- {1.96 * entry.gain_error:.2f}"
         rows.append((entry.session, str(entry.movements), *cells, gain))
-    channels = (f"{name} [{unit}]" for name in names)
-    return Table(("session", "movements", *channels, "gain [nats a movement]"), rows)
+    names = (f"{name} [{channels.unit}]" for name in channels.names)
+    return Table(("session", "movements", *names, "gain [nats a movement]"), rows)
 
 
 def left_out_line(found: Calibration) -> str:

@@ -267,18 +267,9 @@ def watch_until_end(
     console: Console,
     until_s: float,
 ) -> Changes:
-    """Watch a robot; on a terminal with a live view, else with a line for each change.
+    """Watch a robot until `until_s` of our monotonic clock [s], and return all that has changed.
 
-    Args:
-        shadow: The shadow of the robot.
-        source: The robot.
-        sinks: Where the shadow tells what it knows.
-        motors: Names of the robot's motors in chain order.
-        console: Where to draw.
-        until_s: When to stop, by our own monotonic clock [s].
-
-    Returns:
-        All that has changed.
+    On a terminal there is a live view, else a line for each change.
     """
     changes, view = Changes(motors), View(motors, source.name)
     live = Live(console=console, auto_refresh=False) if console.is_terminal else nullcontext()

@@ -207,14 +207,7 @@ class Changes:
     def notice(
         self, snapshot: Snapshot, counts: LinkCounts, jumps: int, troubles: tuple[str, ...]
     ) -> list[Change]:
-        """Return what has changed since the last call.
-
-        Args:
-            snapshot: What the shadow knows.
-            counts: What the link has seen.
-            jumps: How often the robot's clock was set.
-            troubles: What keeps sinks from working.
-        """
+        """Return what has changed since the last call."""
         texts = self._link(snapshot.stream_time, counts, jumps, troubles)
         texts += self._silence(snapshot)
         texts += self._diagnosis(snapshot)

@@ -30,6 +30,7 @@ from failuretwin.core.types import IntArray
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import reason, replacing
+from failuretwin.decision.evaluation import Truths
 from failuretwin.decision.learned.features import Encoder, signals_of
 from failuretwin.digital_model.robot import Robot
 
@@ -136,14 +137,8 @@ def real_test_set(path: Path, robot: Robot, published_labels: bool) -> Exam:
     """
     runs = read_runs(path, robot, ReadOptions("published", published_labels))
     check_motors(runs, robot.name, robot.motor_names)
-    truth = truth_of(runs)
-    if truth is None:
-        raise InputError(
-            f"{path}: the truth of its runs is not known, so nothing can be tested on them. Give a "
-            "run set with `fault`, or raw sessions whose folders end in _label_K with "
-            "--published-labels."
-        )
-    strange = sorted(set(truth) - set(class_names(robot)))
+    truth = {known.fault for known in Truths.of(runs, str(path)).by_run.values()}
+    strange = sorted(truth - set(class_names(robot)))
     if strange:
         raise InputError(
             f"{path}: runs of {', '.join(strange)} are no class of the study. Expected "
@@ -193,35 +188,19 @@ LOOK_S = 0.5
 
 
 @dataclass(frozen=True)
-class Checkpoint:
-    """Shares of runs that a network gets right at one point of its training.
-
-    Attributes:
-        iteration: Batches seen.
-        training: On the runs it learns from.
-        validation: On simulated runs it does not learn from.
-        test: On the test set.
-    """
-
-    iteration: int
-    training: float
-    validation: float
-    test: float
-
-
-@dataclass(frozen=True)
 class Training:
     """The result of one job.
 
     Attributes:
         job: What was trained.
-        checkpoints: In the order of their iterations.
-        confusion: Counts on the test set at the last of them, rows of (truth, diagnosis).
+        accuracies: Shares of runs that are right at each checkpoint of the plan, on those learned
+            from (`training`), simulated ones held out (`validation`) and the `test` set.
+        confusion: Counts on the test set at the last checkpoint, rows of (truth, diagnosis).
         seconds: Time it took [s].
     """
 
     job: Job
-    checkpoints: tuple[Checkpoint, ...]
+    accuracies: dict[str, tuple[float, ...]]
     confusion: tuple[tuple[int, ...], ...]
     seconds: float
 
@@ -231,12 +210,7 @@ def run_all(
 ) -> list[Training]:
     """Do all trainings that have no result in `folder` yet; return the results of all.
 
-    Args:
-        plan: What to do.
-        folder: Where the arrays are and the results go.
-        classes: Number of classes.
-        on_progress: Called with the number of iterations just done, those of earlier attempts
-            included.
+    Progress counts iterations, those of earlier attempts included.
     """
     jobs = list(plan.jobs())
     missing = [job for job in jobs if not _file(folder, job).is_file()]
@@ -336,18 +310,19 @@ def train(plan: StudyPlan, folder: Path, classes: int, job: Job) -> None:
     torch.manual_seed(int(rng.integers(2**31)))
     network = build_network("lstm", Shape(simulated.shape[2], classes))
     batches = shuffled_batches(*sets["training"], BATCH_RUNS, rng)
-    checkpoints = []
+    right: dict[str, list[float]] = {name: [] for name in sets}
     verdicts: dict[str, IntArray] = {}
     for iteration in training(network, batches, Pace(plan.iterations, job.learning_rate)):
         _count()
         if iteration in plan.checkpoints:
             verdicts = {name: scores_of(network, x).argmax(axis=1) for name, (x, _) in sets.items()}
-            right = {name: float(np.mean(verdicts[name] == sets[name][1])) for name in sets}
-            checkpoints.append(Checkpoint(iteration, **right))
+            for name, shares in right.items():
+                shares.append(float(np.mean(verdicts[name] == sets[name][1])))
     confusion = np.zeros((classes, classes), dtype=np.int64)
     np.add.at(confusion, (arrays["test_class"], verdicts["test"]), 1)
     counts = tuple(tuple(row) for row in confusion.tolist())
-    result = Training(job, tuple(checkpoints), counts, time.perf_counter() - begun)
+    accuracies = {name: tuple(shares) for name, shares in right.items()}
+    result = Training(job, accuracies, counts, time.perf_counter() - begun)
     with replacing(_file(folder, job)) as file:
         file.write_text(json.dumps(asdict(result), indent=1), encoding="utf-8")
 

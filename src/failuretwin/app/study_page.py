@@ -11,16 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from failuretwin import __version__
-from failuretwin.app.plots import (
-    BLUE,
-    GREY,
-    MM_PER_M,
-    RED,
-    clean,
-    figure_class,
-    png,
-    render_page,
-)
+from failuretwin.app import plots
+from failuretwin.app.plots import BLUE, GREY, MM_PER_M, RED
 from failuretwin.app.study import (
     FEATURES,
     PRINTED_RATE,
@@ -103,8 +95,8 @@ def spread_of(values: Sequence[float] | FloatArray) -> Spread:
 
 def accuracies(repeats: Sequence[Training], name: str) -> list[Spread]:
     """Return the accuracy on one of `SETS` at each checkpoint."""
-    rows = [[getattr(point, name) for point in training.checkpoints] for training in repeats]
-    return [spread_of(column) for column in np.array(rows).T]
+    rows = np.array([training.accuracies[name] for training in repeats])
+    return [spread_of(column) for column in rows.T]
 
 
 def class_ratios(repeats: Sequence[Training]) -> list[tuple[Spread, ...]]:
@@ -136,16 +128,17 @@ def mean_confusion(repeats: Sequence[Training]) -> FloatArray:
 COLOURS = {"training": GREY, "validation": BLUE, "test": RED}
 
 
-def training_figure(trainings: Sequence[Training], learning_rate: float) -> Figure:
+def training_figure(
+    trainings: Sequence[Training], learning_rate: float, iterations: Sequence[int]
+) -> Figure:
     """Return accuracy by iterations, a panel for each feature set, with error bars of one sd.
 
     The published accuracies are lines in the panel of augmented features.
     """
-    figure = figure_class()(figsize=(11.0, 4.2), layout="constrained")
+    figure = plots.figure_class()(figsize=(11.0, 4.2), layout="constrained")
     panels = figure.subplots(1, len(FEATURES), sharey=True)
     for panel, features in zip(panels, FEATURES, strict=True):
         repeats = of_kind(trainings, features, learning_rate)
-        iterations = [point.iteration for point in repeats[0].checkpoints]
         for name in SETS:
             rows = accuracies(repeats, name)
             panel.errorbar(
@@ -163,7 +156,7 @@ def training_figure(trainings: Sequence[Training], learning_rate: float) -> Figu
         panel.set_title(f"{features} features", fontsize=10)
         panel.set_xlabel("iterations")
         panel.set_ylim(0.0, 102.0)
-        clean(panel)
+        plots.clean(panel)
     panels[0].set_ylabel("right [%]")
     panels[0].legend(loc="lower right", fontsize=8, frameon=False)
     return figure
@@ -175,7 +168,7 @@ def path_figure(runs: xr.Dataset, run: int, twin: DigitalTwin) -> Figure:
     measured = as_floats(runs["measured"].values[run])
     simulated = twin.path(twin.respond(as_floats(runs["command"].values[run]), time))
     seen = np.isfinite(measured).all(axis=1)
-    figure = figure_class()(figsize=(11.0, 5.4), layout="constrained")
+    figure = plots.figure_class()(figsize=(11.0, 5.4), layout="constrained")
     panels = figure.subplots(2, len(AXES), sharex=True)
     for column, axis in enumerate(AXES):
         upper, lower = panels[:, column]
@@ -185,8 +178,8 @@ def path_figure(runs: xr.Dataset, run: int, twin: DigitalTwin) -> Figure:
         residual = MM_PER_M * (measured - simulated)[seen, column]
         lower.plot(time[seen], residual, color=RED)
         lower.set_xlabel("time [s]")
-        clean(upper)
-        clean(lower)
+        plots.clean(upper)
+        plots.clean(lower)
     panels[0, 0].legend(fontsize=8, frameon=False)
     panels[1, 0].set_ylabel("residual [mm]")
     return figure
@@ -199,7 +192,7 @@ def confusion_figure(shares: Mapping[str, FloatArray], classes: Sequence[str]) -
         shares: Share of each truth that got each diagnosis, by title, (truth, diagnosis).
         classes: Names of the classes.
     """
-    figure = figure_class()(figsize=(6.0 * len(shares), 5.6), layout="constrained")
+    figure = plots.figure_class()(figsize=(6.0 * len(shares), 5.6), layout="constrained")
     panels = figure.subplots(1, len(shares), sharey=True, squeeze=False)[0]
     for panel, (title, share) in zip(panels, shares.items(), strict=True):
         panel.imshow(np.nan_to_num(share), vmin=0.0, vmax=1.0, cmap="Blues")
@@ -240,11 +233,11 @@ def write_study_page(
         "progress": _progress(trainings, plan),
         "classes": [_table_3(trainings, features, names) for features in FEATURES],
         "rates": RATES,
-        "pictures": _pictures(trainings, robot, test, names),
+        "pictures": _pictures(trainings, plan, robot, test),
         "minutes": sum(training.seconds for training in trainings) / 60.0,
     }
     with replacing(path) as partial:
-        partial.write_text(render_page("study.html.j2", values), encoding="utf-8")
+        partial.write_text(plots.render_page("study.html.j2", values), encoding="utf-8")
 
 
 def _table_2(trainings: Sequence[Training], test: Exam) -> Table:
@@ -304,13 +297,15 @@ def percent(value: Spread) -> str:
 
 
 def _pictures(
-    trainings: Sequence[Training], robot: Robot, test: Exam, names: Sequence[str]
+    trainings: Sequence[Training], plan: StudyPlan, robot: Robot, test: Exam
 ) -> dict[str, str]:
     shares = {
         f"{features} features": mean_confusion(of_kind(trainings, features, REPRODUCING_RATE))
         for features in FEATURES
     }
-    figures = {f"training {rate:g}": training_figure(trainings, rate) for rate in RATES}
+    figures = {
+        f"training {rate:g}": training_figure(trainings, rate, plan.checkpoints) for rate in RATES
+    }
     figures["path"] = path_figure(test.runs, 0, DigitalTwin(robot))
-    figures["confusion"] = confusion_figure(shares, [_plain(name) for name in names])
-    return {name: png(figure) for name, figure in figures.items()}
+    figures["confusion"] = confusion_figure(shares, [_plain(name) for name in class_names(robot)])
+    return {name: plots.png(figure) for name, figure in figures.items()}

@@ -136,11 +136,9 @@ def simulate(
     names = model.motor_names
     plan = Plan(
         robot=model,
-        hypotheses=(
-            parse_hypotheses(hypotheses.split(","), names)
-            if hypotheses is not None
-            else paper_hypotheses(names)
-        ),
+        hypotheses=paper_hypotheses(names)
+        if hypotheses is None
+        else parse_hypotheses(hypotheses.split(","), names),
         runs_per_class=runs_per_class,
         seed=seed,
         imperfections=load_imperfections(imperfections, model),

@@ -162,16 +162,9 @@ def study(
     Both feature sets, both readings of the learning rate, five repetitions, the figures of
     tables II and III beside the published ones. Each training that is done is kept.
     """
+    from failuretwin.app import study as paper
     from failuretwin.app.inputs import check_learning
     from failuretwin.app.plots import figure_class
-    from failuretwin.app.study import (
-        StudyPlan,
-        check_folder,
-        quick_plan,
-        real_test_set,
-        run_study,
-        stand_in_test_set,
-    )
     from failuretwin.app.tables import progress_bar
     from failuretwin.core.errors import InputError
     from failuretwin.digital_model.robot import load_robot
@@ -179,16 +172,16 @@ def study(
     if published_labels and test_path is None:
         raise InputError("--published-labels says how to read a test set. Add --test PATH.")
     model = load_robot(robot)
-    plan = quick_plan(seed) if quick else StudyPlan(seed)
-    check_folder(out, resume)
+    plan = paper.quick_plan(seed) if quick else paper.StudyPlan(seed)
+    paper.check_folder(out, resume)
     figure_class()  # better told before the work than after it
     test = (
-        stand_in_test_set(plan, model)
+        paper.stand_in_test_set(plan, model)
         if test_path is None
-        else real_test_set(test_path, model, published_labels)
+        else paper.real_test_set(test_path, model, published_labels)
     )
     check_learning()
     total = len(list(plan.jobs())) * plan.iterations
     with progress_bar("training", total) as advance:
-        page = run_study(plan, model, test, out, advance)
+        page = paper.run_study(plan, model, test, out, advance)
     click.echo(f"written to {page}")
