@@ -10,8 +10,8 @@ import numpy as np
 
 from failuretwin import __version__
 from failuretwin.app.calibration_tables import (
-    Channels,
     beats_uncalibrated,
+    channels,
     held_out_table,
     left_out_line,
     parameter_groups,
@@ -41,14 +41,14 @@ LOAD_FLOOR_NM = 1e-3
 """Load torque below which a motor counts as unloaded in the pictures [N m]."""
 
 
-def _panels(channels: Channels) -> tuple[Figure, list[Axes]]:
+def _panels(names: list[str]) -> tuple[Figure, list[Axes]]:
     """Return a figure with a panel for each channel, to be handed to `finish`."""
-    count = len(channels.names)
+    count = len(names)
     columns = min(count, MOST_COLUMNS)
     rows = -(-count // columns)
     figure = figure_class()(figsize=(WIDTH_IN, PANEL_IN * rows + 0.4), layout="constrained")
     panels = [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
-    for panel, name in zip(panels, channels.names, strict=True):
+    for panel, name in zip(panels, names, strict=True):
         panel.set_title(name, fontsize=10)
     return figure, panels
 
@@ -70,9 +70,8 @@ def finish(figure: Figure, panels: Sequence[Axes], below: str = "", beside: str 
 
 def load_figure(seen: Predictions, settling: Settling, robot: Robot) -> Figure:
     """Return the settled error of each motor against its load, with the fitted lines."""
-    channels = Channels.of(robot, True)
-    scale = channels.scale
-    figure, panels = _panels(channels)
+    names, scale, unit = channels(robot, True)
+    figure, panels = _panels(names)
     for k, panel in enumerate(panels):
         torque = seen.torque[:, k]
         loaded = bool(np.abs(torque).max(initial=0.0) > LOAD_FLOOR_NM)
@@ -86,17 +85,16 @@ def load_figure(seen: Predictions, settling: Settling, robot: Robot) -> Figure:
             panel.plot(ends, scale * line, color=colour, lw=1.8, label=label)
         panel.axhline(0.0, color=GREY, lw=0.8, zorder=0)
         panel.set_xlabel("load torque [N m]" if loaded else "target [deg], no load", fontsize=9)
-    return finish(figure, panels, beside=f"settled error [{channels.unit}]")
+    return finish(figure, panels, beside=f"settled error [{unit}]")
 
 
 def expected_figure(seen: Predictions, robot: Robot) -> Figure:
     """Return settled errors against what was expected of them, each channel a panel."""
-    channels = Channels.of(robot, seen.of_motors)
-    unit = channels.unit
-    figure, panels = _panels(channels)
-    for k, (panel, name) in enumerate(zip(panels, channels.names, strict=True)):
+    names, scale, unit = channels(robot, seen.of_motors)
+    figure, panels = _panels(names)
+    for k, (panel, name) in enumerate(zip(panels, names, strict=True)):
         kept = seen.counts[:, k]
-        expected, error = (channels.scale * e[kept, k] for e in (seen.expected, seen.error))
+        expected, error = (scale * e[kept, k] for e in (seen.expected, seen.error))
         reach = _reach(expected, error)
         panel.plot([-reach, reach], [0.0, 0.0], color=GREY, lw=1.5, label="uncalibrated twin")
         panel.plot([-reach, reach], [-reach, reach], color=BLUE, lw=1.5, label="calibrated twin")
@@ -122,7 +120,7 @@ def quantile_figure(seen: Predictions, dof: float, robot: Robot) -> Figure:
     """Return quantiles of what is left against those of the fitted Student t distribution."""
     from scipy.stats import beta, t
 
-    figure, panels = _panels(Channels.of(robot, seen.of_motors))
+    figure, panels = _panels(channels(robot, seen.of_motors)[0])
     for k, panel in enumerate(panels):
         kept = seen.counts[:, k]
         left = np.sort((seen.error - seen.expected)[kept, k] / seen.scale[kept, k])
@@ -139,8 +137,8 @@ def quantile_figure(seen: Predictions, dof: float, robot: Robot) -> Figure:
 
 def ramp_figure(ramp: ExampleRamp, robot: Robot) -> Figure:
     """Return one movement: command, twin before and after calibration, and readings."""
-    channels = Channels.of(robot, ramp.of_motors)
-    figure, panels = _panels(channels)
+    names, scale, unit = channels(robot, ramp.of_motors)
+    figure, panels = _panels(names)
     lines: tuple[tuple[FloatArray, dict[str, Any]], ...] = (
         (ramp.command, {"color": GREY, "lw": 2.2, "label": "command"}),
         (ramp.plain, {"color": RED, "lw": 1.2, "ls": "--", "label": "uncalibrated"}),
@@ -149,30 +147,31 @@ def ramp_figure(ramp: ExampleRamp, robot: Robot) -> Figure:
     )
     for k, panel in enumerate(panels):
         for values, style in lines:
-            panel.plot(ramp.time, channels.scale * values[:, k], **style)
+            panel.plot(ramp.time, scale * values[:, k], **style)
     what = "angle" if ramp.of_motors else "position"
-    return finish(figure, panels, "time since the command [s]", f"{what} [{channels.unit}]")
+    return finish(figure, panels, "time since the command [s]", f"{what} [{unit}]")
 
 
-def session_figure(held_out: Sequence[HeldOut], channels: Channels) -> Figure:
+def session_figure(held_out: Sequence[HeldOut], robot: Robot, of_motors: bool) -> Figure:
     """Return the size of the settled error of each unseen session, before and after."""
+    names, scale, unit = channels(robot, of_motors)
     height = max(1.9, 0.34 * len(held_out) + 1.2)
     figure = figure_class()(figsize=(WIDTH_IN, height), layout="constrained")
-    panels = figure.subplots(1, len(channels.names), sharey=True, squeeze=False)[0]
+    panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
     rows = np.arange(len(held_out))[::-1]
     bars = (
         (0.19, GREY, "uncalibrated", [entry.before for entry in held_out]),
         (-0.19, BLUE, "calibrated", [entry.after for entry in held_out]),
     )
-    for k, (panel, name) in enumerate(zip(panels, channels.names, strict=True)):
+    for k, (panel, name) in enumerate(zip(panels, names, strict=True)):
         for shift, colour, label, sizes in bars:
-            size = channels.scale * np.array(sizes)[:, k]
+            size = scale * np.array(sizes)[:, k]
             panel.barh(rows + shift, size, 0.36, color=colour, label=label)
         panel.set_title(name, fontsize=10)
         panel.set_yticks(rows, [entry.session for entry in held_out], fontsize=8)
         panel.tick_params(axis="y", length=0)
         panel.set_ylim(-0.6, len(held_out) - 0.4)
-    return finish(figure, panels, f"settled error [{channels.unit}]")
+    return finish(figure, panels, f"settled error [{unit}]")
 
 
 # The page.
@@ -181,11 +180,7 @@ def session_figure(held_out: Sequence[HeldOut], channels: Channels) -> Figure:
 def write_calibration_page(
     found: Calibration, runs: xr.Dataset, robot: Robot, folder: Path
 ) -> None:
-    """Write `index.html` into an existing folder; the runs are those learned from or judged on.
-
-    Raises:
-        InputError: If jinja2 or matplotlib is missing.
-    """
+    """Write `index.html` into an existing folder; the runs are those learned from or judged on."""
     units, better = robot.profile.servo_units, beats_uncalibrated(found)
     left_out = [(e.run, str(e.movement or "all"), f"{e.motor} {e.reason}") for e in found.left_out]
     seen, settling = predict(found, runs, robot), settling_of(found, robot)
@@ -236,8 +231,7 @@ def _pictures(
     """Return those pictures that there is something to show in, by name."""
     figures = {}
     if found.held_out:
-        channels = Channels.of(robot, found.used_readings)
-        figures["sessions"] = session_figure(found.held_out, channels)
+        figures["sessions"] = session_figure(found.held_out, robot, found.used_readings)
     if seen.counts.any():
         figures["expected"] = expected_figure(seen, robot)
         figures["quantiles"] = quantile_figure(seen, settling.tail_dof, robot)

@@ -43,40 +43,25 @@ def _title(parameter: Parameter) -> str:
     return f"{parameter.name}, {parameter.motor}" if parameter.motor else parameter.name
 
 
-@dataclass(frozen=True)
-class Channels:
-    """What is compared: the angles of the motors, or the axes of the tool.
-
-    Attributes:
-        names: As people say them.
-        scale: From SI to the unit that people read.
-        unit: That unit.
-    """
-
-    names: list[str]
-    scale: float
-    unit: str
-
-    @classmethod
-    def of(cls, robot: Robot, of_motors: bool) -> Channels:
-        """Return those of a robot."""
-        if not of_motors:
-            return cls([f"tool {axis}" for axis in AXES], 1e3, "mm")
-        return cls(
-            [name.replace("_", " ") for name in robot.motor_names], *shown_unit("rad", robot)
-        )
+def channels(robot: Robot, of_motors: bool) -> tuple[list[str], float, str]:
+    """Return the name of each motor or tool axis, factor and name of the unit that people read."""
+    if not of_motors:
+        return [f"tool {axis}" for axis in AXES], 1e3, "mm"
+    scale, unit = shown_unit("rad", robot)
+    return [name.replace("_", " ") for name in robot.motor_names], scale, unit
 
 
 def held_out_table(found: Calibration, robot: Robot) -> Table:
     """Return the settled error of each unseen session, uncalibrated and predicted, and the gain."""
-    channels, rows = Channels.of(robot, found.used_readings), []
+    names, scale, unit = channels(robot, found.used_readings)
+    rows = []
     for entry in found.held_out:
-        pairs = channels.scale * np.array([entry.before, entry.after]).T
+        pairs = scale * np.array([entry.before, entry.after]).T
         cells = (f"{before:.2f} -> {after:.2f}" for before, after in pairs)
         gain = f"{entry.gain:+.2f} +- {1.96 * entry.gain_error:.2f}"
         rows.append((entry.session, str(entry.movements), *cells, gain))
-    names = (f"{name} [{channels.unit}]" for name in channels.names)
-    return Table(("session", "movements", *names, "gain [nats a movement]"), rows)
+    settled = (f"{name} [{unit}]" for name in names)
+    return Table(("session", "movements", *settled, "gain [nats a movement]"), rows)
 
 
 def left_out_line(found: Calibration) -> str:

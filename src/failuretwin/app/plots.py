@@ -59,11 +59,7 @@ def png(figure: Figure) -> str:
 def plot_runs(
     runs: xr.Dataset, diagnoses: Sequence[Diagnosis], twin: DigitalTwin, folder: Path
 ) -> list[Path]:
-    """Write a picture of each run into `folder`; diagnoses are in the order of the runs.
-
-    Raises:
-        InputError: If matplotlib is missing.
-    """
+    """Write a picture of each run into `folder`; diagnoses are in the order of the runs."""
     time = as_floats(runs["time"].values)
     written = []
     stems = unique_names([re.sub(r"[^\w.+-]+", "_", diagnosis.run) for diagnosis in diagnoses])
@@ -172,11 +168,7 @@ def render_page(template: str, values: Mapping[str, Any]) -> str:
 def write_page(
     diagnoses: Sequence[Diagnosis], pictures: Sequence[Path], robot: str, path: Path
 ) -> None:
-    """Write the page of some runs, which holds the PNG file of each (in the same order).
-
-    Raises:
-        InputError: If jinja2 is missing.
-    """
+    """Write the page of some runs, which holds the PNG file of each (in the same order)."""
     judged = Judged.of(diagnoses)
     values = {
         "runs": [
@@ -226,11 +218,7 @@ def write_reliability(evaluation: Evaluation, folder: Path) -> None:
 
 
 def reliability_figure(bins: Reliability, title: str) -> Figure:
-    """Return how often verdicts are right by how sure they are, and how many there are.
-
-    Raises:
-        InputError: If matplotlib is missing.
-    """
+    """Return how often verdicts are right by how sure they are, and how many there are."""
     figure = figure_class()(figsize=(5.6, 6.4), layout="constrained")
     grid = figure.add_gridspec(2, 1, height_ratios=[4.0, 1.0])
     upper = figure.add_subplot(grid[0])

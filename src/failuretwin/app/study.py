@@ -221,25 +221,17 @@ def run_all(
     return [from_table(Training, json.loads(f.read_text(encoding="utf-8")), str(f)) for f in files]
 
 
-def processes(jobs: int) -> int:
-    """Return how many trainings run at a time: one for each core, or one on a GPU."""
-    import torch
-
-    if torch.cuda.is_available():
-        return 1
-    from failuretwin.decision.learned.networks import cores
-
-    return min(jobs, cores())
-
-
 def _spread(
     work: Callable[[Job], None], jobs: Sequence[Job], on_progress: Callable[[int], None]
 ) -> None:
+    import torch
+
+    from failuretwin.decision.learned.networks import cores
+
+    at_a_time = 1 if torch.cuda.is_available() else min(len(jobs), cores())
     context = multiprocessing.get_context("spawn")
     done, reported = context.Value("q", 0), 0
-    with ProcessPoolExecutor(
-        processes(len(jobs)), context, initializer=_begin, initargs=(done,)
-    ) as pool:
+    with ProcessPoolExecutor(at_a_time, context, initializer=_begin, initargs=(done,)) as pool:
         running = {pool.submit(work, job) for job in jobs}
         try:
             while running:

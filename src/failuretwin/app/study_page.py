@@ -217,11 +217,7 @@ RATES = (REPRODUCING_RATE, PRINTED_RATE)
 def write_study_page(
     trainings: Sequence[Training], plan: StudyPlan, robot: Robot, test: Exam, path: Path
 ) -> None:
-    """Write tables and pictures of a finished study.
-
-    Raises:
-        InputError: If jinja2 or matplotlib is missing.
-    """
+    """Write tables and pictures of a finished study."""
     names = class_names(robot)
     values = {
         "plan": plan,
