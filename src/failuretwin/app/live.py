@@ -154,12 +154,7 @@ SHOWN_CHANGES = 8
 
 
 class View:
-    """Draws what the shadow knows.
-
-    Args:
-        motors: Names of the robot's motors in chain order.
-        source: What the robot is called.
-    """
+    """Draws what the shadow knows."""
 
     def __init__(self, motors: Sequence[str], source: str) -> None:
         self._motors = motors
@@ -281,7 +276,8 @@ def watch_until_end(
             troubles = _troubles(shadow, source, sinks, time.monotonic() - begun_s)
             found = changes.notice(shadow.snapshot, source.counts, shadow.clock_jumps, troubles)
             if shown is None:
-                _print(found)
+                for change in found:
+                    click.echo(str(change))
                 continue
             view.remember(shadow.snapshot)
             if not going or time.monotonic() >= drawn_s + REFRESH_S:
@@ -302,8 +298,3 @@ def _troubles(
         wait = math.ceil(2.0 * shadow.late_s) / 2.0
         found.append(f"commands come late: put commands_late_s = {wait} into the --topics file")
     return tuple(found)
-
-
-def _print(found: Sequence[Change]) -> None:
-    for change in found:
-        click.echo(str(change))

@@ -105,7 +105,7 @@ def run_figure(
         panel.set_xlim(-0.02 * time[-1], 1.02 * time[-1])
         clean(panel)
     _plot_posterior(figure.add_subplot(grid[:, 1]), diagnosis)
-    truth = "" if diagnosis.truth is None else f"\n(truth: {_plain(diagnosis.truth)})"
+    truth = "" if diagnosis.truth is None else f"\n(truth: {plain(diagnosis.truth)})"
     title = textwrap.fill(diagnosis.verdict, TITLE_COLUMNS) + truth
     figure.suptitle(title, fontsize=12, fontweight="bold")
     return figure
@@ -126,7 +126,7 @@ def _plot_posterior(panel: Axes, diagnosis: Diagnosis) -> None:
     values = [100.0 * diagnosis.posterior[name] for name in names]
     colours = [BLUE if name == diagnosis.diagnosis else GREY for name in names]
     panel.barh(range(len(names)), values, color=colours)
-    panel.set_yticks(range(len(names)), [_plain(name) for name in names], fontsize=9)
+    panel.set_yticks(range(len(names)), [plain(name) for name in names], fontsize=9)
     panel.set_xlim(0.0, 115.0)
     panel.set_xticks([0, 50, 100])
     panel.set_xlabel("probability [%]")
@@ -136,7 +136,8 @@ def _plot_posterior(panel: Axes, diagnosis: Diagnosis) -> None:
     clean(panel)
 
 
-def _plain(hypothesis: str) -> str:
+def plain(hypothesis: str) -> str:
+    """Return a hypothesis as people say it."""
     return plain_name(Hypothesis.parse(hypothesis))
 
 
@@ -190,7 +191,7 @@ def _truth_cell(diagnosis: Diagnosis) -> tuple[str, bool]:
     if diagnosis.truth is None:
         return "", False
     truth = judged_truth(diagnosis.truth, diagnosis.posterior)
-    return _plain(diagnosis.truth), truth != diagnosis.diagnosis
+    return plain(diagnosis.truth), truth != diagnosis.diagnosis
 
 
 def _embedded(picture: Path) -> str:

@@ -53,12 +53,7 @@ class Snapshot:
 class Shadow:
     """Feeds a diagnoser from a source and publishes what was seen and what is believed.
 
-    Args:
-        source: The robot.
-        diagnoser: The streaming diagnoser.
-        twin: Kinematics of the robot.
-        sinks: Where events and answers go.
-        commands_late_s: How much later than their stamps commands may arrive [s].
+    Commands may arrive `commands_late_s` [s] later than their stamps.
     """
 
     def __init__(
@@ -188,11 +183,7 @@ class Change:
 
 
 class Changes:
-    """Notices changes from snapshot to snapshot.
-
-    Args:
-        motors: Names of the robot's motors in chain order.
-    """
+    """Notices changes from snapshot to snapshot."""
 
     def __init__(self, motors: list[str]) -> None:
         self.lines: deque[Change] = deque(maxlen=KEPT)

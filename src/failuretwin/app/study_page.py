@@ -23,10 +23,8 @@ from failuretwin.app.study import (
     class_names,
 )
 from failuretwin.app.tables import Table
-from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.runs import AXES
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.failure_modes import plain_name
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
@@ -267,16 +265,12 @@ def _table_3(trainings: Sequence[Training], features: str, names: Sequence[str])
     """Return ratios of each class at the reproducing rate beside those of the paper."""
     ours = class_ratios(of_kind(trainings, features, REPRODUCING_RATE))
     rows = [
-        (_plain(name), *map(text, ours[names.index(name)]), *map(text, published))
+        (plots.plain(name), *map(text, ours[names.index(name)]), *map(text, published))
         for name, published in TABLE_3.items()
         if name in names
     ]
     headings = ("", *RATIOS, *(f"{ratio}, the paper" for ratio in RATIOS))
     return Table(headings, rows, title=f"{features.capitalize()} features")
-
-
-def _plain(name: str) -> str:
-    return plain_name(Hypothesis.parse(name))
 
 
 def text(value: Spread, scale: float = 1.0) -> str:
@@ -303,5 +297,7 @@ def _pictures(
         f"training {rate:g}": training_figure(trainings, rate, plan.checkpoints) for rate in RATES
     }
     figures["path"] = path_figure(test.runs, 0, DigitalTwin(robot))
-    figures["confusion"] = confusion_figure(shares, [_plain(name) for name in class_names(robot)])
+    figures["confusion"] = confusion_figure(
+        shares, [plots.plain(name) for name in class_names(robot)]
+    )
     return {name: plots.png(figure) for name, figure in figures.items()}
