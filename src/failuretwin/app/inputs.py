@@ -36,15 +36,11 @@ if TYPE_CHECKING:
 
     from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
 
-TOLD_ERROR_M = 1e-6
+REPORTED_ERROR_M = 1e-6
 """Error of recovered commands that the user is told of [m]; exact ones are below 1e-9."""
 
 
-def read_inputs(
-    sources: Sequence[Path],
-    robot: Robot,
-    reading: LogOptions,
-) -> xr.Dataset:
+def read_inputs(sources: Sequence[Path], robot: Robot, reading: LogOptions) -> xr.Dataset:
     """Return the runs of all inputs as one run set."""
     options = ReadOptions(
         cast(As, reading.how), reading.published_labels, approximate=reading.approximate
@@ -53,7 +49,7 @@ def read_inputs(
         options = _with_map(options, reading.columns, sources, robot)
     runs = read_runs(list(sources), robot, options)
     error = float(runs.attrs.get(RECOVERY_ERROR, 0.0))
-    if error > TOLD_ERROR_M:
+    if error > REPORTED_ERROR_M:
         click.echo(
             f"note: approximate commands miss the desired path by up to {1000 * error:.1f} mm "
             f"(worst: {runs.attrs[RECOVERY_WORST]}); a diagnosis can be no better than that",
@@ -62,32 +58,18 @@ def read_inputs(
     return runs
 
 
-def tell_mismatch(runs: xr.Dataset, expected: str) -> None:
-    """Tell the user where simulated runs lack the imperfections that a diagnoser expects.
-
-    Args:
-        runs: The run set.
-        expected: Name of those imperfections.
-    """
-    made_with = _made_with(runs)
-    if made_with is not None and made_with != expected and expected != GENERIC_NAME:
+def warn_mismatch(runs: xr.Dataset, expected: str) -> None:
+    """Tell the user where simulated runs lack the imperfections (by name) that are expected."""
+    try:
+        made_with = json.loads(runs.attrs["configuration"])["imperfections"]
+    except (KeyError, TypeError, ValueError):  # a run set of other people may say anything there
+        return
+    if isinstance(made_with, str) and expected not in (made_with, GENERIC_NAME):
         click.echo(
             f"note: the runs were simulated with imperfections '{made_with}', the diagnosis "
             f"expects '{expected}'; there will be false alarms",
             err=True,
         )
-
-
-def _made_with(runs: xr.Dataset) -> str | None:
-    """Return the imperfections that runs were simulated with; None for any other run set."""
-    try:
-        configuration = json.loads(runs.attrs.get("configuration", ""))
-    except (TypeError, ValueError):  # a run set of other people may say anything there
-        return None
-    if not isinstance(configuration, dict):
-        return None
-    made_with = configuration.get("imperfections")
-    return made_with if isinstance(made_with, str) else None
 
 
 def _with_map(
@@ -140,12 +122,8 @@ BLEND = f"{BAYES}+"
 """What stands before the file of a network that is blended with it."""
 
 
-def told_hypotheses(text: str | None, robot: Robot) -> tuple[Hypothesis, ...] | None:
-    """Return the hypotheses that the user names; None where none are named.
-
-    Args:
-        text: Hypotheses in their text form, separated by commas.
-        robot: The robot, for the names of its motors.
+def parse_cli_hypotheses(text: str | None, robot: Robot) -> tuple[Hypothesis, ...] | None:
+    """Return the hypotheses that the user names, separated by commas; None where none are.
 
     Raises:
         InputError: If one cannot be read, or there is only one, which would always be certain.
@@ -211,14 +189,7 @@ def _pooled(network: LearnedDiagnoser, bayes: BayesDiagnoser, path: Path) -> Hyb
 
 
 def expected_name(diagnoser: Diagnoser, bayes: BayesDiagnoser) -> str:
-    """Return the name of the healthy behaviour that a diagnoser expects.
-
-    Args:
-        diagnoser: As `chosen_diagnoser` gave it.
-        bayes: The Bayesian diagnoser, which is it or a part of it unless it is another method.
-    """
-    if isinstance(diagnoser, BayesDiagnoser | HybridDiagnoser):
-        return bayes.healthy_model.imperfections.name
+    """Return the name of the healthy behaviour that a diagnoser of `chosen_diagnoser` expects."""
     encoder = getattr(diagnoser, "encoder", None)
     if encoder is None:
         return GENERIC_NAME  # a class of the user's own: not known, so nothing to warn of

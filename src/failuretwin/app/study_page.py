@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from failuretwin import __version__
-from failuretwin.app.calibration_report import png
-from failuretwin.app.plots import BLUE, GREY, MM_PER_M, RED, clean, environment, figure_class
-from failuretwin.app.study.trainings import (
+from failuretwin.app import plots
+from failuretwin.app.plots import BLUE, GREY, MM_PER_M, RED
+from failuretwin.app.study import (
     FEATURES,
     PRINTED_RATE,
     REPRODUCING_RATE,
@@ -24,10 +22,9 @@ from failuretwin.app.study.trainings import (
     Training,
     class_names,
 )
-from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.app.tables import Table
 from failuretwin.core.runs import AXES
-from failuretwin.core.types import FloatArray, IntArray, as_floats
-from failuretwin.data_knowledge.failure_modes import plain_name
+from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
@@ -96,31 +93,22 @@ def spread_of(values: Sequence[float] | FloatArray) -> Spread:
 
 def accuracies(repeats: Sequence[Training], name: str) -> list[Spread]:
     """Return the accuracy on one of `SETS` at each checkpoint."""
-    rows = [[getattr(point, name) for point in training.checkpoints] for training in repeats]
-    return [spread_of(column) for column in np.array(rows).T]
+    rows = np.array([training.accuracies[name] for training in repeats])
+    return [spread_of(column) for column in rows.T]
 
 
-def class_ratios(repeats: Sequence[Training]) -> list[tuple[Spread, Spread, Spread]]:
+def class_ratios(repeats: Sequence[Training]) -> list[tuple[Spread, ...]]:
     """Return precision, recall and F1 of each class on the test set.
 
     Precision and F1 are NaN in a repetition that never names the class, as in the paper.
     """
-    ratios = np.array([_ratios(np.array(training.confusion)) for training in repeats])
-    return [
-        (spread_of(rows[:, 0]), spread_of(rows[:, 1]), spread_of(rows[:, 2]))
-        for rows in np.moveaxis(ratios, 1, 0)
-    ]
-
-
-def _ratios(confusion: IntArray) -> FloatArray:
-    """Return (class, 3) ratios of one confusion matrix (truth, diagnosis)."""
-    hits = np.diag(confusion).astype(np.float64)
+    counts = np.array([training.confusion for training in repeats], dtype=np.float64)
+    hits = np.diagonal(counts, axis1=1, axis2=2)
+    true, named = counts.sum(axis=2), counts.sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        precision = hits / confusion.sum(axis=0)
-        recall = hits / confusion.sum(axis=1)
-        f1 = 2.0 * hits / (confusion.sum(axis=0) + confusion.sum(axis=1))
-    f1[np.isnan(precision)] = np.nan
-    return np.stack([precision, recall, f1], axis=1)
+        f1 = np.where(named > 0.0, 2.0 * hits / (named + true), np.nan)
+        ratios = np.stack([hits / named, hits / true, f1], axis=-1)  # (repeat, class, ratio)
+    return [tuple(spread_of(column) for column in rows.T) for rows in np.moveaxis(ratios, 1, 0)]
 
 
 def mean_confusion(repeats: Sequence[Training]) -> FloatArray:
@@ -139,20 +127,16 @@ COLOURS = {"training": GREY, "validation": BLUE, "test": RED}
 
 
 def training_figure(
-    trainings: Sequence[Training], learning_rate: float, published: Mapping[str, float]
+    trainings: Sequence[Training], learning_rate: float, iterations: Sequence[int]
 ) -> Figure:
     """Return accuracy by iterations, a panel for each feature set, with error bars of one sd.
 
-    Args:
-        trainings: All results.
-        learning_rate: Which of them to show.
-        published: Published accuracies by set, drawn as lines in the panel of augmented features.
+    The published accuracies are lines in the panel of augmented features.
     """
-    figure = figure_class()(figsize=(11.0, 4.2), layout="constrained")
+    figure = plots.figure_class()(figsize=(11.0, 4.2), layout="constrained")
     panels = figure.subplots(1, len(FEATURES), sharey=True)
     for panel, features in zip(panels, FEATURES, strict=True):
         repeats = of_kind(trainings, features, learning_rate)
-        iterations = [point.iteration for point in repeats[0].checkpoints]
         for name in SETS:
             rows = accuracies(repeats, name)
             panel.errorbar(
@@ -166,29 +150,23 @@ def training_figure(
                 label=name,
             )
             if features == "augmented":
-                panel.axhline(100.0 * published[name], color=COLOURS[name], lw=0.8, ls=":")
+                panel.axhline(100.0 * TABLE_2[name].mean, color=COLOURS[name], lw=0.8, ls=":")
         panel.set_title(f"{features} features", fontsize=10)
         panel.set_xlabel("iterations")
         panel.set_ylim(0.0, 102.0)
-        clean(panel)
+        plots.clean(panel)
     panels[0].set_ylabel("right [%]")
     panels[0].legend(loc="lower right", fontsize=8, frameon=False)
     return figure
 
 
 def path_figure(runs: xr.Dataset, run: int, twin: DigitalTwin) -> Figure:
-    """Return the simulated and the measured path of a run, and what lies between them.
-
-    Args:
-        runs: The test set.
-        run: Number of the run in it.
-        twin: The published twin.
-    """
+    """Return the simulated and the measured path of a run, and what lies between them."""
     time = as_floats(runs["time"].values)
     measured = as_floats(runs["measured"].values[run])
     simulated = twin.path(twin.respond(as_floats(runs["command"].values[run]), time))
     seen = np.isfinite(measured).all(axis=1)
-    figure = figure_class()(figsize=(11.0, 5.4), layout="constrained")
+    figure = plots.figure_class()(figsize=(11.0, 5.4), layout="constrained")
     panels = figure.subplots(2, len(AXES), sharex=True)
     for column, axis in enumerate(AXES):
         upper, lower = panels[:, column]
@@ -198,8 +176,8 @@ def path_figure(runs: xr.Dataset, run: int, twin: DigitalTwin) -> Figure:
         residual = MM_PER_M * (measured - simulated)[seen, column]
         lower.plot(time[seen], residual, color=RED)
         lower.set_xlabel("time [s]")
-        clean(upper)
-        clean(lower)
+        plots.clean(upper)
+        plots.clean(lower)
     panels[0, 0].legend(fontsize=8, frameon=False)
     panels[1, 0].set_ylabel("residual [mm]")
     return figure
@@ -212,7 +190,7 @@ def confusion_figure(shares: Mapping[str, FloatArray], classes: Sequence[str]) -
         shares: Share of each truth that got each diagnosis, by title, (truth, diagnosis).
         classes: Names of the classes.
     """
-    figure = figure_class()(figsize=(6.0 * len(shares), 5.6), layout="constrained")
+    figure = plots.figure_class()(figsize=(6.0 * len(shares), 5.6), layout="constrained")
     panels = figure.subplots(1, len(shares), sharey=True, squeeze=False)[0]
     for panel, (title, share) in zip(panels, shares.items(), strict=True):
         panel.imshow(np.nan_to_num(share), vmin=0.0, vmax=1.0, cmap="Blues")
@@ -229,117 +207,97 @@ def confusion_figure(shares: Mapping[str, FloatArray], classes: Sequence[str]) -
     return figure
 
 
+# The page.
+
 RATES = (REPRODUCING_RATE, PRINTED_RATE)
 
 
 def write_study_page(
     trainings: Sequence[Training], plan: StudyPlan, robot: Robot, test: Exam, path: Path
 ) -> None:
-    """Write tables and pictures of a finished study.
-
-    Args:
-        trainings: All results.
-        plan: What was done.
-        robot: The robot.
-        test: What was tested on.
-        path: HTML file to write.
-
-    Raises:
-        InputError: If jinja2 or matplotlib is missing.
-    """
-    template = (files("failuretwin.app.study") / "study.html.j2").read_text(encoding="utf-8")
+    """Write tables and pictures of a finished study."""
     names = class_names(robot)
-    text = (
-        environment()
-        .from_string(template)
-        .render(
-            plan=plan,
-            robot=robot.name,
-            version=__version__,
-            test=test,
-            full=plan == StudyPlan(plan.seed),
-            table_2=_table_2(trainings),
-            progress=_progress(trainings),
-            iterations=plan.checkpoints,
-            table_3={name: _table_3(trainings, name, names) for name in FEATURES},
-            ratios=RATIOS,
-            rates=RATES,
-            pictures=_pictures(trainings, robot, test, names),
-            minutes=sum(training.seconds for training in trainings) / 60.0,
-        )
-    )
+    values = {
+        "plan": plan,
+        "robot": robot.name,
+        "version": __version__,
+        "test": test,
+        "full": plan == StudyPlan(plan.seed),
+        "accuracies": _table_2(trainings, test),
+        "progress": _progress(trainings, plan),
+        "classes": [_table_3(trainings, features, names) for features in FEATURES],
+        "rates": RATES,
+        "pictures": _pictures(trainings, plan, robot, test),
+        "minutes": sum(training.seconds for training in trainings) / 60.0,
+    }
     with replacing(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+        partial.write_text(plots.render_page("study.html.j2", values), encoding="utf-8")
 
 
-def _table_2(trainings: Sequence[Training]) -> list[dict[str, Any]]:
-    """Return a row for each kind of training and one for the paper."""
-    rows = [{"name": "the paper", **{name: percent(TABLE_2[name]) for name in SETS}}]
+def _table_2(trainings: Sequence[Training], test: Exam) -> Table:
+    """Return a row for the paper and one for each kind of training."""
+    stand_in = "" if test.real else " (stand-in)"
+    rows = [("the paper", *(percent(TABLE_2[name]) for name in SETS))]
     for features in reversed(FEATURES):
         for rate in RATES:
             repeats = of_kind(trainings, features, rate)
-            last = {name: percent(accuracies(repeats, name)[-1]) for name in SETS}
-            rows.append({"name": f"{features} features, learning rate {rate:g}", **last})
-    return rows
+            *seen, tested = (percent(accuracies(repeats, name)[-1]) for name in SETS)
+            name = f"{features} features, learning rate {rate:g}"
+            rows.append((name, *seen, tested + stand_in))
+    return Table(("", *SETS), rows)
 
 
-def _progress(trainings: Sequence[Training]) -> list[dict[str, Any]]:
+def _progress(trainings: Sequence[Training], plan: StudyPlan) -> Table:
     """Return accuracies at every checkpoint, a row for each kind of training and set."""
-    return [
-        {
-            "name": f"{features} features, {rate:g}, {name}",
-            "cells": [percent(row) for row in accuracies(of_kind(trainings, features, rate), name)],
-        }
+    rows = [
+        (
+            f"{features} features, {rate:g}, {name}",
+            *map(percent, accuracies(of_kind(trainings, features, rate), name)),
+        )
         for features in FEATURES
         for rate in RATES
         for name in SETS
     ]
+    return Table(("features, learning rate, runs", *map(str, plan.checkpoints)), rows)
 
 
-def _table_3(
-    trainings: Sequence[Training], features: str, names: Sequence[str]
-) -> list[dict[str, Any]]:
+def _table_3(trainings: Sequence[Training], features: str, names: Sequence[str]) -> Table:
     """Return ratios of each class at the reproducing rate beside those of the paper."""
     ours = class_ratios(of_kind(trainings, features, REPRODUCING_RATE))
-    rows = []
-    for name, published in TABLE_3.items():
-        if name in names:
-            rows.append(
-                {
-                    "name": plain_name(Hypothesis.parse(name)),
-                    "ours": [share(value) for value in ours[names.index(name)]],
-                    "published": [share(value) for value in published],
-                }
-            )
-    return rows
+    rows = [
+        (plots.plain(name), *map(text, ours[names.index(name)]), *map(text, published))
+        for name, published in TABLE_3.items()
+        if name in names
+    ]
+    headings = ("", *RATIOS, *(f"{ratio}, the paper" for ratio in RATIOS))
+    return Table(headings, rows, title=f"{features.capitalize()} features")
+
+
+def text(value: Spread, scale: float = 1.0) -> str:
+    """Return a mean with its standard deviation, as the paper writes it."""
+    if math.isnan(value.mean):
+        return "NaN"
+    mean = f"{scale * value.mean:.2f}"
+    return mean if math.isnan(value.deviation) else f"{mean} ± {scale * value.deviation:.2f}"
 
 
 def percent(value: Spread) -> str:
-    """Return an accuracy with its standard deviation in per cent."""
-    if math.isnan(value.deviation):
-        return f"{100.0 * value.mean:.2f}"
-    return f"{100.0 * value.mean:.2f} ± {100.0 * value.deviation:.2f}"
-
-
-def share(value: Spread) -> str:
-    """Return a ratio with its standard deviation, as the paper writes it."""
-    if math.isnan(value.mean):
-        return "NaN"
-    if math.isnan(value.deviation):
-        return f"{value.mean:.2f}"
-    return f"{value.mean:.2f} ± {value.deviation:.2f}"
+    """Return an accuracy in per cent."""
+    return text(value, 100.0)
 
 
 def _pictures(
-    trainings: Sequence[Training], robot: Robot, test: Exam, names: Sequence[str]
+    trainings: Sequence[Training], plan: StudyPlan, robot: Robot, test: Exam
 ) -> dict[str, str]:
-    published = {name: TABLE_2[name].mean for name in SETS}
     shares = {
         f"{features} features": mean_confusion(of_kind(trainings, features, REPRODUCING_RATE))
         for features in FEATURES
     }
-    plain = [plain_name(Hypothesis.parse(name)) for name in names]
-    figures = {f"training {rate:g}": training_figure(trainings, rate, published) for rate in RATES}
+    figures = {
+        f"training {rate:g}": training_figure(trainings, rate, plan.checkpoints) for rate in RATES
+    }
     figures["path"] = path_figure(test.runs, 0, DigitalTwin(robot))
-    figures["confusion"] = confusion_figure(shares, plain)
-    return {name: base64.b64encode(png(figure)).decode("ascii") for name, figure in figures.items()}
+    figures["confusion"] = confusion_figure(
+        shares, [plots.plain(name) for name in class_names(robot)]
+    )
+    return {name: plots.png(figure) for name, figure in figures.items()}

@@ -1,4 +1,4 @@
-"""`failuretwin train`: a network for a real robot, from its twin."""
+"""`failuretwin calibrate`, `train` and `study`: what is learned, from logs or from the twin."""
 
 from __future__ import annotations
 
@@ -6,17 +6,75 @@ from pathlib import Path
 
 import click
 
-from failuretwin.app.commands.options import PATH, common_options
+from failuretwin.app.commands.options import (
+    PATH,
+    LogOptions,
+    calibration_option,
+    common_options,
+    reading_options,
+)
+
+
+@click.command()
+@click.argument("logs", nargs=-1, required=True, type=PATH, metavar="LOG...")
+@click.option("--out", required=True, type=PATH, help="Calibration to write (.toml).")
+@click.option(
+    "--hold-out",
+    metavar="SESSION",
+    help="Learn nothing from sessions with this in their name; only see how well they are "
+    "predicted. Default: each session is left out once, and the result learns from all.",
+)
+@click.option("--name", help="What results call the calibration. Default: the file's name.")
+@click.option("--report", type=PATH, metavar="DIR", help="Write a page with tables and pictures.")
+@reading_options
+@common_options
+def calibrate(
+    logs: tuple[Path, ...],
+    out: Path,
+    hold_out: str | None,
+    name: str | None,
+    report: Path | None,
+    reading: LogOptions,
+    robot: str,
+    seed: int,
+) -> None:
+    """Learn from healthy logs where the motors settle, how they lag and what goes wrong by chance.
+
+    LOG is whatever `diagnose` reads. Motor readings are used where the logs have them, else the
+    tool path alone. Runs that are labelled or look faulty are left out. Step tests (CSV files, or
+    folders that hold some) add servo loops and speed limits.
+    """
+    del seed  # nothing here depends on chance
+    from failuretwin.app.calibration_tables import beats_uncalibrated, print_calibration
+    from failuretwin.app.inputs import learn_loops, read_inputs, split_step_tests, with_step_tests
+    from failuretwin.connection.calibration.calibrate import calibrate as learn
+    from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
+    from failuretwin.digital_model.robot import load_robot
+
+    check_calibration_file(out)
+    tests, others = split_step_tests(logs, reading.columns)
+    steps = learn_loops(tests, load_robot(robot))
+    model = steps.robot
+    runs = read_inputs(others, model, reading)
+    source = ", ".join(str(log) for log in logs)
+    found = learn(runs, model, name or out.stem, source, hold_out)
+    found = with_step_tests(found, steps)
+    if report is not None:
+        from failuretwin.app.calibration_report import write_calibration_page
+        from failuretwin.data_knowledge.store import filling
+
+        with filling(report) as folder:
+            write_calibration_page(found, runs, model, folder)
+    save_calibration(found, model, out)
+    print_calibration(found, model)
+    click.echo(f"written to {out}")
+    if beats_uncalibrated(found) is not False:
+        click.echo(f"use it with `failuretwin diagnose --calibration {out}`")
 
 
 @click.command()
 @click.option("--out", required=True, type=PATH, metavar="MODEL", help="Network to write (.npz).")
-@click.option(
-    "--calibration",
-    type=PATH,
-    metavar="FILE",
-    help="What `calibrate` learned of this robot. Default: the calibration its profile names.",
-)
+@calibration_option
 @click.option(
     "--network",
     type=click.Choice(["cnn", "motorwise", "lstm"]),
@@ -69,9 +127,6 @@ def train(
     click.echo(f"or together with Bayes: --method bayes+{out}")
 
 
-# `failuretwin study`: the paper's study from end to end.
-
-
 @click.command()
 @click.option("--out", required=True, type=PATH, metavar="DIR", help="Folder for everything.")
 @click.option(
@@ -104,15 +159,9 @@ def study(
     Both feature sets, both readings of the learning rate, five repetitions, the figures of
     tables II and III beside the published ones. Each training that is done is kept.
     """
+    from failuretwin.app import study as paper
     from failuretwin.app.inputs import check_learning
     from failuretwin.app.plots import figure_class
-    from failuretwin.app.study.study import check_folder, run_study
-    from failuretwin.app.study.trainings import (
-        StudyPlan,
-        quick_plan,
-        real_test_set,
-        stand_in_test_set,
-    )
     from failuretwin.app.tables import progress_bar
     from failuretwin.core.errors import InputError
     from failuretwin.digital_model.robot import load_robot
@@ -120,16 +169,16 @@ def study(
     if published_labels and test_path is None:
         raise InputError("--published-labels says how to read a test set. Add --test PATH.")
     model = load_robot(robot)
-    plan = quick_plan(seed) if quick else StudyPlan(seed)
-    check_folder(out, resume)
+    plan = paper.quick_plan(seed) if quick else paper.StudyPlan(seed)
+    paper.check_folder(out, resume)
     figure_class()  # better told before the work than after it
     test = (
-        stand_in_test_set(plan, model)
+        paper.stand_in_test_set(plan, model)
         if test_path is None
-        else real_test_set(test_path, model, published_labels)
+        else paper.real_test_set(test_path, model, published_labels)
     )
     check_learning()
     total = len(list(plan.jobs())) * plan.iterations
     with progress_bar("training", total) as advance:
-        page = run_study(plan, model, test, out, advance)
+        page = paper.run_study(plan, model, test, out, advance)
     click.echo(f"written to {page}")

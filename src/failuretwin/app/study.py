@@ -1,32 +1,43 @@
-"""The study's trainings: each a job of its own, whose result is kept, several at a time."""
+"""The paper's study from end to end: its plan, its trainings, each kept, and the page.
+
+The networks learn from runs of the published twin alone and are tested on real runs. A study that
+was cut short goes on with the trainings that have no result yet.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import multiprocessing
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from failuretwin.core.errors import FailureTwinError, InputError
+from failuretwin import __version__
+from failuretwin.core.config import fingerprint, from_table
+from failuretwin.core.errors import FailureTwinError, InputError, OutputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import IntArray
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.read import ReadOptions, read_runs
-from failuretwin.data_knowledge.store import replacing
-from failuretwin.decision.learned.feature_encoder import FeatureEncoder, Floats, signals_of
+from failuretwin.data_knowledge.store import reason, replacing
+from failuretwin.decision.evaluation import Truths
+from failuretwin.decision.learned.feature_encoder import FeatureEncoder, signals_of
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:
     import xarray as xr
+
+PLAN_FILE, WORK, PAGE = "study.json", "trainings", "index.html"
 
 # What the study does, to the letter of the paper; and a small version of it.
 
@@ -95,7 +106,7 @@ def quick_plan(seed: int) -> StudyPlan:
     return StudyPlan(seed, 60, (50, 100, 150, 200, 250), 2, 20)
 
 
-# The study's runs as features: simulated by the published twin, and a test set beside them.
+# The runs as features: simulated by the published twin, and a test set beside them.
 
 
 @dataclass(frozen=True)
@@ -113,23 +124,6 @@ class Exam:
     source: str
 
 
-@dataclass(frozen=True)
-class Arrays:
-    """Features and classes of the simulated runs and of the test set, by feature set.
-
-    Attributes:
-        simulated: (run, point, channel).
-        simulated_class: (run,).
-        test: (run, point, channel).
-        test_class: (run,).
-    """
-
-    simulated: Floats
-    simulated_class: IntArray
-    test: Floats
-    test_class: IntArray
-
-
 def class_names(robot: Robot) -> list[str]:
     """Return the paper's classes in the order of its labels."""
     return [str(hypothesis) for hypothesis in paper_hypotheses(robot.motor_names)]
@@ -143,14 +137,8 @@ def real_test_set(path: Path, robot: Robot, published_labels: bool) -> Exam:
     """
     runs = read_runs(path, robot, ReadOptions("published", published_labels))
     check_motors(runs, robot.name, robot.motor_names)
-    truth = truth_of(runs)
-    if truth is None:
-        raise InputError(
-            f"{path}: the truth of its runs is not known, so nothing can be tested on them. Give a "
-            "run set with `fault`, or raw sessions whose folders end in _label_K with "
-            "--published-labels."
-        )
-    strange = sorted(set(truth) - set(class_names(robot)))
+    truth = {known.fault for known in Truths.of(runs, str(path)).by_run.values()}
+    strange = sorted(truth - set(class_names(robot)))
     if strange:
         raise InputError(
             f"{path}: runs of {', '.join(strange)} are no class of the study. Expected "
@@ -162,13 +150,9 @@ def real_test_set(path: Path, robot: Robot, published_labels: bool) -> Exam:
 def stand_in_test_set(plan: StudyPlan, robot: Robot) -> Exam:
     """Simulate a test set with the physics engine, for want of a real one."""
     hypotheses = paper_hypotheses(robot.motor_names)
-    count = plan.stand_in_runs
-    runs = simulate(Plan(robot, hypotheses, count, plan.seed + 1, engine="physics"))
-    return Exam(
-        runs,
-        real=False,
-        source=f"{len(hypotheses) * count} runs of the physics engine, which stands in for a robot",
-    )
+    runs = simulate(Plan(robot, hypotheses, plan.stand_in_runs, plan.seed + 1, engine="physics"))
+    engine = "runs of the physics engine, which stands in for a robot"
+    return Exam(runs, real=False, source=f"{runs.sizes['run']} {engine}")
 
 
 def make_arrays(plan: StudyPlan, robot: Robot, test: Exam, folder: Path) -> None:
@@ -179,7 +163,7 @@ def make_arrays(plan: StudyPlan, robot: Robot, test: Exam, folder: Path) -> None
     )
     for features in FEATURES:
         encoder = FeatureEncoder(features, robot)
-        with replacing(_data_file(folder, features)) as partial, partial.open("wb") as file:
+        with replacing(_data_file(folder, features)) as new, new.open("wb") as file:
             np.savez(
                 file,
                 simulated=encoder.encode(signals_of(simulated)),
@@ -187,12 +171,6 @@ def make_arrays(plan: StudyPlan, robot: Robot, test: Exam, folder: Path) -> None
                 test=encoder.encode(signals_of(test.runs)),
                 test_class=_classes(test.runs, names),
             )
-
-
-def load_arrays(folder: Path, features: str) -> Arrays:
-    """Return what `make_arrays` wrote."""
-    with np.load(_data_file(folder, features), allow_pickle=False) as stored:
-        return Arrays(**stored)
 
 
 def _data_file(folder: Path, features: str) -> Path:
@@ -203,25 +181,10 @@ def _classes(runs: xr.Dataset, names: list[str]) -> IntArray:
     return np.array([names.index(fault) for fault in truth_of(runs) or []], dtype=np.int64)
 
 
+# The trainings, each a process of its own.
+
 LOOK_S = 0.5
 """Time between two looks at how far the trainings are [s]."""
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """Shares of runs that a network gets right at one point of its training.
-
-    Attributes:
-        iteration: Batches seen.
-        training: On the runs it learns from.
-        validation: On simulated runs it does not learn from.
-        test: On the test set.
-    """
-
-    iteration: int
-    training: float
-    validation: float
-    test: float
 
 
 @dataclass(frozen=True)
@@ -230,13 +193,14 @@ class Training:
 
     Attributes:
         job: What was trained.
-        checkpoints: In the order of their iterations.
-        confusion: Counts on the test set at the last of them, rows of (truth, diagnosis).
+        accuracies: Shares of runs that are right at each checkpoint of the plan, on those learned
+            from (`training`), simulated ones held out (`validation`) and the `test` set.
+        confusion: Counts on the test set at the last checkpoint, rows of (truth, diagnosis).
         seconds: Time it took [s].
     """
 
     job: Job
-    checkpoints: tuple[Checkpoint, ...]
+    accuracies: dict[str, tuple[float, ...]]
     confusion: tuple[tuple[int, ...], ...]
     seconds: float
 
@@ -246,52 +210,34 @@ def run_all(
 ) -> list[Training]:
     """Do all trainings that have no result in `folder` yet; return the results of all.
 
-    Args:
-        plan: What to do.
-        folder: Where the arrays are and the results go.
-        classes: Number of classes.
-        on_progress: Called with the number of iterations just done, those of earlier attempts
-            included.
+    Progress counts iterations, those of earlier attempts included.
     """
     jobs = list(plan.jobs())
     missing = [job for job in jobs if not _file(folder, job).is_file()]
     on_progress((len(jobs) - len(missing)) * plan.iterations)
     if missing:
-        _spread(plan, folder, classes, missing, on_progress)
-    return [read_training(_file(folder, job)) for job in jobs]
-
-
-def processes(jobs: int) -> int:
-    """Return how many trainings run at a time: one for each core, or one on a GPU."""
-    import torch
-
-    if torch.cuda.is_available():
-        return 1
-    from failuretwin.decision.learned.training_data import cores
-
-    return min(jobs, cores())
+        _spread(partial(train, plan, folder, classes), missing, on_progress)
+    files = [_file(folder, job) for job in jobs]
+    return [from_table(Training, json.loads(f.read_text(encoding="utf-8")), str(f)) for f in files]
 
 
 def _spread(
-    plan: StudyPlan,
-    folder: Path,
-    classes: int,
-    jobs: Iterable[Job],
-    on_progress: Callable[[int], None],
+    work: Callable[[Job], None], jobs: Sequence[Job], on_progress: Callable[[int], None]
 ) -> None:
+    import torch
+
+    from failuretwin.decision.learned.training_data import cores
+
+    at_a_time = 1 if torch.cuda.is_available() else min(len(jobs), cores())
     context = multiprocessing.get_context("spawn")
-    done = context.Value("q", 0)
-    waiting = list(jobs)
-    told = 0
-    with ProcessPoolExecutor(
-        processes(len(waiting)), context, initializer=_begin, initargs=(done,)
-    ) as pool:
-        running = {pool.submit(train, plan, folder, classes, job) for job in waiting}
+    done, reported = context.Value("q", 0), 0
+    with ProcessPoolExecutor(at_a_time, context, initializer=_begin, initargs=(done,)) as pool:
+        running = {pool.submit(work, job) for job in jobs}
         try:
             while running:
                 finished, running = wait(running, LOOK_S, FIRST_COMPLETED)
-                on_progress(done.value - told)
-                told = done.value
+                on_progress(done.value - reported)
+                reported = done.value
                 for future in finished:
                     future.result()
         except BrokenProcessPool as error:
@@ -340,52 +286,122 @@ def train(plan: StudyPlan, folder: Path, classes: int, job: Job) -> None:
     )
 
     begun = time.perf_counter()
-    arrays = load_arrays(folder, job.features)
+    with np.load(_data_file(folder, job.features), allow_pickle=False) as stored:
+        arrays = dict(stored)
+    simulated, truth = arrays["simulated"], arrays["simulated_class"]
     rng = np.random.default_rng([plan.seed, job.repeat])
-    order = rng.permutation(len(arrays.simulated))
+    order = rng.permutation(len(simulated))
     held_out = round(VALIDATION_SHARE * len(order))
     validation, learning = order[:held_out], order[held_out:]
-    standard = Standard.of(arrays.simulated[learning])
+    standard = Standard.of(simulated[learning])
     sets = {
-        "training": (standard(arrays.simulated[learning]), arrays.simulated_class[learning]),
-        "validation": (standard(arrays.simulated[validation]), arrays.simulated_class[validation]),
-        "test": (standard(arrays.test), arrays.test_class),
+        "training": (standard(simulated[learning]), truth[learning]),
+        "validation": (standard(simulated[validation]), truth[validation]),
+        "test": (standard(arrays["test"]), arrays["test_class"]),
     }
     torch.manual_seed(int(rng.integers(2**31)))
-    network = build_network("lstm", Shape(arrays.simulated.shape[2], classes))
+    network = build_network("lstm", Shape(simulated.shape[2], classes))
     batches = shuffled_batches(*sets["training"], BATCH_RUNS, rng)
-    checkpoints = []
-    said: IntArray = np.empty(0, dtype=np.int64)
+    right: dict[str, list[float]] = {name: [] for name in sets}
+    verdicts: dict[str, IntArray] = {}
     for iteration in training(network, batches, Pace(plan.iterations, job.learning_rate)):
         _count()
         if iteration in plan.checkpoints:
-            right = {}
-            for name, (features, truth) in sets.items():
-                said = scores_of(network, features).argmax(axis=1)
-                right[name] = float(np.mean(said == truth))
-            checkpoints.append(Checkpoint(iteration, **right))
+            verdicts = {name: scores_of(network, x).argmax(axis=1) for name, (x, _) in sets.items()}
+            for name, shares in right.items():
+                shares.append(float(np.mean(verdicts[name] == sets[name][1])))
     confusion = np.zeros((classes, classes), dtype=np.int64)
-    np.add.at(confusion, (arrays.test_class, said), 1)
-    result = Training(
-        job,
-        tuple(checkpoints),
-        tuple(tuple(row) for row in confusion.tolist()),
-        time.perf_counter() - begun,
-    )
-    with replacing(_file(folder, job)) as partial:
-        partial.write_text(json.dumps(asdict(result), indent=1), encoding="utf-8")
-
-
-def read_training(path: Path) -> Training:
-    """Return the result that a job wrote."""
-    stored = json.loads(path.read_text(encoding="utf-8"))
-    return Training(
-        Job(**stored["job"]),
-        tuple(Checkpoint(**checkpoint) for checkpoint in stored["checkpoints"]),
-        tuple(tuple(row) for row in stored["confusion"]),
-        stored["seconds"],
-    )
+    np.add.at(confusion, (arrays["test_class"], verdicts["test"]), 1)
+    counts = tuple(tuple(row) for row in confusion.tolist())
+    accuracies = {name: tuple(shares) for name, shares in right.items()}
+    result = Training(job, accuracies, counts, time.perf_counter() - begun)
+    with replacing(_file(folder, job)) as file:
+        file.write_text(json.dumps(asdict(result), indent=1), encoding="utf-8")
 
 
 def _file(folder: Path, job: Job) -> Path:
     return folder / f"{job.name}.json"
+
+
+# The study in one call: take up what is there, do what is missing, write the page.
+
+
+def check_folder(folder: Path, resume: bool) -> None:
+    """Refuse a folder that this study must not write to.
+
+    Raises:
+        InputError: If it holds anything and is not to be resumed, or is to be and is no study.
+    """
+    taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    if taken and not resume:
+        raise InputError(
+            f"{folder}: is there already. Go on with a study begun there (--resume), or choose "
+            "another folder."
+        )
+    names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
+    begun = names == [WORK]  # interrupted before it had a plan
+    if taken and not begun and not (folder / PLAN_FILE).is_file():
+        raise InputError(f"{folder}: holds no study to resume ({PLAN_FILE} is missing).")
+
+
+def run_study(
+    plan: StudyPlan, robot: Robot, test: Exam, folder: Path, on_progress: Callable[[int], None]
+) -> Path:
+    """Do the study in a folder that `check_folder` allowed; return its page.
+
+    Raises:
+        InputError: If the folder holds a study with another plan, or an extra is missing.
+    """
+    manifest = _manifest(plan, robot, test)
+    stored = folder / PLAN_FILE
+    if stored.is_file():
+        _check_same(json.loads(stored.read_text(encoding="utf-8")), manifest, folder)
+    else:
+        _make(folder / WORK)
+        make_arrays(plan, robot, test, folder / WORK)
+        with replacing(stored) as new:
+            new.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+    trainings = run_all(plan, folder / WORK, len(class_names(robot)), on_progress)
+    from failuretwin.app.study_page import write_study_page
+
+    page = folder / PAGE
+    write_study_page(trainings, plan, robot, test, page)
+    return page
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be made ({reason(error)}).") from error
+
+
+def _manifest(plan: StudyPlan, robot: Robot, test: Exam) -> dict[str, Any]:
+    """Return what decides the study's figures."""
+    return {
+        "seed": plan.seed,
+        "runs_per_class": plan.runs_per_class,
+        "checkpoints": list(plan.checkpoints),
+        "repeats": plan.repeats,
+        "robot": fingerprint(robot),
+        "test": test.source,
+        "test_sha256": _digest(test),
+        "failuretwin_version": __version__,
+    }
+
+
+def _digest(test: Exam) -> str:
+    """Return a hash of all that networks see of the test set, and of its truth."""
+    digest = hashlib.sha256(json.dumps([str(f) for f in test.runs["fault"].values]).encode())
+    for name in ("command", "measured"):
+        digest.update(test.runs[name].values.tobytes())
+    return digest.hexdigest()
+
+
+def _check_same(stored: dict[str, Any], wanted: dict[str, Any], folder: Path) -> None:
+    for key, value in wanted.items():
+        if stored.get(key) != value:
+            raise InputError(
+                f"{folder}: the study begun there has {key} {stored.get(key)!r}, this one "
+                f"{value!r}. Give the same arguments again, or choose another folder."
+            )
