@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
-from failuretwin.inference.evidence import MOST_READINGS, settled_evidence, transient_samples
+from failuretwin.inference.evidence import MOST_READINGS, Evidence
 
 STARTS = np.array([0.03, 2.05, 4.06])
 TARGETS = np.array([[0.5, -0.3], [-0.4, 0.2], [0.1, 0.6]])
@@ -54,8 +54,8 @@ def drawn_out(first, every=10, count=600):
 
 
 def readings(runs):
-    settled = settled_evidence(runs)
-    return settled, transient_samples(runs, settled)
+    found = Evidence(runs)
+    return found.settled, found.transient
 
 
 @given(first=st.integers(0, 9))
