@@ -32,8 +32,7 @@ from failuretwin.decision.metrics import (
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.failure_behavior.fault import FaultValue
 from failuretwin.failure_behavior.modes import MODES, SteadyStateError, Stuck
-from failuretwin.inference.evidence import settled_evidence, transient_samples
-from failuretwin.inference.log_quality import drop_invalid, log_quality
+from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.onset import OnsetPrior
 from failuretwin.inference.posterior import marginal_likelihood_of
 from failuretwin.inference.priors import Priors
@@ -135,9 +134,9 @@ def outcomes(
 ) -> Iterator[Outcome]:
     """Diagnose runs, and draw onset and size from their posterior given the true hypothesis."""
     diagnoses = diagnoser.diagnose(runs)
-    sound = drop_invalid(runs, log_quality(runs))
-    evidence = settled_evidence(sound)
-    moving = transient_samples(sound, evidence).where(diagnoser.transient_mask(evidence.usable))
+    sound = Evidence(runs).sound
+    evidence = sound.settled
+    moving = sound.transient.where(diagnoser.transient_mask(evidence.usable))
     names = runs["fault"].values
     for name in dict.fromkeys(names):
         rows = np.flatnonzero(names == name)

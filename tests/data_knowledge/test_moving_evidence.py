@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
-from failuretwin.inference.evidence import settled_evidence, transient_samples
+from failuretwin.inference.evidence import Evidence
 
 MOST_READINGS = 12
 
@@ -56,8 +56,8 @@ def drawn_out(first, every=10, count=600):
 
 
 def readings(runs):
-    settled = settled_evidence(runs)
-    return settled, transient_samples(runs, settled)
+    found = Evidence(runs)
+    return found.settled, found.transient
 
 
 @given(first=st.integers(0, 9))

@@ -97,7 +97,7 @@ def test_lines_across_a_gap_are_no_evidence(first, begin, lasts):
     lone[at] = point
     runs = [run_set(path, 10.0) for path in (lone, drawn(grid(), at, point))]
     expected, found = map(settled_evidence, runs)
-    for name in ("usable", "moving", "begin", "end", "resumed"):
+    for name in ("usable", "moving", "begin", "end", "first_reading_delay"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-9)
     np.testing.assert_allclose(found.point, expected.point, atol=1e-12)
     assert log_quality(runs[1]) == log_quality(runs[0])
@@ -178,7 +178,7 @@ def test_paths_filled_otherwise_pass_as_they_are():
     found = measured_samples(run_set(turning(filled), 10.0))
     assert found.filled.all()
     assert found.seen.all()
-    assert np.isnan(settled_evidence(run_set(turning(filled), 10.0)).resumed).all()
+    assert np.isnan(settled_evidence(run_set(turning(filled), 10.0)).first_reading_delay).all()
 
 
 def test_without_a_lower_rate_every_sample_is_a_reading():

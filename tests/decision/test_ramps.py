@@ -8,7 +8,7 @@ from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
 from failuretwin.digital_model.nonidealities import Imperfections, Readings, Timing
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.evidence import settled_evidence, transient_samples
+from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.transient_likelihood import TransientHypothesis, TransientLikelihood
 
@@ -59,8 +59,8 @@ class Case:
             measured=measured[None],
             measured_rate_hz=10.0,
         ).to_dataset()
-        settled = settled_evidence(runs)
-        self.ramps = TransientLikelihood(self.model, settled, transient_samples(runs, settled))
+        found = Evidence(runs)
+        self.ramps = TransientLikelihood(self.model, found.settled, found.transient)
 
     def angles(self, time):
         """Lag, late starts, delays and slowness as told, (time, motor) [rad]."""

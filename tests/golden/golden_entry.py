@@ -29,9 +29,9 @@ from failuretwin.digital_model.nonidealities import LostCommand, Readings, gener
 from failuretwin.failure_behavior.modes import MODES
 from failuretwin.inference import diagnoser as bayes
 from failuretwin.inference import posterior as posterior
-from failuretwin.inference.evidence import settled_evidence, transient_samples
+from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.expected_bayes_factors import expected_log_bayes_factors
-from failuretwin.inference.log_quality import drop_invalid, log_quality
+from failuretwin.inference.log_quality import log_quality
 from failuretwin.inference.priors import MONITORING, priors_of
 
 __all__ = [
@@ -81,13 +81,10 @@ def robust_features(robot, imperfections, runs):
 
 def evidence_of(diagnoser, runs):
     """Return what the runs say where the tool rests, and on the way as far as that counts."""
-    sound = drop_invalid(runs, log_quality(runs))
-    settled = settled_evidence(sound)
+    sound = Evidence(runs).sound
     if not diagnoser.uses_transients:
-        return settled, None
-    return settled, transient_samples(sound, settled).where(
-        diagnoser.transient_mask(settled.usable)
-    )
+        return sound.settled, None
+    return sound.settled, sound.transient.where(diagnoser.transient_mask(sound.settled.usable))
 
 
 def with_log_evidence(diagnoser, runs):

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
 
+from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 
@@ -122,7 +124,7 @@ and of a smooth start the shortest travel is seen last."""
 
 
 @dataclass(frozen=True)
-class Movements:
+class Movements(ArrayStruct):
     """Movements of many runs as arrays; runs with fewer movements are padded with NaN at the end.
 
     Attributes:
@@ -132,10 +134,10 @@ class Movements:
         start: Time at which the ramps begin, (run, movement) [s].
     """
 
-    initial: FloatArray
-    target: FloatArray
-    ramp_duration: FloatArray
-    start: FloatArray
+    initial: Annotated[FloatArray, Axes("run", "motor", empty=np.nan)]
+    target: Annotated[FloatArray, Axes("run", "movement", "motor", empty=np.nan)]
+    ramp_duration: Annotated[FloatArray, Axes("run", "movement", "motor", empty=np.nan)]
+    start: Annotated[FloatArray, Axes("run", "movement", empty=np.nan)]
 
     @property
     def exists(self) -> BoolArray:

@@ -77,6 +77,8 @@ class Profile:
         servo_units: Count scale of commands and readings in raw logs, if they use one.
         imperfections: Imperfections of the healthy robot, a TOML file relative to the profile.
         physics: Motors and gears for the physics engine, a TOML file relative to the profile.
+        inference: Lengths and angles by which its runs are read, where they are not the usual
+            ones; see `InferenceSettings`.
         sources: Where each group of numbers comes from.
     """
 
@@ -89,6 +91,7 @@ class Profile:
     servo_units: ServoUnits | None = None
     imperfections: str | None = None
     physics: str | None = None
+    inference: dict[str, float] = field(default_factory=dict)
     sources: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

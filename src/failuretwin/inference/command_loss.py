@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 
+from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.movements import Movements
 from failuretwin.core.numerics import log_of
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
@@ -113,7 +115,7 @@ LATE_MARGIN_S = 0.15
 
 
 @dataclass(frozen=True)
-class CommandOutcomes:
+class CommandOutcomes(ArrayStruct):
     """What may become of each movement: which motors lost how many commands in a row.
 
     Attributes:
@@ -124,15 +126,9 @@ class CommandOutcomes:
     """
 
     lost: BoolArray
-    base: FloatArray
-    direction: FloatArray
-    log_weight: FloatArray
-
-    def __getitem__(self, runs: slice) -> CommandOutcomes:
-        """Return the outcomes of some of the runs."""
-        return CommandOutcomes(
-            self.lost, self.base[runs], self.direction[runs], self.log_weight[runs]
-        )
+    base: Annotated[FloatArray, Axes("run", "movement", "outcome", "motor")]
+    direction: Annotated[FloatArray, Axes("run", "movement", "outcome", "motor")]
+    log_weight: Annotated[FloatArray, Axes("run", "movement", "outcome")]
 
 
 @dataclass(frozen=True)

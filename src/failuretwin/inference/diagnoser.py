@@ -15,9 +15,8 @@ from failuretwin.core.runs import check_motors, check_runs, truth_of
 from failuretwin.core.types import BoolArray
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.inference.evidence import settled_evidence, transient_samples
+from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.log_quality import drop_invalid, log_quality
 from failuretwin.inference.posterior import (
     check_diagnosable,
     compute_posterior,
@@ -105,16 +104,15 @@ class BayesDiagnoser:
             InputError: If the run set is of another robot or no run holds a movement.
         """
         self._check(runs)
-        quality = log_quality(runs)
-        sound = drop_invalid(runs, quality)
-        evidence, moving = settled_evidence(sound), None
+        seen = Evidence(runs, self.healthy_model.settings)
+        evidence, moving = seen.sound.settled, None
         if evidence.movements.start.shape[1] == 0:
             raise InputError(
                 "no run holds a movement: `command` never leaves its first value. Expected runs "
                 "of one movement at least."
             )
         if self.uses_transients:
-            moving = transient_samples(sound, evidence).where(self.transient_mask(evidence.usable))
+            moving = seen.sound.transient.where(self.transient_mask(evidence.usable))
         names = [str(name) for name in runs["run"].values]
         faults = truth_of(runs)
         truth: list[str | None] = [None] * len(names) if faults is None else list(faults)
@@ -127,7 +125,9 @@ class BayesDiagnoser:
             posterior_of_runs = compute_posterior(likelihood, self.hypothesis_set, self.priors)
             for at in range(len(names))[rows]:
                 results.append(
-                    posterior_of_runs.to_diagnosis(at - first, names[at], quality[at], truth[at])
+                    posterior_of_runs.to_diagnosis(
+                        at - first, names[at], seen.quality[at], truth[at]
+                    )
                 )
         return results
 

@@ -1,20 +1,24 @@
-"""What a run says at system level: where the tool settled after each movement.
+"""What a run says at system level: where the tool settled after each movement, and its way there.
 
 Only `command` and `measured` of the run set are looked at, here and in everything that follows.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
+from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.numerics import masked_median
 from failuretwin.core.runs import measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
+from failuretwin.inference.log_quality import LogQuality, drop_invalid, log_quality
 from failuretwin.inference.readings import MeasuredSamples, grid_steps, measured_samples
+from failuretwin.inference.settings import USUAL, InferenceSettings
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -25,16 +29,97 @@ WINDOW_S = 0.6
 """Longest stretch at the end of a plateau that is averaged [s]; outlasts late starts."""
 SILENT_PERIODS = 2.0
 """A tool that moves on time is read elsewhere so many readings after its command."""
-STILL_M = 0.004
-"""Spread of the readings above which the tool is still moving [m]; one count moves it 1 mm."""
-
-
 JUST_AFTER_S = 1e-6
 """A plateau that nothing ends is taken to end so soon after the last reading [s]."""
+MOST_READINGS = 12
+"""Readings of one movement that are looked at on the way; more say nothing new, as all share one
+lag."""
 
 
 @dataclass(frozen=True)
-class SettledEvidence:
+class Evidence:
+    """What a run set says at system level, each part worked out once, when it is asked for.
+
+    Attributes:
+        runs: The run set; `command` (run, time, motor) [rad] and `measured` (run, time, axis) [m]
+            are read.
+        settings: How near is at rest.
+    """
+
+    runs: xr.Dataset
+    settings: InferenceSettings = USUAL
+
+    @cached_property
+    def readings(self) -> MeasuredSamples:
+        """The readings behind the samples of `measured`."""
+        return measured_samples(self.runs)
+
+    @cached_property
+    def quality(self) -> list[LogQuality]:
+        """Defects of the log of each run."""
+        return log_quality(self.runs, self.readings, self.settings)
+
+    @cached_property
+    def sound(self) -> Evidence:
+        """The same without spoilt readings."""
+        runs = drop_invalid(self.runs, self.quality)
+        return self if runs is self.runs else replace(self, runs=runs)
+
+    @cached_property
+    def settled(self) -> SettledEvidence:
+        """Where the tool settled after each movement; lines drawn between readings do not count."""
+        time, readings = as_floats(self.runs["time"].values), self.readings
+        movements = find_movements(as_floats(self.runs["command"].values), time)
+        end = _plateau_ends(movements, readings.point, time)
+        begin = rest_begin(movements.start, movements.ramp_duration, end)
+        silence = SILENT_PERIODS / measured_rate(self.runs)
+        found = replace(
+            SettledEvidence.empty(
+                run=len(end), movement=end.shape[1], motor=movements.initial.shape[1], axis=3
+            ),
+            movements=movements,
+            begin=begin,
+            end=end,
+            first_reading_delay=_first_reading_delay(movements, readings, time, silence),
+        )
+        item = np.nonzero(movements.exists & (begin < end))
+        samples, inside = _between(readings.point, time, item[0], begin[item], end[item])
+        found.settle(item, estimate_rest(samples, inside, self.settings.moving_spread_m))
+        return found
+
+    @cached_property
+    def transient(self) -> TransientSamples:
+        """The readings of each movement before those that `settled` has used.
+
+        Of densely sampled paths readings are left out evenly, so that no two lie closer than the
+        true rate of the sensor says; samples on lines drawn between readings do not count.
+        """
+        time, settled, readings = as_floats(self.runs["time"].values), self.settled, self.readings
+        read, least_step = readings.seen.copy(), 0.9 / measured_rate(self.runs)
+        for run in np.flatnonzero(readings.filled):
+            read[run] &= _corners(readings.point[run], grid_steps(self.runs))
+        start, until = settled.movements.start, settled.transient_until
+        runs, movements = start.shape
+        found = TransientSamples.empty(run=runs, movement=movements, reading=MOST_READINGS, axis=3)
+        for run, movement in np.argwhere(settled.movements.exists & (until > start)):
+            first, stop = np.searchsorted(time, [start[run, movement], until[run, movement] - 1e-9])
+            rows = first + np.flatnonzero(read[run, first:stop])
+            item, point = (run, movement), readings.point[run, rows]
+            found.take_in(item, start[item], time[rows], point, least_step)
+        return found
+
+
+def settled_evidence(runs: xr.Dataset) -> SettledEvidence:
+    """Return where the tool settled after each movement of each run, of an arm of usual size."""
+    return Evidence(runs).settled
+
+
+PerMovement = Annotated[FloatArray, Axes("run", "movement", empty=np.nan)]
+MovementMask = Annotated[BoolArray, Axes("run", "movement", empty=False)]
+
+
+@dataclass(frozen=True)
+class SettledEvidence(ArrayStruct):
     """Settled tool positions of many runs.
 
     Attributes:
@@ -50,25 +135,66 @@ class SettledEvidence:
     """
 
     movements: Movements
-    point: FloatArray
-    usable: BoolArray
-    moving: BoolArray
-    begin: FloatArray
-    end: FloatArray
-    first_reading_delay: FloatArray
+    point: Annotated[FloatArray, Axes("run", "movement", "axis")]
+    usable: MovementMask
+    moving: MovementMask
+    begin: PerMovement
+    end: PerMovement
+    first_reading_delay: PerMovement
 
-    def __getitem__(self, runs: slice) -> SettledEvidence:
-        """Return the evidence of some of the runs."""
-        m = self.movements
-        return SettledEvidence(
-            Movements(m.initial[runs], m.target[runs], m.ramp_duration[runs], m.start[runs]),
-            self.point[runs],
-            self.usable[runs],
-            self.moving[runs],
-            self.begin[runs],
-            self.end[runs],
-            self.first_reading_delay[runs],
+    @property
+    def transient_until(self) -> FloatArray:
+        """Until when readings are on the way, (run, movement) [s]."""
+        return np.where(self.usable, self.begin, self.end)
+
+    def settle(self, item: tuple[IntArray, ...], rest: Rest) -> None:
+        """Write down where tools rest after some movements, given by run and movement."""
+        self.point[item], self.usable[item], self.moving[item] = (
+            rest.point,
+            rest.usable,
+            rest.moving,
         )
+
+
+@dataclass(frozen=True)
+class TransientSamples(ArrayStruct):
+    """Readings on the way, for each movement of many runs.
+
+    Attributes:
+        since: Time since the movement was commanded, (run, movement, reading) [s].
+        point: Tool position, (run, movement, reading, axis) [m]; 0 where there is none.
+        seen: Readings that are there, (run, movement, reading).
+    """
+
+    since: Annotated[FloatArray, Axes("run", "movement", "reading")]
+    point: Annotated[FloatArray, Axes("run", "movement", "reading", "axis")]
+    seen: Annotated[BoolArray, Axes("run", "movement", "reading", empty=False)]
+
+    def where(self, wanted: BoolArray) -> TransientSamples:
+        """Return the evidence of some of the movements alone, (run, movement)."""
+        return replace(self, seen=self.seen & wanted[..., None])
+
+    def take_in(
+        self,
+        item: tuple[int, int],
+        start: float,
+        time: FloatArray,
+        point: FloatArray,
+        least_step: float,
+    ) -> None:
+        """Write down what was read on the way of a movement.
+
+        Args:
+            item: Its run and its number.
+            start: When it was commanded [s].
+            time: When the tool was read, sorted, (reading,) [s].
+            point: Tool positions, (reading, axis) [m].
+            least_step: Least time between two readings [s]; others are left out.
+        """
+        kept = _spread_out(time, least_step)
+        self.seen[item] = np.arange(MOST_READINGS) < len(kept)
+        self.since[item][: len(kept)] = time[kept] - start
+        self.point[item][: len(kept)] = point[kept]
 
 
 @dataclass(frozen=True)
@@ -98,41 +224,20 @@ def rest_begin(start: FloatArray, ramp_duration: FloatArray, end: FloatArray) ->
     return np.maximum(reached, end - WINDOW_S)
 
 
-def estimate_rest(samples: FloatArray, inside: BoolArray) -> Rest:
+def estimate_rest(samples: FloatArray, inside: BoolArray, moving_spread_m: float) -> Rest:
     """Return where the tool rests in some stretches of time.
 
     Args:
         samples: Tool positions, (stretch, sample, axis) [m]; NaN where there is none.
         inside: Samples that lie inside the stretch, (stretch, sample).
+        moving_spread_m: Median distance from their median above which it is still moving [m].
     """
     kept = inside & np.isfinite(samples).all(axis=-1)
     point = np.stack([masked_median(samples[..., axis], kept) for axis in range(3)], axis=-1)
     from_point = np.where(kept[..., None], samples, 0.0) - point[:, None]
     spread = masked_median(np.linalg.norm(from_point, axis=-1), kept)
-    some, moving = kept.any(axis=1), spread > STILL_M
+    some, moving = kept.any(axis=1), spread > moving_spread_m
     return Rest(point, some & ~moving, some & moving)
-
-
-def settled_evidence(runs: xr.Dataset) -> SettledEvidence:
-    """Return where the tool settled after each movement of each run.
-
-    Samples on lines drawn between readings do not count.
-
-    Args:
-        runs: A run set; `command` (run, time, motor) and `measured` (run, time, axis) are read.
-    """
-    time, readings = as_floats(runs["time"].values), measured_samples(runs)
-    measured = readings.point
-    movements = find_movements(as_floats(runs["command"].values), time)
-    end = _plateau_ends(movements, measured, time)
-    begin = rest_begin(movements.start, movements.ramp_duration, end)
-    shape = movements.start.shape
-    point, usable, moving = np.zeros((*shape, 3)), np.zeros(shape, bool), np.zeros(shape, bool)
-    item = np.nonzero(movements.exists & (begin < end))
-    found = estimate_rest(*_between(measured, time, item[0], begin[item], end[item]))
-    point[item], usable[item], moving[item] = found.point, found.usable, found.moving
-    first_reading_delay = _resumed(movements, readings, time, SILENT_PERIODS / measured_rate(runs))
-    return SettledEvidence(movements, point, usable, moving, begin, end, first_reading_delay)
 
 
 def _between(
@@ -145,7 +250,7 @@ def _between(
     return measured[run[:, None], np.minimum(at, len(time) - 1)], inside
 
 
-def _resumed(
+def _first_reading_delay(
     movements: Movements, readings: MeasuredSamples, time: FloatArray, silence: float
 ) -> FloatArray:
     """Return the time from each command to the first reading after it, (run, movement) [s].
@@ -179,65 +284,6 @@ def _plateau_ends(movements: Movements, measured: FloatArray, time: FloatArray) 
     return np.fmin(following, stop[:, None])
 
 
-# What a run says while the arm moves: readings of the tool from each start until it rests.
-
-MOST_READINGS = 12
-"""Readings of one movement that are looked at; more say nothing new, as all share one lag."""
-
-
-@dataclass(frozen=True)
-class TransientSamples:
-    """Readings on the way, for each movement of many runs.
-
-    Attributes:
-        since: Time since the movement was commanded, (run, movement, reading) [s].
-        point: Tool position, (run, movement, reading, axis) [m]; 0 where there is none.
-        seen: Readings that are there, (run, movement, reading).
-    """
-
-    since: FloatArray
-    point: FloatArray
-    seen: BoolArray
-
-    def __getitem__(self, runs: slice) -> TransientSamples:
-        """Return the evidence of some of the runs."""
-        return TransientSamples(self.since[runs], self.point[runs], self.seen[runs])
-
-    def where(self, wanted: BoolArray) -> TransientSamples:
-        """Return the evidence of some of the movements alone, (run, movement)."""
-        return TransientSamples(self.since, self.point, self.seen & wanted[..., None])
-
-
-def transient_samples(runs: xr.Dataset, settled: SettledEvidence) -> TransientSamples:
-    """Return the readings of each movement before those that `settled` has used.
-
-    Of densely sampled paths readings are left out evenly, so that no two lie closer than the true
-    rate of the sensor says; samples on lines drawn between readings do not count.
-
-    Args:
-        runs: A run set; `measured` (run, time, axis) is read.
-        settled: Where the tool settled in the same runs.
-    """
-    time = as_floats(runs["time"].values)
-    readings, least_step = measured_samples(runs), 0.9 / measured_rate(runs)
-    measured, read = readings.point, readings.seen.copy()
-    for run in np.flatnonzero(readings.filled):
-        read[run] &= _corners(measured[run], grid_steps(runs))
-    start = settled.movements.start
-    until = np.where(settled.usable, settled.begin, settled.end)
-    shape = (*start.shape, MOST_READINGS)
-    since, point = np.zeros(shape), np.zeros((*shape, 3))
-    seen = np.zeros(shape, dtype=bool)
-    for run, movement in np.argwhere(settled.movements.exists & (until > start)):
-        first, stop = np.searchsorted(time, [start[run, movement], until[run, movement] - 1e-9])
-        rows = first + np.flatnonzero(read[run, first:stop])
-        rows = rows[spread_out(time[rows], least_step)]
-        since[run, movement, : len(rows)] = time[rows] - start[run, movement]
-        point[run, movement, : len(rows)] = measured[run, rows]
-        seen[run, movement, : len(rows)] = True
-    return TransientSamples(since, point, seen)
-
-
 def _corners(path: FloatArray, every: int) -> BoolArray:
     """Return which samples of a filled path (time, axis) may be readings, (time,).
 
@@ -250,7 +296,7 @@ def _corners(path: FloatArray, every: int) -> BoolArray:
     return np.asarray(phase == np.argmax(np.bincount(phase, bend)))
 
 
-def spread_out(time: FloatArray, least_step: float) -> IntArray:
+def _spread_out(time: FloatArray, least_step: float) -> IntArray:
     """Return which readings of a movement to look at: few, none close together, (reading,).
 
     Args:

@@ -26,7 +26,7 @@ from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.fault import FaultValue
 from failuretwin.failure_behavior.injection import Injection, replayed
 from failuretwin.failure_behavior.modes import MODES
-from failuretwin.inference.evidence import settled_evidence, transient_samples
+from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.joint_likelihood import JointLikelihood
 from failuretwin.inference.marginal import FaultModel, movement_log_likelihoods
@@ -230,11 +230,10 @@ class ExpectedLogBayesFactor:
     def _fits(
         self, runs: xr.Dataset, faults: Sequence[Sequence[FaultValue]], onset: FloatArray
     ) -> FloatArray:
-        silent = self.noise_free(runs, faults)
-        settled = settled_evidence(silent)
-        moving = transient_samples(silent, settled) if self._needs_way else None
-        likelihood = ExpectedRunLikelihood(settled, self.model, moving)
-        first = first_affected(settled.movements, onset)
+        evidence = Evidence(self.noise_free(runs, faults), self.model.settings)
+        moving = evidence.transient if self._needs_way else None
+        likelihood = ExpectedRunLikelihood(evidence.settled, self.model, moving)
+        first = first_affected(evidence.settled.movements, onset)
         return np.stack(
             [max_likelihood(likelihood, h, self.priors, first) for h in self.hypotheses], axis=1
         )

@@ -16,6 +16,7 @@ from failuretwin.digital_model.settling import Settling, loads_in_range
 from failuretwin.digital_model.twin import SAG_ROUNDS, DigitalTwin
 from failuretwin.inference.command_loss import OUTLIER_RATE, CommandOutcomes, LostCommands
 from failuretwin.inference.evidence import SettledEvidence
+from failuretwin.inference.settings import InferenceSettings
 
 PATH_NOISE_M = 0.001
 """Noise assumed of a settled tool position where the sensor is not known [m]."""
@@ -44,6 +45,11 @@ class HealthyModel:
             return cls(twin, imperfections)
         known = load_calibration(None, twin.robot)
         return cls(known.twin, known.imperfections)
+
+    @cached_property
+    def settings(self) -> InferenceSettings:
+        """Lengths and angles by which runs of this robot are read."""
+        return InferenceSettings.of(self.twin.robot, self.imperfections)
 
     @cached_property
     def settling(self) -> Settling:
@@ -136,17 +142,15 @@ class HealthyModel:
         return self.lost_commands.outcomes(movements)
 
     def filtered_outcomes(
-        self, evidence: SettledEvidence, outcomes: CommandOutcomes, terms: FloatArray
+        self, evidence: SettledEvidence, outcomes: CommandOutcomes, density: FloatArray
     ) -> CommandOutcomes:
         """Return outcomes with their probability given what was seen of the movements before.
 
         Args:
             evidence: Settled positions.
             outcomes: What may have become of each movement, whatever was seen.
-            terms: How well they explain the settled positions, from `explain`.
+            density: How well each explains the settled positions, from `explain`.
         """
-        possible = np.isfinite(outcomes.log_weight)
-        density = terms - np.where(possible, outcomes.log_weight, 0.0)
         says = np.logaddexp(np.log1p(-OUTLIER_RATE) + density, self.outlier_log_density)
         says = np.where(evidence.usable[..., None], says, 0.0)
         late = self.late(evidence.movements, evidence.first_reading_delay)
@@ -190,7 +194,7 @@ class HealthyModel:
             outcomes: What may have become of each movement.
 
         Returns:
-            Log weight times density of each outcome if no motor is faulty,
+            Log density of each position under each outcome if no motor is faulty,
             (run, movement, outcome) [log 1/m3], and the pose, scattered so as to meet the
             position, (run, movement, outcome, motor) [rad].
         """
@@ -200,10 +204,7 @@ class HealthyModel:
         spread = Ellipsoid.of(jacobian * self.scatter, self.path_noise**2)
         dof = self.settling.tail_dof
         density = spread.log_norm(dof) + log_fall(spread.product(error, error), dof)
-        return (
-            outcomes.log_weight + density,
-            pose + scattered(spread, jacobian, self.scatter, error),
-        )
+        return density, pose + scattered(spread, jacobian, self.scatter, error)
 
 
 def scattered(

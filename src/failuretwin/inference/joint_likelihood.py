@@ -8,10 +8,12 @@ numbers say all that a movement can say of this motor, and any fault of it is we
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.numerics import Ellipsoid, log_norm
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.inference.command_loss import CommandOutcomes
@@ -33,8 +35,11 @@ LEAST_PRECISION = 1e-3
 """Precision [1/rad2] below which a movement says nothing of the motor: the tool is on its axis."""
 
 
+PerOutcome = Annotated[FloatArray, Axes("run", "movement", "outcome")]
+
+
 @dataclass(frozen=True)
-class JointLikelihood:
+class JointLikelihood(ArrayStruct):
     """Evidence on the settled angle of one motor, (..., outcome) each.
 
     Leading axes are run and movement, and one more where another motor takes several angles.
@@ -58,32 +63,18 @@ class JointLikelihood:
             which `mode` stands.
     """
 
-    mode: FloatArray
-    precision: FloatArray
-    min_distance2: FloatArray
-    log_weight: FloatArray
-    expected: FloatArray
+    mode: PerOutcome
+    precision: PerOutcome
+    min_distance2: PerOutcome
+    log_weight: PerOutcome
+    expected: PerOutcome
     scatter: float
     dof: float
     outlier: float
-    usable: BoolArray
+    usable: Annotated[BoolArray, Axes("run", "movement", empty=False)]
     wraps: bool
-    map_pose: FloatArray
-    faulty_baseline: FloatArray
-
-    def __getitem__(self, run: int) -> JointLikelihood:
-        """Return what one of the runs says, without the axis of runs."""
-        return replace(
-            self,
-            mode=self.mode[run],
-            precision=self.precision[run],
-            min_distance2=self.min_distance2[run],
-            log_weight=self.log_weight[run],
-            expected=self.expected[run],
-            usable=self.usable[run],
-            map_pose=self.map_pose[run],
-            faulty_baseline=self.faulty_baseline[run],
-        )
+    map_pose: Annotated[FloatArray, Axes("run", "movement", "outcome", "motor")]
+    faulty_baseline: PerOutcome
 
     def log_terms(self, angle: FloatArray, held: bool) -> FloatArray:
         """Return log weight times density of each outcome.
@@ -297,7 +288,7 @@ def nearest_on_circle(
 
 
 @dataclass(frozen=True)
-class MovementLikelihoods:
+class MovementLikelihoods(ArrayStruct):
     """What every movement says by itself, whatever fault may have come later.
 
     Attributes:
@@ -312,9 +303,9 @@ class MovementLikelihoods:
 
     model: HealthyModel
     outcomes: CommandOutcomes
-    density: FloatArray
-    poses: FloatArray
-    profiles: Sequence[JointLikelihood]
+    density: PerOutcome
+    poses: Annotated[FloatArray, Axes("run", "movement", "outcome", "motor")]
+    profiles: tuple[JointLikelihood, ...]
 
     @property
     def terms(self) -> FloatArray:
@@ -325,29 +316,7 @@ class MovementLikelihoods:
 def movement_likelihoods(evidence: SettledEvidence, model: HealthyModel) -> MovementLikelihoods:
     """Return what every movement says by itself."""
     usual = model.outcomes(evidence.movements)
-    density, poses = likelihood_given_outcome(evidence, model, usual)
-    found = filtered_outcomes(evidence, model, usual, density)
+    density, poses = model.explain(evidence, usual)
+    found = model.filtered_outcomes(evidence, usual, density)
     profiles = joint_likelihoods(evidence, model, found, range(len(model.scatter)))
-    return MovementLikelihoods(model, found, density, poses, profiles)
-
-
-def likelihood_given_outcome(
-    evidence: SettledEvidence, model: HealthyModel, outcomes: CommandOutcomes
-) -> tuple[FloatArray, FloatArray]:
-    """Return how well each outcome explains the settled positions, as in `MovementLikelihoods`."""
-    as_likely = replace(outcomes, log_weight=np.zeros_like(outcomes.log_weight))
-    return model.explain(evidence, as_likely)
-
-
-def filtered_outcomes(
-    evidence: SettledEvidence, model: HealthyModel, usual: CommandOutcomes, density: FloatArray
-) -> CommandOutcomes:
-    """Return outcomes with their probability given what was seen of the movements before.
-
-    Args:
-        evidence: Settled positions.
-        model: The healthy robot.
-        usual: What may have become of each movement, whatever was seen.
-        density: How well that explains the settled positions.
-    """
-    return model.filtered_outcomes(evidence, usual, usual.log_weight + density)
+    return MovementLikelihoods(model, found, density, poses, tuple(profiles))

@@ -10,7 +10,8 @@ import numpy as np
 
 from failuretwin.core.runs import AXES, measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
-from failuretwin.inference.readings import measured_samples
+from failuretwin.inference.readings import MeasuredSamples, measured_samples
+from failuretwin.inference.settings import USUAL, InferenceSettings
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -29,10 +30,9 @@ FROZEN_S = 2.5
 """Shortest time that a channel must stand still to be called frozen [s]; a plateau is shorter."""
 FROZEN_TRAVEL_RAD = 0.2
 """Travel of two motors that must show at the tool [rad], about 12 degrees; one may be stuck."""
-NEARLY_STILL_M = 0.003
-"""A tool that stays this near [m] stands still, give or take the noise of its sensor."""
 NEARLY_STILL_S = 4.0
-"""For so long it is the sensor or the whole arm [s]; a plateau and a late start last 3 s."""
+"""A tool that stands nearly still for so long is dead, or its sensor [s]; a plateau and a late
+start last 3 s."""
 LOOK_S = 0.1
 """Readings are looked at no more often than this for a tool that stands nearly still [s]."""
 DEAD_SHARE = 0.6
@@ -59,18 +59,24 @@ class LogQuality:
     spoilt: tuple[tuple[float, float], ...] = ()
 
 
-def log_quality(runs: xr.Dataset) -> list[LogQuality]:
+def log_quality(
+    runs: xr.Dataset,
+    readings: MeasuredSamples | None = None,
+    settings: InferenceSettings = USUAL,
+) -> list[LogQuality]:
     """Return the defects of each run's log.
 
     Lines drawn across a gap do not hide it.
 
     Args:
         runs: A run set; `command` and `measured` are read.
+        readings: The readings of the same runs, where they are known already.
+        settings: How near is still.
     """
-    time = as_floats(runs["time"].values)
+    time, rate = as_floats(runs["time"].values), measured_rate(runs)
     command = as_floats(runs["command"].values)
-    measured, rate = measured_samples(runs).point, measured_rate(runs)
-    return [_quality(time, c, m, rate) for c, m in zip(command, measured, strict=True)]
+    point, near = (readings or measured_samples(runs)).point, settings.nearly_still_m
+    return [_quality(time, c, m, rate, near) for c, m in zip(command, point, strict=True)]
 
 
 def drop_invalid(runs: xr.Dataset, quality: Sequence[LogQuality]) -> xr.Dataset:
@@ -85,7 +91,7 @@ def drop_invalid(runs: xr.Dataset, quality: Sequence[LogQuality]) -> xr.Dataset:
 
 
 def _quality(
-    time: FloatArray, command: FloatArray, measured: FloatArray, rate: float
+    time: FloatArray, command: FloatArray, measured: FloatArray, rate: float, near: float
 ) -> LogQuality:
     seen = np.asarray(np.isfinite(measured).all(axis=1))
     if seen.sum() < 2:
@@ -100,7 +106,7 @@ def _quality(
     still = [stretch for stretch in frozen if stretch is not None]
     if len(still) == len(frozen):
         return _still_tool(tuple(remarks), still, time[seen])
-    nearly = _nearly_still(time, command, measured, seen)
+    nearly = _nearly_still(time, command, measured[seen], time[seen], near)
     if nearly is not None:
         return _still_tool(tuple(remarks), [nearly], time[seen])
     spoilt = []
@@ -200,35 +206,52 @@ def _frozen(
     longest = int(np.argmax(np.diff(edges)))
     first, last = int(edges[longest]), int(edges[longest + 1]) - 1
     begin, end = float(at[first]), float(at[last])
-    if end - begin < FROZEN_S or not _should_move(time, command, begin, end):
+    if end - begin < FROZEN_S or not _told_to_move(time, command, begin, end):
         return None
     return begin, end
 
 
 def _nearly_still(
-    time: FloatArray, command: FloatArray, measured: FloatArray, seen: BoolArray
+    time: FloatArray, command: FloatArray, point: FloatArray, at: FloatArray, radius: float
 ) -> tuple[float, float] | None:
-    """Return the longest stretch [s] in which the tool stays near one place though told to move."""
-    at, point = time[seen], measured[seen]
+    """Return the longest stretch [s] in which the tool stays near one place though told to move.
+
+    Args:
+        time: Uniform grid, (time,) [s].
+        command: References, (time, motor) [rad].
+        point: Readings, (reading, axis) [m].
+        at: When they were taken, (reading,) [s].
+        radius: How near [m].
+    """
     every = max(1, int(LOOK_S / np.median(np.diff(at))))
     best, first = (0, 0), 0
     for last in range(0, len(at), every):
-        if np.abs(point[last] - point[first]).max() > NEARLY_STILL_M:
+        if np.abs(point[last] - point[first]).max() > radius:
             first = last
         elif at[last] - at[first] > at[best[1]] - at[best[0]]:
             best = (first, last)
-    near = np.abs(point[best[1] :] - point[best[0]]).max(axis=1) <= NEARLY_STILL_M
+    near = np.abs(point[best[1] :] - point[best[0]]).max(axis=1) <= radius
     leaves = len(near) if near.all() else int(np.argmin(near))
     begin, end = float(at[best[0]]), float(at[best[1] + leaves - 1])
-    if end - begin < NEARLY_STILL_S or not _should_move(time, command, begin, end):
+    if end - begin < NEARLY_STILL_S or not _told_to_move(time, command, begin, end):
         return None
     return begin, end
 
 
-def _should_move(time: FloatArray, command: FloatArray, begin: float, end: float) -> bool:
-    """Return whether motors are told to travel that no single stuck one could hide."""
-    travel = np.sort(np.ptp(command[(time >= begin) & (time <= end)], axis=0))
-    return bool(travel[-2:].min(initial=np.inf) > FROZEN_TRAVEL_RAD)
+def _told_to_move(time: FloatArray, command: FloatArray, begin: float, end: float) -> bool:
+    return bool(should_move(np.ptp(command[(time >= begin) & (time <= end)], axis=0)))
+
+
+def should_move(travel: FloatArray) -> BoolArray:
+    """Return where motors are told to travel so far that no single stuck one could hide it.
+
+    Args:
+        travel: Range of their references, (..., motor) [rad]; NaN where not known.
+
+    Returns:
+        (...).
+    """
+    return np.asarray(np.sort(travel, axis=-1)[..., -2:].min(axis=-1) > FROZEN_TRAVEL_RAD)
 
 
 def _times(stretches: Sequence[tuple[float, float]]) -> str:

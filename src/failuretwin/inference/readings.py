@@ -14,10 +14,11 @@ once drawn out, the steady part of its way counts as a line.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
+from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.runs import measured_rate, time_step
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 
@@ -97,8 +98,11 @@ def grid_steps(runs: xr.Dataset) -> int:
     return round(1.0 / (measured_rate(runs) * time_step(runs)))
 
 
+PerSample = Annotated[BoolArray, Axes("run", "time", empty=False)]
+
+
 @dataclass(frozen=True)
-class _Shapes:
+class _Shapes(ArrayStruct):
     """How paths run through each of their samples, (run, time) each.
 
     A sample with a neighbour missing is none of the first three, except at the ends of a path.
@@ -111,11 +115,11 @@ class _Shapes:
         seen: Samples that are there.
     """
 
-    on_line: BoolArray
-    at_rest: BoolArray
-    corner: BoolArray
-    bend: FloatArray
-    seen: BoolArray
+    on_line: PerSample
+    at_rest: PerSample
+    corner: PerSample
+    bend: Annotated[FloatArray, Axes("run", "time")]
+    seen: PerSample
 
     @classmethod
     def of(cls, point: FloatArray, seen: BoolArray, time: FloatArray) -> _Shapes:
@@ -138,16 +142,6 @@ class _Shapes:
         at_rest[row, first] = still[row, np.minimum(first, still.shape[1] - 1)]
         at_rest[row, last] = still[row, np.maximum(last - 1, 0)]
         return cls(on_line, at_rest, inside & ~(on_line | at_rest), bend, seen)
-
-    def __getitem__(self, runs: BoolArray) -> _Shapes:
-        """Return the shapes of some of the runs."""
-        return _Shapes(
-            self.on_line[runs],
-            self.at_rest[runs],
-            self.corner[runs],
-            self.bend[runs],
-            self.seen[runs],
-        )
 
     def drawn_by_lines(self) -> BoolArray:
         """Return which paths are straight lines from corner to corner, all along, (run,)."""

@@ -148,11 +148,11 @@ def test_a_saved_stream_goes_on_as_if_nothing_had_happened(twin, work, tmp_path)
         whole.update(*sample)
         first.update(*sample)
     first.save(path)
-    first_reading_delay = StreamingDiagnoser.load(path, method)
+    resumed = StreamingDiagnoser.load(path, method)
     for sample in samples[middle:]:
-        expected, answer = whole.update(*sample), first_reading_delay.update(*sample)
+        expected, answer = whole.update(*sample), resumed.update(*sample)
         assert answer == expected
-    assert first_reading_delay.to_diagnosis() == whole.to_diagnosis()
+    assert resumed.conclude() == whole.conclude()
 
 
 def test_a_fleet_can_be_saved_before_it_has_seen_anything(twin, tmp_path):
@@ -218,7 +218,7 @@ def test_samples_far_apart_tell_of_no_movement(watcher, rng, step):
     for k in range(5):
         answer = watcher.update(step * k, rng.uniform(-0.5, 0.5, 4), [0.1, 0.1, 0.2])
     assert answer.diagnosis is None
-    assert watcher.to_diagnosis().diagnosis is None
+    assert watcher.conclude().diagnosis is None
 
 
 def test_between_two_judgements_nothing_said_changes(twin, work):
@@ -255,7 +255,7 @@ def test_other_arms_are_streamed_as_they_are_recorded(name, rate_hz):
     points[:, np.arange(points.shape[1]) % every != 0] = np.nan
     for i, time in enumerate(runs["time"].values):
         fleet.update(time, runs["command"].values[:, i], points[:, i])
-    fleet.to_diagnosis()
+    fleet.conclude()
     thinned = runs.assign(measured=(runs["measured"].dims, points))
     thinned.attrs["measured_rate_hz"] = rate_hz
     expected = [list(d.posterior.values()) for d in method.diagnose(thinned)]

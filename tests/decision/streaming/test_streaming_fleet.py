@@ -35,7 +35,7 @@ def play(runs, diagnoser, robots=slice(None), order=None, skip=()):
 
 def test_the_end_of_a_stream_is_the_batch(live_runs, live_diagnoser):
     fleet = play(live_runs, live_diagnoser)
-    fleet.to_diagnosis()
+    fleet.conclude()
     expected = decided(live_diagnoser, live_runs)
     np.testing.assert_allclose(fleet.posterior, expected, rtol=0.0, atol=1e-9)
     for robot, diagnosis in enumerate(live_diagnoser.diagnose(live_runs)):
@@ -59,7 +59,7 @@ def test_modes_that_show_on_the_way_count_in_streams(live_runs, twin):
     )
     diagnoser, some = BayesDiagnoser(twin, hypotheses=hypotheses), live_runs.isel(run=[0, 3])
     fleet = play(some, diagnoser)
-    fleet.to_diagnosis()
+    fleet.conclude()
     expected = decided(diagnoser, some)
     np.testing.assert_allclose(fleet.posterior, expected, rtol=0.0, atol=1e-9)
 
@@ -77,7 +77,7 @@ def test_samples_may_come_late(live_runs, live_diagnoser, rng):
     for now, i in enumerate(order):
         fleet.update(time[now], command[:, now], None)
         fleet.update(time[i], None, measured[:, i])
-    fleet.to_diagnosis()
+    fleet.conclude()
     np.testing.assert_allclose(fleet.posterior, decided(settled, some), rtol=0.0, atol=1e-9)
 
 
@@ -87,7 +87,7 @@ def test_missing_samples_are_no_evidence(live_runs, live_diagnoser, rng):
     lost = rng.random(some["measured"].shape[:2]) < 0.3
     some["measured"].values[lost] = np.nan
     fleet = play(some, live_diagnoser)
-    fleet.to_diagnosis()
+    fleet.conclude()
     expected = decided(live_diagnoser, some)
     np.testing.assert_allclose(fleet.posterior, expected, rtol=0.0, atol=1e-9)
 
@@ -100,7 +100,7 @@ def test_whole_samples_may_be_missing(live_runs, live_diagnoser, rng):
     kept[:30] = True
     fewer = play(live_runs, live_diagnoser, skip=set(np.flatnonzero(~kept & ~read).tolist()))
     for fleet in (whole, fewer):
-        fleet.to_diagnosis()
+        fleet.conclude()
     np.testing.assert_allclose(fewer.posterior, whole.posterior, atol=0.02)
 
 
@@ -144,7 +144,7 @@ def test_five_hundred_runs_as_streams(armpi, twin, rng):
     for now, i in enumerate(order):
         fleet.update(time[now], command[:, now], None)
         fleet.update(time[i], None, measured[:, i])
-    fleet.to_diagnosis()
+    fleet.conclude()
     off = np.abs(fleet.posterior - decided(diagnoser, runs)).max(axis=1)
     # A tool that stands still while motors should move is dead for a stream, at once; a recorded
     # run is judged by what is left of it.

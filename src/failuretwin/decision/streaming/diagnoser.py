@@ -27,7 +27,7 @@ from failuretwin.inference.priors import MONITORING
 
 # The state of a stream in a file: plain arrays, read without running anything.
 
-FORMAT = 1
+FORMAT = 2
 SUFFIX = ".npz"
 HEADER = "header"
 

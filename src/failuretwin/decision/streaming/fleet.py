@@ -7,21 +7,22 @@ its last movements say, with the same arithmetic as a recorded run.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import isfinite
 from numbers import Real
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.decision.streaming.samples import KEEP_S, FrozenSensorDetector
-from failuretwin.decision.streaming.tracking import MovementTracker, Starts
-from failuretwin.decision.streaming.window import Arrays, arrays_of, put_arrays
+from failuretwin.decision.streaming.tracking import MovementTracker
 from failuretwin.inference.diagnoser import BayesDiagnoser
-from failuretwin.inference.evidence import SETTLING_S
 from failuretwin.inference.log_quality import LogQuality
 from failuretwin.inference.posterior import (
     Posterior,
@@ -34,9 +35,6 @@ from failuretwin.inference.run_likelihood import RunLikelihood
 
 MOVEMENTS = 5
 """Movements that are remembered, the present one included: as many as a run of the paper has."""
-UPDATE_THRESHOLD_M = 0.0005
-"""A tool that rests this near to where it was judged to rest is not judged anew [m]: a tenth of
-what a healthy one scatters."""
 SILENCE_S = 5.0
 """Without a reading for so long nothing is known of the present [s]; the bus of the ArmPi stalls
 for 4 s."""
@@ -45,8 +43,8 @@ DEAD = LogQuality(
 )
 
 
-@dataclass
-class FleetPosterior:
+@dataclass(frozen=True)
+class FleetPosterior(ArrayStruct):
     """What is believed of each robot.
 
     Attributes:
@@ -57,10 +55,10 @@ class FleetPosterior:
         dead: Robots whose tools stand still though they should move, (robot,).
     """
 
-    posterior: FloatArray
-    judged: BoolArray
-    point: FloatArray
-    dead: BoolArray
+    posterior: Annotated[FloatArray, Axes("run", "hypothesis")]
+    judged: Annotated[BoolArray, Axes("run", empty=False)]
+    point: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
+    dead: Annotated[BoolArray, Axes("run", empty=False)]
 
 
 @dataclass(frozen=True)
@@ -115,17 +113,13 @@ class StreamingFleet:
         self._zero: float | None = None
         self._now = -np.inf
         model = diagnoser.healthy_model
-        latest_s = model.imperfections.timing.late_s[1] + model.lag_s + SETTLING_S
-        starts = Starts(latest_s, model.lost_commands.late_after_s)
-        self._following = MovementTracker(robots, diagnoser.twin, movements, rate_hz, starts)
-        self._stillness = FrozenSensorDetector.unknown(robots, motors)
+        self._settings = model.settings
+        self._tracker = MovementTracker(model, robots, movements, rate_hz)
+        self._frozen = FrozenSensorDetector.empty(run=robots, axis=3, value=4, motor=motors)
         self._prior = np.exp(log_prior(diagnoser.hypothesis_set, diagnoser.priors))
-        self._beliefs = FleetPosterior(
-            posterior=np.tile(self._prior, (robots, 1)),
-            judged=np.zeros(robots, dtype=bool),
-            point=np.full((robots, 3), np.nan),
-            dead=np.zeros(robots, dtype=bool),
-        )
+        sizes = {"run": robots, "hypothesis": len(self._prior), "axis": 3}
+        self._beliefs = FleetPosterior.empty(**sizes)
+        self._beliefs.posterior[:] = self._prior
         self._everything_counts = any(shows_in_transients(h) for h in diagnoser.hypothesis_set)
         self._latest = _Latest(np.array([], dtype=np.int64), None, [])
 
@@ -147,7 +141,7 @@ class StreamingFleet:
     @property
     def stale(self) -> BoolArray:
         """Robots that have not been seen for a while: nothing is known of their present."""
-        read_s = self._following.read_s
+        read_s = self._tracker.read_s
         return np.asarray(np.isinf(read_s) | (read_s < self._now - SILENCE_S))
 
     def update(
@@ -167,7 +161,7 @@ class StreamingFleet:
         reference, points = self._checked(time, command, measured)
         time = self._by_own_clock(time)
         points, died = self._alive(time, reference, points)
-        begun, at_rest = self._following.take(time, reference, points)
+        begun, at_rest = self._tracker.take(time, reference, points)
         self._beliefs.point[begun] = np.nan
         return np.append(died, self._judge(self._with_news(at_rest)))
 
@@ -176,11 +170,11 @@ class StreamingFleet:
 
         What comes after it is a new beginning for the movement that was under way.
         """
-        following = self._following
-        for robot in np.flatnonzero(following.references.moved):
-            following.find_movements(int(robot))
-        there = np.flatnonzero(following.windows.count > 0)
-        following.conclude(there)
+        tracker = self._tracker
+        for robot in np.flatnonzero(tracker.references.moved):
+            tracker.find_movements(int(robot))
+        there = np.flatnonzero(tracker.window.count > 0)
+        tracker.conclude(there)
         self._judge(there)
 
     def diagnosis(self, robot: int, before: Diagnosis | None = None) -> Diagnosis | None:
@@ -191,9 +185,9 @@ class StreamingFleet:
             before: What was said of it before; of a fault that is older than what is remembered,
                 the onset told then stands.
         """
-        beliefs, windows = self._beliefs, self._following.windows
+        beliefs, window = self._beliefs, self._tracker.window
         known = beliefs.judged[robot] or beliefs.dead[robot]
-        if not known or windows.count[robot] == 0:
+        if not known or window.count[robot] == 0:
             return None
         if robot not in self._latest.robots or self._latest.posterior_of_runs is None:
             self._remember(np.array([robot]), self._judgement(np.array([robot])))
@@ -206,9 +200,9 @@ class StreamingFleet:
 
     def _remember(self, robots: IntArray, posterior_of_runs: Posterior) -> None:
         """Keep a judgement for whoever asks for it in words."""
-        windows, zero = self._following.windows, self._zero or 0.0
+        window, zero = self._tracker.window, self._zero or 0.0
         places = [
-            StreamPosition(float(windows.zero_s[robot]) + zero, int(windows.forgotten[robot]))
+            StreamPosition(float(window.zero_s[robot]) + zero, int(window.forgotten[robot]))
             for robot in robots
         ]
         self._latest = _Latest(robots, posterior_of_runs, places)
@@ -229,39 +223,33 @@ class StreamingFleet:
     def state(self) -> dict[str, np.ndarray]:
         """Return all that the stream knows, by name."""
         zero = np.nan if self._zero is None else self._zero
-        found = {"clock": np.array([zero, self._now]), "read_s": self._following.read_s}
+        found = {"clock": np.array([zero, self._now]), "read_s": self._tracker.read_s}
         for name, part in self._parts.items():
-            found |= arrays_of(part, name)
-        for name in ("time", "command", "measured"):
-            found[f"samples/{name}"] = getattr(self._following.samples, name)
-        kept = self._following.memory.arrays
-        return found | {f"memory/{name}": values for name, values in kept.items()}
+            found |= part.to_arrays(name)
+        return found | self._tracker.samples.state()
 
-    def restore(self, state: Arrays) -> None:
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Take over what `state` returned.
 
         Raises:
             KeyError: If something is missing.
             ValueError: If something is of another shape.
         """
-        following = self._following
         zero, self._now = state["clock"].tolist()
         self._zero = None if np.isnan(zero) else zero
-        following.read_s[:] = state["read_s"]
+        self._tracker.read_s[:] = state["read_s"]
         for name, part in self._parts.items():
-            put_arrays(part, name, state)
-        following.samples.restore(*(state[f"samples/{n}"] for n in ("time", "command", "measured")))
-        following.memory.restore(state)
+            part.from_arrays(name, state)
+        self._tracker.samples.restore(state)
 
     @property
-    def _parts(self) -> dict[str, object]:
+    def _parts(self) -> dict[str, ArrayStruct]:
         """What is kept of each robot, by name."""
         return {
-            "references": self._following.references,
-            "windows": self._following.windows,
-            "memory": self._following.memory,
+            "references": self._tracker.references,
+            "window": self._tracker.window,
             "beliefs": self._beliefs,
-            "stillness": self._stillness,
+            "frozen": self._frozen,
         }
 
     def _checked(
@@ -286,34 +274,38 @@ class StreamingFleet:
 
         What such a sensor said before that was noticed is forgotten.
         """
-        beliefs, last = self._beliefs, self._following.references.last
+        beliefs, last = self._beliefs, self._tracker.references.last
         read = np.asarray(np.isfinite(points).all(axis=1))
         known = np.where(np.isfinite(command), command, last)
-        still, alone = self._stillness.see(time, read, points, known)
+        near_m = self._settings.nearly_still_m
+        still, alone = self._frozen.see(time, read, points, known, near_m)
         still |= beliefs.dead & ~read
         died = still & ~beliefs.dead
         beliefs.dead[:] = still
         beliefs.posterior[died] = self._prior
         for robot in np.flatnonzero(died):
-            self._following.spoil(int(robot), float(self._stillness.since_s(int(robot))))
+            self._tracker.spoil(int(robot), self._frozen.still_since(int(robot)))
         silent = still | alone.any(axis=1)
         return np.where(silent[:, None], np.nan, points), np.flatnonzero(died)
 
     def _with_news(self, robots: IntArray) -> IntArray:
         """Return the robots whose tools rest elsewhere than they were judged to."""
-        windows = self._following.windows
-        now = windows.point[robots, windows.count[robots] - 1]
-        near = (np.abs(now - self._beliefs.point[robots]) < UPDATE_THRESHOLD_M).all(axis=1)
-        return robots[~near]
+        moved = np.abs(self._resting(robots) - self._beliefs.point[robots])
+        return robots[~(moved < self._settings.update_m).all(axis=1)]
+
+    def _resting(self, robots: IntArray) -> FloatArray:
+        """Return where tools rest after the present movement, (robot, axis) [m]."""
+        window = self._tracker.window
+        return window.settled.point[robots, window.count[robots] - 1]
 
     def _judge(self, robots: IntArray) -> IntArray:
         """Renew what is believed of robots by what their last movements say."""
-        windows, beliefs = self._following.windows, self._beliefs
+        window, beliefs = self._tracker.window, self._beliefs
         for robot in robots:
-            self._following.see_on_way(int(robot), int(windows.count[robot]) - 1)
+            self._tracker.see_on_way(int(robot), int(window.count[robot]) - 1)
         # The way takes long to judge, so that robots of which it does not count are apart.
-        log_transient = self._on_way(robots)
-        for group in (robots[log_transient], robots[~log_transient]):
+        on_way = self._on_way(robots)
+        for group in (robots[on_way], robots[~on_way]):
             if len(group) == 0:
                 continue
             posterior_of_runs = self._judgement(group)
@@ -322,22 +314,22 @@ class StreamingFleet:
                 beliefs.posterior[robot] = posterior_of_runs.posterior(at, undecided)
             self._remember(group, posterior_of_runs)
         beliefs.judged[robots] = True
-        beliefs.point[robots] = windows.point[robots, windows.count[robots] - 1]
+        beliefs.point[robots] = self._resting(robots)
         return robots
 
     def _on_way(self, robots: IntArray) -> BoolArray:
         """Return of which robots readings on the way count, (robot,)."""
-        windows = self._following.windows
-        there = np.arange(self.movements) < windows.count[robots, None]
-        unseen = (there & ~windows.usable[robots]).any(axis=1)
+        window = self._tracker.window
+        there = np.arange(self.movements) < window.count[robots, None]
+        unseen = (there & ~window.settled.usable[robots]).any(axis=1)
         return np.asarray(self.diagnoser.uses_transients & (unseen | self._everything_counts))
 
     def _judgement(self, robots: IntArray) -> Posterior:
-        diagnoser, windows = self.diagnoser, self._following.windows
-        evidence, moving = windows.evidence(robots), None
-        if self._on_way(robots).any():
-            moving = windows.log_transient(robots).where(diagnoser.transient_mask(evidence.usable))
+        diagnoser, window = self.diagnoser, self._tracker.window
+        settled, transient = window.evidence(robots)
+        counts = self._on_way(robots).any()
+        moving = transient.where(diagnoser.transient_mask(settled.usable)) if counts else None
         model = diagnoser.healthy_model
-        findings = self._following.memory.findings(robots, evidence, model)
-        likelihood = RunLikelihood(evidence, model, moving, remembered=findings)
+        likelihoods = window.judge(robots, settled, model)
+        likelihood = RunLikelihood(settled, model, moving, remembered=likelihoods)
         return compute_posterior(likelihood, diagnoser.hypothesis_set, diagnoser.priors)

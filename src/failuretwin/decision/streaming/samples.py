@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.inference.log_quality import (
     FROZEN_S,
-    FROZEN_TRAVEL_RAD,
     NEAR_ZERO_M,
-    NEARLY_STILL_M,
     NEARLY_STILL_S,
     STILL_M,
+    should_move,
 )
 
 KEEP_S = 30.0
@@ -79,10 +81,19 @@ class SampleBuffer:
         """Return the samples that are no older than a time [s]."""
         return slice(int(np.searchsorted(self.time, time)), len(self.time))
 
-    def restore(self, time: FloatArray, command: FloatArray, measured: FloatArray) -> None:
+    def state(self) -> dict[str, np.ndarray]:
+        """Return all samples, by name."""
+        return {
+            "samples/time": self.time,
+            "samples/command": self.command,
+            "samples/measured": self.measured,
+        }
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Take over the samples of another stream, in the order of their times."""
-        for sample in zip(time.tolist(), command, measured, strict=True):
-            self.add(*sample)
+        named = (state[name] for name in self.state())
+        for time, command, measured in zip(*named, strict=True):
+            self.add(float(time), command, measured)
 
     def _make_room(self) -> None:
         if self._stop < len(self._time):
@@ -106,72 +117,37 @@ def _fill(old: FloatArray, new: FloatArray) -> None:
 # Tools that stand still though motors are told to move: a dead sensor, or a dead arm.
 
 
-@dataclass
-class _StuckValue:
-    """Since when values have not moved, and how far motors were told to travel meanwhile.
+STILL_FOR_S = np.array([FROZEN_S, FROZEN_S, FROZEN_S, NEARLY_STILL_S])
+"""Shortest time for which each axis must stand still to be called frozen, and the tool [s]."""
+
+
+@dataclass(frozen=True)
+class FrozenSensorDetector(ArrayStruct):
+    """Watches the tools of many robots, by the same rules as `log_quality`.
+
+    Four values of each robot may stand still: each axis, as long as it reports the very same
+    number, and the tool as a whole, as long as it stays near one place.
 
     Attributes:
-        value: Where they stood then, (robot, value).
-        since_s: (robot, value) [s].
+        number: What each axis reports, (robot, axis) [m].
+        place: Where the tool is, (robot, axis) [m].
+        since_s: Since when each stands still, (robot, value) [s].
         low: Least references since then, (robot, value, motor) [rad].
         high: Greatest ones.
     """
 
-    value: FloatArray
-    since_s: FloatArray
-    low: FloatArray
-    high: FloatArray
+    number: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
+    place: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
+    since_s: Annotated[FloatArray, Axes("run", "value", empty=np.nan)]
+    low: Annotated[FloatArray, Axes("run", "value", "motor", empty=np.nan)]
+    high: Annotated[FloatArray, Axes("run", "value", "motor", empty=np.nan)]
 
-    @classmethod
-    def empty(cls, robots: int, values: int, motors: int) -> _StuckValue:
-        none = np.full((robots, values), np.nan)
-        travel = np.full((robots, values, motors), np.nan)
-        return cls(none.copy(), none.copy(), travel.copy(), travel.copy())
-
-    def begin(self, anew: BoolArray, time: float, value: FloatArray, command: FloatArray) -> None:
-        """Begin anew with some of the values (robot, value)."""
-        self.value[anew], self.since_s[anew] = value[anew], time
-        reference = np.broadcast_to(command[:, None], self.low.shape)
-        self.low[anew], self.high[anew] = reference[anew], reference[anew]
-
-    def follow(self, command: FloatArray) -> None:
-        """Take references, (robot, motor) [rad]; NaN where not known."""
-        np.fmin(self.low, command[:, None], out=self.low)
-        np.fmax(self.high, command[:, None], out=self.high)
-
-    def still_for(self, time: float, least_s: float) -> BoolArray:
-        """Return which stand still though two motors at least should move, (robot, value)."""
-        with np.errstate(invalid="ignore"):
-            travel = np.sort(self.high - self.low, axis=-1)[..., -2:].min(axis=-1)
-            return (time - self.since_s >= least_s) & (travel > FROZEN_TRAVEL_RAD)
-
-
-@dataclass
-class FrozenSensorDetector:
-    """Watches the tools of many robots, by the same rules as `log_quality`.
-
-    Attributes:
-        channels: Coordinates that report the very same number, by axis.
-        tools: Tools that stay near one place.
-        place: That place, (robot, axis) [m].
-    """
-
-    channels: _StuckValue
-    tools: _StuckValue
-    place: FloatArray
-
-    @classmethod
-    def unknown(cls, robots: int, motors: int) -> FrozenSensorDetector:
-        """Return a watch over tools that were never seen."""
-        tools = _StuckValue.empty(robots, 1, motors)
-        return cls(_StuckValue.empty(robots, 3, motors), tools, np.full((robots, 3), np.nan))
-
-    def since_s(self, robot: int) -> float:
+    def still_since(self, robot: int) -> float:
         """Return since when the tool of a robot has stood where it stands [s]."""
-        return float(min(self.tools.since_s[robot, 0], self.channels.since_s[robot].max()))
+        return float(min(self.since_s[robot, 3], self.since_s[robot, :3].max()))
 
     def see(
-        self, time: float, read: BoolArray, points: FloatArray, command: FloatArray
+        self, time: float, read: BoolArray, points: FloatArray, command: FloatArray, near_m: float
     ) -> tuple[BoolArray, BoolArray]:
         """Take readings and say what is dead.
 
@@ -180,23 +156,26 @@ class FrozenSensorDetector:
             read: Robots that were read, (robot,).
             points: Tool positions of all, (robot, axis) [m].
             command: References of all, as far as known, (robot, motor) [rad].
+            near_m: A tool that stays this near stands still [m].
 
         Returns:
             Tools among those read that stand still, (robot,), and channels that do alone,
             (robot, axis).
         """
+        anew = np.repeat(read[:, None], 4, axis=1)
         with np.errstate(invalid="ignore"):
-            same = np.abs(points - self.channels.value) <= STILL_M
-            near = np.abs(points - self.place).max(axis=1) <= NEARLY_STILL_M
-        self.channels.begin(read[:, None] & ~same, time, points, command)
-        away = read & ~near
-        self.place[away] = points[away]
-        self.tools.begin(away[:, None], time, points[:, :1], command)
-        for watch in (self.channels, self.tools):
-            watch.follow(command)
-        frozen = self.channels.still_for(time, FROZEN_S)
-        frozen &= read[:, None]
-        still = self.tools.still_for(time, NEARLY_STILL_S)[:, 0] & read | frozen.all(axis=1)
+            anew[:, :3] &= ~(np.abs(points - self.number) <= STILL_M)
+            anew[:, 3] &= ~(np.abs(points - self.place).max(axis=1) <= near_m)
+        self.number[anew[:, :3]], self.place[anew[:, 3]] = points[anew[:, :3]], points[anew[:, 3]]
+        self.since_s[anew] = time
+        reference = np.broadcast_to(command[:, None], self.low.shape)
+        self.low[anew] = self.high[anew] = reference[anew]
+        np.fmin(self.low, reference, out=self.low)
+        np.fmax(self.high, reference, out=self.high)
+        with np.errstate(invalid="ignore"):
+            still = (time - self.since_s >= STILL_FOR_S) & should_move(self.high - self.low)
+        still &= read[:, None]
+        dead = still[:, 3] | still[:, :3].all(axis=1)
         # One at zero may be held there by a stuck motor; see `log_quality`.
-        alone = frozen & ~still[:, None] & (np.abs(self.channels.value) > NEAR_ZERO_M)
-        return still, alone
+        alone = still[:, :3] & ~dead[:, None] & (np.abs(self.number) > NEAR_ZERO_M)
+        return dead, alone

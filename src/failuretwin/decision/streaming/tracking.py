@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
+from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.movements import Movements, find_movements, simplify
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.decision.streaming.samples import SampleBuffer
-from failuretwin.decision.streaming.window import LikelihoodCache, MovementWindow
-from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.decision.streaming.window import MovementWindow
 from failuretwin.inference.evidence import (
     JUST_AFTER_S,
     SETTLING_S,
     Rest,
     estimate_rest,
     rest_begin,
-    spread_out,
 )
+from failuretwin.inference.healthy_model import HealthyModel
+
+Items = tuple[IntArray, IntArray]
+"""Robots and their movements, (item,) each."""
 
 # Movements in the references of many robots, found as soon as a reference comes to rest.
 
@@ -36,8 +40,8 @@ GRID_S = 0.01
 TWO_SAMPLES = GRID_S * np.arange(2.0)
 
 
-@dataclass
-class References:
+@dataclass(frozen=True)
+class References(ArrayStruct):
     """Which references move, (robot,) each.
 
     Attributes:
@@ -51,28 +55,14 @@ class References:
         left_s: When it left that rest [s].
     """
 
-    last: FloatArray
-    stood: FloatArray
-    last_s: FloatArray
-    still: IntArray
-    moved: BoolArray
-    rest_s: FloatArray
-    before_s: FloatArray
-    left_s: FloatArray
-
-    @classmethod
-    def unknown(cls, robots: int, motors: int) -> References:
-        """Return references of which nothing is known yet."""
-        return cls(
-            last=np.full((robots, motors), np.nan),
-            stood=np.full((robots, motors), np.nan),
-            last_s=np.full(robots, -np.inf),
-            still=np.zeros(robots, dtype=np.int64),
-            moved=np.zeros(robots, dtype=bool),
-            rest_s=np.full(robots, -np.inf),
-            before_s=np.full(robots, -np.inf),
-            left_s=np.full(robots, -np.inf),
-        )
+    last: Annotated[FloatArray, Axes("run", "motor", empty=np.nan)]
+    stood: Annotated[FloatArray, Axes("run", "motor", empty=np.nan)]
+    last_s: Annotated[FloatArray, Axes("run", empty=-np.inf)]
+    still: Annotated[IntArray, Axes("run", empty=0)]
+    moved: Annotated[BoolArray, Axes("run", empty=False)]
+    rest_s: Annotated[FloatArray, Axes("run", empty=-np.inf)]
+    before_s: Annotated[FloatArray, Axes("run", empty=-np.inf)]
+    left_s: Annotated[FloatArray, Axes("run", empty=-np.inf)]
 
     def see(self, time: float, command: FloatArray) -> IntArray:
         """Take references at a time and return the robots whose movements can be found now.
@@ -89,7 +79,7 @@ class References:
             turns = known & (np.abs(command - self.stood).max(axis=1) > TURN_RAD)
         leaves = turns & ~self.moved
         self.left_s[leaves], self.before_s[leaves] = self.last_s[leaves], self.rest_s[leaves]
-        self.moved |= turns
+        self.moved[turns] = True
         self.rest_s[first | turns], self.stood[first | turns] = time, command[first | turns]
         self.still[turns] = 0
         self.still[known & ~turns & ~first] += 1
@@ -142,55 +132,35 @@ def _evenly(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArra
     return grid, np.stack([np.interp(grid, time, v) for v in values.T], axis=-1)
 
 
-NO_REST = Rest(np.zeros((1, 3)), np.zeros(1, dtype=bool), np.zeros(1, dtype=bool))
+# Where the tools of many robots come to rest after their movements, seen reading by reading.
+
 REST_S = 0.15
 """Time in the same place that shows a tool at rest while it may still be moving [s]."""
-SAME_PLACE_M = 0.002
-"""How near readings then lie [m]: some counts of the servos, and slower than 2 cm/s."""
-UNMOVED_M = 0.02
-"""A tool this near to where it rested before may not have set out yet [m]."""
-
-
-@dataclass(frozen=True)
-class Starts:
-    """When movements begin after their commands.
-
-    Attributes:
-        latest_s: At the latest [s].
-        late_after_s: Readings that come back later than this say that it begins late [s].
-    """
-
-    latest_s: float
-    late_after_s: float
+NO_REST = Rest(np.zeros((1, 3)), np.zeros(1, dtype=bool), np.zeros(1, dtype=bool))
 
 
 class MovementTracker:
     """What is known of the last movements of many robots.
 
     Args:
+        model: The healthy robot.
         robots: How many robots there are.
-        twin: Digital twin of each of them.
         movements: Movements that are remembered, the present one included.
         rate_hz: True rate of the tool sensors [Hz]; None: all readings are real.
-        starts: When movements begin.
     """
 
     def __init__(
-        self,
-        robots: int,
-        twin: DigitalTwin,
-        movements: int,
-        rate_hz: float | None,
-        starts: Starts,
+        self, model: HealthyModel, robots: int, movements: int, rate_hz: float | None
     ) -> None:
-        motors = len(twin.robot.motors)
+        motors = len(model.scatter)
         self.samples = SampleBuffer(robots, motors)
-        self.references = References.unknown(robots, motors)
-        self.windows = MovementWindow.empty(robots, movements, motors)
-        self.memory = LikelihoodCache.empty(robots, movements)
+        self.references = References.empty(run=robots, motor=motors)
+        self.window = MovementWindow.of(model, robots, movements)
         self.read_s = np.full(robots, -np.inf)
-        self._twin, self._starts = twin, starts
+        self._twin, self._settings = model.twin, model.settings
         self._least_step = 0.0 if rate_hz is None else 0.9 / rate_hz
+        self._latest_start_s = model.imperfections.timing.late_s[1] + model.lag_s + SETTLING_S
+        self._late_after_s = model.lost_commands.late_after_s
 
     def take(self, time: float, command: FloatArray, points: FloatArray) -> tuple[IntArray, ...]:
         """Take a sample.
@@ -214,18 +184,15 @@ class MovementTracker:
 
     def find_movements(self, robot: int) -> None:
         """Add the movements of a reference, up to now."""
-        movements, windows = self.references.movements(robot, self.samples), self.windows
-        if np.isnan(windows.zero_s[robot]):
-            windows.zero_s[robot] = self.samples.time[0]
+        movements, window = self.references.movements(robot, self.samples), self.window
+        if np.isnan(window.zero_s[robot]):
+            window.zero_s[robot] = self.samples.time[0]
         for number, start in enumerate(movements.start[0]):
-            if windows.count[robot] > 0:
-                last = int(windows.count[robot]) - 1
-                self._settle(np.array([robot]), np.array([last]), np.array([start]))
+            if window.count[robot] > 0:
+                last = int(window.count[robot]) - 1
+                self._settle((np.array([robot]), np.array([last])), np.array([start]))
                 self.see_on_way(robot, last)
-            if windows.full(robot):
-                windows.forget_oldest(robot)
-                self.memory.forget_oldest(robot)
-            windows.append(robot, movements, number)
+            window.append(robot, movements, number)
 
     def look(self, robots: IntArray) -> IntArray:
         """See where tools rest by now and return the robots whose tools do.
@@ -236,74 +203,67 @@ class MovementTracker:
         Args:
             robots: Robots that were read.
         """
-        still = robots[~self.references.moved[robots]]
-        robots, place, begin, end = self._due(*self._present(still))
-        if len(robots) == 0:
-            return robots
-        samples, time, inside = self._readings(robots, begin, end)
-        found = estimate_rest(samples, _since_rest(samples, time, inside))
-        waits = self._under_way(robots, place) | self._may_start_late(robots, place, found.point)
+        at, begin, end = self._due(*self._present(robots[~self.references.moved[robots]]))
+        if len(at[0]) == 0:
+            return at[0]
+        samples, time, inside = self._readings(at[0], begin, end)
+        inside = _since_rest(samples, time, inside, self._settings.same_place_m)
+        found = estimate_rest(samples, inside, self._settings.moving_spread_m)
+        waits = self._under_way(at) | self._may_start_late(at, found.point)
         found = replace(found, usable=found.usable & ~waits)
-        self.windows.settle(robots, place, end, found)
-        return robots[found.usable]
+        self.window.settled.settle(at, found)
+        return at[0][found.usable]
 
     def conclude(self, robots: IntArray) -> None:
         """See where tools rest after present movements, taking them to be over."""
         self._settle(*self._present(robots))
 
-    def _present(self, robots: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
+    def _present(self, robots: IntArray) -> tuple[Items, FloatArray]:
         """Return the robots that have a movement and readings, which, and when these end [s]."""
-        some = robots[(self.windows.count[robots] > 0) & np.isfinite(self.read_s[robots])]
-        return some, self.windows.count[some] - 1, self.read_s[some] + JUST_AFTER_S
+        some = robots[(self.window.count[robots] > 0) & np.isfinite(self.read_s[robots])]
+        return (some, self.window.count[some] - 1), self.read_s[some] + JUST_AFTER_S
 
     def see_on_way(self, robot: int, place: int) -> None:
         """Note what was read on the way of a movement, until the tool rested."""
         self._resume(robot, place)
-        windows, samples = self.windows, self.samples
-        at = robot, place
-        until = windows.begin[at] if windows.usable[at] else windows.end[at]
-        some = samples.since(float(windows.start[at]))
-        time, point = samples.time[some], samples.measured[some, robot]
+        settled, at = self.window.settled, (robot, place)
+        start, until = settled.movements.start[at], settled[at].transient_until
+        some = self.samples.since(float(start))
+        time, point = self.samples.time[some], self.samples.measured[some, robot]
         there = np.isfinite(point).all(axis=1) & (time < until - 1e-9)
-        time, point = time[there], point[there]
-        chosen = spread_out(time, self._least_step)
-        windows.see_on_way(*at, time[chosen], point[chosen])
+        self.window.transient.take_in(at, start, time[there], point[there], self._least_step)
 
     def spoil(self, robot: int, since_s: float) -> None:
         """Forget the readings of a robot since a time [s], and what they said of its movements."""
-        windows = self.windows
+        settled = self.window.settled
         self.samples.measured[self.samples.since(since_s), robot] = np.nan
-        for place in range(int(windows.count[robot])):
-            if windows.end[robot, place] > since_s:
+        for place in range(int(self.window.count[robot])):
+            if settled.end[robot, place] > since_s:
                 at = np.array([robot]), np.array([place])
-                windows.settle(*at, windows.end[at], NO_REST)
-                self._settle(*at, windows.end[at])
+                settled.settle(at, NO_REST)
+                self._settle(at, settled.end[at])
                 self.see_on_way(robot, place)
 
-    def _settle(self, robots: IntArray, place: IntArray, end: FloatArray) -> None:
+    def _settle(self, at: Items, end: FloatArray) -> None:
         """See where tools rest after movements that end.
 
         Args:
-            robots: Indices, (item,).
-            place: Their movements, (item,).
+            at: Robots and their movements, (item,) each.
             end: Ends of the plateaus, (item,) [s].
         """
-        robots, place, begin, end = self._due(robots, place, end)
-        if len(robots):
-            samples, _, inside = self._readings(robots, begin, end)
-            found = estimate_rest(samples, inside)
-            self.windows.settle(robots, place, end, found)
+        at, begin, end = self._due(at, end)
+        if len(begin):
+            samples, _, inside = self._readings(at[0], begin, end)
+            found = estimate_rest(samples, inside, self._settings.moving_spread_m)
+            self.window.settled.settle(at, found)
 
-    def _due(
-        self, robots: IntArray, place: IntArray, end: FloatArray
-    ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    def _due(self, at: Items, end: FloatArray) -> tuple[Items, FloatArray, FloatArray]:
         """Return robots that may be at rest, their movements, and when to look [s]."""
-        windows, at = self.windows, (robots, place)
-        begin = rest_begin(windows.start[at], windows.ramp_duration[at], end)
-        windows.begin[at], windows.end[at] = begin, end
-        self.memory.fresh[at] = False
+        settled, now = self.window.settled, self.window.settled.movements[at]
+        begin = rest_begin(now.start, now.ramp_duration, end)
+        settled.begin[at], settled.end[at], self.window.judged[at] = begin, end, False
         over = begin < end
-        return robots[over], place[over], begin[over], end[over]
+        return (at[0][over], at[1][over]), begin[over], end[over]
 
     def _readings(
         self, robots: IntArray, begin: FloatArray, end: FloatArray
@@ -314,41 +274,44 @@ class MovementTracker:
         inside = (time >= begin[:, None] - 1e-9) & (time < end[:, None] - 1e-9)
         return self.samples.measured[some, robots].swapaxes(0, 1), time, inside
 
-    def _under_way(self, robots: IntArray, place: IntArray) -> BoolArray:
+    def _under_way(self, at: Items) -> BoolArray:
         """Return which movements must still be on their way, as readings came back late."""
-        windows, at = self.windows, (robots, place)
-        for k in np.flatnonzero(np.isnan(windows.first_reading_delay[at])):
-            self._resume(int(robots[k]), int(place[k]))
-        first_reading_delay, ramp = (
-            windows.first_reading_delay[at],
-            windows.ramp_duration[at].max(axis=-1),
-        )
-        over = self.read_s[robots] - windows.start[at] > first_reading_delay + ramp + SETTLING_S
-        return np.asarray((first_reading_delay > self._starts.late_after_s) & ~over)
+        settled = self.window.settled
+        for k in np.flatnonzero(np.isnan(settled.first_reading_delay[at])):
+            self._resume(int(at[0][k]), int(at[1][k]))
+        delay, now = settled.first_reading_delay[at], settled.movements[at]
+        lasts = delay + now.ramp_duration.max(axis=-1) + SETTLING_S
+        over = self.read_s[at[0]] - now.start > lasts
+        return np.asarray((delay > self._late_after_s) & ~over)
 
     def _resume(self, robot: int, place: int) -> None:
         """Note when readings came back after the command of a movement."""
-        windows, samples = self.windows, self.samples
-        if np.isfinite(windows.first_reading_delay[robot, place]):
+        settled, samples = self.window.settled, self.samples
+        if np.isfinite(settled.first_reading_delay[robot, place]):
             return
-        start = float(windows.start[robot, place])
+        start = float(settled.movements.start[robot, place])
         some = samples.since(start)
         there = np.isfinite(samples.measured[some, robot]).all(axis=1)
         if there.any():
-            windows.first_reading_delay[robot, place] = samples.time[some][np.argmax(there)] - start
+            first = samples.time[some][np.argmax(there)]
+            settled.first_reading_delay[robot, place] = first - start
 
-    def _may_start_late(self, robots: IntArray, place: IntArray, point: FloatArray) -> BoolArray:
+    def _may_start_late(self, at: Items, point: FloatArray) -> BoolArray:
         """Return which tools still rest where they did before, and may yet set out, (robot,)."""
-        windows, before = self.windows, np.maximum(place - 1, 0)
-        seen = (place > 0) & windows.usable[robots, before]
-        told = np.where(place[:, None] > 0, windows.target[robots, before], windows.initial[robots])
-        rested = np.where(seen[:, None], windows.point[robots, before], self._twin.path(told))
-        unmoved = np.linalg.norm(point - rested, axis=1) < UNMOVED_M
-        since = self.read_s[robots] - windows.start[robots, place]
-        return np.asarray(unmoved & (since < self._starts.latest_s))
+        (robots, place), settled = at, self.window.settled
+        known, before = settled.movements, (robots, np.maximum(place - 1, 0))
+        later = place > 0
+        told = np.where(later[:, None], known.target[before], known.initial[robots])
+        seen = (later & settled.usable[before])[:, None]
+        rested = np.where(seen, settled.point[before], self._twin.path(told))
+        unmoved = np.linalg.norm(point - rested, axis=1) < self._settings.unmoved_m
+        since = self.read_s[robots] - known.start[at]
+        return np.asarray(unmoved & (since < self._latest_start_s))
 
 
-def _since_rest(samples: FloatArray, time: FloatArray, inside: BoolArray) -> BoolArray:
+def _since_rest(
+    samples: FloatArray, time: FloatArray, inside: BoolArray, same_place_m: float
+) -> BoolArray:
     """Return the readings from which on all are near the newest, (robot, sample).
 
     None where they span too short a time to tell rest from a slow start.
@@ -357,6 +320,7 @@ def _since_rest(samples: FloatArray, time: FloatArray, inside: BoolArray) -> Boo
         samples: Tool positions, (robot, sample, axis) [m]; NaN where there is none.
         time: When they were taken, (sample,) [s].
         inside: Samples that count, (robot, sample).
+        same_place_m: How near is near [m].
     """
     there = inside & np.isfinite(samples).all(axis=-1)
     if not there.any():
@@ -365,7 +329,7 @@ def _since_rest(samples: FloatArray, time: FloatArray, inside: BoolArray) -> Boo
     newest = np.where(there, number, 0).max(axis=1)
     off = samples - samples[np.arange(len(samples)), newest][:, None]
     with np.errstate(invalid="ignore"):
-        far = there & (np.linalg.norm(off, axis=-1) > SAME_PLACE_M)
+        far = there & (np.linalg.norm(off, axis=-1) > same_place_m)
     kept = there & (number > np.where(far, number, -1).max(axis=1, keepdims=True))
     first = np.where(kept, time, np.inf).min(axis=1)
     return kept & (time[newest] - first >= REST_S)[:, None]

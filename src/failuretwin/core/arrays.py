@@ -1,0 +1,147 @@
+"""Frozen dataclasses of arrays whose leading axes have names, such as runs and movements.
+
+A field says by `Axes` what its axes are and what stands where there is nothing; a field without is
+the same for all entries::
+
+    @dataclass(frozen=True)
+    class Movements(ArrayStruct):
+        target: Annotated[FloatArray, Axes("run", "movement", "motor", empty=np.nan)]
+
+Whatever is done to such a value is done to all its arrays, and to those of the values within it:
+what is written into a buffer of a stream, forgotten or saved is named nowhere else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, ClassVar, Self, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+ENTRY_AXES = ("run", "movement")
+"""Axes by which entries are taken; where an array has them, they lead, in this order."""
+
+Entries = Any
+"""Index of one run or of some, or a tuple of one for runs and one for movements."""
+Change = Callable[[np.ndarray, "Axes"], np.ndarray]
+
+
+class Axes:
+    """What the axes of an array are.
+
+    Args:
+        names: Their names; those of `ENTRY_AXES` lead.
+        empty: What stands where there is nothing; its type is that of the array.
+    """
+
+    def __init__(self, *names: str, empty: float | bool = 0.0) -> None:
+        self.names, self.empty = names, empty
+        self._entry = [ENTRY_AXES.index(name) for name in names if name in ENTRY_AXES]
+
+    def of_entries(self, entries: Entries) -> tuple[Any, ...]:
+        """Return what of an index belongs to the axes that the array has."""
+        index = entries if isinstance(entries, tuple) else (entries,)
+        return tuple(index[i] for i in self._entry if i < len(index))
+
+
+class ArrayStruct:
+    """Base of frozen dataclasses of arrays; the arrays themselves may be written into."""
+
+    _parts: ClassVar[Mapping[str, Axes | type[ArrayStruct]]]
+    """Axes of each array, and the class of each value (or tuple of them) with arrays of its own."""
+
+    def __init_subclass__(cls) -> None:
+        found: dict[str, Axes | type[ArrayStruct]] = {}
+        for name, hint in get_type_hints(cls, include_extras=True).items():
+            inner = get_args(hint)[0] if get_origin(hint) is tuple else hint
+            axes = [part for part in getattr(hint, "__metadata__", ()) if isinstance(part, Axes)]
+            if axes:
+                found[name] = axes[0]
+            elif isinstance(inner, type) and issubclass(inner, ArrayStruct):
+                found[name] = inner
+        cls._parts = found
+
+    @classmethod
+    def empty(cls, **sizes: int) -> Self:
+        """Return a value with nothing in it.
+
+        Args:
+            sizes: Length of every axis that its arrays have, by name.
+        """
+        return cls(
+            **{
+                name: np.full([sizes[axis] for axis in of.names], of.empty)
+                if isinstance(of, Axes)
+                else of.empty(**sizes)
+                for name, of in cls._parts.items()
+            }
+        )
+
+    def blank(self, *sizes: int) -> Self:
+        """Return a value like this one with nothing in it, for so many runs and movements."""
+
+        def emptied(array: np.ndarray, axes: Axes) -> np.ndarray:
+            lead = axes.of_entries(sizes)
+            return np.full((*lead, *array.shape[len(lead) :]), axes.empty)
+
+        return self._with(emptied)
+
+    def __getitem__(self, entries: Entries) -> Self:
+        """Return some of the runs, or of their movements."""
+        return self._with(lambda array, axes: array[axes.of_entries(entries)])
+
+    def put(self, entries: Entries, values: Self) -> None:
+        """Write values into some of the entries."""
+        new = values._arrays()
+        for (_, array, axes), (_, value, _) in zip(self._arrays(), new, strict=True):
+            array[axes.of_entries(entries)] = value
+
+    def forget_oldest(self, run: int) -> None:
+        """Drop the first movement of a run; behind the last one there is then nothing."""
+        for _, array, axes in self._arrays():
+            if "movement" in axes.names:
+                array[run, :-1] = array[run, 1:].copy()
+                array[run, -1] = axes.empty
+
+    def to_arrays(self, prefix: str) -> dict[str, np.ndarray]:
+        """Return all arrays by ``prefix/field``, and ``prefix/field/field`` of values within."""
+        return {prefix + name: array for name, array, _ in self._arrays()}
+
+    def from_arrays(self, prefix: str, arrays: Mapping[str, np.ndarray]) -> None:
+        """Write what `to_arrays` returned into the arrays.
+
+        Raises:
+            KeyError: If one is missing.
+            ValueError: If one is of another shape.
+        """
+        for name, array, _ in self._arrays():
+            value = arrays[prefix + name]
+            if value.shape != array.shape:
+                raise ValueError(f"{prefix}{name} has shape {value.shape}, expected {array.shape}")
+            array[...] = value
+
+    def _with(self, change: Change) -> Self:
+        """Return a copy with every array changed."""
+        values: dict[str, Any] = {}
+        for name, of in self._parts.items():
+            value = getattr(self, name)
+            if isinstance(of, Axes):
+                values[name] = change(value, of)
+            elif isinstance(value, tuple):
+                values[name] = tuple(part._with(change) for part in value)
+            else:
+                values[name] = value._with(change)
+        return dataclasses.replace(self, **values)  # type: ignore[type-var]
+
+    def _arrays(self) -> Iterator[tuple[str, np.ndarray, Axes]]:
+        """Yield ``/field`` of every array, the array and its axes."""
+        for name, of in self._parts.items():
+            value = getattr(self, name)
+            if isinstance(of, Axes):
+                yield f"/{name}", value, of
+                continue
+            parts = enumerate(value) if isinstance(value, tuple) else [("", value)]
+            for i, part in parts:
+                for inner, array, axes in part._arrays():
+                    yield f"/{name}{i}{inner}", array, axes
