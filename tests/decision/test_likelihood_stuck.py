@@ -97,9 +97,10 @@ def test_a_stuck_motor_stands_where_a_healthy_one_settles(run_on, from_start):
     assert found == pytest.approx(np.log(stuck_by_force(brute, start=0.012).sum()), abs=0.05)
 
 
-@pytest.mark.parametrize(("early", "free"), [(0.1, 0.2), (1.0, 0.2), (0.5, 0.6)])
-def test_beliefs_of_a_stuck_motor_count_as_told(run_on, early, free):
-    likelihood, brute = run_on(TARGETS, HELD["on the third ramp"])
+@pytest.mark.parametrize("held", ["from the start", "on the third ramp"])
+@pytest.mark.parametrize(("early", "free"), [(0.1, 0.2), (1.0, 0.2), (0.5, 0.6), (0.5, 0.9)])
+def test_beliefs_of_a_stuck_motor_count_as_told(run_on, early, free, held):
+    likelihood, brute = run_on(TARGETS, HELD[held])
     found = told(
         marginal_likelihood(likelihood, stuck_model(likelihood, 0, OnsetPrior(early, free)))
     )
