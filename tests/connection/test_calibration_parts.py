@@ -7,12 +7,7 @@ import pytest
 from scipy import stats
 
 from failuretwin import DigitalTwin
-from failuretwin.connection.calibration.cross_validation import (
-    best_payload,
-    cross_validate,
-    judge,
-    sense_remarks,
-)
+from failuretwin.connection.calibration.cross_validation import cross_validate, judge
 from failuretwin.connection.calibration.observations import Observations, lost_command, rounding
 from failuretwin.connection.calibration.parameters import (
     Rate,
@@ -21,7 +16,12 @@ from failuretwin.connection.calibration.parameters import (
     median_interval,
     spread_of,
 )
-from failuretwin.connection.calibration.settling_fit import settling_posterior, sort_and_fit
+from failuretwin.connection.calibration.settling_fit import (
+    best_payload,
+    sense_remarks,
+    settling_posterior,
+    sort_and_fit,
+)
 from failuretwin.connection.calibration.timing_fit import (
     Transients,
     fit_timing,

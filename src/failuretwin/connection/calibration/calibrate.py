@@ -9,12 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.connection.calibration.cross_validation import (
-    best_payload,
-    cross_validate,
-    judge,
-    sense_remarks,
-)
+from failuretwin.connection.calibration.cross_validation import cross_validate, judge
 from failuretwin.connection.calibration.observations import observe, session_names
 from failuretwin.connection.calibration.parameters import (
     LossRates,
@@ -32,7 +27,12 @@ from failuretwin.connection.calibration.parameters import (
     timing_parameters,
 )
 from failuretwin.connection.calibration.result import Calibration, HeldOut, LeftOut, Parameter
-from failuretwin.connection.calibration.settling_fit import SettlingFit, sort_and_fit
+from failuretwin.connection.calibration.settling_fit import (
+    SettlingFit,
+    best_payload,
+    sense_remarks,
+    sort_and_fit,
+)
 from failuretwin.connection.calibration.timing_fit import (
     fit_timing,
     gap_starts,

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from threading import Condition
-from time import monotonic, sleep
 from time import time as wall_clock
 from typing import Protocol, Self, cast
 
@@ -328,13 +328,13 @@ class Pace:
         """
         if self.speed == AS_FAST_AS_POSSIBLE:
             return True
-        now = monotonic()
+        now = time.monotonic()
         if self._zero is None:
             self._zero = event_time, now
         first, began = self._zero
         left = began + (event_time - first) / self.speed - now
         if left > 0.0:
-            sleep(min(left, timeout_s))
+            time.sleep(min(left, timeout_s))
         return left <= timeout_s
 
 
