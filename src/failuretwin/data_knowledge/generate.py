@@ -331,7 +331,7 @@ def simulate(
     on_progress: Callable[[int], None] = lambda runs: None,
     scheduler: str | None = None,
 ) -> xr.Dataset:
-    """Simulate all runs of a plan in memory; `run_factory.produce` has no need to hold them.
+    """Simulate all runs of a plan in memory; `resumable.produce` has no need to hold them.
 
     Args:
         plan: What to simulate.
@@ -347,7 +347,9 @@ def simulate(
         range(first, min(first + CHUNK_RUNS, plan.size))
         for first in range(0, plan.size, CHUNK_RUNS)
     ]
-    with Workforce(workers, scheduler).at_work(partial(simulate_runs, plan), chunks) as results:
+    with Workforce(workers, scheduler).map_unordered(
+        partial(simulate_runs, plan), chunks
+    ) as results:
         return assemble(_datasets(results, on_progress), plan.size)
 
 
