@@ -7,7 +7,7 @@ import pytest
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
-from failuretwin.data_knowledge.generate import Plan, simulate, without_chance
+from failuretwin.data_knowledge.generate import Plan, deterministic, simulate
 from failuretwin.digital_model.nonidealities import default_imperfections
 from failuretwin.failure_behavior.modes import MODES
 from failuretwin.inference.expected_bayes_factors import Judge, separation, truth_and_faults
@@ -20,7 +20,7 @@ SETTLED = ("stuck", "encoder_bias", "encoder_scale", "backlash", "torque_loss", 
 
 def quiet(imperfections):
     """Return imperfections without chance, but with their declared scatter."""
-    return dataclasses.replace(without_chance(imperfections), settling=imperfections.settling)
+    return dataclasses.replace(deterministic(imperfections), settling=imperfections.settling)
 
 
 def test_the_truth_is_nearest_to_itself(twin, imperfect):
@@ -57,12 +57,12 @@ def test_readings_count_only_by_being_there(twin, imperfect):
 @pytest.fixture(scope="module")
 def of_all_modes(armpi, measured_armpi):
     """Runs of every mode at motor 2, with all of their profiles, on an arm that never errs."""
-    sure = without_chance(measured_armpi)
+    sure = deterministic(measured_armpi)
     return simulate(Plan(armpi, single_faults(["motor_2"], MODES), 4, 2, sure))
 
 
 def test_runs_are_made_again_as_they_were(twin, armpi, measured_armpi, of_all_modes):
-    judge = Judge(HealthyModel(twin, without_chance(measured_armpi)), (HEALTHY,), Priors())
+    judge = Judge(HealthyModel(twin, deterministic(measured_armpi)), (HEALTHY,), Priors())
     faults = truth_and_faults(of_all_modes)[1]
     again = judge.silent(of_all_modes, faults)
     np.testing.assert_allclose(again["measured"], of_all_modes["measured"], rtol=0, atol=1e-12)
@@ -81,7 +81,7 @@ def test_a_law_puts_the_tool_where_the_simulator_does(twin, armpi, measured_armp
     hypothesis = Hypothesis.parse(f"{motor}:{mode}")
     known = quiet(measured_armpi)
     law = dataclasses.replace(MODES[mode], onset_s=(0.0, 0.0), profiles=("step",))
-    runs = simulate(Plan(armpi, [hypothesis], 4, 1, without_chance(known), modes={mode: law}))
+    runs = simulate(Plan(armpi, [hypothesis], 4, 1, deterministic(known), modes={mode: law}))
     judge = Judge(HealthyModel(twin, known), (hypothesis, HEALTHY), Priors())
     faults = truth_and_faults(runs)[1]
     own, healthy = judge.fits(runs, faults, runs["onset"].values).T

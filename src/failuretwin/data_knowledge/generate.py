@@ -385,12 +385,12 @@ def noise_free_path(
     """
     runs, count = movements.start.shape
     rng = np.random.default_rng(0)  # asked, but nothing that it says counts
-    luck = draw_disturbances(without_chance(imperfections), twin.robot, count, 0.0, rng)
+    luck = draw_disturbances(deterministic(imperfections), twin.robot, count, 0.0, rng)
     drive = drive_of(movements, movements.reference(time), time, injection, stack([luck] * runs))
     return twin.path(ServoEngine(twin.robot).angles(drive, time))
 
 
-def without_chance(imperfections: Imperfections) -> Imperfections:
+def deterministic(imperfections: Imperfections) -> Imperfections:
     """Return imperfections that leave nothing to chance; ranges shrink to their middles."""
     timing, settling = imperfections.timing, imperfections.settling
     if settling is not None:
