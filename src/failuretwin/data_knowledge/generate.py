@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing import parent_process
@@ -24,7 +24,6 @@ from failuretwin.core.hypothesis import Fault, Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable, Truth
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.timed_log import assemble
 from failuretwin.data_knowledge.workers import Workforce
 from failuretwin.digital_model.disturbances import (
     Disturbances,
@@ -331,7 +330,7 @@ def simulate(
     on_progress: Callable[[int], None] = lambda runs: None,
     scheduler: str | None = None,
 ) -> xr.Dataset:
-    """Simulate all runs of a plan in memory; `run_factory.produce` has no need to hold them.
+    """Simulate all runs of a plan in memory; `resumable.produce` has no need to hold them.
 
     Args:
         plan: What to simulate.
@@ -347,16 +346,26 @@ def simulate(
         range(first, min(first + CHUNK_RUNS, plan.size))
         for first in range(0, plan.size, CHUNK_RUNS)
     ]
-    with Workforce(workers, scheduler).at_work(partial(simulate_runs, plan), chunks) as results:
-        return assemble(_datasets(results, on_progress), plan.size)
+    work, workforce = partial(simulate_runs, plan), Workforce(workers, scheduler)
+    with workforce.map_unordered(work, chunks) as results:
+        return _assembled(results, plan.size, on_progress)
 
 
-def _datasets(
-    results: Iterator[tuple[range, RunTable]], on_progress: Callable[[int], None]
-) -> Iterator[tuple[int, xr.Dataset]]:
-    for runs, table in results:
-        yield runs[0], table.to_dataset()
-        on_progress(len(runs))
+def _assembled(
+    parts: Iterable[tuple[range, RunTable]], runs: int, on_progress: Callable[[int], None]
+) -> xr.Dataset:
+    """Return one run set in which every part, in any order, has its place; none is held twice."""
+    arrays: dict[Hashable, np.ndarray] = {}
+    for place, table in parts:
+        part = table.to_dataset()
+        for name, variable in part.variables.items():
+            if variable.dims[:1] == ("run",):
+                empty = np.empty((runs, *variable.shape[1:]), variable.dtype)
+                arrays.setdefault(name, empty)[place.start : place.stop] = variable.values
+        on_progress(len(place))
+    shared = part.drop_dims("run").assign_coords(run=arrays.pop("run"))
+    filled = {name: (part[name].dims, array, part[name].attrs) for name, array in arrays.items()}
+    return shared.assign(filled)[list(part.data_vars)]
 
 
 # Runs in which nothing is left to chance: the signature that a fault leaves on the tool.
@@ -383,12 +392,12 @@ def noise_free_path(
     """
     runs, count = movements.start.shape
     rng = np.random.default_rng(0)  # asked, but nothing that it says counts
-    luck = draw_disturbances(without_chance(imperfections), twin.robot, count, 0.0, rng)
+    luck = draw_disturbances(deterministic(imperfections), twin.robot, count, 0.0, rng)
     drive = drive_of(movements, movements.reference(time), time, injection, stack([luck] * runs))
     return twin.path(ServoEngine(twin.robot).angles(drive, time))
 
 
-def without_chance(imperfections: Imperfections) -> Imperfections:
+def deterministic(imperfections: Imperfections) -> Imperfections:
     """Return imperfections that leave nothing to chance; ranges shrink to their middles."""
     timing, settling = imperfections.timing, imperfections.settling
     if settling is not None:

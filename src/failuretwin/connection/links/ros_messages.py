@@ -16,16 +16,20 @@ from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.types import MS_PER_S, FloatArray
-from failuretwin.data_knowledge.bags.messages import KINDS, NS_PER_S, Kind, Role
+from failuretwin.data_knowledge.bags.messages import (
+    MONITORING,
+    NS_PER_S,
+    Kind,
+    Role,
+    check_role,
+    kind_of_type,
+)
 from failuretwin.digital_model.robot import Robot
 
 # Names and types of the topics that a robot is connected by; TOML, Python and defaults agree.
 
 AUTHORS_TYPE = "cm/msg_cm"
 """Type of the message of the data set's authors; any other package may define the same fields."""
-MONITORING = Kind.MONITORING
-STANDARD_TYPES = {kind.value.replace("/msg/", "/"): kind for kind in Kind if kind is not MONITORING}
-"""Kinds of the standard types by their ROS 1 names."""
 STANDARD_PACKAGES = ("std_msgs", "sensor_msgs", "geometry_msgs", "trajectory_msgs", "nav_msgs")
 """Packages of ROS itself: their other types have none of the fields that are looked for."""
 TOPIC_NAME = re.compile(r"[~/]?[A-Za-z]\w*(/[A-Za-z]\w*)*")
@@ -81,11 +85,7 @@ class RosTopics:
                 )
             kind = kind_of_type(type_)
             foreign = kind is MONITORING and type_.split("/")[0] in STANDARD_PACKAGES
-            if foreign or kind not in KINDS[role]:
-                raise InputError(
-                    f"{role}_type is {type_!r}, which cannot be the {role}. Expected "
-                    f"{', '.join(k.value for k in KINDS[role])}."
-                )
+            check_role(role, None if foreign else kind, f"{role}_type is {type_!r}, which")
 
     @property
     def wait_s(self) -> float:
@@ -97,7 +97,9 @@ class RosTopics:
 
     def check_fits(self, robot: Robot) -> None:
         """Raise InputError if a message would hold servo counts and the robot has none."""
-        in_counts = [type_ for _, _, type_ in self.subscribed if kind_of_type(type_) is MONITORING]
+        in_counts = [
+            type_ for _, _, type_ in self.subscribed if kind_of_type(type_) is Kind.MONITORING
+        ]
         has_counts = robot.profile.servo_units and all(motor.log_column for motor in robot.motors)
         if in_counts and not has_counts:
             raise InputError(
@@ -115,11 +117,6 @@ class RosTopics:
             ("position", self.position, self.position_type),
         ]
         return [entry for entry in found if entry[1]]
-
-
-def kind_of_type(type_: str) -> Kind:
-    """Return the kind of a message type; one that is not standard has the authors' fields."""
-    return STANDARD_TYPES.get(type_.replace("/msg/", "/"), MONITORING)
 
 
 def load_topics(path: Path) -> RosTopics:

@@ -13,10 +13,9 @@ from failuretwin.connection.links.ros_messages import (
     DIAGNOSTICS_TYPE,
     DiagnosticsPublisher,
     RosTopics,
-    kind_of_type,
 )
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.bags.messages import Kind, Role
+from failuretwin.data_knowledge.bags.messages import Kind, Role, kind_of_type
 from failuretwin.digital_model.robot import Robot
 
 CONNECT_S = 5.0

@@ -17,11 +17,11 @@ import xarray as xr
 from failuretwin import read_runs
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge import resumable as run_factory
-from failuretwin.data_knowledge import resumable as run_pieces
+from failuretwin.data_knowledge import resumable
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.data_knowledge.resumable import produce
+from failuretwin.data_knowledge.resumable import make_chunk, produce
 from failuretwin.data_knowledge.store import load_run_set, save_run_set, sole_writer
+from failuretwin.data_knowledge.workers import ONE_PROCESS
 from failuretwin.digital_model.calibrated_robot import load_calibration
 
 RUNS_PER_CLASS = 2
@@ -59,12 +59,12 @@ def cut_short(plan, path, pieces, monkeypatch, error=KeyboardInterrupt):
         if len(made) == pieces:
             raise error
         made.append(piece)
-        return run_pieces.make_piece(job, piece)
+        return make_chunk(job, piece)
 
     with monkeypatch.context() as patch:
-        patch.setattr(run_factory, "make_piece", failing)
+        patch.setattr(resumable, "make_chunk", failing)
         with pytest.raises(OutputError if error is OSError else error):
-            produce(plan, path, tell=told.append, piece_runs=PIECE)
+            produce(plan, path, tell=told.append, chunk_runs=PIECE)
     return told
 
 
@@ -72,17 +72,17 @@ def counting(monkeypatch):
     """Count the pieces that are made from now on."""
     made = []
 
-    def make_piece(job, piece):
+    def counted(job, piece):
         made.append(piece)
-        return run_pieces.make_piece(job, piece)
+        return make_chunk(job, piece)
 
-    monkeypatch.setattr(run_factory, "make_piece", make_piece)
+    monkeypatch.setattr(resumable, "make_chunk", counted)
     return made
 
 
-@pytest.mark.parametrize("piece_runs", [1, PIECE, 100])
-def test_what_is_made_piece_by_piece_is_what_is_made_in_memory(tmp_path, plan, piece_runs):
-    produce(plan, tmp_path / "runs.zarr", piece_runs=piece_runs)
+@pytest.mark.parametrize("chunk_runs", [1, PIECE, 100])
+def test_what_is_made_piece_by_piece_is_what_is_made_in_memory(tmp_path, plan, chunk_runs):
+    produce(plan, tmp_path / "runs.zarr", chunk_runs=chunk_runs)
     whole = simulate(plan)
     xr.testing.assert_identical(load_run_set(tmp_path / "runs.zarr"), whole)
     save_run_set(whole, tmp_path / "whole.zarr")
@@ -112,7 +112,7 @@ def test_netcdf_beyond_memory_is_refused_at_once(tmp_path, imperfect):
 
 
 def test_manifest_says_what_was_made(tmp_path, imperfect):
-    produce(imperfect, tmp_path / "runs.zarr", piece_runs=PIECE)
+    produce(imperfect, tmp_path / "runs.zarr", chunk_runs=PIECE)
     manifest = json.loads((tmp_path / "runs.zarr" / "manifest.json").read_text())
     assert (manifest["runs"], manifest["runs_per_chunk"]) == (18, PIECE)
     assert manifest["versions"]["numpy"] == np.__version__
@@ -123,7 +123,7 @@ def test_manifest_says_what_was_made(tmp_path, imperfect):
 
 def test_manifest_holds_the_hash_of_the_data(tmp_path, imperfect):
     """The hash as its documentation defines it, from nothing but the files."""
-    produce(imperfect, tmp_path / "runs.zarr", piece_runs=PIECE)
+    produce(imperfect, tmp_path / "runs.zarr", chunk_runs=PIECE)
     pieces = []
     for piece in range(PIECES):
         total = hashlib.sha256()
@@ -138,11 +138,11 @@ def test_manifest_holds_the_hash_of_the_data(tmp_path, imperfect):
 
 
 def test_work_that_was_interrupted_goes_on(monkeypatch, tmp_path, plan):
-    produce(plan, tmp_path / "whole.zarr", piece_runs=PIECE)
+    produce(plan, tmp_path / "whole.zarr", chunk_runs=PIECE)
     (told,) = cut_short(plan, tmp_path / "runs.zarr", 3, monkeypatch)
     assert told.startswith("12 of 18 runs are kept in ")
     made, done, told = counting(monkeypatch), [], []
-    produce(plan, tmp_path / "runs.zarr", run_factory.ONE_PROCESS, done.append, told.append, PIECE)
+    produce(plan, tmp_path / "runs.zarr", ONE_PROCESS, done.append, told.append, PIECE)
     assert made == [3, 4]
     assert told == ["continuing: 12 of 18 runs were there"]
     assert done == [12, 4, 2]
@@ -161,14 +161,14 @@ def test_unfinished_work_cannot_be_read(monkeypatch, tmp_path, imperfect):
 
 
 def test_pieces_that_are_not_what_was_written_are_made_again(monkeypatch, tmp_path, imperfect):
-    produce(imperfect, tmp_path / "whole.zarr", piece_runs=PIECE)
+    produce(imperfect, tmp_path / "whole.zarr", chunk_runs=PIECE)
     cut_short(imperfect, tmp_path / "runs.zarr", 4, monkeypatch)
     (partial,) = tmp_path.glob(".*.partial")
     (partial / "store" / "fault" / "c.0").unlink()
     torn = partial / "store" / "command" / "c.2.0.0"
     torn.write_bytes(torn.read_bytes()[:100])
     made = counting(monkeypatch)
-    produce(imperfect, tmp_path / "runs.zarr", piece_runs=PIECE)
+    produce(imperfect, tmp_path / "runs.zarr", chunk_runs=PIECE)
     assert made == [0, 2, 4]
     assert contents(tmp_path / "runs.zarr") == contents(tmp_path / "whole.zarr")
 
@@ -178,7 +178,7 @@ def test_another_plan_starts_over(monkeypatch, tmp_path, imperfect, change):
     cut_short(imperfect, tmp_path / "runs.zarr", 2, monkeypatch)
     made, told = counting(monkeypatch), []
     other = replace(imperfect, **change)
-    produce(other, tmp_path / "runs.zarr", tell=told.append, piece_runs=PIECE)
+    produce(other, tmp_path / "runs.zarr", tell=told.append, chunk_runs=PIECE)
     assert (told, made[0]) == ([], 0)
     xr.testing.assert_identical(load_run_set(tmp_path / "runs.zarr"), simulate(other))
     assert listing(tmp_path) == ["runs.zarr"]
@@ -187,8 +187,8 @@ def test_another_plan_starts_over(monkeypatch, tmp_path, imperfect, change):
 def test_other_versions_start_over(monkeypatch, tmp_path, imperfect):
     cut_short(imperfect, tmp_path / "runs.zarr", 2, monkeypatch)
     made = counting(monkeypatch)
-    monkeypatch.setattr(run_pieces, "__version__", "0.0.0")
-    produce(imperfect, tmp_path / "runs.zarr", piece_runs=PIECE)
+    monkeypatch.setattr(resumable, "__version__", "0.0.0")
+    produce(imperfect, tmp_path / "runs.zarr", chunk_runs=PIECE)
     assert made == [0, 1, 2, 3, 4]
 
 
@@ -196,7 +196,7 @@ def test_other_versions_start_over(monkeypatch, tmp_path, imperfect):
 def old(tmp_path, imperfect):
     """A run set that stands where the new one is to go."""
     path = tmp_path / "runs.zarr"
-    produce(replace(imperfect, runs_per_class=1, seed=99), path, piece_runs=PIECE)
+    produce(replace(imperfect, runs_per_class=1, seed=99), path, chunk_runs=PIECE)
     return path
 
 
@@ -205,31 +205,40 @@ def test_the_old_run_set_stands_until_the_new_one_does(monkeypatch, imperfect, o
 
     def watching(job, piece):
         seen.append(contents(old) == before)
-        return run_pieces.make_piece(job, piece)
+        return make_chunk(job, piece)
 
-    monkeypatch.setattr(run_factory, "make_piece", watching)
-    produce(imperfect, old, piece_runs=PIECE)
+    monkeypatch.setattr(resumable, "make_chunk", watching)
+    produce(imperfect, old, chunk_runs=PIECE)
     assert seen == [True] * PIECES
     xr.testing.assert_identical(load_run_set(old), simulate(imperfect))
     assert listing(old.parent) == [old.name]
 
 
-def test_an_old_run_set_that_was_left_over_is_not_taken_for_the_new_one(tmp_path, imperfect, old):
-    """As after a kill between the exchange of old and new and the removal of the old one."""
-    cut = old.with_name("cut.zarr")
-    job, _ = run_factory._open_job(imperfect, cut, PIECE)
-    for piece in range(PIECES):
-        run_pieces.make_piece(job, piece)
-    job.unfinished.store.rename(tmp_path / "new")
-    old.rename(job.unfinished.store)
-    produce(imperfect, cut, piece_runs=PIECE)
-    xr.testing.assert_identical(load_run_set(cut), simulate(imperfect))
+def test_a_kill_between_the_two_renames_is_mended_by_the_same_command(monkeypatch, imperfect, old):
+    """The old run set stands aside, the new one is whole but not yet in its place."""
+    cut_short(imperfect, old, PIECES - 1, monkeypatch)
+    old.rename(old.with_name(".runs.zarr.old"))
+    produce(imperfect, old, chunk_runs=PIECE)
+    xr.testing.assert_identical(load_run_set(old), simulate(imperfect))
+    assert listing(old.parent) == [old.name]
+
+
+def test_what_a_kill_left_half_written_is_no_part_of_the_run_set(monkeypatch, tmp_path, imperfect):
+    produce(imperfect, tmp_path / "whole.zarr", chunk_runs=PIECE)
+    cut_short(imperfect, tmp_path / "runs.zarr", 2, monkeypatch)
+    (partial,) = tmp_path.glob(".*.partial")
+    (partial / "store" / "command" / "c.2.0.0123.partial").write_bytes(b"half")
+    (partial / "done" / "2").write_bytes(b"")
+    made = counting(monkeypatch)
+    produce(imperfect, tmp_path / "runs.zarr", chunk_runs=PIECE)
+    assert made == [2, 3, 4]
+    assert contents(tmp_path / "runs.zarr") == contents(tmp_path / "whole.zarr")
 
 
 def test_a_link_stays_a_link(tmp_path, imperfect):
     (tmp_path / "disk").mkdir()
     (tmp_path / "runs.zarr").symlink_to(tmp_path / "disk" / "runs.zarr")
-    produce(imperfect, tmp_path / "runs.zarr", piece_runs=100)
+    produce(imperfect, tmp_path / "runs.zarr", chunk_runs=100)
     assert (tmp_path / "runs.zarr").is_symlink()
     assert load_run_set(tmp_path / "runs.zarr").sizes["run"] == 18
 
@@ -281,17 +290,17 @@ def test_a_lock_is_for_one_run_set_and_ends_with_its_block(tmp_path):
 
 
 def test_worker_with_other_versions_is_refused(tmp_path, imperfect):
-    job, _ = run_factory._open_job(imperfect, tmp_path / "runs.zarr", PIECE)
+    job, _ = resumable._open(imperfect, tmp_path / "runs.zarr", PIECE)
     other = replace(job, versions={**job.versions, "numpy": "1.0"})
     with pytest.raises(InputError, match=r"expected .*numpy 1\.0.* Install the same versions"):
-        run_pieces.make_piece(other, 0)
+        make_chunk(other, 0)
 
 
 def test_worker_that_does_not_share_the_folder_is_refused(tmp_path, imperfect):
-    job, _ = run_factory._open_job(imperfect, tmp_path / "runs.zarr", PIECE)
-    job.unfinished.remove()
+    job, _ = resumable._open(imperfect, tmp_path / "runs.zarr", PIECE)
+    job.remove()
     with pytest.raises(InputError, match=r"sees no .* that all workers share"):
-        run_pieces.make_piece(job, 0)
+        make_chunk(job, 0)
     assert listing(tmp_path) == []
 
 
@@ -301,7 +310,7 @@ from pathlib import Path
 from failuretwin import load_robot
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.data_knowledge.generate import Plan
-from failuretwin.data_knowledge.resumable import produce
+from failuretwin.data_knowledge.resumable import make_chunk, produce
 produce(Plan(load_robot("armpi_fpv"), [Hypothesis()], int(sys.argv[2])), Path(sys.argv[1]))
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
@@ -328,12 +337,12 @@ from pathlib import Path
 from failuretwin import load_robot
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan
-from failuretwin.data_knowledge.resumable import produce
+from failuretwin.data_knowledge.resumable import make_chunk, produce
 from failuretwin.digital_model.calibrated_robot import load_calibration
 robot = load_robot("armpi_fpv")
 known = load_calibration("armpi_fpv", robot).imperfections
 plan = Plan(robot, paper_hypotheses(robot.motor_names), 20, 5, known)
-produce(plan, Path(sys.argv[1]), piece_runs=4)
+produce(plan, Path(sys.argv[1]), chunk_runs=4)
 """
 
 
@@ -348,8 +357,8 @@ def test_killed_process_loses_at_most_the_piece_in_hand(monkeypatch, tmp_path, i
     assert not path.exists()
     there = len(list(tmp_path.glob(".runs.zarr.*.partial/done/*")))
     made = counting(monkeypatch)
-    produce(plan, path, piece_runs=PIECE)
+    produce(plan, path, chunk_runs=PIECE)
     assert len(made) == 45 - there
-    produce(plan, tmp_path / "whole.zarr", piece_runs=PIECE)
+    produce(plan, tmp_path / "whole.zarr", chunk_runs=PIECE)
     assert contents(path) == contents(tmp_path / "whole.zarr")
     assert listing(tmp_path) == ["runs.zarr", "whole.zarr"]

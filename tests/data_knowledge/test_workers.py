@@ -15,8 +15,7 @@ import pytest
 
 from failuretwin.core.errors import FailureTwinError, InputError, OutputError
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge import workers as dask_client
-from failuretwin.data_knowledge import workers as workforce
+from failuretwin.data_knowledge import workers as dask_workers
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.resumable import produce
 from failuretwin.data_knowledge.workers import Workforce
@@ -55,7 +54,7 @@ def contents(folder):
 
 
 def results(work, items, workforce):
-    with workforce.at_work(work, items) as done:
+    with workforce.map_unordered(work, items) as done:
         return dict(done)
 
 
@@ -69,7 +68,7 @@ def test_every_item_is_done_once(scheduler):
 def test_no_more_is_given_out_than_workers_can_do_soon(scheduler):
     taken = []
     items = (taken.append(n) or n for n in range(1000))
-    with Workforce(scheduler=scheduler).at_work(abs, items) as done:
+    with Workforce(scheduler=scheduler).map_unordered(abs, items) as done:
         next(done)
         assert len(taken) < 10
 
@@ -132,14 +131,14 @@ class Client:
 def test_workers_that_are_gone_are_waited_for_a_while():
     clock, client = StandingClock(), Client(workers=0)
     with pytest.raises(FailureTwinError, match=r"have gone, and none came back within 30 s\. Look"):
-        workforce._next_done(client, clock)
+        dask_workers._next_done(client, clock)
     assert (clock.waited_s, client.limits) == (30.0, [30.0])
 
 
 def test_workers_that_do_nothing_are_not_waited_for_for_ever():
     clock, client = StandingClock(), Client(workers=2)
     with pytest.raises(FailureTwinError, match="finished nothing for 30 minutes"):
-        workforce._next_done(client, clock)
+        dask_workers._next_done(client, clock)
     assert clock.waited_s == 1800.0
 
 
@@ -152,7 +151,7 @@ def test_a_result_that_is_lost_is_not_waited_for_for_ever():
             raise TimeoutError
 
     with pytest.raises(FailureTwinError, match="finished nothing for 30 minutes"):
-        workforce._result(Lost())
+        dask_workers._result(Lost())
 
 
 def test_workers_without_our_package_are_named(scheduler):
@@ -169,7 +168,7 @@ def test_workers_without_our_package_are_named(scheduler):
     ],
 )
 def test_scheduler_that_is_none(monkeypatch, address, words):
-    monkeypatch.setattr(dask_client, "ANSWER_S", 0.2)
+    monkeypatch.setattr(dask_workers, "ANSWER_S", 0.2)
     with pytest.raises(InputError, match=rf"scheduler '{address}' does not answer \({words}"):
         results(abs, [1], Workforce(scheduler=address))
 
@@ -192,7 +191,7 @@ def test_a_scheduler_has_five_seconds_to_answer(monkeypatch):
 def test_scheduler_without_workers(monkeypatch):
     from distributed import LocalCluster
 
-    monkeypatch.setattr(dask_client, "FIRST_WORKER_S", 0.2)
+    monkeypatch.setattr(dask_workers, "FIRST_WORKER_S", 0.2)
     with LocalCluster(
         n_workers=0, host="127.0.0.1", dashboard_address="127.0.0.1:0", silence_logs=50
     ) as cluster:
@@ -221,8 +220,8 @@ def test_without_dask_the_extra_is_named(monkeypatch):
 
 
 def test_workers_of_a_scheduler_make_the_same_runs(tmp_path, plan, scheduler):
-    produce(plan, tmp_path / "one.zarr", piece_runs=PIECE)
-    produce(plan, tmp_path / "many.zarr", Workforce(scheduler=scheduler), piece_runs=PIECE)
+    produce(plan, tmp_path / "one.zarr", chunk_runs=PIECE)
+    produce(plan, tmp_path / "many.zarr", Workforce(scheduler=scheduler), chunk_runs=PIECE)
     assert contents(tmp_path / "many.zarr") == contents(tmp_path / "one.zarr")
     assert simulate(plan, scheduler=scheduler).identical(simulate(plan))
 
@@ -239,7 +238,7 @@ from failuretwin.digital_model.calibrated_robot import load_calibration
 robot = load_robot("armpi_fpv")
 known = load_calibration("armpi_fpv", robot).imperfections
 plan = Plan(robot, paper_hypotheses(robot.motor_names), 20, 5, known)
-produce(plan, Path(sys.argv[1]), Workforce(2), piece_runs=4)
+produce(plan, Path(sys.argv[1]), Workforce(2), chunk_runs=4)
 """
 
 
@@ -257,7 +256,7 @@ def test_killed_worker_is_replaced(tmp_path, plan):
         assert b"Traceback" not in process.stderr.read()
     assert len(workers) == 2
     assert 0 < done_at_kill < 45
-    produce(plan, tmp_path / "one.zarr", piece_runs=PIECE)
+    produce(plan, tmp_path / "one.zarr", chunk_runs=PIECE)
     assert contents(path) == contents(tmp_path / "one.zarr")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["one.zarr", "two.zarr"]
 
