@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,7 +120,9 @@ class Ramps:
 
     def reference(self, time: FloatArray) -> FloatArray:
         """Return the reference at `time` (time,) [s], (guess, time, motor) [rad]."""
-        return _reference(self.parameters, time, self.origin.shape[1])
+        motors = self.origin.shape[1]
+        pose, _, _ = _unpack(self.parameters, motors)
+        return _reference(pose, _shares(self.parameters, time, motors))
 
 
 @dataclass(frozen=True)
@@ -192,10 +195,7 @@ def fit_ramps(ramps: Ramps, free: Free, part: PathPart, twin: DigitalTwin, steps
         moved[:, durations] = np.maximum(moved[:, durations], 0.5 * x[:, durations])
         return moved
 
-    def evaluate(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        error, J = _error_and_jacobian(x, part, twin)
-        return error, J[..., columns]
-
+    evaluate = partial(_error_and_jacobian, columns=columns, part=part, twin=twin)
     return Ramps.of(least_squares(evaluate, move, ramps.parameters, steps))
 
 
@@ -217,32 +217,39 @@ def _shares(x: FloatArray, time: FloatArray, motors: int) -> FloatArray:
     return np.clip(passed / duration[:, :, None], 0.0, 1.0)
 
 
-def _reference(x: FloatArray, time: FloatArray, motors: int) -> FloatArray:
-    """Return the reference at `time` (time,) [s], (guess, time, motor) [rad]."""
-    pose, _, _ = _unpack(x, motors)
-    travel = np.diff(pose, axis=1)
-    return pose[:, :1] + np.einsum("gmtk,gmk->gtk", _shares(x, time, motors), travel)
+def _reference(pose: FloatArray, share: FloatArray) -> FloatArray:
+    """Return the reference where so much of each ramp is done, (guess, time, motor) [rad]."""
+    return pose[:, :1] + (share * np.diff(pose, axis=1)[:, :, None]).sum(axis=1)
 
 
 def _error_and_jacobian(
-    x: FloatArray, part: PathPart, twin: DigitalTwin
+    x: FloatArray, columns: BoolArray, part: PathPart, twin: DigitalTwin
 ) -> tuple[FloatArray, FloatArray]:
-    """Return errors (guess, time * axis) [m] and derivatives (guess, time * axis, parameter)."""
+    """Return errors (guess, time * axis) [m] and derivatives (guess, time * axis, column).
+
+    Args:
+        x: Parameters, (guess, parameter).
+        columns: Which of them derivatives are by, (parameter,); all starts are among them.
+        part: The path.
+        twin: Its kinematics make a path of a reference.
+    """
     motors = len(twin.robot.motors)
     pose, duration, _ = _unpack(x, motors)
-    share, travel = _shares(x, part.time, motors), np.diff(pose, axis=1)
-    path, by_motor = twin.path_and_jacobian(_reference(x, part.time, motors))
+    share = _shares(x, part.time, motors)
+    path, by_motor = twin.path_and_jacobian(_reference(pose, share))
     # The speed counts while the ramp is under way.
     under_way = (share > 0.0) & (share < 1.0)
-    speed = np.where(under_way, (travel / duration)[:, :, None], 0.0)
+    speed = np.where(under_way, (np.diff(pose, axis=1) / duration)[:, :, None], 0.0)
     of_pose = [1.0 - share[:, :1], share[:, :-1] - share[:, 1:], share[:, -1:]]
-    by_pose = np.einsum("gtak,gmtk->gtamk", by_motor, np.concatenate(of_pose, axis=1))
-    by_duration = np.einsum("gtak,gmtk->gtamk", by_motor, -speed * share)
-    by_start = np.einsum("gtak,gmtk->gtam", by_motor, -speed)
+    angle = np.concatenate([*of_pose, -speed * share], axis=1).transpose(0, 2, 1, 3)
+    angles = len(columns) - speed.shape[1]
+    free = np.flatnonzero(columns[:angles])
+    angle = angle.reshape(*angle.shape[:2], 1, angles)
+    by_free = angle[..., free] * by_motor[..., free % motors]
+    by_start = -by_motor @ speed.transpose(0, 2, 3, 1)
+    J = np.concatenate([by_free, by_start], axis=-1)
     shape = (len(x), 3 * len(part.time))
-    parts = (by_pose, by_duration, by_start)
-    J = np.concatenate([d.reshape(*shape, int(np.prod(d.shape[3:]))) for d in parts], axis=2)
-    return (path - part.point).reshape(shape), J
+    return (path - part.point).reshape(shape), J.reshape(*shape, J.shape[-1])
 
 
 # All movements of a run fitted to its path at once.
@@ -276,7 +283,9 @@ def fit_movements(path: PathPart, twin: DigitalTwin, ramps: Sequence[Ramps]) -> 
     )
     low, high = _bounds(ramps, twin.robot)
     fitted = least_squares(
-        evaluate=lambda x: _error_and_jacobian(x, path, twin),
+        evaluate=partial(
+            _error_and_jacobian, columns=np.full(len(guess), True), part=path, twin=twin
+        ),
         move=lambda x, step: np.clip(x + step, low, high),
         guess=np.clip(guess, low, high)[None],
         steps=STEPS,
