@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from failuretwin.core.movements import Movements
-from failuretwin.core.numerics import Ellipsoid, log_fall
+from failuretwin.core.numerics import Ellipsoid
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.nonidealities import Imperfections, Timing
 from failuretwin.digital_model.settling import Settling, loads_in_range
@@ -189,10 +189,8 @@ class HealthyModel:
         predicted, jacobian = self.twin.path_and_jacobian(pose)
         error = evidence.point[:, :, None] - predicted
         spread = Ellipsoid.of(jacobian * self.scatter, self.path_noise**2)
-        dof = self.settling.tail_dof
-        density = spread.log_norm(dof) + log_fall(spread.product(error, error), dof)
         return (
-            outcomes.log_weight + density,
+            outcomes.log_weight + spread.log_student(error, self.settling.tail_dof),
             pose + scattered(spread, jacobian, self.scatter, error),
         )
 

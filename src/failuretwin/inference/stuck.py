@@ -8,9 +8,8 @@ the motor keeps its angle and the others behave as healthy ones.
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import gammaln
 
-from failuretwin.core.numerics import log_of, log_sum, log_trapezoid_weights
+from failuretwin.core.numerics import log_fall, log_norm, log_of, log_sum, log_trapezoid_weights
 from failuretwin.core.types import FloatArray
 from failuretwin.inference.fault_models import nodes_around
 from failuretwin.inference.healthy_model import HealthyModel
@@ -25,6 +24,8 @@ PRIOR_STEPS = np.array([-5, -2.5, -1, 0, 1, 2.5, 5.0])
 SETTLED_SCALE, ON_THE_WAY_SCALE = 2.0, 8.0
 """How sharply the prior ties the held angle to where the motor had settled, and to where its ramp
 was at a known onset, in scatters of the motor."""
+TIED_DOF = 4.0
+"""Degrees of freedom of that prior: heavy tails."""
 LAG_STEPS_S = np.array([-0.03, -0.015, 0.0, 0.015, 0.03])
 """Steps by which the lag may differ from run to run [s]."""
 LATE_QUADRATURE = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
@@ -105,10 +106,10 @@ def _log_prior(
     origin, target = _ends(likelihood, motor)
     scale = max(float(likelihood.model.scatter[motor]), 1e-4)
     low, high = likelihood.held_range(motor)
-    plateau = _student(angle[:, None] - origin[..., None], SETTLED_SCALE * scale, 4.0)
+    plateau = _tied(angle[:, None] - origin[..., None], SETTLED_SCALE * scale)
     if prior.known_s is not None:
         way = _position_at(likelihood, motor, prior.known_s)
-        ramp = _student(angle[:, None] - way[..., None], ON_THE_WAY_SCALE * scale, 4.0)
+        ramp = _tied(angle[:, None] - way[..., None], ON_THE_WAY_SCALE * scale)
     else:
         ramp = _between(angle[:, None], origin[..., None], target[..., None], 4.0 * scale)
     tied = np.stack([plateau, ramp], axis=2)
@@ -119,9 +120,9 @@ def _log_prior(
     return mass + log_of(_onset_weights(likelihood, motor, prior))[..., None]
 
 
-def _student(error: FloatArray, scale: float, dof: float) -> FloatArray:
-    constant = gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * np.log(dof * np.pi) - np.log(scale)
-    return constant - 0.5 * (dof + 1) * np.log1p((error / scale) ** 2 / dof)
+def _tied(off: FloatArray, scale: float) -> FloatArray:
+    """Return the log density of a held angle that is off by `off` from where it is tied to."""
+    return log_norm(TIED_DOF, dims=1) - np.log(scale) + log_fall((off / scale) ** 2, TIED_DOF, 1)
 
 
 def _between(x: FloatArray, a: FloatArray, b: FloatArray, margin: float) -> FloatArray:

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from failuretwin.core.numerics import log_norm, log_of, log_sum
+from failuretwin.core.numerics import log_fall, log_norm, log_of, log_sum
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.inference.evidence import SettledEvidence, TransientSamples
 from failuretwin.inference.healthy_model import HealthyModel
@@ -150,7 +150,7 @@ class TransientLikelihood:
         error2 = sum(e * e for e in error)
         stretched = variance + speed2 * (JITTER_S**2 + step**2 / 12.0)
         square = np.maximum(error2 - along2, 0.0) / variance + along2 / stretched
-        log_at = -0.5 * (DOF + 3.0) * np.log1p(square / DOF) - 0.5 * np.log(stretched)
+        log_at = log_fall(square, DOF) - 0.5 * np.log(stretched)
         log_at += log_norm(DOF) - np.log(variance) + np.log1p(-GLITCH_RATE)
         log_at = np.logaddexp(log_at, self.log_outlier)
         log_at *= self.moving.seen[item][:, None, :, None]

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.core.numerics import Ellipsoid
+from failuretwin.core.numerics import Ellipsoid, log_fall, log_norm
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.command_loss import CommandOutcomes
 from failuretwin.inference.evidence import SettledEvidence
@@ -86,7 +86,7 @@ def two_joint_likelihood(
         near = _laplace(evidence.point, model, chosen, pair, angle)
         angle = angle + near.step
     dof = model.settling.tail_dof
-    log_weight = chosen.log_weight[..., None] + near.log_norm + _over_plane(near.square, dof)
+    log_weight = chosen.log_weight[..., None] + near.log_norm + log_fall(near.square, dof, dims=1)
     log_weight = np.where(_found(model, pair, angle, near.covariance), log_weight, -np.inf)
     shape = (*evidence.usable.shape, len(kept) * SOLUTIONS)
     return TwoJointLikelihood(
@@ -154,7 +154,7 @@ def _laplace(
         step,
         np.maximum(spread.product(error, error) - gained, 0.0),
         np.stack([bb, aa, -ab], axis=-1) * area[..., None],
-        spread.log_norm(model.settling.tail_dof) + 0.5 * np.log(area),
+        log_norm(model.settling.tail_dof, dims=1) + 0.5 * np.log(area / spread.determinant),
     )
 
 
@@ -202,11 +202,3 @@ def _found(
     apart = bb * a * a + aa * b * b - 2.0 * ab * a * b > SAME**2 * (aa * bb - ab * ab)
     there[..., 1:] &= apart | ~there[..., :1]
     return there
-
-
-def _over_plane(square: FloatArray, dof: float) -> FloatArray:
-    """Return the log of a 3-variate Student t over its centre, integrated over two directions."""
-    if np.isinf(dof):
-        return np.log(2.0 * np.pi) - 0.5 * square
-    whole = np.log(2.0 * np.pi * dof / (dof + 1.0))
-    return whole - 0.5 * (dof + 1.0) * np.log1p(square / dof)
