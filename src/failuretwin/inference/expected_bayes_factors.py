@@ -29,7 +29,7 @@ from failuretwin.failure_behavior.modes import MODES
 from failuretwin.inference.evidence import settled_evidence, transient_samples
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.joint_likelihood import JointLikelihood
-from failuretwin.inference.marginal import FaultModel, movement_log_likelihoods
+from failuretwin.inference.marginal import change_points, movement_log_likelihoods
 from failuretwin.inference.missed_movements import MISSED_MOVEMENT_FAULTS, log_densities
 from failuretwin.inference.posterior import (
     TRANSIENT_FAULTS,
@@ -67,7 +67,7 @@ def first_affected(movements: Movements, onset: FloatArray) -> BoolArray:
 def max_likelihood(
     likelihood: RunLikelihood, hypothesis: Hypothesis, priors: Priors, first: BoolArray
 ) -> FloatArray:
-    """Return the log density of each run under the best member of a hypothesis, (run,).
+    """Return max over m0, z of log p(e | m0, z), of the best member of a hypothesis, (run,).
 
     Args:
         likelihood: The runs.
@@ -78,20 +78,15 @@ def max_likelihood(
     if hypothesis.is_healthy:
         return np.asarray((likelihood.log_healthy + likelihood.log_transient).sum(axis=1))
     fault = hypothesis.faults[0]
+    log_first = log_of(first)[..., None]
     if fault.mode in MISSED_MOVEMENT_FAULTS:
-        whole = log_densities(likelihood, motor_of(likelihood, fault), fault.mode)[:, -1]
-    else:
-        whole = _by_first_and_cell(likelihood, fault_model_of(likelihood, fault, priors))
-    return np.asarray((whole + log_of(first)[..., None]).max(axis=(1, 2)))
-
-
-def _by_first_and_cell(likelihood: RunLikelihood, fault_model: FaultModel) -> FloatArray:
-    """Return the log density of each run, (run, first movement spoilt, cell)."""
+        chain = log_densities(likelihood, motor_of(likelihood, fault), fault.mode)[:, -1]
+        return np.asarray((chain + log_first).max(axis=(1, 2)))
+    fault_model = fault_model_of(likelihood, fault, priors)
     says = movement_log_likelihoods(likelihood, fault_model)
-    healthy, faulty = likelihood.log_healthy + likelihood.log_transient, says.by_cell + says.way
-    before = np.cumsum(healthy, axis=1) - healthy
-    after = np.cumsum(faulty[:, ::-1], axis=1)[:, ::-1]
-    return np.where(np.isfinite(fault_model.log_prior), before[:, :, None] + after, -np.inf)
+    possible = log_first + log_of(np.isfinite(fault_model.log_prior))
+    healthy = likelihood.log_healthy + likelihood.log_transient
+    return change_points(healthy, says.by_cell + says.way, possible).max(axis=(1, 2))
 
 
 # Noise-free runs as they are weighed on average: what a distance is expected to cost.
