@@ -58,8 +58,8 @@ def missed_movements_likelihood(
         prior_before_run: Probability that the fault was there before the run.
     """
     sizes = _sizes(mode)
-    stretches = next_movement(likelihood.evidence.movements)
-    log_first = log_of(stretches.weights(prior_before_run)) - np.log(SHARES)
+    intervals = next_movement(likelihood.evidence.movements)
+    log_first = log_of(intervals.weights(prior_before_run)) - np.log(SHARES)
     after = log_densities(likelihood, motor, mode)
     found = ChangePointPosterior.of(after[:, -1] + log_first[..., None])
     share = np.exp(found.log_responsibility)
@@ -67,7 +67,7 @@ def missed_movements_likelihood(
     by_movement = np.diff(so_far, axis=1, prepend=log_sum(log_first, axis=1)[:, None] + 0.0)
 
     def estimate(run: int) -> Estimate:
-        onset, part = stretches.samples(prior_before_run, run)
+        onset, part = (values[run] for values in intervals.samples(prior_before_run))
         when = (share[run].sum(axis=1)[:, None] * part).ravel()
         return Estimate(
             onset=Weighted(onset.ravel(), when),

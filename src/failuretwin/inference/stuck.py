@@ -1,6 +1,6 @@
 """A stuck motor: one unknown angle after an unknown onset.
 
-The onset falls in one of two stretches for each movement: on the plateau before it (the motor
+The onset falls in one of two intervals for each movement: on the plateau before it (the motor
 then stands where it had settled) or on its ramp (it stands somewhere on the way). From there on
 the motor keeps its angle and the others behave as healthy ones.
 """
@@ -14,7 +14,7 @@ from failuretwin.core.types import FloatArray
 from failuretwin.inference.fault_models import nodes_around
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.marginal import FaultModel
-from failuretwin.inference.onset import QUADRATURE, OnsetPrior
+from failuretwin.inference.onset import QUADRATURE, OnsetIntervals, OnsetPrior, plateau_or_ramp
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 COARSE_NODES = 49
@@ -100,7 +100,7 @@ def _log_prior(
 ) -> FloatArray:
     """Return log prior masses, (run, movement first affected, plateau | ramp, node).
 
-    Each stretch has its share of the prior; within it the nodes carry the density of the angle
+    Each interval has its share of the prior; within it the nodes carry the density of the angle
     times the weights of the trapezoidal rule, normalised so that no mass is lost between nodes.
     """
     origin, target = _ends(likelihood, motor)
@@ -117,7 +117,10 @@ def _log_prior(
     mixed = np.logaddexp(np.log1p(-share) + tied, np.log(share) - np.log(high - low))
     mass = mixed + log_trapezoid_weights(angle)[:, None, None]
     mass -= log_sum(mass, axis=-1)[..., None]
-    return mass + log_of(_onset_weights(likelihood, motor, prior))[..., None]
+    intervals = _intervals(likelihood, motor)
+    if prior.known_s is not None:
+        return mass + log_of(intervals.holding(prior.known_s))[..., None]
+    return mass + log_of(intervals.weights(prior.before_run("stuck")))[..., None]
 
 
 def _tied(off: FloatArray, scale: float) -> FloatArray:
@@ -153,43 +156,22 @@ def _ends(likelihood: RunLikelihood, motor: int) -> tuple[FloatArray, FloatArray
     return np.nan_to_num(movements.origin()[..., motor]) + before, np.nan_to_num(settled)
 
 
-def _stretches(likelihood: RunLikelihood, motor: int) -> tuple[FloatArray, FloatArray]:
-    """Return begin and end of plateau and ramp of each movement, (run, movement, 2) [s].
+def _intervals(likelihood: RunLikelihood, motor: int) -> OnsetIntervals:
+    """Return plateau and ramp of each movement, (run, movement, plateau | ramp) [s].
 
-    The plateau of the first movement is the time before it, from the start of the run. Movements
-    that are likely to have started late count as begun by so much later.
+    Movements that are likely to have started late count as begun by so much later.
     """
     movements, model = likelihood.evidence.movements, likelihood.model
     late_s = float(np.mean(model.imperfections.timing.late_s))
     start = movements.start + model.lag_s + likelihood.late * late_s
-    reached = start + movements.ramp_duration[..., motor] * (1.0 - model.shortening)
-    plateau_begin = np.concatenate([np.zeros_like(start[:, :1]), reached[:, :-1]], axis=1)
-    begin = np.stack([np.minimum(plateau_begin, start), start], axis=-1)
-    return begin, np.stack([start, reached], axis=-1)
-
-
-def _onset_weights(likelihood: RunLikelihood, motor: int, prior: OnsetPrior) -> FloatArray:
-    """Return the prior probability of each stretch, (run, movement, plateau | ramp)."""
-    begin, end = _stretches(likelihood, motor)
-    length = np.nan_to_num(np.maximum(end - begin, 0.0))
-    if prior.known_s is not None:
-        inside = (begin <= prior.known_s) & (prior.known_s < end)
-        none = ~inside.any(axis=(1, 2))
-        inside[none, -1, 1] = True
-        return inside.astype(np.float64)
-    later = length.copy()
-    later[:, 0] = 0.0
-    total = later.sum(axis=(1, 2), keepdims=True)
-    prior_before_run = np.where(total > 0, prior.before_run("stuck"), 1.0)
-    weights = (1.0 - prior_before_run) * later / np.where(total > 0, total, 1.0)
-    weights[:, 0] = 0.5 * prior_before_run[:, 0]
-    return weights
+    ramp = movements.ramp_duration[..., motor] * (1.0 - model.shortening)
+    return plateau_or_ramp(start, start + ramp)
 
 
 def _onsets(
     likelihood: RunLikelihood, motor: int, angle: FloatArray, known_s: float | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return onsets of one run [s] and their share of their stretch, (movement, node, sample).
+    """Return onsets of one run [s] and their share of their interval, (movement, node, sample).
 
     The first samples are for the plateau, where any time is as likely; before the first movement
     that is before the run, or, with its share of the run's length, until then. The others are for
@@ -202,7 +184,8 @@ def _onsets(
         known_s: The onset, where it is known [s].
     """
     movements, model = likelihood.evidence.movements, likelihood.model
-    begin, end = (np.nan_to_num(x[0]) for x in _stretches(likelihood, motor))
+    intervals = _intervals(likelihood, motor)
+    begin, end = (np.nan_to_num(x[0]) for x in (intervals.begin, intervals.end))
     origin, target = (x[0] for x in _ends(likelihood, motor))
     travel = target - origin
     span = np.where(np.abs(travel) > 1e-6, travel, np.inf)
