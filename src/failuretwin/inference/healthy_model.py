@@ -15,6 +15,7 @@ from failuretwin.digital_model.settling import Settling, loads_in_range
 from failuretwin.digital_model.twin import SAG_ROUNDS, DigitalTwin
 from failuretwin.inference.command_loss import OUTLIER_RATE, CommandOutcomes, LostCommands
 from failuretwin.inference.evidence import SettledEvidence
+from failuretwin.inference.start_delay import StartDelay
 
 PATH_NOISE_M = 0.001
 """Noise assumed of a settled tool position where the sensor is not known [m]."""
@@ -89,6 +90,11 @@ class HealthyModel:
         timing = self.imperfections.timing
         loops = [1.0 / motor.loop.I for motor in self.twin.robot.motors]
         return float(np.mean(loops) + np.mean(timing.delay_s) + np.mean(timing.lag_s))
+
+    @cached_property
+    def start_delay(self) -> StartDelay:
+        """How long after its command a movement begins."""
+        return StartDelay.of(self.lag_s, self.imperfections.timing.late_s)
 
     @cached_property
     def shortening(self) -> float:

@@ -112,14 +112,26 @@ class OnsetIntervals:
             points: Where in an interval onsets are sampled, as shares of its length.
         """
         weight = self.weights(prior_before_run)[:, 0]
-        before = np.zeros_like(self.length)
         some = weight > prior_before_run
-        before[:, 0] = np.divide(prior_before_run, weight, out=np.ones_like(weight), where=some)
+        before = np.divide(prior_before_run, weight, out=np.ones_like(weight), where=some)
+        return self.spread(before, points)
+
+    def spread(
+        self, before: FloatArray, points: FloatArray = QUADRATURE
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return `samples` with a given share of those before the run.
+
+        Args:
+            before: That share of the first interval of each run, (run,).
+            points: Where in an interval onsets are sampled, as shares of its length.
+        """
         begin = np.nan_to_num(self.begin)[..., None]
         onset = begin + np.concatenate([[0.0], points]) * self.length[..., None]
         onset[..., 0] = 0.0
-        inside = np.repeat((1.0 - before)[..., None] / len(points), len(points), axis=-1)
-        return onset, np.concatenate([before[..., None], inside], axis=-1)
+        share = np.full(onset.shape, 1.0 / len(points))
+        share[..., 0] = 0.0
+        share[:, 0, 0], share[:, 0, 1:] = before, (1.0 - before[:, None]) / len(points)
+        return onset, share
 
     def onsets(self, prior_before_run: float) -> Callable[[int], tuple[FloatArray, FloatArray]]:
         """Return `samples` of a run by its index, with an axis for nodes: (movement, 1, sample)."""

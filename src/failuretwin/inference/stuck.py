@@ -12,9 +12,8 @@ import numpy as np
 from failuretwin.core.numerics import log_fall, log_norm, log_of, log_sum, log_trapezoid_weights
 from failuretwin.core.types import FloatArray
 from failuretwin.inference.fault_models import nodes_around
-from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.marginal import FaultModel
-from failuretwin.inference.onset import QUADRATURE, OnsetIntervals, OnsetPrior, plateau_or_ramp
+from failuretwin.inference.onset import OnsetIntervals, OnsetPrior, plateau_or_ramp
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 COARSE_NODES = 49
@@ -26,10 +25,6 @@ SETTLED_SCALE, ON_THE_WAY_SCALE = 2.0, 8.0
 was at a known onset, in scatters of the motor."""
 TIED_DOF = 4.0
 """Degrees of freedom of that prior: heavy tails."""
-LAG_STEPS_S = np.array([-0.03, -0.015, 0.0, 0.015, 0.03])
-"""Steps by which the lag may differ from run to run [s]."""
-LATE_QUADRATURE = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
-"""Points at which late starts are sampled, as shares of their range."""
 FREE_IF_KNOWN = 0.05
 """Probability that the held angle is unrelated to the commands where the onset is known."""
 
@@ -53,12 +48,14 @@ def stuck_model(
     log_prior = log_sum(parts, axis=2)
 
     def of_run(run: int) -> tuple[FloatArray, FloatArray]:
-        onset, share = _onsets(likelihood[run], motor, angle[run], prior.known_s)
+        by_part = _onsets(likelihood[run], motor, angle[run])
         whole = np.where(np.isfinite(log_prior[run]), log_prior[run], 0.0)
         of_part = np.exp(parts[run] - whole[:, None])
-        plateau = np.repeat(of_part[:, 0, :, None], len(QUADRATURE), axis=-1)
-        ramp = np.repeat(of_part[:, 1, :, None], onset.shape[-1] - len(QUADRATURE), axis=-1)
-        return onset, share * np.concatenate([plateau, ramp], axis=-1)
+        onset = np.concatenate([onset for onset, _ in by_part], axis=-1)
+        if prior.known_s is not None:
+            onset = np.full_like(onset, prior.known_s)
+        shares = [of_part[:, k, :, None] * share for k, (_, share) in enumerate(by_part)]
+        return onset, np.concatenate(shares, axis=-1)
 
     return FaultModel(
         motor=motor,
@@ -169,57 +166,36 @@ def _intervals(likelihood: RunLikelihood, motor: int) -> OnsetIntervals:
 
 
 def _onsets(
-    likelihood: RunLikelihood, motor: int, angle: FloatArray, known_s: float | None
-) -> tuple[FloatArray, FloatArray]:
-    """Return onsets of one run [s] and their share of their interval, (movement, node, sample).
+    likelihood: RunLikelihood, motor: int, angle: FloatArray
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return onsets of one run [s] and their share, (movement, node, sample): plateau, then ramp.
 
-    The first samples are for the plateau, where any time is as likely; before the first movement
-    that is before the run, or, with its share of the run's length, until then. The others are for
-    the ramp, where the held angle says when.
+    On the plateau any time is as likely; before the first movement that is before the run, or, with
+    its share of the run's length, until then. On the ramp the held angle says when.
 
     Args:
         likelihood: A single run.
         motor: Index of the motor.
         angle: Held angles, (node,) [rad].
-        known_s: The onset, where it is known [s].
     """
     movements, model = likelihood.evidence.movements, likelihood.model
     intervals = _intervals(likelihood, motor)
-    begin, end = (np.nan_to_num(x[0]) for x in (intervals.begin, intervals.end))
+    plateau = OnsetIntervals(intervals.begin[..., 0], intervals.end[..., 0])
+    end = np.nan_to_num(intervals.end)
+    waits = end[:, 0, 0] / np.maximum(end.max(axis=(1, 2)), 1e-9)
+    waiting = [values[0, :, None] for values in plateau.spread(1.0 - waits)]
     origin, target = (x[0] for x in _ends(likelihood, motor))
     travel = target - origin
     span = np.where(np.abs(travel) > 1e-6, travel, np.inf)
     done = np.clip((angle - origin[:, None]) / span[:, None], 0.0, 1.0)
-    shift, shift_share = _starts(model, likelihood.late[0])
     ramp = np.nan_to_num(movements.ramp_duration[0, :, motor]) * (1.0 - model.shortening)
-    on_ramp = np.nan_to_num(movements.start[0])[:, None] + done * ramp[:, None]
-    on_ramp = np.maximum(on_ramp[..., None] + shift, 0.0)
-    on_plateau = begin[:, 0, None] + QUADRATURE * (end - begin)[:, 0, None]
-    on_plateau[0, 0] = 0.0
-    plateau_share = np.full((len(begin), len(QUADRATURE)), 1 / len(QUADRATURE))
-    waits = end[0, 0] / max(float(end.max()), 1e-9)
-    plateau_share[0] = np.append(
-        1.0 - waits, np.full(len(QUADRATURE) - 1, waits / (len(QUADRATURE) - 1))
-    )
-    on_plateau = np.repeat(on_plateau[:, None], len(angle), axis=1)
-    onset = np.concatenate([on_plateau, on_ramp], axis=-1)
-    if known_s is not None:
-        onset = np.full_like(onset, known_s)
-    share = np.concatenate([plateau_share, shift_share], axis=-1)
-    return onset, np.broadcast_to(share[:, None], onset.shape)
+    reached = np.nan_to_num(movements.start[0])[:, None] + done * ramp[:, None]
+    delay, chance = model.start_delay.nodes(likelihood.late[0])
+    moving = [reached[..., None] + delay, chance[:, None]]
+    return [_for_nodes(part, len(angle)) for part in (waiting, moving)]
 
 
-def _starts(model: HealthyModel, late: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return by how much motions start after their command, (start,) [s], and how probable it is.
-
-    (movement, start).
-
-    Args:
-        model: The healthy robot.
-        late: Probability that each movement starts late, (movement,).
-    """
-    low, high = model.imperfections.timing.late_s
-    shift = model.lag_s + np.concatenate([LAG_STEPS_S, low + LATE_QUADRATURE * (high - low)])
-    punctual = np.repeat((1.0 - late)[:, None] / len(LAG_STEPS_S), len(LAG_STEPS_S), axis=1)
-    held_up = np.repeat(late[:, None] / len(LATE_QUADRATURE), len(LATE_QUADRATURE), axis=1)
-    return shift, np.concatenate([punctual, held_up], axis=1)
+def _for_nodes(part: list[FloatArray], nodes: int) -> tuple[FloatArray, FloatArray]:
+    """Return onsets and shares, (movement, node or 1, sample), for all of the nodes."""
+    onset, share = (np.repeat(x, nodes // x.shape[1], axis=1) for x in part)
+    return onset, share
