@@ -15,6 +15,7 @@ from failuretwin.inference.marginal import (
     FaultModel,
     MarginalLikelihood,
     change_points,
+    movement_log_likelihoods,
 )
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.unknown import way_of_two
@@ -50,15 +51,17 @@ def double_fault_likelihood(
 
 def _weigh_one(likelihood: RunLikelihood, one: FaultModel, two: FaultModel) -> MarginalLikelihood:
     one, two = _thinned(likelihood, one), _thinned(likelihood, two)
+    first, second = (movement_log_likelihoods(likelihood, fault) for fault in (one, two))
     settled = _Densities(
         likelihood.log_healthy,
-        _cells(_alone(likelihood, one), one)[..., None],
-        _cells(_alone(likelihood, two), two)[:, :, None],
+        first.by_cell[..., None],
+        second.by_cell[:, :, None],
         _both(likelihood, one, two),
     )
     whole = settled.on_way(
         likelihood.log_transient,
-        *(_way(likelihood, one)[..., None], _way(likelihood, two)[:, :, None]),
+        first.way[..., None],
+        second.way[:, :, None],
         way_of_two(likelihood, (one.motor, two.motor))[..., None, None],
     )
     log_joint = _log_joint(whole, one.log_prior[..., None], two.log_prior[:, :, None])
@@ -143,18 +146,6 @@ def _log_joint(says: _Densities, log_one: FloatArray, log_two: FloatArray) -> Fl
     return joint
 
 
-def _way(likelihood: RunLikelihood, fault_model: FaultModel) -> FloatArray:
-    """Return log densities of the way with one of the faults alone, (1, movement, node or 1)."""
-    if fault_model.log_transient is not None:
-        return fault_model.log_transient
-    return likelihood.log_transient_offset(fault_model.motor, fault_model.gain)[..., None]
-
-
-def _alone(likelihood: RunLikelihood, fault_model: FaultModel) -> FloatArray:
-    """Return log densities with one of the faults alone, (1, movement, node)."""
-    return likelihood.profile(fault_model.motor).log_density(fault_model.angle, fault_model.held)
-
-
 def _both(likelihood: RunLikelihood, one: FaultModel, two: FaultModel) -> FloatArray:
     """Return log densities with both faults, (1, movement, cell of one, cell of two)."""
     profile = _given(likelihood, one, two.motor)
@@ -162,8 +153,8 @@ def _both(likelihood: RunLikelihood, one: FaultModel, two: FaultModel) -> FloatA
     if not two.held:  # an offset from where the motor settles with the other fault there
         angle = angle - likelihood.profile(two.motor).expected[:, :, None, None]
         angle = angle + profile.expected[:, :, :, None]
-    density = _cells(profile.log_density(angle, two.held), two)
-    return np.swapaxes(_cells(np.swapaxes(density, 2, 3), one), 2, 3)
+    density = two.by_cell(profile.log_density(angle, two.held))
+    return np.swapaxes(one.by_cell(np.swapaxes(density, 2, 3)), 2, 3)
 
 
 def _given(likelihood: RunLikelihood, one: FaultModel, motor: int) -> JointLikelihood:
@@ -182,19 +173,13 @@ def _given(likelihood: RunLikelihood, one: FaultModel, motor: int) -> JointLikel
     return profile
 
 
-def _cells(density: FloatArray, fault_model: FaultModel) -> FloatArray:
-    """Return densities by cell: by node, or by group where every movement draws its own node."""
-    if fault_model.redrawn is None:
-        return density
-    return log_sum(density[..., None, :] + fault_model.redrawn, axis=-1)
-
-
 def _thinned(likelihood: RunLikelihood, fault_model: FaultModel) -> FaultModel:
     """Return the fault model with few nodes: those within reach of what the movements say."""
     nodes = fault_model.angle.shape[2]
     if fault_model.redrawn is not None or nodes <= MOST_NODES:
         return fault_model
-    density = _alone(likelihood, fault_model)[0]
+    profile = likelihood.profile(fault_model.motor)
+    density = profile.log_density(fault_model.angle, fault_model.held)[0]
     near = density - density.max(axis=1, keepdims=True) > -FEWEST_NATS
     score = near.sum(axis=0) + log_sum(fault_model.log_prior[0], axis=0) / 100.0
     kept = np.sort(np.argsort(-score, kind="stable")[:MOST_NODES])

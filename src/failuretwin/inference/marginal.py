@@ -147,6 +147,17 @@ class FaultModel:
     log_transient: FloatArray | None = None
     gain: FloatArray | None = None
 
+    def by_cell(self, by_node: FloatArray) -> FloatArray:
+        """Return log densities by cell: by node, or by group where nodes are redrawn, (..., cell).
+
+        Args:
+            by_node: Log densities at each node, (..., node).
+        """
+        if self.redrawn is None:
+            return by_node
+        top = by_node.max(axis=-1, keepdims=True)
+        return np.asarray(top + np.log(np.exp(by_node - top) @ np.exp(self.redrawn).T))
+
 
 @dataclass(frozen=True)
 class MovementLogLikelihoods:
@@ -169,26 +180,11 @@ def movement_log_likelihoods(
     likelihood: RunLikelihood, fault_model: FaultModel
 ) -> MovementLogLikelihoods:
     """Return what each movement says of a fault of one motor."""
-    by_node = by_cell = likelihood.profile(fault_model.motor).log_density(
-        fault_model.angle, fault_model.held
-    )
-    if fault_model.redrawn is not None:
-        by_cell = _in_groups(by_node, fault_model.redrawn)
-    way = fault_model.log_transient
+    profile, way = likelihood.profile(fault_model.motor), fault_model.log_transient
+    by_node = profile.log_density(fault_model.angle, fault_model.held)
     if way is None:
         way = likelihood.log_transient_offset(fault_model.motor, fault_model.gain)[..., None]
-    return MovementLogLikelihoods(by_node, by_cell, way)
-
-
-def _in_groups(by_node: FloatArray, log_weight: FloatArray) -> FloatArray:
-    """Return the log of weighted sums over nodes, (run, movement, group).
-
-    Args:
-        by_node: Logs of what is summed, (run, movement, node).
-        log_weight: (group, node).
-    """
-    top = by_node.max(axis=-1, keepdims=True)
-    return np.asarray(top + np.log(np.exp(by_node - top) @ np.exp(log_weight).T))
+    return MovementLogLikelihoods(by_node, fault_model.by_cell(by_node), way)
 
 
 def marginal_likelihood(likelihood: RunLikelihood, fault_model: FaultModel) -> MarginalLikelihood:

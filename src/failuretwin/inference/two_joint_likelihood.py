@@ -303,98 +303,91 @@ class GreedyPath:
     angle: FloatArray
 
 
-def greedy_map_path(
-    seen: TwoJointLikelihood, offsets: LinearOffsets, usable: BoolArray, outlier: float
-) -> GreedyPath:
-    """Return the most probable path of each run and kind among those begun at some movements.
+@dataclass(frozen=True)
+class PathFilter:
+    """Runs of two motors that are off, followed movement by movement.
 
-    Args:
+    Attributes:
         seen: What each movement says of the two angles.
         offsets: Where the motors may stand.
         usable: Movements with evidence, (run, movement).
         outlier: Log density of the tool being anywhere, times its rate.
     """
-    count = usable.shape[1]
-    starts = np.unique(np.linspace(0, count - 1, min(SEEDS, count)).astype(np.int64)).tolist()
-    paths = [
-        _greedy_path(seen, offsets, usable, outlier, start, way)
-        for start in starts
-        for way in range(SOLUTIONS)
-    ]
-    total = np.array([path.log_density.sum(axis=-1) for path in paths])
-    best = np.argmax(total > total.max(axis=0) - SAME_NATS, axis=0)
-    chosen = (best, *np.indices(best.shape))
-    return GreedyPath(
-        np.stack([path.log_density for path in paths])[chosen],
-        np.stack([path.way for path in paths])[chosen],
-        np.stack([path.angle for path in paths])[chosen],
-    )
 
+    seen: TwoJointLikelihood
+    offsets: LinearOffsets
+    usable: BoolArray
+    outlier: float
 
-def _greedy_path(
-    seen: TwoJointLikelihood,
-    offsets: LinearOffsets,
-    usable: BoolArray,
-    outlier: float,
-    start: int,
-    way: int,
-) -> GreedyPath:
-    """Return the path that begins with one way of one movement and goes on as is best each time.
+    def map_path(self) -> GreedyPath:
+        """Return the most probable path of each run and kind, begun at one movement or another."""
+        count = self.usable.shape[1]
+        starts = np.unique(np.linspace(0, count - 1, min(SEEDS, count)).astype(np.int64)).tolist()
+        paths = [self._path(start, way) for start in starts for way in range(SOLUTIONS)]
+        total = np.array([path.log_density.sum(axis=-1) for path in paths])
+        best = np.argmax(total > total.max(axis=0) - SAME_NATS, axis=0)
+        chosen = (best, *np.indices(best.shape))
+        return GreedyPath(
+            np.stack([path.log_density for path in paths])[chosen],
+            np.stack([path.way for path in paths])[chosen],
+            np.stack([path.angle for path in paths])[chosen],
+        )
 
-    Args:
-        seen: What each movement says of the two angles.
-        offsets: Where the motors may stand.
-        usable: Movements with evidence, (run, movement).
-        outlier: Log density of the tool being anywhere, times its rate.
-        start: The movement that is met first; then come the others in their order.
-        way: Way that it took, with both faults showing.
-    """
-    runs, movements, kinds, _ = offsets.slope.shape
-    mean, variance = (
-        np.broadcast_to(values, (runs, kinds, 2)) for values in (offsets.mean, offsets.variance)
-    )
-    belief = GaussianBelief(mean, variance[..., None] * np.eye(2))
-    log_density = np.zeros((runs, kinds, movements))
-    taken = np.full((runs, kinds, movements), -1)
-    for m in (start, *(m for m in range(movements) if m != start)):
-        log_at, slope, error, covariance = _options(seen, offsets, belief, m)
-        best = np.full((runs, kinds), way) if m == start else np.argmax(log_at, axis=-1)
-        at = _select(log_at, best)
-        here = usable[:, m, None] & (at > outlier)
-        learnt = belief.update(*(_select(values, best) for values in (slope, error, covariance)))
-        belief = learnt.where(here, belief)
-        log_density[:, :, m] = np.where(usable[:, m, None], np.maximum(at, outlier), 0.0)
-        taken[:, :, m] = np.where(here, best % seen.log_weight.shape[-1], -1)
-    centre, slope = (np.moveaxis(values, 1, 2) for values in (offsets.centre, offsets.slope))
-    return GreedyPath(log_density, taken, centre + slope * belief.mean[:, :, None])
+    def _path(self, start: int, way: int) -> GreedyPath:
+        """Return the path that begins with one way of one movement and goes on as is best.
 
+        Args:
+            start: The movement that is met first; then come the others in their order.
+            way: Way that it took, with both faults showing.
+        """
+        offsets = self.offsets
+        runs, movements, kinds, _ = offsets.slope.shape
+        mean, variance = (
+            np.broadcast_to(values, (runs, kinds, 2)) for values in (offsets.mean, offsets.variance)
+        )
+        belief = GaussianBelief(mean, variance[..., None] * np.eye(2))
+        log_density = np.zeros((runs, kinds, movements))
+        taken = np.full((runs, kinds, movements), -1)
+        for m in (start, *(m for m in range(movements) if m != start)):
+            log_at, *options = self._options(belief, m)
+            best = np.full((runs, kinds), way) if m == start else np.argmax(log_at, axis=-1)
+            at, usable = _select(log_at, best), self.usable[:, m, None]
+            here = usable & (at > self.outlier)
+            belief = belief.update(*(_select(values, best) for values in options)).where(
+                here, belief
+            )
+            log_density[:, :, m] = np.where(usable, np.maximum(at, self.outlier), 0.0)
+            taken[:, :, m] = np.where(here, best % self.seen.log_weight.shape[-1], -1)
+        centre, slope = (np.moveaxis(values, 1, 2) for values in (offsets.centre, offsets.slope))
+        return GreedyPath(log_density, taken, centre + slope * belief.mean[:, :, None])
 
-def _options(
-    seen: TwoJointLikelihood, offsets: LinearOffsets, belief: GaussianBelief, m: int
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return what may have become of a movement, by state of the faults and way of the tool.
+    def _options(
+        self, belief: GaussianBelief, m: int
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return what may have become of a movement, by state of the faults and way of the tool.
 
-    Returns:
-        Log density, (run, kind, option), and for each option the slope of both motors (..., 2),
-        their error (..., 2) and its covariance (..., 2, 2).
-    """
-    slope = np.where(SHOWS, offsets.slope[:, m, :, None], 0.0)  # (run, kind, state, motor)
-    centre = np.where(SHOWS, offsets.centre[:, m, :, None], offsets.well[:, m, None, None])
-    noise = np.where(SHOWS, offsets.noise[:, None], offsets.well_noise)
-    predicted = belief.predict(slope) + noise[..., None] * np.eye(2)
-    expected = centre + slope * belief.mean[:, :, None]
-    error = seen.angle[:, m, None, None] - expected[..., None, :]
-    covariance = predicted[:, :, :, None] + seen.covariance[:, m, None, None]
-    log_at = log_normal_2d(error, covariance)
-    log_at = log_at + LOG_SHOWS[:, None] + seen.log_weight[:, m, None, None]
-    slope = np.broadcast_to(slope[..., None, :], error.shape)
-    options = (*log_at.shape[:2], -1)
-    return (
-        log_at.reshape(options),
-        slope.reshape(*options, 2),
-        error.reshape(*options, 2),
-        covariance.reshape(*options, 2, 2),
-    )
+        Returns:
+            Log density, (run, kind, option), and for each option the slope of both motors (..., 2),
+            their error (..., 2) and its covariance (..., 2, 2).
+        """
+        seen, offsets = self.seen, self.offsets
+        slope = np.where(SHOWS, offsets.slope[:, m, :, None], 0.0)  # (run, kind, state, motor)
+        centre = np.where(SHOWS, offsets.centre[:, m, :, None], offsets.well[:, m, None, None])
+        noise = np.where(SHOWS, offsets.noise[:, None], offsets.well_noise)
+        predicted = belief.predict(slope) + noise[..., None] * np.eye(2)
+        expected = centre + slope * belief.mean[:, :, None]
+        error = seen.angle[:, m, None, None] - expected[..., None, :]
+        covariance = predicted[:, :, :, None] + seen.covariance[:, m, None, None]
+        log_at = log_normal_2d(error, covariance)
+        log_at = log_at + LOG_SHOWS[:, None] + seen.log_weight[:, m, None, None]
+        slope = np.broadcast_to(slope[..., None, :], error.shape)
+        options = (*log_at.shape[:2], -1)
+        return (
+            log_at.reshape(options),
+            slope.reshape(*options, 2),
+            error.reshape(*options, 2),
+            covariance.reshape(*options, 2, 2),
+        )
 
 
 def _select(values: FloatArray, option: IntArray) -> FloatArray:

@@ -20,8 +20,8 @@ from failuretwin.inference.marginal import Estimate, MarginalLikelihood
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.two_joint_likelihood import (
     LinearOffsets,
+    PathFilter,
     TwoJointLikelihood,
-    greedy_map_path,
     two_joint_likelihood,
 )
 
@@ -109,7 +109,7 @@ def _of_pair(
     """Return log densities of settled positions and of the way, (run, movement) each."""
     seen = two_joint_likelihood(likelihood.evidence, likelihood.model, likelihood.outcomes, pair)
     offsets, outlier = _offsets(likelihood, seen), likelihood.model.outlier_log_density
-    path = greedy_map_path(seen, offsets, likelihood.usable, outlier)
+    path = PathFilter(seen, offsets, likelihood.usable, outlier).map_path()
     log_chance = np.where(_among(known, likelihood, pair), -np.inf, LOG_CHANCE)
     total = path.log_density.sum(axis=-1) + log_chance  # (run, kind)
     best = np.arange(len(total)), np.argmax(total, axis=1)
