@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from failuretwin.core.movements import Movements
-from failuretwin.core.numerics import Ellipsoid, log_fall
+from failuretwin.core.numerics import Ellipsoid
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections, Timing
@@ -17,6 +17,7 @@ from failuretwin.digital_model.twin import SAG_ROUNDS, DigitalTwin
 from failuretwin.inference.command_loss import OUTLIER_RATE, CommandOutcomes, LostCommands
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.settings import InferenceSettings
+from failuretwin.inference.start_delay import StartDelay
 
 PATH_NOISE_M = 0.001
 """Noise assumed of a settled tool position where the sensor is not known [m]."""
@@ -104,6 +105,11 @@ class HealthyModel:
         timing = self.imperfections.timing
         loops = [1.0 / motor.loop.I for motor in self.twin.robot.motors]
         return float(np.mean(loops) + np.mean(timing.delay_s) + np.mean(timing.lag_s))
+
+    @cached_property
+    def start_delay(self) -> StartDelay:
+        """How long after its command a movement begins."""
+        return StartDelay.of(self.lag_s, self.imperfections.timing.late_s)
 
     @cached_property
     def shortening(self) -> float:
@@ -202,8 +208,7 @@ class HealthyModel:
         predicted, jacobian = self.twin.path_and_jacobian(pose)
         error = evidence.point[:, :, None] - predicted
         spread = Ellipsoid.of(jacobian * self.scatter, self.path_noise**2)
-        dof = self.settling.tail_dof
-        density = spread.log_norm(dof) + log_fall(spread.product(error, error), dof)
+        density = spread.log_student(error, self.settling.tail_dof)
         return density, pose + scattered(spread, jacobian, self.scatter, error)
 
 

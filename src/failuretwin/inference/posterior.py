@@ -186,7 +186,7 @@ def _fault_models_of_two(
             return fault_model_of(likelihood, fault, priors)
         motor = motor_of(likelihood, fault)
         at = seen.pair.index(motor)
-        width = np.sqrt(seen.covariance[..., at])
+        width = np.sqrt(seen.covariance[..., at, at])
         nodes = seen.angle[..., at, None] + width[..., None] * LOCAL_STEPS
         return stuck_model(likelihood, motor, priors.onset, nodes.reshape(len(nodes), -1))
 

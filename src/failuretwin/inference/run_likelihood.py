@@ -34,6 +34,8 @@ class RunLikelihood:
         moving: Readings on the way; None: they are left aside.
         way_blur: Factor on the scatter of the way alone; 1 for a robot as it is.
         remembered: What every movement says by itself, where that was computed before.
+        healthy: Log density of each settled position if no motor is faulty, (run, movement), where
+            that is not what the movements say of a healthy robot.
     """
 
     evidence: SettledEvidence
@@ -41,6 +43,7 @@ class RunLikelihood:
     moving: TransientSamples | None = None
     transient_scatter_factor: float = 1.0
     remembered: MovementLikelihoods | None = None
+    healthy: FloatArray | None = None
     _off: dict[int, FloatArray] = field(default_factory=dict, init=False, compare=False, repr=False)
     _held: dict[int, FloatArray] = field(
         default_factory=dict, init=False, compare=False, repr=False
@@ -145,6 +148,8 @@ class RunLikelihood:
     @cached_property
     def log_healthy(self) -> FloatArray:
         """Log density of each settled position if no motor is faulty, (run, movement)."""
+        if self.healthy is not None:
+            return self.healthy
         return with_outliers(self.findings.terms, self.model.outlier_log_density, self.usable)
 
     @cached_property

@@ -1,7 +1,7 @@
 """How well readings on the way agree with motors that go from one pose to another in given times.
 
 When exactly a movement began is not known: the lag differs from run to run, and a stalled bus may
-hold the start up for a second. All motors share that shift, and it is summed over.
+hold the start up for a second. All motors share that delay, and it is summed over.
 """
 
 from __future__ import annotations
@@ -11,10 +11,11 @@ from functools import cached_property
 
 import numpy as np
 
-from failuretwin.core.numerics import log_norm, log_of, log_sum
+from failuretwin.core.numerics import log_fall, log_norm, log_of, log_sum
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.inference.evidence import SettledEvidence, TransientSamples
 from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.start_delay import StartNodes
 
 KNOTS = 11
 """Instants of a ramp at which the path is computed; between them it is a straight line."""
@@ -26,12 +27,6 @@ not. All readings of a movement share its ends, so that each tells a twelfth of 
 them; what is known of them is taken as it was seen."""
 JITTER_S = 0.012
 """Standard deviation of the stamps of single readings [s], on top of the shared lag."""
-LAG_STEPS_S = np.array([-0.04, -0.02, 0.0, 0.02, 0.04])
-"""Punctual starts to sum over, around the lag expected [s]."""
-LAG_SPREAD_S = 0.018
-"""Standard deviation of the lag from movement to movement [s]."""
-LATE_STEP_S = 0.1
-"""Step of the late starts to sum over [s]."""
 DOF = 4.0
 """Degrees of freedom of single readings: heavy tails."""
 GLITCH_RATE = 0.03
@@ -87,19 +82,6 @@ class TransientLikelihood:
     moving: TransientSamples
 
     @cached_property
-    def _punctual(self) -> tuple[FloatArray, FloatArray]:
-        """Punctual starts to sum over (shift,) [s], and their log prior (shift,)."""
-        weight = np.exp(-0.5 * (LAG_STEPS_S / LAG_SPREAD_S) ** 2)
-        return np.maximum(self.model.lag_s + LAG_STEPS_S, 0.0), np.log(weight / weight.sum())
-
-    @cached_property
-    def _delayed(self) -> tuple[FloatArray, FloatArray]:
-        """Late starts to sum over (shift,) [s], and their log prior (shift,)."""
-        low, high = self.model.imperfections.timing.late_s
-        shift = np.arange(low, high + 0.5 * LATE_STEP_S, LATE_STEP_S) + self.model.lag_s
-        return shift, np.full(len(shift), -np.log(len(shift)))
-
-    @cached_property
     def _late(self) -> FloatArray:
         """Log probability that each movement starts late, (run, movement)."""
         return log_of(self.model.late(self.settled.movements, self.settled.first_reading_delay))
@@ -117,30 +99,27 @@ class TransientLikelihood:
         """
         late = self._late[ramps.run, ramps.movement]
         found = np.full(ramps.origin.shape[:2], -np.inf)
-        for starts, chance, step in (
-            (self._punctual, log_of(-np.expm1(np.minimum(late, 0.0))), 0.0),
-            (self._delayed, late, LATE_STEP_S),
-        ):
+        delay = self.model.start_delay
+        punctual = log_of(-np.expm1(np.minimum(late, 0.0)))
+        for starts, chance in ((delay.punctual, punctual), (delay.late, late)):
             some = np.flatnonzero(chance > -np.inf)
             if len(some) > 0:
-                says = self._of_starts(ramps[some], starts, step) + chance[some, None]
+                says = self._of_starts(ramps[some], starts) + chance[some, None]
                 found[some] = np.logaddexp(found[some], says)
         return found
 
-    def _of_starts(
-        self, ramps: TransientHypothesis, starts: tuple[FloatArray, FloatArray], step: float
-    ) -> FloatArray:
+    def _of_starts(self, ramps: TransientHypothesis, starts: StartNodes) -> FloatArray:
         """Return the log density given that a movement begins at one of some times, (item, case).
 
         Args:
             ramps: What the motors do in each case.
-            starts: Times after the command (shift,) [s] and their log prior (shift,).
-            step: How coarse the sum over them is [s].
+            starts: Times after the command.
         """
-        item, (shift, log_prior) = (ramps.run, ramps.movement), starts
+        item = ramps.run, ramps.movement
         path, longest = self._path(ramps)
         variance = self._variance(ramps)[:, None, None, None] + ramps.spread_m**2
-        since = self.moving.since[item][:, None, :, None] - shift  # (item, 1, reading, shift)
+        # (item, 1, reading, start)
+        since = self.moving.since[item][:, None, :, None] - starts.delay
         predicted, velocity = _along(path, longest, since)
         point = self.moving.point[item][:, None, :, None]
         error = [point[..., axis] - predicted[axis] for axis in range(3)]
@@ -148,13 +127,13 @@ class TransientLikelihood:
         along2 = sum(e * v for e, v in zip(error, velocity, strict=True)) ** 2
         along2 /= np.maximum(speed2, 1e-12)
         error2 = sum(e * e for e in error)
-        stretched = variance + speed2 * (JITTER_S**2 + step**2 / 12.0)
+        stretched = variance + speed2 * (JITTER_S**2 + starts.step_s**2 / 12.0)
         square = np.maximum(error2 - along2, 0.0) / variance + along2 / stretched
-        log_at = -0.5 * (DOF + 3.0) * np.log1p(square / DOF) - 0.5 * np.log(stretched)
+        log_at = log_fall(square, DOF) - 0.5 * np.log(stretched)
         log_at += log_norm(DOF) - np.log(variance) + np.log1p(-GLITCH_RATE)
         log_at = np.logaddexp(log_at, self.log_outlier)
         log_at *= self.moving.seen[item][:, None, :, None]
-        return log_sum(log_at.sum(axis=2) + log_prior, axis=-1)
+        return log_sum(log_at.sum(axis=2) + starts.log_weight, axis=-1)
 
     def _variance(self, ramps: TransientHypothesis) -> FloatArray:
         """Return the variance of a reading on each axis, (item,) [m2]."""
@@ -193,10 +172,10 @@ def _along(
     Args:
         path: The tool at each knot, (item, case, knot, axis) [m].
         longest: Time of the last knot, (item, case) [s].
-        since: Times, (item, 1, reading, shift) [s].
+        since: Times, (item, 1, reading, start) [s].
 
     Returns:
-        For each axis, (item, case, reading, shift), [m] and [m/s].
+        For each axis, (item, case, reading, start), [m] and [m/s].
     """
     interval = longest[..., None, None] / (KNOTS - 1)
     knot = since / interval
