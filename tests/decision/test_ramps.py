@@ -10,14 +10,12 @@ from failuretwin.digital_model.nonidealities import Imperfections, Readings, Tim
 from failuretwin.digital_model.settling import Settling
 from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.transient_likelihood import (
     DOF,
     GLITCH_RATE,
-    ROUGHNESS_M,
     SEEN,
     UNSEEN,
-    TransientHypothesis,
-    TransientLikelihood,
 )
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
@@ -63,7 +61,7 @@ class Case:
             measured_rate_hz=10.0,
         ).to_dataset()
         found = Evidence(runs)
-        self.ramps = TransientLikelihood(self.model, found.settled, found.transient)
+        self.ramps = RunLikelihood(found.settled, self.model, found.transient).transients
 
     def angles(self, time):
         """Lag, late starts, delays and slowness as told, (time, motor) [rad]."""
@@ -78,11 +76,10 @@ class Case:
 
     def compute_posterior(self, movement, origin, destination, duration, delay):
         """Return log densities of one movement over cases; arguments (case, motor)."""
-        ramps = TransientHypothesis(
-            np.array([0]), np.array([movement]), origin[None], destination[None],
-            duration[None], delay,
-        )  # fmt: skip
-        return self.ramps.log_density(ramps)[0]
+        item = np.array([0]), np.array([movement])
+        return self.ramps.log_density(item, origin[None], destination[None], duration[None], delay)[
+            0
+        ]
 
     def over(self, movement, motor, *, delays=(0.0,), factors=(1.0,), off=(0.0,)):
         """Return log densities over what one motor may have done (case,)."""
@@ -153,7 +150,7 @@ def test_a_motor_at_rest_has_a_closed_form(twin, end_seen):
     step = 1e-6 * np.eye(4)
     slopes = ((twin.path(pose + step) - twin.path(pose - step)) / 2e-6).T
     variance = (SEEN if end_seen else UNSEEN) * np.sum((slopes * SCATTER) ** 2) / 3.0
-    variance += case.model.path_noise**2 + ROUGHNESS_M**2
+    variance += case.model.path_noise**2 + 0.002**2
     points = case.ramps.moving.point[0, 1, case.ramps.moving.seen[0, 1]]
     kind = stats.multivariate_t(twin.path(pose), variance * np.eye(3), DOF)
     anywhere = 1.0 / (4 / 3 * np.pi * REACH_M**3)

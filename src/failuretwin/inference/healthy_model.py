@@ -116,9 +116,14 @@ class HealthyModel:
         return np.zeros(len(self.scatter), dtype=bool)
 
     @cached_property
+    def anywhere_log_density(self) -> float:
+        """Log density of a tool that is anywhere within reach [log 1/m3]."""
+        return -float(np.log(4.0 / 3.0 * np.pi * self.reach**3))
+
+    @cached_property
     def outlier_log_density(self) -> float:
-        """Log of the outlier rate times the density of "anywhere within reach" [1/m3]."""
-        return float(np.log(OUTLIER_RATE) - np.log(4.0 / 3.0 * np.pi * self.reach**3))
+        """Log of the outlier rate times the density of "anywhere within reach" [log 1/m3]."""
+        return float(np.log(OUTLIER_RATE) + self.anywhere_log_density)
 
     @cached_property
     def reach(self) -> float:

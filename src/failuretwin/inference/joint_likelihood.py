@@ -312,6 +312,11 @@ class MovementLikelihoods(ArrayStruct):
         """Log weight times density of each outcome, (run, movement, outcome)."""
         return self.outcomes.log_weight + self.density
 
+    @property
+    def expected(self) -> FloatArray:
+        """Where a healthy arm settles, (run, movement, outcome, motor) [rad]; 0 if impossible."""
+        return np.stack([profile.expected for profile in self.profiles], axis=-1)
+
 
 def movement_likelihoods(evidence: SettledEvidence, model: HealthyModel) -> MovementLikelihoods:
     """Return what every movement says by itself."""

@@ -18,7 +18,6 @@ from failuretwin.inference.joint_likelihood import (
     movement_likelihoods,
 )
 from failuretwin.inference.transient_likelihood import TransientLikelihood
-from failuretwin.inference.transients import TrajectoryLikelihood, TransientEvidence
 
 HELD_ANGLES = 25
 """Held angles at which the way is judged, over the range of a motor."""
@@ -76,18 +75,14 @@ class RunLikelihood:
         return self.model.settle(initial, np.zeros_like(initial), self.model.none_held)
 
     @cached_property
-    def transients(self) -> TransientEvidence | None:
+    def transients(self) -> TransientLikelihood | None:
         """What the readings on the way say; None where they are left aside."""
         if self.moving is None:
             return None
         model = replace(
             self.model, scatter_factor=self.model.scatter_factor * self.transient_scatter_factor
         )
-        ramps = TransientLikelihood(model, self.evidence, self.moving)
-        found = self.findings
-        return TransientEvidence(
-            TrajectoryLikelihood(ramps, found.outcomes), found.terms, found.poses
-        )
+        return TransientLikelihood(model, self.evidence, self.moving, self.findings, self.start)
 
     @cached_property
     def log_transient(self) -> FloatArray:

@@ -138,7 +138,7 @@ def _on_way(likelihood: RunLikelihood, seen: TwoJointLikelihood, course: GreedyP
     followed = course.way >= 0
     way = np.maximum(course.way, 0)[..., None]
     at = np.take_along_axis(seen.angle, way[..., None], axis=2)[:, :, 0]
-    ends = transients.judge.expected.copy()
+    ends = transients.findings.expected
     ends[..., pair] = np.where(followed[..., None], at, course.angle)[:, :, None]
     outcome_probability = np.where(followed, seen.outcome_probability[way[..., 0]], 0)
     return transients.toward(ends, outcome_probability, seen.pair[0])
