@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from failuretwin.core.movements import Movements
-from failuretwin.core.numerics import Ellipsoid, log_fall
+from failuretwin.core.numerics import Ellipsoid, log_fall, log_of
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections, Timing
@@ -20,8 +20,31 @@ from failuretwin.inference.settings import InferenceSettings
 
 PATH_NOISE_M = 0.001
 """Noise assumed of a settled tool position where the sensor is not known [m]."""
+LAG_STEPS_S = np.array([-0.04, -0.02, 0.0, 0.02, 0.04])
+"""Punctual starts to sum over, around the lag expected [s]."""
+LAG_SPREAD_S = 0.018
+"""Standard deviation of the lag from movement to movement [s]."""
+LATE_STEP_S = 0.1
+"""Step of the late starts to sum over [s]."""
 LEAST_NOISE_M = 0.0003
 """What a calibration leaves unsaid of the tool's path: bending links, bearings [m]; assumed."""
+
+
+@dataclass(frozen=True)
+class StartDelay:
+    """How long after its command a movement begins, as a sum over times.
+
+    Attributes:
+        shift_s: The times, (shift,) [s].
+        log_prior: Their log probability, (shift,).
+        step_s: How coarse the sum is [s].
+        log_chance: Log probability that a movement is one of these, (run, movement).
+    """
+
+    shift_s: FloatArray
+    log_prior: FloatArray
+    step_s: float
+    log_chance: FloatArray
 
 
 @dataclass(frozen=True)
@@ -50,6 +73,16 @@ class HealthyModel:
     def settings(self) -> InferenceSettings:
         """Lengths and angles by which runs of this robot are read."""
         return InferenceSettings.of(self.twin.robot, self.imperfections)
+
+    @cached_property
+    def motor_names(self) -> list[str]:
+        """Names of the motors in chain order."""
+        return self.twin.robot.motor_names
+
+    @cached_property
+    def movement_range(self) -> list[tuple[float, float]]:
+        """Lowest and highest target of each motor, (motor,) [rad]."""
+        return [motor.movement_range for motor in self.twin.robot.motors]
 
     @cached_property
     def settling(self) -> Settling:
@@ -174,6 +207,20 @@ class HealthyModel:
         """
         return self.lost_commands.late(movements, first_reading_delay)
 
+    def start_delays(self, evidence: SettledEvidence) -> tuple[StartDelay, StartDelay]:
+        """Return how late movements begin that are punctual, and those that are not."""
+        lag, (low, high) = self.lag_s, self.imperfections.timing.late_s
+        weight = np.exp(-0.5 * (LAG_STEPS_S / LAG_SPREAD_S) ** 2)
+        punctual = np.maximum(lag + LAG_STEPS_S, 0.0)
+        delayed = np.arange(low, high + 0.5 * LATE_STEP_S, LATE_STEP_S) + lag
+        evenly = np.full(len(delayed), -np.log(len(delayed)))
+        late = log_of(self.late(evidence.movements, evidence.first_reading_delay))
+        on_time = log_of(-np.expm1(np.minimum(late, 0.0)))
+        return (
+            StartDelay(punctual, np.log(weight / weight.sum()), 0.0, on_time),
+            StartDelay(delayed, evenly, LATE_STEP_S, late),
+        )
+
     def settle(self, base: FloatArray, direction: FloatArray, held: BoolArray) -> FloatArray:
         """Return the angles at which the motors settle, (..., motor) [rad].
 
@@ -188,6 +235,26 @@ class HealthyModel:
             offset = self.settling.offset(robot, near, direction)
             near = base + np.where(held, 0.0, offset)
         return near
+
+    def residual(
+        self, point: FloatArray, pose: FloatArray, scale: FloatArray
+    ) -> tuple[FloatArray, FloatArray, Ellipsoid]:
+        """Return what the tool sensor says of poses: all that a settled position is weighed by.
+
+        Linear in the scatter of the motors, r = J dq + noise with J the Jacobian of the position.
+
+        Args:
+            point: Settled positions, (..., 3) [m].
+            pose: Angles at which the motors settle, (..., motor) [rad].
+            scale: Scale of their scatter, (..., motor) [rad]; 0: held.
+
+        Returns:
+            The residual r, seen minus expected, (..., 3) [m]; J, (..., 3, motor) [m/rad]; and the
+            scale matrix of r, (...) [m2].
+        """
+        predicted, jacobian = self.twin.path_and_jacobian(pose)
+        spread = Ellipsoid.of(jacobian * scale[..., None, :], self.path_noise**2)
+        return point - predicted, jacobian, spread
 
     def explain(
         self, evidence: SettledEvidence, outcomes: CommandOutcomes
@@ -204,9 +271,7 @@ class HealthyModel:
             position, (run, movement, outcome, motor) [rad].
         """
         pose = self.settle(outcomes.base, outcomes.direction, self.none_held)
-        predicted, jacobian = self.twin.path_and_jacobian(pose)
-        error = evidence.point[:, :, None] - predicted
-        spread = Ellipsoid.of(jacobian * self.scatter, self.path_noise**2)
+        error, jacobian, spread = self.residual(evidence.point[:, :, None], pose, self.scatter)
         dof = self.settling.tail_dof
         density = spread.log_norm(dof) + log_fall(spread.product(error, error), dof)
         return density, pose + scattered(spread, jacobian, self.scatter, error)

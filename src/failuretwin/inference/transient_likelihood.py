@@ -17,7 +17,7 @@ import numpy as np
 from failuretwin.core.numerics import along_polyline, log_norm, log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.evidence import SettledEvidence, TransientSamples
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.healthy_model import HealthyModel, StartDelay
 from failuretwin.inference.joint_likelihood import (
     LARGEST_OFFSET_RAD,
     JointLikelihood,
@@ -32,12 +32,6 @@ not. All readings of a movement share its ends, so that each tells a twelfth of 
 them; what is known of them is taken as it was seen."""
 JITTER_S = 0.012
 """Standard deviation of the stamps of single readings [s], on top of the shared lag."""
-LAG_STEPS_S = np.array([-0.04, -0.02, 0.0, 0.02, 0.04])
-"""Punctual starts to sum over, around the lag expected [s]."""
-LAG_SPREAD_S = 0.018
-"""Standard deviation of the lag from movement to movement [s]."""
-LATE_STEP_S = 0.1
-"""Step of the late starts to sum over [s]."""
 DOF = 4.0
 """Degrees of freedom of single readings: heavy tails."""
 GLITCH_RATE = 0.03
@@ -374,34 +368,19 @@ class TransientLikelihood:
         path, longest = self._path(origin, destination, np.nan_to_num(duration), late)
         variance = self._variance(item, destination[:, 0]) + spread_m**2
         found = np.full(origin.shape[:2], -np.inf)
-        for shift, log_prior, step, log_chance in self._starts:
-            chance = log_chance[item]
+        for start in self._starts:
+            chance = start.log_chance[item]
             some = np.flatnonzero(chance > -np.inf)
             if len(some) > 0:
                 at, ways = tuple(index[some] for index in item), (path[some], longest[some])
-                says = self._of_starts(at, *ways, variance[some], shift, step)
-                says = log_sum(says + log_prior, axis=-1) + chance[some, None]
-                found[some] = np.logaddexp(found[some], says)
+                says = self._of_starts(at, *ways, variance[some], start)
+                found[some] = np.logaddexp(found[some], says + chance[some, None])
         return found
 
     @cached_property
-    def _starts(self) -> tuple[tuple[FloatArray, FloatArray, float, FloatArray], ...]:
-        """Punctual starts and late ones.
-
-        Times after the command to sum over (shift,) [s], their log prior (shift,), how coarse the
-        sum is [s], and the log probability that a movement starts so, (run, movement).
-        """
-        lag, (low, high) = self.model.lag_s, self.model.imperfections.timing.late_s
-        weight = np.exp(-0.5 * (LAG_STEPS_S / LAG_SPREAD_S) ** 2)
-        punctual = np.maximum(lag + LAG_STEPS_S, 0.0)
-        delayed = np.arange(low, high + 0.5 * LATE_STEP_S, LATE_STEP_S) + lag
-        evenly = np.full(len(delayed), -np.log(len(delayed)))
-        late = log_of(self.model.late(self.settled.movements, self.settled.first_reading_delay))
-        on_time = log_of(-np.expm1(np.minimum(late, 0.0)))
-        return (
-            (punctual, np.log(weight / weight.sum()), 0.0, on_time),
-            (delayed, evenly, LATE_STEP_S, late),
-        )
+    def _starts(self) -> tuple[StartDelay, ...]:
+        """How late movements may start."""
+        return self.model.start_delays(self.settled)
 
     def _of_starts(
         self,
@@ -409,10 +388,9 @@ class TransientLikelihood:
         path: FloatArray,
         longest: FloatArray,
         variance: FloatArray,
-        shift: FloatArray,
-        step: float,
+        start: StartDelay,
     ) -> FloatArray:
-        """Return log densities given when a movement begins, (item, case, shift).
+        """Return log densities of movements that begin so late, (item, case).
 
         A reading is of a 3-variate Student t around the path, wider along it by the doubt of its
         time, or anywhere within reach.
@@ -422,11 +400,12 @@ class TransientLikelihood:
             path: The tool at each knot, (item, case, knot, axis) [m].
             longest: Time of the last knot, (item, case) [s].
             variance: Of a reading on each axis, (item,) [m2].
-            shift: Times after the command, (shift,) [s].
-            step: How coarse the sum over them is [s].
+            start: How late.
         """
         variance = variance[:, None, None, None]
-        since = self.moving.since[item][:, None, :, None] - shift  # (item, 1, reading, shift)
+        since = (
+            self.moving.since[item][:, None, :, None] - start.shift_s
+        )  # (item, 1, reading, shift)
         predicted, velocity = along_polyline(path, longest, since)
         point = self.moving.point[item][:, None, :, None]
         error = [point[..., axis] - predicted[axis] for axis in range(3)]
@@ -434,21 +413,16 @@ class TransientLikelihood:
         along2 = sum(e * v for e, v in zip(error, velocity, strict=True)) ** 2
         along2 /= np.maximum(speed2, 1e-12)
         error2 = sum(e * e for e in error)
-        stretched = variance + speed2 * (JITTER_S**2 + step**2 / 12.0)
+        stretched = variance + speed2 * (JITTER_S**2 + start.step_s**2 / 12.0)
         square = np.maximum(error2 - along2, 0.0) / variance + along2 / stretched
         log_at = -0.5 * (DOF + 3.0) * np.log1p(square / DOF) - 0.5 * np.log(stretched)
         log_at += log_norm(DOF) - np.log(variance) + np.log1p(-GLITCH_RATE)
         log_at = np.logaddexp(log_at, np.log(GLITCH_RATE) + self.model.anywhere_log_density)
         log_at *= self.moving.seen[item][:, None, :, None]
-        return np.asarray(log_at.sum(axis=2))
+        return log_sum(log_at.sum(axis=2) + start.log_prior, axis=-1)
 
     def _variance(self, item: tuple[IntArray, ...], destination: FloatArray) -> FloatArray:
-        """Return the variance of a reading on each axis, (item,) [m2].
-
-        Args:
-            item: Runs and numbers of movements, (item,) each.
-            destination: Where they end, (item, motor) [rad].
-        """
+        """Return the variance of a reading on each axis, (item,) [m2]; ends (item, motor) [rad]."""
         _, jacobian = self.model.twin.path_and_jacobian(destination)
         scaled = np.sum((jacobian * self.model.scatter) ** 2, axis=(-1, -2)) / 3.0
         seen = self.settled.usable.copy()

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.core.numerics import Ellipsoid
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.command_loss import CommandOutcomes
 from failuretwin.inference.evidence import SettledEvidence
@@ -137,9 +136,7 @@ def _laplace(
     pose = np.repeat(outcomes.base[..., None, :], SOLUTIONS, axis=-2)
     pose[..., list(pair)] = angle
     settled = model.settle(pose, outcomes.direction[..., None, :], fixed)
-    predicted, jacobian = model.twin.path_and_jacobian(settled)
-    error = point[:, :, None, None] - predicted
-    spread = Ellipsoid.of(jacobian * scale, model.path_noise**2)
+    error, jacobian, spread = model.residual(point[:, :, None, None], settled, scale)
     levers = [jacobian[..., motor] for motor in pair]
     pulls = [spread.solve(lever) for lever in levers]
     aa, bb, ab = (np.sum(pulls[i] * levers[j], axis=-1) for i, j in ((0, 0), (1, 1), (0, 1)))

@@ -213,7 +213,13 @@ def _inflated(likelihood: RunLikelihood) -> list[RunLikelihood]:
         for scatter_factor in SCATTER_FACTORS
     ]
     if likelihood.moving is not None:
-        inflated.append(replace(likelihood, transient_scatter_factor=TRANSIENT_SCATTER_FACTOR))
+        inflated.append(
+            replace(
+                likelihood,
+                transient_scatter_factor=TRANSIENT_SCATTER_FACTOR,
+                remembered=likelihood.findings,
+            )
+        )
     return inflated
 
 
