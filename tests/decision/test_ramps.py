@@ -10,7 +10,7 @@ from failuretwin.digital_model.nonidealities import Imperfections, Readings, Tim
 from failuretwin.digital_model.settling import Settling
 from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.transient_likelihood import TransientHypothesis, TransientLikelihood
+from failuretwin.inference.run_likelihood import RunLikelihood
 
 DOF, GLITCH_RATE, ROUGHNESS_M = 4.0, 0.03, 0.002
 NOISE_M = 0.0003
@@ -60,7 +60,7 @@ class Case:
             measured_rate_hz=10.0,
         ).to_dataset()
         found = Evidence(runs)
-        self.ramps = TransientLikelihood(self.model, found.settled, found.transient)
+        self.ramps = RunLikelihood(found.settled, self.model, found.transient).transients
 
     def angles(self, time):
         """Lag, late starts, delays and slowness as told, (time, motor) [rad]."""
@@ -75,11 +75,10 @@ class Case:
 
     def compute_posterior(self, movement, origin, destination, duration, delay):
         """Return log densities of one movement over cases; arguments (case, motor)."""
-        ramps = TransientHypothesis(
-            np.array([0]), np.array([movement]), origin[None], destination[None],
-            duration[None], delay,
-        )  # fmt: skip
-        return self.ramps.log_density(ramps)[0]
+        item = np.array([0]), np.array([movement])
+        return self.ramps.log_density(item, origin[None], destination[None], duration[None], delay)[
+            0
+        ]
 
     def over(self, movement, motor, *, delays=(0.0,), factors=(1.0,), off=(0.0,)):
         """Return log densities over what one motor may have done (case,)."""

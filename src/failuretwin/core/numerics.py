@@ -207,3 +207,39 @@ def masked_median(values: FloatArray, kept: BoolArray) -> FloatArray:
     low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, values.shape[1] - 1)
     middle = 0.5 * (ordered[row, low] + ordered[row, high])
     return np.where(count > 0, middle, 0.0)
+
+
+# Points and velocities along paths that are straight from knot to knot, many at once.
+
+
+def along_polyline(
+    path: FloatArray, longest: FloatArray, since: FloatArray
+) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Return place and velocity on polylines whose knots are passed at an even pace.
+
+    Before the first knot and after the last one all is at rest there.
+
+    Args:
+        path: The knots, (item, case, knot, axis).
+        longest: Time of the last knot, (item, case) [s]; the first is at 0.
+        since: Times, (item, 1, reading, shift) [s].
+
+    Returns:
+        For each axis, (item, case, reading, shift).
+    """
+    items, cases, knots, axes = path.shape
+    interval = longest[..., None, None] / (knots - 1)
+    knot = since / interval
+    moving = ((knot > 0.0) & (knot < knots - 1)) / interval
+    knot = np.clip(knot, 0.0, knots - 1)
+    low = np.minimum(knot.astype(np.int64), knots - 2)
+    share = knot - low
+    low += knots * np.arange(items * cases).reshape(items, cases, 1, 1)
+    place, velocity = [], []
+    for axis in range(axes):
+        values = np.ascontiguousarray(path[..., axis]).ravel()
+        before = values[low]
+        step = values[low + 1] - before
+        place.append(before + share * step)
+        velocity.append(step * moving)
+    return place, velocity

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -69,15 +70,17 @@ class DigitalTwin:
             Tool positions (..., axis) [m] and Jacobians (..., axis, motor) [m/rad].
         """
         point, jacobian = self.robot.chain.position_and_jacobian(self._sensor_pose(position))
-        if np.all(self.robot.sensor_sense == 1.0):
-            return point, jacobian
-        return point, jacobian * self.robot.sensor_sense
+        return point, jacobian if self._turned is None else jacobian * self._turned
 
     def _sensor_pose(self, position: ArrayLike) -> FloatArray:
-        position = as_floats(position)
-        if np.all(self.robot.sensor_sense == 1.0):
-            return position
-        return position * self.robot.sensor_sense
+        position = np.asarray(position, dtype=np.float64)
+        return position if self._turned is None else position * self._turned
+
+    @cached_property
+    def _turned(self) -> FloatArray | None:
+        """Sense of the motors in the sensor's pose, (motor,); None: as in the log."""
+        sense = self.robot.sensor_sense
+        return None if np.all(sense == 1.0) else sense
 
 
 def _uniform_step(time: FloatArray) -> float:

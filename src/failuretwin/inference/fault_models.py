@@ -18,6 +18,7 @@ from failuretwin.inference.joint_likelihood import JointLikelihood
 from failuretwin.inference.marginal import FaultModel
 from failuretwin.inference.onset import immediate, next_movement
 from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.settings import Range
 
 # Nodes of an unknown that holds for the whole run: dense where a movement may point.
 
@@ -336,16 +337,6 @@ def _reached(
 
 # A steady-state error: an unknown offset from the target, drawn anew for each movement.
 
-Range = tuple[float, float]
-
-_COUNT = np.deg2rad(0.24)
-ERROR_RANGES: tuple[Range, ...] = (
-    (4 * _COUNT, 20 * _COUNT),
-    (7 * _COUNT, 35 * _COUNT),
-    (10 * _COUNT, 50 * _COUNT),
-)
-"""Run-level ranges of the error's size [rad]: from just above the healthy scatter of the ArmPi FPV
-to the paper's own 10 to 50 counts of 0.24 deg."""
 ERROR_NODES = 36
 """Sizes to sum over on each side of zero, up to the largest error considered."""
 

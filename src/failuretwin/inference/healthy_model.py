@@ -53,6 +53,16 @@ class HealthyModel:
         return InferenceSettings.of(self.twin.robot, self.imperfections)
 
     @cached_property
+    def motor_names(self) -> list[str]:
+        """Names of the motors in chain order."""
+        return self.twin.robot.motor_names
+
+    @cached_property
+    def movement_range(self) -> list[tuple[float, float]]:
+        """Lowest and highest target of each motor, (motor,) [rad]."""
+        return [motor.movement_range for motor in self.twin.robot.motors]
+
+    @cached_property
     def settling(self) -> Settling:
         """Settled offsets; of ideal motors where the imperfections have none."""
         return self.imperfections.settling or Settling.ideal(len(self.twin.robot.motors))
@@ -122,9 +132,14 @@ class HealthyModel:
         return np.zeros(len(self.scatter), dtype=bool)
 
     @cached_property
+    def anywhere_log_density(self) -> float:
+        """Log density of a tool that is anywhere within reach [log 1/m3]."""
+        return -float(np.log(4.0 / 3.0 * np.pi * self.reach**3))
+
+    @cached_property
     def outlier_log_density(self) -> float:
-        """Log of the outlier rate times the density of "anywhere within reach" [1/m3]."""
-        return float(np.log(OUTLIER_RATE) - np.log(4.0 / 3.0 * np.pi * self.reach**3))
+        """Log of the outlier rate times the density of "anywhere within reach" [log 1/m3]."""
+        return float(np.log(OUTLIER_RATE) + self.anywhere_log_density)
 
     @cached_property
     def reach(self) -> float:
@@ -190,6 +205,26 @@ class HealthyModel:
             near = base + np.where(held, 0.0, offset)
         return near
 
+    def residual(
+        self, point: FloatArray, pose: FloatArray, scale: FloatArray
+    ) -> tuple[FloatArray, FloatArray, Ellipsoid]:
+        """Return what the tool sensor says of poses: all that a settled position is weighed by.
+
+        Linear in the scatter of the motors, r = J dq + noise with J the Jacobian of the position.
+
+        Args:
+            point: Settled positions, (..., 3) [m].
+            pose: Angles at which the motors settle, (..., motor) [rad].
+            scale: Scale of their scatter, (..., motor) [rad]; 0: held.
+
+        Returns:
+            The residual r, seen minus expected, (..., 3) [m]; J, (..., 3, motor) [m/rad]; and the
+            scale matrix of r, (...) [m2].
+        """
+        predicted, jacobian = self.twin.path_and_jacobian(pose)
+        spread = Ellipsoid.of(jacobian * scale[..., None, :], self.path_noise**2)
+        return point - predicted, jacobian, spread
+
     def explain(
         self, evidence: SettledEvidence, outcomes: CommandOutcomes
     ) -> tuple[FloatArray, FloatArray]:
@@ -205,9 +240,7 @@ class HealthyModel:
             position, (run, movement, outcome, motor) [rad].
         """
         pose = self.settle(outcomes.base, outcomes.direction, self.none_held)
-        predicted, jacobian = self.twin.path_and_jacobian(pose)
-        error = evidence.point[:, :, None] - predicted
-        spread = Ellipsoid.of(jacobian * self.scatter, self.path_noise**2)
+        error, jacobian, spread = self.residual(evidence.point[:, :, None], pose, self.scatter)
         density = spread.log_student(error, self.settling.tail_dof)
         return density, pose + scattered(spread, jacobian, self.scatter, error)
 

@@ -14,7 +14,7 @@ from typing import Annotated
 import numpy as np
 
 from failuretwin.core.arrays import ArrayStruct, Axes
-from failuretwin.core.numerics import Ellipsoid, log_fall
+from failuretwin.core.numerics import log_fall
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.inference.command_loss import CommandOutcomes
 from failuretwin.inference.evidence import SettledEvidence
@@ -179,9 +179,8 @@ def joint_likelihoods(
     for _ in range(REFINEMENTS):
         pose = np.where(own, angle[..., None], base)
         settled = model.settle(pose, direction, own | another)
-        predicted, jacobian = model.twin.path_and_jacobian(settled)
-        spread = Ellipsoid.of(jacobian * scale[..., None, :], model.path_noise**2)
-        lever, error = np.sum(jacobian * own[..., None, :], axis=-1), point - predicted
+        error, jacobian, spread = model.residual(point, settled, scale)
+        lever = np.sum(jacobian * own[..., None, :], axis=-1)
         precision = spread.product(lever, lever)
         slope = spread.product(lever, error)
         step = slope / np.maximum(precision, LEAST_PRECISION)
@@ -244,7 +243,7 @@ def _beside(
 
 def _may_turn_around(model: HealthyModel, motor: int) -> bool:
     """Return whether a motor may be half a turn or more from where it should be."""
-    low, high = model.twin.robot.motors[motor].movement_range
+    low, high = model.movement_range[motor]
     return not model.twin.robot.chain.joints[motor].prismatic and HELD_BEYOND * (high - low) > np.pi
 
 
@@ -305,6 +304,11 @@ class MovementLikelihoods(ArrayStruct):
     def terms(self) -> FloatArray:
         """Log weight times density of each outcome, (run, movement, outcome)."""
         return self.outcomes.log_weight + self.density
+
+    @property
+    def expected(self) -> FloatArray:
+        """Where a healthy arm settles, (run, movement, outcome, motor) [rad]; 0 if impossible."""
+        return np.stack([profile.expected for profile in self.profiles], axis=-1)
 
 
 def movement_likelihoods(evidence: SettledEvidence, model: HealthyModel) -> MovementLikelihoods:

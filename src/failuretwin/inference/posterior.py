@@ -142,7 +142,7 @@ def marginal_likelihood_of(
     likelihood: RunLikelihood, hypothesis: Hypothesis, priors: Priors
 ) -> MarginalLikelihood:
     """Return what runs say of one known hypothesis."""
-    if hypothesis.is_healthy:
+    if not hypothesis.faults:
         return _healthy_likelihood(likelihood)
     if len(hypothesis.faults) == 2:
         likelihoods = [likelihood[run] for run in range(len(likelihood.log_healthy))]
@@ -161,7 +161,7 @@ def marginal_likelihood_of(
 
 def motor_of(likelihood: RunLikelihood, fault: Fault) -> int:
     """Return the index of the motor that has the fault."""
-    return likelihood.model.twin.robot.motor_names.index(fault.motor)
+    return likelihood.model.motor_names.index(fault.motor)
 
 
 def fault_model_of(likelihood: RunLikelihood, fault: Fault, priors: Priors) -> FaultModel:

@@ -9,8 +9,8 @@ import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.digital_model.robot import Robot
-from failuretwin.inference.fault_models import ERROR_RANGES, Range
 from failuretwin.inference.onset import OnsetPrior
+from failuretwin.inference.settings import USUAL, InferenceSettings, Range
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Priors:
     """
 
     onset: OnsetPrior = field(default_factory=OnsetPrior)
-    error_ranges: Sequence[Range] = ERROR_RANGES
+    error_ranges: Sequence[Range] = USUAL.error_ranges
     healthy_odds: float = 1.0
 
     def __post_init__(self) -> None:
@@ -60,7 +60,7 @@ def priors_of(
         InputError: If the range is not 0 <= low < high, no motor can be off by that much, or the
             onset is negative.
     """
-    priors = Priors()
+    priors = Priors(error_ranges=InferenceSettings.of(robot).error_ranges)
     if error_range_counts is not None:
         low, high = error_range_counts
         if not 0.0 <= low < high < np.inf:

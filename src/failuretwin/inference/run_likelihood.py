@@ -18,7 +18,6 @@ from failuretwin.inference.joint_likelihood import (
     movement_likelihoods,
 )
 from failuretwin.inference.transient_likelihood import TransientLikelihood
-from failuretwin.inference.transients import TrajectoryLikelihood, TransientEvidence
 
 HELD_ANGLES = 25
 """Held angles at which the way is judged, over the range of a motor."""
@@ -26,16 +25,20 @@ HELD_ANGLES = 25
 
 @dataclass(frozen=True)
 class RunLikelihood:
-    """Some runs, ready to be weighed: what was seen, and what a healthy robot would do.
+    """The posterior predictive density of a healthy robot for some runs, movement by movement.
+
+    What was seen, laid beside what a healthy robot would do given the movements before; from the
+    same numbers, the density of every movement with one motor off or held.
 
     Attributes:
         evidence: Settled positions.
         model: The healthy robot.
         moving: Readings on the way; None: they are left aside.
-        way_blur: Factor on the scatter of the way alone; 1 for a robot as it is.
+        transient_scatter_factor: Factor on the scatter of the way alone; 1 for a robot as it is.
         remembered: What every movement says by itself, where that was computed before.
         healthy: Log density of each settled position if no motor is faulty, (run, movement), where
             that is not what the movements say of a healthy robot.
+        memo: What was found on the way of each motor, by kind and index of the motor.
     """
 
     evidence: SettledEvidence
@@ -44,16 +47,17 @@ class RunLikelihood:
     transient_scatter_factor: float = 1.0
     remembered: MovementLikelihoods | None = None
     healthy: FloatArray | None = None
-    _off: dict[int, FloatArray] = field(default_factory=dict, init=False, compare=False, repr=False)
-    _held: dict[int, FloatArray] = field(
+    memo: dict[tuple[str, int], FloatArray] = field(
         default_factory=dict, init=False, compare=False, repr=False
     )
 
     def __getitem__(self, run: int) -> RunLikelihood:
-        """Return the scene of one of the runs."""
+        """Return one of the runs alone."""
         rows = slice(run, run + 1)
         moving = None if self.moving is None else self.moving[rows]
-        return RunLikelihood(self.evidence[rows], self.model, moving, self.transient_scatter_factor)
+        return replace(
+            self, evidence=self.evidence[rows], moving=moving, remembered=self.findings[rows]
+        )
 
     @cached_property
     def findings(self) -> MovementLikelihoods:
@@ -67,7 +71,7 @@ class RunLikelihood:
         """What may have become of each movement."""
         return self.findings.outcomes
 
-    @property
+    @cached_property
     def late(self) -> FloatArray:
         """Probability that each movement started late, (run, movement)."""
         return self.model.late(self.evidence.movements, self.evidence.first_reading_delay)
@@ -79,18 +83,14 @@ class RunLikelihood:
         return self.model.settle(initial, np.zeros_like(initial), self.model.none_held)
 
     @cached_property
-    def transients(self) -> TransientEvidence | None:
+    def transients(self) -> TransientLikelihood | None:
         """What the readings on the way say; None where they are left aside."""
         if self.moving is None:
             return None
-        model = replace(
-            self.model, scatter_factor=self.model.scatter_factor * self.transient_scatter_factor
-        )
-        ramps = TransientLikelihood(model, self.evidence, self.moving)
-        found = self.findings
-        return TransientEvidence(
-            TrajectoryLikelihood(ramps, found.outcomes), found.terms, found.poses
-        )
+        model, factor = self.model, self.transient_scatter_factor
+        if factor != 1.0:
+            model = replace(model, scatter_factor=model.scatter_factor * factor)
+        return TransientLikelihood(model, self.evidence, self.moving, self.findings, self.start)
 
     @cached_property
     def log_transient(self) -> FloatArray:
@@ -109,9 +109,10 @@ class RunLikelihood:
             return self.log_transient
         if gain is not None:
             return self.transients.offset(motor, self.profile(motor), gain)
-        if motor not in self._off:
-            self._off[motor] = self.transients.offset(motor, self.profile(motor))
-        return self._off[motor]
+        known = ("off", motor)
+        if known not in self.memo:
+            self.memo[known] = self.transients.offset(motor, self.profile(motor))
+        return self.memo[known]
 
     def log_transient_stuck(self, motor: int, angle: FloatArray) -> FloatArray:
         """Return the same with one motor that is held at some angle or gets stuck there.
@@ -126,22 +127,23 @@ class RunLikelihood:
         if self.transients is None:
             return np.repeat(self.log_transient[..., None], angle.shape[1], axis=2)
         low, high = self.held_range(motor)
-        if motor not in self._held:
+        known = ("held", motor)
+        if known not in self.memo:
             grid = np.linspace(low, high, HELD_ANGLES)
-            self._held[motor] = self.transients.stuck(motor, self.profile(motor), grid)
+            self.memo[known] = self.transients.stuck(motor, self.profile(motor), grid)
         place = np.clip((angle - low) / (high - low) * (HELD_ANGLES - 1), 0, HELD_ANGLES - 1)
         left = np.minimum(place.astype(np.int64), HELD_ANGLES - 2)
         share = (place - left)[:, None]
         shape = (*self.usable.shape, angle.shape[1])
         at, after = (
-            np.take_along_axis(self._held[motor], np.broadcast_to(k[:, None], shape), axis=2)
+            np.take_along_axis(self.memo[known], np.broadcast_to(k[:, None], shape), axis=2)
             for k in (left, left + 1)
         )
         return at + share * (after - at)
 
     def held_range(self, motor: int) -> tuple[float, float]:
         """Return the range of angles at which a motor may be held [rad]."""
-        low, high = self.model.twin.robot.motors[motor].movement_range
+        low, high = self.model.movement_range[motor]
         margin = 0.1 * (high - low)
         return low - margin, high + margin
 

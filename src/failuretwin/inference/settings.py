@@ -14,6 +14,12 @@ from failuretwin.digital_model.robot import Robot
 NOISE_FACTOR = 3.0
 """Lengths by which rest is told from motion are at least so many times the sensor's noise: the
 distance of a reading from the median of many exceeds that once in 34 times if it is normal."""
+Range = tuple[float, float]
+"""Least and greatest."""
+ERROR_STEPS = (1.0, 1.75, 2.5)
+"""Where ranges of steady-state errors begin, in the least error."""
+WIDEST_ERROR = 5.0
+"""Greatest error of a range, in its least one: the paper's 10 to 50 counts."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +55,15 @@ class InferenceSettings:
     def __post_init__(self) -> None:
         for entry in fields(self):
             check_number(f"inference: {entry.name}", getattr(self, entry.name), low=0.0)
+
+    @property
+    def error_ranges(self) -> tuple[Range, ...]:
+        """Run-level ranges of a steady-state error's size [rad].
+
+        From just above the healthy scatter to the paper's own, of the ArmPi FPV 10 to 50 counts.
+        """
+        least = np.array(ERROR_STEPS) * self.least_error_rad
+        return tuple((float(low), float(WIDEST_ERROR * low)) for low in least)
 
     @classmethod
     def of(cls, robot: Robot, imperfections: Imperfections | None = None) -> InferenceSettings:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.core.numerics import Ellipsoid, log_fall, log_norm, log_normal_2d
+from failuretwin.core.numerics import log_fall, log_norm, log_normal_2d
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.inference.command_loss import CommandOutcomes
 from failuretwin.inference.evidence import SettledEvidence
@@ -137,9 +137,7 @@ def _laplace(
     pose = np.repeat(outcomes.base[..., None, :], SOLUTIONS, axis=-2)
     pose[..., list(pair)] = angle
     settled = model.settle(pose, outcomes.direction[..., None, :], fixed)
-    predicted, jacobian = model.twin.path_and_jacobian(settled)
-    error = point[:, :, None, None] - predicted
-    spread = Ellipsoid.of(jacobian * scale, model.path_noise**2)
+    error, jacobian, spread = model.residual(point[:, :, None, None], settled, scale)
     lever = jacobian[..., list(pair)]  # (..., axis, motor)
     pull = np.stack([spread.solve(lever[..., k]) for k in range(2)], axis=-1)
     precision = np.swapaxes(lever, -1, -2) @ pull + LEAST_PRECISION * np.eye(2)

@@ -174,7 +174,7 @@ def _on_way(
     assert transients is not None
     taken = np.maximum(way, 0)
     at = np.take_along_axis(seen.angle, taken[..., None, None], axis=2)[:, :, 0]
-    ends = transients.judge.expected.copy()
+    ends = transients.findings.expected
     ends[..., list(seen.pair)] = np.where((way >= 0)[..., None], at, angle)[:, :, None]
     outcome = np.where(way >= 0, seen.outcome[taken], 0)
     return transients.toward(ends, outcome, seen.pair[0])
@@ -226,7 +226,13 @@ def _inflated(likelihood: RunLikelihood) -> list[RunLikelihood]:
         for scatter_factor in SCATTER_FACTORS
     ]
     if likelihood.moving is not None:
-        inflated.append(replace(likelihood, transient_scatter_factor=TRANSIENT_SCATTER_FACTOR))
+        inflated.append(
+            replace(
+                likelihood,
+                transient_scatter_factor=TRANSIENT_SCATTER_FACTOR,
+                remembered=likelihood.findings,
+            )
+        )
     return inflated
 
 
