@@ -31,7 +31,8 @@ from failuretwin.decision.metrics.probability import (
 )
 from failuretwin.digital_model.nonidealities import load_imperfections
 from failuretwin.failure_behavior.fault import FaultValue
-from failuretwin.failure_behavior.modes import MODES, SteadyStateError, Stuck
+from failuretwin.failure_behavior.modes import SteadyStateError, Stuck
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.evidence import settled_evidence, transient_samples
 from failuretwin.inference.log_quality import drop_invalid, log_quality
 from failuretwin.inference.onset import OnsetPrior

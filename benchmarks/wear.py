@@ -26,7 +26,8 @@ from failuretwin.data_knowledge.generate import Plan, simulate, simulate_runs
 from failuretwin.digital_model.nonidealities import Imperfections, load_imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import loads_in_range
-from failuretwin.failure_behavior.modes import MODES, SteadyStateError
+from failuretwin.failure_behavior.modes import SteadyStateError
+from failuretwin.failure_behavior.registry import MODES
 
 if TYPE_CHECKING:
     import xarray as xr

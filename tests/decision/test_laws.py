@@ -7,22 +7,19 @@ from hypothesis import strategies as st
 
 from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import UNKNOWN, Hypothesis, single_faults
-from failuretwin.data_knowledge.failure_modes import magnitude_range
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference import double_faults as pairs
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.fault_models import (
-    AMOUNTS,
-    constant_fault_model,
-    drift_model,
-    lag_model,
+    growing_offset_model,
+    offset_model,
     offset_nodes,
+    redrawn_offset_model,
     size_nodes,
-    slow_model,
-    steady_state_error_model,
+    transient_model,
 )
 from failuretwin.inference.onset import OnsetPrior
 from failuretwin.inference.posterior import (
-    DIAGNOSABLE_MODES,
     marginal_likelihood_of,
     marginal_likelihoods,
 )
@@ -38,15 +35,19 @@ FAULT_MODELS = {
     "stuck at a known time": lambda likelihood, early: stuck_model(
         likelihood, 1, OnsetPrior(known_s=2.3)
     ),
-    "steady_state_error": lambda likelihood, early: steady_state_error_model(
-        likelihood, 1, RANGES, early
+    "steady_state_error": lambda likelihood, early: redrawn_offset_model(
+        likelihood, 1, MODES["steady_state_error"], RANGES, early
     ),
-    "drift": lambda likelihood, early: drift_model(likelihood, 1, early),
-    "lag": lambda likelihood, early: lag_model(likelihood, 1, early),
-    "slow": lambda likelihood, early: slow_model(likelihood, 1, early),
+    "drift": lambda likelihood, early: growing_offset_model(likelihood, 1, MODES["drift"], early),
     **{
-        mode: lambda likelihood, early, mode=mode: constant_fault_model(likelihood, 1, mode, early)
-        for mode in AMOUNTS
+        name: lambda likelihood, early, mode=MODES[name]: transient_model(
+            likelihood, 1, mode, early
+        )
+        for name in ("lag", "slow")
+    },
+    **{
+        name: lambda likelihood, early, mode=MODES[name]: offset_model(likelihood, 1, mode, early)
+        for name in ("encoder_bias", "encoder_scale", "backlash", "torque_loss")
     },
 }
 
@@ -109,7 +110,7 @@ def test_onsets_lie_in_the_run(likelihood, fault_model):
 
 @pytest.mark.parametrize(
     "hypothesis",
-    [*single_faults(MOTORS[1:2], DIAGNOSABLE_MODES), UNKNOWN,
+    [*single_faults(MOTORS[1:2], MODES), UNKNOWN,
      Hypothesis.parse("motor_2:encoder_bias+motor_3:stuck"),
      Hypothesis.parse("motor_1:drift+motor_4:steady_state_error")],
     ids=str,
@@ -163,9 +164,9 @@ def test_errors_are_as_likely_within_each_range(ranges):
 
 
 def test_drifts_of_all_rates_and_both_signs_are_as_likely(likelihood):
-    fault_model = drift_model(likelihood, 0, 0.6)
+    fault_model = growing_offset_model(likelihood, 0, MODES["drift"], 0.6)
     mass = np.exp(fault_model.log_prior[0]).sum(axis=0)
-    low, high = magnitude_range("drift")
+    low, high = MODES["drift"].considered
     size = fault_model.size[0]
     assert np.abs(size).min() == pytest.approx(low)
     assert np.abs(size).max() == pytest.approx(high)

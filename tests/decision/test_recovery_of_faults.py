@@ -11,11 +11,10 @@ from scipy import stats
 
 from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
-from failuretwin.data_knowledge.failure_modes import magnitude_range
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.nonidealities import Imperfections, load_imperfections
 from failuretwin.failure_behavior.fault import STEP
-from failuretwin.failure_behavior.modes import MODES
+from failuretwin.failure_behavior.registry import MODES
 
 RUNS = 12
 """Runs for each motor."""
@@ -79,7 +78,7 @@ def study(request, twin, armpi, imperfections):
     """All there before the run and of one severity; sizes from the range that is believed."""
     mode = request.param
     profiles = {} if mode == "intermittent" else {"profiles": (STEP,)}
-    known = type(MODES[mode])(magnitude=magnitude_range(mode), onset_s=(0.0, 0.0), **profiles)
+    known = type(MODES[mode])(magnitude=MODES[mode].considered, onset_s=(0.0, 0.0), **profiles)
     faults = single_faults(armpi.motor_names, [mode])[1:]
     if mode == "torque_loss":  # motor 1 carries no load
         faults = faults[1:]
@@ -109,7 +108,7 @@ def test_sizes_lie_in_their_intervals(study):
 def test_intervals_are_narrower_than_what_was_believed(study):
     """Five movements say next to nothing of the share of time that a motor sticks."""
     mode, seen = study
-    low, high = magnitude_range(mode)
+    low, high = MODES[mode].considered
     widths = [np.ptp(d.magnitude_90) for d in seen.told if d.magnitude_90 is not None]
     most = 0.95 if mode == "intermittent" else 0.8
     assert np.median(widths) < most * (high - low)
@@ -138,5 +137,5 @@ def test_verdicts_name_motor_and_mode(study):
             continue
         (fault,) = Hypothesis.parse(d.truth).faults
         assert fault.motor.replace("_", " ") in d.verdict
-        assert d.magnitude_unit == fault.magnitude_unit
+        assert d.magnitude_unit == MODES[fault.mode].unit
         assert d.magnitude_90[0] <= d.magnitude <= d.magnitude_90[1]

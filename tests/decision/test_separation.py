@@ -9,7 +9,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
 from failuretwin.data_knowledge.generate import Plan, simulate, without_chance
 from failuretwin.digital_model.nonidealities import default_imperfections
-from failuretwin.failure_behavior.modes import MODES
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.expected_bayes_factors import (
     ExpectedLogBayesFactor,
     expected_log_bayes_factors,

@@ -31,7 +31,7 @@ from failuretwin.digital_model.nonidealities import (
     generic_imperfections,
     load_imperfections,
 )
-from failuretwin.failure_behavior.modes import MODES
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference import diagnoser as bayes
 from failuretwin.inference import posterior as posterior
 from failuretwin.inference.evidence import settled_evidence, transient_samples

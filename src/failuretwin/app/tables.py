@@ -15,14 +15,13 @@ from rich.table import Table
 
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.types import as_floats
-from failuretwin.data_knowledge.failure_modes import plain_name
 from failuretwin.decision.metrics import Scores, judged_truth
 from failuretwin.decision.results import Record, as_unknown_line, score_line, score_records
 from failuretwin.digital_model.urdf import UrdfJoint
 from failuretwin.digital_model.urdf_check import JointReport, UrdfReport
 from failuretwin.digital_model.urdf_findings import has_range
 from failuretwin.inference.diagnoser import BayesDiagnoser
-from failuretwin.inference.explanation import size_words
+from failuretwin.inference.explanation import plain_name, size_words
 from failuretwin.inference.isolability import IsolabilityReport, isolability
 
 if TYPE_CHECKING:

@@ -6,7 +6,14 @@ from pathlib import Path
 
 import click
 
-from failuretwin.app.commands.options import PATH, LogOptions, common_options, reading_options
+from failuretwin.app.commands.options import (
+    PATH,
+    HypothesesOption,
+    LogOptions,
+    common_options,
+    plugin_option,
+    reading_options,
+)
 
 
 @click.command()
@@ -32,6 +39,7 @@ from failuretwin.app.commands.options import PATH, LogOptions, common_options, r
 )
 @click.option(
     "--hypotheses",
+    cls=HypothesesOption,
     metavar="H,...",
     help="What may be the case, two at least: healthy, MOTOR:MODE, two of these joined by '+', "
     "unknown. Such as healthy,motor_2:stuck. Default: the paper's nine classes.",
@@ -53,6 +61,7 @@ from failuretwin.app.commands.options import PATH, LogOptions, common_options, r
     help="Write a picture of each run, and index.html with all of them.",
 )
 @reading_options
+@plugin_option
 @common_options
 def diagnose(
     inputs: tuple[Path, ...],

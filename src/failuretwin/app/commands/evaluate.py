@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from failuretwin.app.commands.options import PATH, common_options
+from failuretwin.app.commands.options import PATH, common_options, plugin_option
 
 
 @click.command()
@@ -31,6 +31,7 @@ from failuretwin.app.commands.options import PATH, common_options
 )
 @click.option("--latex", type=PATH, metavar="FILE", help="Write the scores as LaTeX tables.")
 @click.option("--plot", type=PATH, metavar="DIR", help="Write a picture of the reliability.")
+@plugin_option
 @common_options
 def evaluate(
     results: Path,

@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from failuretwin.app.commands.options import PATH, LiveOptions, common_options, live_options
+from failuretwin.app.commands.options import (
+    PATH,
+    LiveOptions,
+    common_options,
+    live_options,
+    plugin_option,
+)
 
 if TYPE_CHECKING:
     from failuretwin.failure_behavior.injection import ScheduledFault
@@ -31,6 +37,7 @@ if TYPE_CHECKING:
     help="Record readings, commands and diagnoses; Foxglove, PlotJuggler and failuretwin read it.",
 )
 @live_options
+@plugin_option
 @common_options
 def watch(
     source: str,
@@ -99,6 +106,7 @@ the last fault has begun or been repaired [s]."""
     "until 20 s after the last fault has begun or been repaired, unless --duration says otherwise.",
 )
 @live_options
+@plugin_option
 @common_options
 def emulate(
     target: str,

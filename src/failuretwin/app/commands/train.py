@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from failuretwin.app.commands.options import PATH, common_options
+from failuretwin.app.commands.options import PATH, HypothesesOption, common_options, plugin_option
 
 
 @click.command()
@@ -31,16 +31,30 @@ from failuretwin.app.commands.options import PATH, common_options
     show_default=True,
     help="Batches of 64 runs to learn from.",
 )
+@click.option(
+    "--hypotheses",
+    cls=HypothesesOption,
+    metavar="H,...",
+    help="What the network tells apart, such as healthy,motor_2:stuck. Default: the paper's nine "
+    "classes.",
+)
+@plugin_option
 @common_options
 def train(
-    out: Path, calibration: Path | None, network: str, iterations: int, robot: str, seed: int
+    out: Path,
+    calibration: Path | None,
+    network: str,
+    iterations: int,
+    hypotheses: str | None,
+    robot: str,
+    seed: int,
 ) -> None:
     """Train a network on the imperfect twin, for `diagnose --method MODEL`.
 
     Runs come fresh from the generator, as various as real ones: no recorded failure is needed. Its
     probabilities are calibrated on simulated runs of the physics engine.
     """
-    from failuretwin.app.inputs import check_learning
+    from failuretwin.app.inputs import check_learning, told_hypotheses
     from failuretwin.app.tables import progress_bar
     from failuretwin.connection.calibration.result import robot_as_calibrated
     from failuretwin.data_knowledge.store import check_writable
@@ -59,7 +73,8 @@ def train(
     else:
         model = robot_as_calibrated(model, str(calibration))
         imperfections = load_imperfections(str(calibration), model)
-    plan = TrainingPlan(network, iterations, seed)
+    told = told_hypotheses(hypotheses, model)
+    plan = TrainingPlan(network, iterations, seed, hypotheses=told)
     with progress_bar("training", iterations) as advance:
         diagnoser, alone, both = train_network(plan, model, imperfections, lambda done: advance(1))
     save_network(diagnoser, out)

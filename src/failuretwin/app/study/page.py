@@ -27,10 +27,10 @@ from failuretwin.app.study.trainings import (
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.runs import AXES
 from failuretwin.core.types import FloatArray, IntArray, as_floats
-from failuretwin.data_knowledge.failure_modes import plain_name
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.explanation import plain_name
 
 if TYPE_CHECKING:
     import xarray as xr

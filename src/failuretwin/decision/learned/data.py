@@ -17,8 +17,9 @@ from failuretwin.decision.learned.features import Encoder, Floats, signals_of, s
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import FaultMode
-from failuretwin.failure_behavior.modes import MODES, SteadyStateError, Stuck
+from failuretwin.failure_behavior.modes import SteadyStateError, Stuck
 from failuretwin.failure_behavior.random_movements import RandomMovements
+from failuretwin.failure_behavior.registry import MODES
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -68,6 +69,8 @@ class Recipe:
         seed: Seed of all chance.
         variants: Kinds of runs, equally frequent.
         engine: What moves the robot; see `Plan`.
+        hypotheses: The classes; none: the paper's.
+        modes: Fault modes by id; a variant says how large the paper's are and when they begin.
     """
 
     robot: Robot
@@ -75,10 +78,12 @@ class Recipe:
     seed: int = 0
     variants: tuple[Variant, ...] = VARIANTS
     engine: str = "servo"
-    hypotheses: tuple[Hypothesis, ...] = field(init=False)
+    hypotheses: tuple[Hypothesis, ...] = ()
+    modes: Mapping[str, FaultMode] = field(default_factory=lambda: dict(MODES))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "hypotheses", paper_hypotheses(self.robot.motor_names))
+        if not self.hypotheses:
+            object.__setattr__(self, "hypotheses", paper_hypotheses(self.robot.motor_names))
 
     @property
     def movements(self) -> tuple[int, int]:
@@ -130,15 +135,14 @@ class Recipe:
             seed=self.seed,
             imperfections=self.imperfections,
             movements=RandomMovements(),
-            modes=_modes(variant),
+            modes={**self.modes, **_modes_of(variant)},
             engine=self.engine,
         )
 
 
-def _modes(variant: Variant) -> Mapping[str, FaultMode]:
+def _modes_of(variant: Variant) -> Mapping[str, FaultMode]:
     low, high = variant.error_counts
     return {
-        **MODES,
         "stuck": Stuck(onset_s=variant.onset_s),
         "steady_state_error": SteadyStateError(magnitude=(low * COUNT_RAD, high * COUNT_RAD)),
     }

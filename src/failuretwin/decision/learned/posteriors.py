@@ -11,8 +11,12 @@ import numpy as np
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import truth_of
 from failuretwin.core.types import FloatArray, IntArray
-from failuretwin.data_knowledge.failure_modes import failure_modes, plain_name
-from failuretwin.inference.explanation import percent, possible_hypotheses
+from failuretwin.inference.explanation import (
+    advice_lines,
+    percent,
+    plain_name,
+    possible_hypotheses,
+)
 from failuretwin.inference.log_quality import LogQuality, drop_invalid, log_quality
 
 if TYPE_CHECKING:
@@ -84,11 +88,7 @@ def _explanation(diagnosis: Diagnosis) -> tuple[str, ...]:
     if len(possible) > 1:
         names = " or ".join(plain_name(h) for h in possible)
         lines.append(f"cannot be told apart in this run: {names}")
-    for fault in possible[0].faults:
-        mode = failure_modes()[fault.mode]
-        lines.append(f"possible causes: {', '.join(mode.mechanisms)}")
-        lines.append(f"what to do: {mode.advice}")
-    return tuple(lines)
+    return (*lines, *advice_lines(possible[0]))
 
 
 def _possible(diagnosis: Diagnosis) -> Sequence[Hypothesis]:
