@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import UNKNOWN, Hypothesis, single_faults
+from failuretwin.failure_behavior.mode import FaultMode
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference import double_faults as pairs
 from failuretwin.inference.evidence import settled_evidence
@@ -172,6 +173,34 @@ def test_drifts_of_all_rates_and_both_signs_are_as_likely(likelihood):
     assert np.abs(size).max() == pytest.approx(high)
     assert mass @ size == pytest.approx(0.0, abs=1e-12)
     assert mass @ np.abs(size) == pytest.approx(0.5 * (low + high), rel=1e-6)
+
+
+@pytest.mark.parametrize("mode", ["encoder_bias", "encoder_scale", "drift", "torque_loss"])
+def test_offsets_are_those_of_the_simulated_motion(likelihood, mode):
+    """What a mode says of its offset is what its stages do to a motor that stands at its target."""
+    said, alone = MODES[mode], likelihood[3]
+    found = type("Asked", (type(said),), {"settled_offset": FaultMode.settled_offset})()
+    model = growing_offset_model if mode == "drift" else offset_model
+    expected, asked = model(alone, 1, said, 0.3), model(alone, 1, found, 0.3)
+    np.testing.assert_allclose(asked.angle, expected.angle, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(asked.size, expected.size, rtol=0.0, atol=1e-9)
+
+
+def test_an_offset_that_bends_with_its_size_is_asked_at_every_node(likelihood):
+    """A stop in the way at (1 - size) of 80 degrees: not in proportion to any amount."""
+
+    def stops(self, faults, reference, time):
+        limit = np.deg2rad(80.0) * (1.0 - faults.effect(time))
+        return np.clip(reference, -limit, limit)
+
+    kind = {"mode": "end_stop", "on_reference": stops, "sizes": (0.3, 0.95)}
+    stop = type("EndStop", (type(MODES["slow"]),), {**kind, "on_movements": FaultMode.on_movements})
+    found = offset_model(likelihood, 1, stop(), 0.3)
+    base = likelihood.outcomes.base[..., 1][:, :, None]
+    limit = np.deg2rad(80.0) * (1.0 - found.size[:, None, :, None])
+    settled = likelihood.profile(1).faulty_baseline[:, :, None]
+    expected = np.broadcast_to(np.clip(base, -limit, limit) - base, found.angle.shape)
+    np.testing.assert_allclose(found.angle - settled, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("mode", ["stuck", "encoder_bias", "drift"])

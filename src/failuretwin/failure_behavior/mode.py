@@ -224,15 +224,14 @@ class FaultMode(ABC):
         Returns:
             Of the shape of both.
         """
-        size, origin, target, sag = np.broadcast_arrays(
-            size, arrival.origin, arrival.target, arrival.sag
+        since = np.asarray(arrival.since_onset)
+        size, origin, target, sag, each = np.broadcast_arrays(
+            size, arrival.origin, arrival.target, arrival.sag, since
         )
-        shape, since = size.shape, arrival.since_onset
-        if np.size(since) > 1:
-            since = np.broadcast_to(since, shape)
+        shape, end = size.shape, max(float(since.max()), 1.0)
+        onset = end - (since if since.size == 1 else each)
         size, origin, target, sag = (x.reshape(-1, 1) for x in (size, origin, target, sag))
-        end = float(np.max(since))
-        faults = FaultGroup(size[:, 0], [Course(STEP, end - at) for at in np.ravel(since).tolist()])
+        faults = FaultGroup(size[:, 0], [Course(STEP, s) for s in np.ravel(onset).tolist()])
         time, nothing = np.array([0.0, 0.5 * end, end]), np.zeros_like(target)
         orders = MotorOrders(target, nothing, nothing, np.zeros(target.shape, dtype=bool))
         followed = self.on_movements(faults, orders)
@@ -304,6 +303,12 @@ class SignedMode(SizedMode):
     signed: ClassVar[bool] = True
 
     both_signs: bool = True
+
+    @property
+    def considered(self) -> Range:
+        """Lowest and highest magnitude that diagnosis considers, whatever their sign."""
+        low, high = self.magnitude
+        return self.sizes or (max(low, -high, 0.0), max(-low, high))
 
     def _draw_magnitude(self, rng: np.random.Generator) -> float:
         size = super()._draw_magnitude(rng)

@@ -145,16 +145,18 @@ def _arrival(
     return Arrival(target - direction * travel[..., None], target, direction, since_onset, load)
 
 
-def _by_node(arrival: Arrival) -> Arrival:
-    """Return the same with an axis for nodes, (run, movement, 1, outcome)."""
+def _by_node(arrival: Arrival, axes: int = 1) -> Arrival:
+    """Return the same with axes for nodes, (run, movement, 1, outcome)."""
     fields = (arrival.origin, arrival.target, arrival.direction, arrival.since_onset, arrival.sag)
-    return Arrival(*(x[:, :, None] if x.ndim == 3 else x for x in fields))
+    new = tuple(range(2, 2 + axes))
+    return Arrival(*(np.expand_dims(x, new) if x.ndim == 3 else x for x in fields))
 
 
 def _gain(mode: FaultMode, arrival: Arrival) -> FloatArray:
-    """Return the offset for each unit of amount at the smallest size, of the arrival's shape."""
-    low = np.array(mode.considered[0])
-    gain = mode.settled_offset(low, arrival) / mode.amount(low)
+    """Return the offset for each unit of amount at the smallest size above 0, of the arrival's shape."""
+    low, high = mode.considered
+    size = np.array(low or high)
+    gain = mode.settled_offset(size, arrival) / mode.amount(size)
     return np.array(np.broadcast_to(gain, arrival.target.shape))
 
 
@@ -215,7 +217,7 @@ def growing_offset_model(
     since = np.maximum(middle[:, :, None] - onset.reshape(runs, 1, -1), 0.0)
     # A node is an onset and a rate; each onset belongs to one movement that it spoils first.
     arrival = _arrival(likelihood, motor, mode, since[..., None, None])
-    arrival = _by_node(_by_node(arrival))  # (run, movement, onset, rate, outcome)
+    arrival = _by_node(arrival, axes=2)  # (run, movement, onset, rate, outcome)
     offset = mode.settled_offset(rate[:, None, None, :, None], arrival)
     own = np.repeat(np.eye(movements), onsets, axis=1)
     log_first = log_of(own) + log_onset.reshape(runs, 1, -1)
