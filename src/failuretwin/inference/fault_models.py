@@ -153,7 +153,7 @@ def _by_node(arrival: Arrival, axes: int = 1) -> Arrival:
 
 
 def _gain(mode: FaultMode, arrival: Arrival) -> FloatArray:
-    """Return the offset for each unit of amount at the smallest size above 0, of the arrival's shape."""
+    """Return the offset for each unit of amount, at the smallest size above 0."""
     low, high = mode.considered
     size = np.array(low or high)
     gain = mode.settled_offset(size, arrival) / mode.amount(size)
