@@ -86,7 +86,7 @@ def shows_in_transients(hypothesis: Hypothesis) -> bool:
 
 def prior_odds(hypothesis: Hypothesis) -> float:
     """Return the odds of a hypothesis against healthy; faults of several motors multiply."""
-    return math.prod(MODES[fault.mode].prior_odds for fault in hypothesis.faults)
+    return math.prod((MODES[fault.mode].prior_odds for fault in hypothesis.faults), start=1.0)
 
 
 def log_prior(hypotheses: Sequence[Hypothesis], priors: Priors) -> FloatArray:
