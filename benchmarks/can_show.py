@@ -144,7 +144,7 @@ class CanShow:
             movements=many,
             truth=Truth(
                 [str(fault.fault)] * count,
-                [{"faults": [value.detail()]}] * count,
+                [{"faults": [value.detail("rad")]}] * count,
                 np.full(count, onset),
                 np.full(count, np.nan),
             ),

@@ -31,7 +31,8 @@ from failuretwin.decision.metrics import (
 )
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.failure_behavior.fault import FaultValue
-from failuretwin.failure_behavior.modes import MODES, SteadyStateError, Stuck
+from failuretwin.failure_behavior.modes import SteadyStateError, Stuck
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.onset import OnsetPrior
 from failuretwin.inference.posterior import marginal_likelihood_of

@@ -27,7 +27,7 @@ from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import FaultMode
-from failuretwin.failure_behavior.modes import MODES
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.expected_bayes_factors import expected_log_bayes_factors
 
 SEPARABLE_NATS = 5.0

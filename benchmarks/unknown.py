@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import ClassVar
 from unittest.mock import patch
@@ -43,13 +44,14 @@ from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.fault import FaultGroup
 from failuretwin.failure_behavior.mode import Range, SizedMode
-from failuretwin.failure_behavior.modes import register
+from failuretwin.failure_behavior.registry import register_mode
 from failuretwin.inference.expected_bayes_factors import (
     ExpectedLogBayesFactor,
     expected_log_bayes_factors,
     truth_and_faults,
 )
-from failuretwin.inference.posterior import DIAGNOSABLE_MODES
+from failuretwin.inference.posterior import unlisted as unlisted_in_full
+from failuretwin.inference.run_likelihood import RunLikelihood
 
 FOREIGN_NATS = 5.0
 DISTANCES = (FOREIGN_NATS, 15.0, 40.0, np.inf)
@@ -74,6 +76,7 @@ class Eccentric(SizedMode):
     """A gear runs eccentrically: the motor is off by so much [rad], back and forth twice a turn."""
 
     mode: ClassVar[str] = "eccentric"
+    unit: ClassVar[str] = "rad"
 
     magnitude: Range = (0.05, 0.2)
 
@@ -89,6 +92,7 @@ class EndStop(SizedMode):
     """Something is in the way: the motor loses this share of its 80 degrees to either side."""
 
     mode: ClassVar[str] = "end_stop"
+    unit: ClassVar[str] = "ratio"
     highest: ClassVar[float] = 1.0
 
     magnitude: Range = (0.6, 0.95)
@@ -110,8 +114,8 @@ def main() -> None:
     parser.add_argument("--engine", default="servo", help="what moves the arm")
     parser.add_argument("--forget", action="store_true", help="the law of the mode that is true")
     options = parser.parse_args()
-    register(Eccentric(), "rad")
-    register(EndStop(), "ratio")
+    register_mode(Eccentric())
+    register_mode(EndStop())
     robot = ft.load_robot("armpi_fpv")
     healthy = load_calibration("armpi_fpv", robot).imperfections
     twin, nine = ft.DigitalTwin(robot), paper_hypotheses(robot.motor_names)
@@ -122,8 +126,9 @@ def main() -> None:
         per_class = -(-options.runs // len(true))
         plan = ft.Plan(robot, true, per_class, options.seed, healthy, engine=options.engine)
         runs = ft.simulate(plan)
-        known_laws = tuple(mode for mode in DIAGNOSABLE_MODES if mode != name or not options.forget)
-        with patch("failuretwin.inference.posterior.DIAGNOSABLE_MODES", known_laws):
+        forgotten = name in ALIEN or options.forget
+        others = partial(_other_hypotheses, name if forgotten else "")
+        with patch("failuretwin.inference.posterior.unlisted", others):
             said = np.array([_kind(d) for d in diagnoser.diagnose(runs)])
         nats_ahead = ahead(diagnoser, runs, nine, healthy)
         tell(name, said, nats_ahead >= FOREIGN_NATS)
@@ -135,6 +140,14 @@ def main() -> None:
         tell(f"  {low:g} to {high:g} nats", said, (nats_ahead >= low) & (nats_ahead < high))
     plan = ft.Plan(robot, nine, options.known, options.seed, healthy, engine=options.engine)
     tell_loss(ft.simulate(plan), diagnoser)
+
+
+def _other_hypotheses(
+    forgotten: str, likelihood: RunLikelihood, known: Sequence[Hypothesis]
+) -> list[Hypothesis]:
+    """Return the single faults that are not offered, but for those of a mode that is forgotten."""
+    others = unlisted_in_full(likelihood, known)
+    return [h for h in others if h.faults[0].mode != forgotten]
 
 
 def _kind(diagnosis: Diagnosis) -> str:
@@ -180,7 +193,7 @@ def ahead(
 ) -> FloatArray:
     """Return by how much the truth of each run beats the nearest of the nine, (run,) [nats]."""
     truth, faults = truth_and_faults(runs)
-    if len(truth[0].faults) == 1 and truth[0].faults[0].mode in DIAGNOSABLE_MODES:
+    if len(truth[0].faults) == 1 and truth[0].faults[0].mode not in ALIEN:
         return expected_log_bayes_factors(diagnoser.twin, runs, healthy, nine).nearest
     # Two faults, or one without a law, explain it exactly: densities are relative to that.
     judge = ExpectedLogBayesFactor(diagnoser.healthy_model, tuple(nine), diagnoser.priors)

@@ -26,7 +26,8 @@ from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import loads_in_range
-from failuretwin.failure_behavior.modes import MODES, SteadyStateError
+from failuretwin.failure_behavior.modes import SteadyStateError
+from failuretwin.failure_behavior.registry import MODES
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.twin import DigitalTwin
+    from failuretwin.failure_behavior.mode import FaultMode, SizedMode
+    from failuretwin.failure_behavior.registry import register_mode
     from failuretwin.inference.diagnoser import BayesDiagnoser
     from failuretwin.inference.isolability import isolability
     from failuretwin.inference.priors import Priors
@@ -25,31 +27,37 @@ __version__ = "0.1.0"
 _HOME = {
     "BayesDiagnoser": "inference.diagnoser",
     "DigitalTwin": "digital_model.twin",
+    "FaultMode": "failure_behavior.mode",
     "InputError": "core.errors",
     "Plan": "data_knowledge.generate",
     "Priors": "inference.priors",
     "ReadOptions": "data_knowledge.read",
+    "SizedMode": "failure_behavior.mode",
     "StreamingDiagnoser": "decision.streaming.diagnoser",
     "isolability": "inference.isolability",
     "iterate": "data_knowledge.generate",
     "load_robot": "digital_model.robot",
     "read_runs": "data_knowledge.read",
+    "register_mode": "failure_behavior.registry",
     "simulate": "data_knowledge.generate",
 }
 
 __all__ = [
     "BayesDiagnoser",
     "DigitalTwin",
+    "FaultMode",
     "InputError",
     "Plan",
     "Priors",
     "ReadOptions",
+    "SizedMode",
     "StreamingDiagnoser",
     "__version__",
     "isolability",
     "iterate",
     "load_robot",
     "read_runs",
+    "register_mode",
     "simulate",
 ]
 

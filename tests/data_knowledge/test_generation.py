@@ -11,7 +11,6 @@ import xarray as xr
 from failuretwin import load_robot
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import (
-    MAGNITUDE_UNITS,
     UNKNOWN,
     Hypothesis,
     paper_hypotheses,
@@ -20,7 +19,7 @@ from failuretwin.core.runs import check_runs
 from failuretwin.data_knowledge import generate as generation
 from failuretwin.data_knowledge.generate import Plan, iterate, simulate, simulate_runs
 from failuretwin.digital_model.calibrated_robot import load_calibration
-from failuretwin.failure_behavior.modes import MODES
+from failuretwin.failure_behavior.registry import MODES
 
 BOTH = pytest.mark.parametrize("imperfections", ["none", "armpi_fpv"])
 VALUES = ("command", "measured", "position")
@@ -235,7 +234,9 @@ def test_plan_that_cannot_be_made_is_refused(plan_of, changes, message):
 
 def test_mode_that_cannot_be_simulated_names_those_that_can(plan_of, armpi):
     modes = {name: MODES[name] for name in ("stuck", "steady_state_error")}
-    with pytest.raises(InputError, match=r"'backlash' cannot .* one of stuck, steady_state_error"):
+    with pytest.raises(
+        InputError, match=r"unknown fault mode 'backlash'.* stuck, steady_state_error"
+    ):
         replace(plan_of(), hypotheses=parse("motor_1:backlash", armpi), modes=modes)
 
 
@@ -248,12 +249,12 @@ def test_torque_loss_is_refused_where_nothing_gives_way(plan_of, armpi, imperfec
 
 
 def test_all_modes_can_be_simulated_with_all_imperfections(plan_of, armpi):
-    faults = ",".join(f"motor_3:{mode}" for mode in MAGNITUDE_UNITS)
+    faults = ",".join(f"motor_3:{mode}" for mode in MODES)
     runs = simulate(plan_of("armpi_fpv", 1, hypotheses=parse(faults, armpi)))
     assert runs["fault"].values.tolist() == faults.split(",")
     assert np.isfinite(runs["magnitude"].values).all()
     modes = json.loads(runs.attrs["configuration"])["modes"]
-    assert list(modes) == list(MAGNITUDE_UNITS)
+    assert list(modes) == list(MODES)
     assert modes["lag"]["magnitude"] == [0.1, 0.3]
 
 

@@ -15,7 +15,8 @@ from failuretwin.core.movements import Movements
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.nonidealities import Imperfections, Readings
 from failuretwin.digital_model.settling import Settling
-from failuretwin.failure_behavior.modes import MODES, SteadyStateError
+from failuretwin.failure_behavior.modes import SteadyStateError
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.expected_bayes_factors import (
     ExpectedLogBayesFactor,
     expected_distance_factor,

@@ -7,21 +7,20 @@ from hypothesis import strategies as st
 
 from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import UNKNOWN, Hypothesis, single_faults
+from failuretwin.failure_behavior.mode import FaultMode
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference import double_faults as pairs
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.fault_models import (
-    AMOUNTS,
-    constant_fault_model,
-    drift_model,
-    lag_model,
+    growing_offset_model,
+    offset_model,
     offset_nodes,
+    redrawn_offset_model,
     size_nodes,
-    slow_model,
-    steady_state_error_model,
+    transient_model,
 )
 from failuretwin.inference.onset import OnsetPrior
 from failuretwin.inference.posterior import (
-    DIAGNOSABLE_MODES,
     marginal_likelihood_of,
     marginal_likelihoods,
 )
@@ -37,15 +36,19 @@ FAULT_MODELS = {
     "stuck at a known time": lambda likelihood, early: stuck_model(
         likelihood, 1, OnsetPrior(known_s=2.3)
     ),
-    "steady_state_error": lambda likelihood, early: steady_state_error_model(
-        likelihood, 1, RANGES, early
+    "steady_state_error": lambda likelihood, early: redrawn_offset_model(
+        likelihood, 1, MODES["steady_state_error"], RANGES, early
     ),
-    "drift": lambda likelihood, early: drift_model(likelihood, 1, early),
-    "lag": lambda likelihood, early: lag_model(likelihood, 1, early),
-    "slow": lambda likelihood, early: slow_model(likelihood, 1, early),
+    "drift": lambda likelihood, early: growing_offset_model(likelihood, 1, MODES["drift"], early),
     **{
-        mode: lambda likelihood, early, mode=mode: constant_fault_model(likelihood, 1, mode, early)
-        for mode in AMOUNTS
+        name: lambda likelihood, early, mode=MODES[name]: transient_model(
+            likelihood, 1, mode, early
+        )
+        for name in ("lag", "slow")
+    },
+    **{
+        name: lambda likelihood, early, mode=MODES[name]: offset_model(likelihood, 1, mode, early)
+        for name in ("encoder_bias", "encoder_scale", "backlash", "torque_loss")
     },
 }
 
@@ -110,7 +113,7 @@ def test_onsets_lie_in_the_run(likelihood, fault_model):
 
 @pytest.mark.parametrize(
     "hypothesis",
-    [*single_faults(MOTORS[1:2], DIAGNOSABLE_MODES), UNKNOWN,
+    [*single_faults(MOTORS[1:2], MODES), UNKNOWN,
      Hypothesis.parse("motor_2:encoder_bias+motor_3:stuck"),
      Hypothesis.parse("motor_1:drift+motor_4:steady_state_error")],
     ids=str,
@@ -165,13 +168,13 @@ def test_errors_are_as_likely_within_each_range(ranges):
 
 def test_a_motor_that_lost_torque_sags_as_its_stiffness_is_left():
     """Load over stiffness: of a share s lost, 1 / (1 - s) times as far, which is so much more."""
-    amount, share = AMOUNTS["torque_loss"], np.linspace(0.0, 0.9, 10)
-    np.testing.assert_allclose(amount.of_size(share), 1.0 / (1.0 - share) - 1.0)
-    np.testing.assert_allclose(amount.to_size(amount.of_size(share)), share, atol=1e-12)
+    weak, share = MODES["torque_loss"], np.linspace(0.0, 0.9, 10)
+    np.testing.assert_allclose(weak.amount(share), 1.0 / (1.0 - share) - 1.0)
+    np.testing.assert_allclose(weak.size_of(weak.amount(share)), share, atol=1e-12)
 
 
 def test_drifts_of_all_rates_and_both_signs_are_as_likely(likelihood):
-    fault_model = drift_model(likelihood, 0, 0.6)
+    fault_model = growing_offset_model(likelihood, 0, MODES["drift"], 0.6)
     mass = np.exp(fault_model.log_prior[0]).sum(axis=0)
     low, high = 0.005, 0.06
     size = fault_model.size[0]
@@ -179,6 +182,34 @@ def test_drifts_of_all_rates_and_both_signs_are_as_likely(likelihood):
     assert np.abs(size).max() == pytest.approx(high)
     assert mass @ size == pytest.approx(0.0, abs=1e-12)
     assert mass @ np.abs(size) == pytest.approx(0.5 * (low + high), rel=1e-6)
+
+
+@pytest.mark.parametrize("mode", ["encoder_bias", "encoder_scale", "drift", "torque_loss"])
+def test_offsets_are_those_of_the_simulated_motion(likelihood, mode):
+    """What a mode says of its offset is what its stages do to a motor that stands at its target."""
+    said, alone = MODES[mode], likelihood[3]
+    found = type("Asked", (type(said),), {"settled_offset": FaultMode.settled_offset})()
+    model = growing_offset_model if mode == "drift" else offset_model
+    expected, asked = model(alone, 1, said, 0.3), model(alone, 1, found, 0.3)
+    np.testing.assert_allclose(asked.angle, expected.angle, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(asked.size, expected.size, rtol=0.0, atol=1e-9)
+
+
+def test_an_offset_that_bends_with_its_size_is_asked_at_every_node(likelihood):
+    """A stop in the way at (1 - size) of 80 degrees: not in proportion to any amount."""
+
+    def stops(self, faults, reference, time):
+        limit = np.deg2rad(80.0) * (1.0 - faults.effect(time))
+        return np.clip(reference, -limit, limit)
+
+    kind = {"mode": "end_stop", "on_reference": stops, "sizes": (0.3, 0.95)}
+    stop = type("EndStop", (type(MODES["slow"]),), {**kind, "on_movements": FaultMode.on_movements})
+    found = offset_model(likelihood, 1, stop(), 0.3)
+    base = likelihood.outcomes.base[..., 1][:, :, None]
+    limit = np.deg2rad(80.0) * (1.0 - found.size[:, None, :, None])
+    settled = likelihood.profile(1).faulty_baseline[:, :, None]
+    expected = np.broadcast_to(np.clip(base, -limit, limit) - base, found.angle.shape)
+    np.testing.assert_allclose(found.angle - settled, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("mode", ["stuck", "encoder_bias", "drift"])

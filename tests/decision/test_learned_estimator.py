@@ -10,13 +10,14 @@ from sklearn.model_selection import cross_val_score
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.decision.learned import training_data as stream_module
 from failuretwin.decision.learned.diagnoser import LearnedDiagnoser, best_temperature, probabilities
 from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of, signals_of
 from failuretwin.decision.learned.networks import Standard
 from failuretwin.decision.learned.training_data import CHUNK_RUNS, Stream, TrainingData
+from user_modes import code_on_the_page, registered_from
 
 
 @parametrize_with_checks([LearnedDiagnoser(iterations=60, learning_rate=5e-3, random_state=0)])
@@ -174,6 +175,21 @@ def test_fresh_runs_come_from_other_processes_in_order(stream, encoder, monkeypa
         expected = stream.data.chunk(number, 48, encoder)
         np.testing.assert_array_equal(features, expected[0])
         np.testing.assert_array_equal(classes, expected[1])
+
+
+def test_a_mode_of_ones_own_is_learned_in_other_processes_too(
+    armpi, measured_armpi, encoder, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(stream_module, "CHUNK_RUNS", 24)
+    with registered_from(code_on_the_page(), tmp_path, "shaft_to_learn"):
+        states = parse_hypotheses(["healthy", "motor_2:bent_shaft"], armpi.motor_names)
+        recipe = TrainingData(armpi, measured_armpi, 3, hypotheses=states)
+        with Stream(recipe, encoder, batch_runs=12).chunks() as chunks:
+            features, classes = next(chunks)
+        expected, order = recipe.chunk(0, 24, encoder)
+    np.testing.assert_array_equal(features, expected)
+    np.testing.assert_array_equal(classes, order)
+    assert set(classes) == {0, 1}
 
 
 def test_learning_from_a_stream_is_repeatable(stream, encoder, runs):

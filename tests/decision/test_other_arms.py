@@ -17,12 +17,12 @@ from failuretwin.digital_model.nonidealities import (
     Readings,
     generic_imperfections,
 )
-from failuretwin.failure_behavior.modes import MODES, SteadyStateError
+from failuretwin.failure_behavior.modes import SteadyStateError
 from failuretwin.failure_behavior.random_movements import RandomMovements
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference import diagnoser as bayes
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.posterior import DIAGNOSABLE_MODES
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 KINDS = {
@@ -62,10 +62,10 @@ def test_bundled_arms_are_diagnosed(name, kind):
 def test_any_mode_can_be_weighed_in_short_runs(armpi, twin, kind, count):
     """All hypotheses, `unknown` too; of a single movement hardly any can be told from others."""
     imperfections = KINDS[kind](armpi)
-    modes = [mode for mode in DIAGNOSABLE_MODES if mode != "torque_loss"]
+    modes = [mode for mode in MODES if mode != "torque_loss"]
     faults = single_faults(["motor_2"], modes)
     plan = Plan(armpi, faults, 1, 3, imperfections, RandomMovements(count=count))
-    weighed = (*single_faults(["motor_2", "motor_3"], DIAGNOSABLE_MODES), UNKNOWN)
+    weighed = (*single_faults(["motor_2", "motor_3"], MODES), UNKNOWN)
     check(BayesDiagnoser(twin, imperfections, weighed).diagnose(simulate(plan)))
 
 

@@ -80,7 +80,10 @@ def test_a_second_fault_that_cannot_show_changes_nothing(twin, imperfect, monkey
     from failuretwin.inference.marginal import FaultModel
     from failuretwin.inference.onset import immediate
 
-    def nothing(likelihood, motor, priors):
+    def nothing(likelihood, fault, priors):
+        motor = weighing.motor_of(likelihood, fault)
+        if fault.mode != other:
+            return real(likelihood, fault, priors)
         stretches = immediate(likelihood.evidence)
         return FaultModel(
             motor=motor,
@@ -95,7 +98,8 @@ def test_a_second_fault_that_cannot_show_changes_nothing(twin, imperfect, monkey
     likelihood = RunLikelihood(settled_evidence(runs), BayesDiagnoser(twin).healthy_model)
     priors = Priors(onset=OnsetPrior(prior_before_run=0.5))
     single = marginal_likelihood_of(likelihood, Hypothesis.parse(f"motor_1:{one}"), priors)
-    monkeypatch.setattr(weighing, "FAULT_MODELS", {**weighing.FAULT_MODELS, other: nothing})
+    real = weighing.fault_model_of
+    monkeypatch.setattr(weighing, "fault_model_of", nothing)
     both = Hypothesis.parse(f"motor_1:{one}+motor_4:{other}")
     pair = marginal_likelihood_of(likelihood, both, priors)
     # Scales do not explain the errors of the second run: in far tails a parabola is a rough one.

@@ -15,7 +15,7 @@ from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.failure_behavior.fault import STEP
-from failuretwin.failure_behavior.modes import MODES
+from failuretwin.failure_behavior.registry import MODES
 
 RUNS = 12
 """Runs for each motor."""
@@ -173,5 +173,5 @@ def test_verdicts_name_motor_and_mode(study):
             continue
         (fault,) = Hypothesis.parse(d.truth).faults
         assert fault.motor.replace("_", " ") in d.verdict
-        assert d.magnitude_unit == fault.magnitude_unit
+        assert d.magnitude_unit == MODES[fault.mode].unit
         assert d.magnitude_90[0] <= d.magnitude <= d.magnitude_90[1]

@@ -5,21 +5,23 @@ import pytest
 
 from failuretwin.core.hypothesis import (
     HEALTHY,
-    MAGNITUDE_UNITS,
     UNKNOWN,
     Diagnosis,
     Fault,
     Hypothesis,
     MovementEvidence,
 )
+from failuretwin.failure_behavior.mode import FaultMode
+from failuretwin.failure_behavior.modes import EncoderBias
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.explanation import (
     explanation,
     percent,
+    plain_name,
     possible_hypotheses,
     size_words,
     verdict,
 )
-from failuretwin.inference.posterior import DIAGNOSABLE_MODES
 
 SIZED = {
     "stuck": (np.deg2rad(-12.3), "motor 3 stuck at -12 deg since 2.5 s, 98 % sure"),
@@ -60,19 +62,19 @@ def single(mode):
 @pytest.mark.parametrize("mode", SIZED)
 def test_verdicts_say_motor_size_onset_and_how_sure(mode):
     size, expected = SIZED[mode]
-    unit = MAGNITUDE_UNITS[mode]
+    unit = MODES[mode].unit
     assert told(single(mode), onset_s=2.5, magnitude=size, magnitude_unit=unit) == expected
 
 
 def test_every_mode_has_its_words():
-    assert set(SIZED) == set(DIAGNOSABLE_MODES)
+    assert set(SIZED) == set(MODES)
 
 
 @pytest.mark.parametrize("onset_s", [0.0, 0.04])
 @pytest.mark.parametrize("mode", SIZED)
 def test_what_was_there_before_the_run_has_no_time(mode, onset_s):
     size, expected = SIZED[mode]
-    got = told(single(mode), onset_s=onset_s, magnitude=size, magnitude_unit=MAGNITUDE_UNITS[mode])
+    got = told(single(mode), onset_s=onset_s, magnitude=size, magnitude_unit=MODES[mode].unit)
     before = " since before the run" if mode == "stuck" else ""
     assert got == expected.replace(" since 2.5 s", before)
 
@@ -89,8 +91,14 @@ def test_what_was_there_before_the_run_has_no_time(mode, onset_s):
     ],
 )
 def test_size_and_unit_of_a_registered_mode_are_told_alike(monkeypatch, unit, size, words):
-    monkeypatch.setitem(MAGNITUDE_UNITS, "bent_shaft", unit)
+    mode = type("BentShaft", (EncoderBias,), {"unit": unit, "size_words": FaultMode.size_words})()
+    monkeypatch.setattr("failuretwin.inference.explanation.MODES", {"bent_shaft": mode})
     assert size_words(Fault("motor_3", "bent_shaft"), size) == words
+
+
+def test_a_mode_without_words_is_told_by_its_id():
+    shaft = Hypothesis.parse("motor_3:bent_shaft+motor_4:drift")
+    assert plain_name(shaft) == "motor 3 bent shaft and motor 4 drifts"
 
 
 def test_a_motor_held_near_zero_is_told_without_a_sign():

@@ -1,21 +1,15 @@
 from __future__ import annotations
 
-import importlib.util
-import re
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from failuretwin.core.hypothesis import MAGNITUDE_UNITS, Fault, Hypothesis
+from failuretwin.core.hypothesis import Fault, Hypothesis
 from failuretwin.data_knowledge.generate import Plan, simulate_runs
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfections
 from failuretwin.digital_model.settling import Settling
-from failuretwin.failure_behavior.modes import MODES
 from failuretwin.failure_behavior.random_movements import RandomMovements
+from user_modes import code_on_the_page, registered_from
 
-PAGE = Path(__file__).parents[2] / "docs" / "fault_modes.md"
 ZERO = (0.0,) * 4
 
 
@@ -29,20 +23,8 @@ def sagging():
 @pytest.fixture(scope="module")
 def template(tmp_path_factory):
     """The mode that the page on fault modes offers for copying, registered for this module."""
-    text = PAGE.read_text("utf-8").partition("## A mode of your own")[2]
-    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    path = tmp_path_factory.mktemp("template") / "mode_from_the_page.py"
-    path.write_text(code)
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = sys.modules[path.stem] = importlib.util.module_from_spec(spec)
-    modes, units = dict(MODES), dict(MAGNITUDE_UNITS)
-    spec.loader.exec_module(module)
-    (name,) = MODES.keys() - modes.keys()
-    yield MODES[name]
-    for registry, before in ((MODES, modes), (MAGNITUDE_UNITS, units)):
-        registry.clear()
-        registry.update(before)
-    del sys.modules[path.stem]
+    with registered_from(code_on_the_page(), tmp_path_factory.mktemp("template")) as mode:
+        yield mode
 
 
 @pytest.fixture(scope="session")

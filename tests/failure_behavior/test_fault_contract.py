@@ -9,18 +9,22 @@ import numpy as np
 import pytest
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import HEALTHY, MAGNITUDE_UNITS
+from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.data_knowledge.generate import Plan, simulate_runs
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
-from failuretwin.failure_behavior.fault import PROFILES
-from failuretwin.failure_behavior.modes import MODES, Drift
+from failuretwin.failure_behavior.fault import PROFILES, Arrival
+from failuretwin.failure_behavior.mode import Signature
+from failuretwin.failure_behavior.modes import Drift
+from failuretwin.failure_behavior.registry import MODES
 
 TIME = np.arange(1000) * 0.01
 STARTS = 2.0 * np.arange(5)
+ENDS = np.arange(200, 1001, 200) - 1
+"""Last samples of the five plateaus."""
 FROM_PAGE = "bent_shaft"
 ALLOWED = {
     **{name: mode.allowed_profiles for name, mode in MODES.items()},
-    FROM_PAGE: ("step", "ramp"),
+    FROM_PAGE: PROFILES,
 }
 ON_MOVEMENTS = ("steady_state_error", "slow", "lost_commands")
 """Modes that take the severity when a movement starts and keep it until the next one."""
@@ -101,7 +105,7 @@ def test_truth_has_the_declared_unit_and_all_parameters(mode, simulate):
     for i, detail in enumerate(details(runs)):
         assert json.loads(json.dumps(detail, allow_nan=False)) == detail
         assert (detail["motor"], detail["mode"]) == ("motor_2", mode.mode)
-        assert detail["unit"] == MAGNITUDE_UNITS[mode.mode]
+        assert detail["unit"] == mode.unit
         assert detail["onset_s"] == runs.truth.onset[i]
         assert detail["magnitude"] == runs.truth.magnitude[i]
         assert 1.0 <= detail["onset_s"] <= 4.0
@@ -158,6 +162,36 @@ def test_intermittent_comes_and_goes(mode, simulate, profile):
         quiet += np.count_nonzero(well_after & (detail["onset_s"] <= TIME))
     assert worst[False] < 1e-3 * worst[True]
     assert quiet > 1000
+
+
+def test_a_motor_settles_where_diagnosis_expects_it(mode, runs_of, sagging):
+    """At the end of movements farther than any play; of modes that hold it, of the first one."""
+    size = {"slow": 0.2, "intermittent": 1.0, "lost_commands": 1.0}.get(mode.mode)
+    shape = "step" if "step" in mode.allowed_profiles else "intermittent"
+    chosen = replace(mode, profiles=(shape,), onset_s=(0.0, 0.0))
+    settling = replace(sagging.settling, compliance=(0.05,) * 4)  # so stiff that loads stay
+    world = replace(sagging, settling=settling) if mode.needs_compliance else NO_IMPERFECTIONS
+    runs = runs_of(sized(chosen, size) if size else chosen, imperfections=world, count=20)
+    healthy = runs_of(imperfections=world, count=20)
+    origin = np.stack([run[ENDS - 200, 1] for run in runs.command])
+    origin[:, 0], target = 0.0, runs.command[:, ENDS, 1]
+    arrival = Arrival(
+        origin,
+        target,
+        np.sign(target - origin),
+        TIME[ENDS] + 0.01,
+        (healthy.position - healthy.command)[:, ENDS, 1],
+    )
+    said = [detail.get("offset_rad", detail["magnitude"]) for detail in details(runs)]
+    size = np.reshape(said, (len(said), -1)).astype(float)
+    expected = np.broadcast_to(mode.settled_offset(size, arrival), target.shape)
+    found = (runs.position - healthy.position)[:, ENDS, 1]
+    far = np.abs(target - origin) > 0.15
+    if mode.signature in (Signature.HELD, Signature.MISSED):
+        far[:, 1:] = False
+    assert far.sum() >= 6
+    np.testing.assert_allclose(found[far], expected[far], rtol=0.05, atol=1e-3)
+    assert (np.abs(expected[far]) > 0.01).any() == (mode.signature is not Signature.TRANSIENT)
 
 
 def test_profiles_that_make_no_sense_are_refused(mode):

@@ -12,7 +12,8 @@ from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from failuretwin.failure_behavior.fault import Course, FaultValue
 from failuretwin.failure_behavior.injection import Injection
-from failuretwin.failure_behavior.modes import MODES, SteadyStateError, Stuck
+from failuretwin.failure_behavior.modes import SteadyStateError, Stuck
+from failuretwin.failure_behavior.registry import MODES
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 TIME = np.arange(300) * 0.01
@@ -115,9 +116,9 @@ def test_what_only_the_motion_tells_joins_the_truth(injection, movements, positi
     assert healthy == []
     assert stuck[0].magnitude == position[1, 50, 2]
     assert error[0].magnitude == pytest.approx(np.sqrt(np.mean(ERROR**2)))
-    assert error[0].detail()["offset_rad"] == ERROR.tolist()
+    assert error[0].detail("rad")["offset_rad"] == ERROR.tolist()
     assert [value.magnitude for value in several] == [0.5, 0.25, 0.2]
-    assert several[0].detail()["lost"] == [True, False, True]
+    assert several[0].detail("ratio")["lost"] == [True, False, True]
 
 
 @pytest.mark.parametrize("imperfections", ["none", "armpi_fpv"])

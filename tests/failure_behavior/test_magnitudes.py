@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
-from failuretwin.failure_behavior.modes import MODES
+from failuretwin.failure_behavior.registry import MODES
 
 ENDS = np.arange(200, 1001, 200) - 1
 """Last samples of the five plateaus."""

@@ -14,7 +14,6 @@ from failuretwin.digital_model.settling import hold
 from failuretwin.failure_behavior.fault import Course, FaultGroup, FaultValue
 from failuretwin.failure_behavior.mode import MotorOrders
 from failuretwin.failure_behavior.modes import (
-    MODES,
     Backlash,
     Drift,
     EncoderBias,
@@ -23,6 +22,7 @@ from failuretwin.failure_behavior.modes import (
     SteadyStateError,
     Stuck,
 )
+from failuretwin.failure_behavior.registry import MODES
 
 COUNT = np.deg2rad(0.24)
 FREEZE = 49
@@ -79,7 +79,7 @@ def test_stuck_draws_no_magnitude():
     fault = Stuck().draw("motor_3", 5, 10.0, np.random.default_rng(0))
     assert str(fault.fault) == "motor_3:stuck"
     assert np.isnan(fault.magnitude)
-    assert fault.detail()["magnitude"] is None
+    assert fault.detail("rad")["magnitude"] is None
 
 
 def test_steady_state_errors_are_those_of_the_paper():

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import re
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import MAGNITUDE_UNITS
-from failuretwin.failure_behavior.modes import MODES, Drift, Lag, Stuck, load_modes, register
+from failuretwin.failure_behavior import registry
+from failuretwin.failure_behavior.modes import Drift, Lag, Stuck
+from failuretwin.failure_behavior.registry import MODES, load_modes, register_mode
+from user_modes import code_on_the_page, registered_from
 
 PAGE = Path(__file__).parents[2] / "docs" / "fault_modes.md"
 
 
 @pytest.fixture(scope="module")
 def page():
-    return PAGE.read_text("utf-8")
+    return PAGE.read_text("utf-8").partition("## A mode of your own")[0]
 
 
 @pytest.fixture
@@ -29,8 +32,7 @@ def load(tmp_path):
     return load
 
 
-def test_every_mode_with_a_unit_can_be_simulated():
-    assert list(MODES) == list(MAGNITUDE_UNITS)
+def test_modes_go_by_their_ids():
     assert all(name == mode.mode for name, mode in MODES.items())
 
 
@@ -89,7 +91,29 @@ def test_bad_files_are_refused_by_name(load, text, message):
 
 
 def test_a_name_is_given_once():
-    before = dict(MODES), dict(MAGNITUDE_UNITS)
-    with pytest.raises(InputError, match="'lag' already"):
-        register(Lag(), "s")
-    assert before == (MODES, MAGNITUDE_UNITS)
+    before = dict(MODES)
+    with pytest.raises(InputError, match="there is a fault mode 'lag' already"):
+        register_mode(Lag())
+    assert before == MODES
+
+
+def test_an_installed_package_makes_its_modes_known(monkeypatch, tmp_path):
+    """By an entry point of the group `failuretwin.modes`, read once, with the first mode."""
+    name = "installed_shafts"
+    (tmp_path / f"{name}.py").write_text(code_on_the_page().replace("bent_shaft", "bent_axle"))
+    monkeypatch.syspath_prepend(tmp_path)
+    entry = EntryPoint("axles", name, "failuretwin.modes")
+    found = []
+    monkeypatch.setattr(registry, "entry_points", lambda group: found.append(group) or [entry])
+    fresh = registry.ModeRegistry()
+    monkeypatch.setattr(registry, "MODES", fresh)
+    assert found == []
+    assert list(fresh) == [*MODES, "bent_axle"]
+    assert fresh["bent_axle"].unit == "rad"
+    assert found == ["failuretwin.modes"]
+
+
+def test_a_module_that_is_run_again_replaces_its_mode(tmp_path):
+    with registered_from(code_on_the_page(), tmp_path, "run_again") as mode:
+        register_mode(type(mode)(magnitude=(0.1, 0.2)))
+        assert MODES[mode.mode].magnitude == (0.1, 0.2)

@@ -26,7 +26,7 @@ from failuretwin.decision.streaming.diagnoser import monitor
 from failuretwin.decision.streaming.fleet import StreamingFleet
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import LostCommand, Readings, generic_imperfections
-from failuretwin.failure_behavior.modes import MODES
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference import diagnoser as bayes
 from failuretwin.inference import posterior as posterior
 from failuretwin.inference.evidence import Evidence

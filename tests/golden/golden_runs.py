@@ -36,7 +36,9 @@ def simulated(hypotheses, imperfections, seed, each=1, arm="armpi_fpv", **modes)
     robot = twin(arm).robot
     states = parse_hypotheses(hypotheses, robot.motor_names)
     changed = {name: replace(MODES[name], **fields) for name, fields in modes.items()}
-    return ft.simulate(ft.Plan(robot, states, each, seed, imperfections, modes=MODES | changed))
+    return ft.simulate(
+        ft.Plan(robot, states, each, seed, imperfections, modes={**MODES, **changed})
+    )
 
 
 def small(runs, keep=(), whole=False):

@@ -17,11 +17,11 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import AXES, unique_names
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.failure_modes import plain_name
 from failuretwin.data_knowledge.store import filling
 from failuretwin.decision.evaluation import Evaluation, Judged, as_unknown_line, score_line
 from failuretwin.decision.metrics import Reliability, Share, judged_truth
 from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.explanation import plain_name
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -15,7 +15,6 @@ from failuretwin.app.tables import Table, figures_table, latex, show
 from failuretwin.connection.tracked_diagnosis import Tracked
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.types import as_floats
-from failuretwin.data_knowledge.failure_modes import plain_name
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision import metrics
 from failuretwin.decision.evaluation import (
@@ -30,7 +29,7 @@ from failuretwin.digital_model.urdf import UrdfJoint
 from failuretwin.digital_model.urdf_check import JointReport, UrdfReport
 from failuretwin.digital_model.urdf_findings import has_range
 from failuretwin.inference.diagnoser import BayesDiagnoser
-from failuretwin.inference.explanation import size_words
+from failuretwin.inference.explanation import plain_name, size_words
 from failuretwin.inference.isolability import IsolabilityReport, isolability
 
 if TYPE_CHECKING:

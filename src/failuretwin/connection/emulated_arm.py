@@ -33,8 +33,8 @@ from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.fault import FaultValue
 from failuretwin.failure_behavior.injection import Injection, ScheduledFault
 from failuretwin.failure_behavior.mode import FaultMode
-from failuretwin.failure_behavior.modes import MODES
 from failuretwin.failure_behavior.random_movements import RandomMovements
+from failuretwin.failure_behavior.registry import MODES
 
 STEP_S = 0.01
 """Step of the arm's time grid [s]."""

@@ -12,40 +12,20 @@ from typing import Any
 
 from failuretwin.core.errors import InputError, unknown_name
 
-MAGNITUDE_UNITS: dict[str, str] = {
-    "stuck": "rad",
-    "steady_state_error": "rad",
-    "slow": "ratio",
-    "lag": "s",
-    "backlash": "rad",
-    "drift": "rad/s",
-    "intermittent": "ratio",
-    "torque_loss": "ratio",
-    "encoder_bias": "rad",
-    "encoder_scale": "ratio",
-    "lost_commands": "ratio",
-}
-"""Unit of the magnitude of every fault mode, by mode id."""
-
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault mode of one motor, without its size or onset."""
+    """One fault mode of one motor, without its size or onset.
+
+    Which modes there are is for those to say who act on them: results may name a mode that is
+    registered elsewhere.
+    """
 
     motor: str
     mode: str
 
-    def __post_init__(self) -> None:
-        if self.mode not in MAGNITUDE_UNITS:
-            raise unknown_name("fault mode", self.mode, MAGNITUDE_UNITS)
-
     def __str__(self) -> str:
         return f"{self.motor}:{self.mode}"
-
-    @property
-    def magnitude_unit(self) -> str:
-        """Unit of the magnitude of this fault's mode."""
-        return MAGNITUDE_UNITS[self.mode]
 
 
 @dataclass(frozen=True)
@@ -75,7 +55,7 @@ class Hypothesis:
                 text that comes from a result.
 
         Raises:
-            InputError: If the text does not follow the form or names an unknown motor or mode.
+            InputError: If the text does not follow the form or names an unknown motor.
         """
         if text in ("healthy", "unknown"):
             return cls(known=text == "healthy")
@@ -110,12 +90,11 @@ UNKNOWN = Hypothesis(known=False)
 
 def _parse_fault(text: str) -> Fault:
     motor, separator, mode = text.partition(":")
-    if not separator:
+    if not (separator and mode):
         raise InputError(
             f"hypothesis {text!r} is not of the form MOTOR:MODE. "
             "Expected 'healthy', 'unknown', a fault such as 'motor_1:stuck', or several joined by "
-            "'+' in chain order, such as 'motor_1:stuck+motor_2:drift'. "
-            f"Modes: {', '.join(MAGNITUDE_UNITS)}."
+            "'+' in chain order, such as 'motor_1:stuck+motor_2:drift'."
         )
     return Fault(motor, mode)
 

@@ -49,8 +49,8 @@ from failuretwin.digital_model.twin import DigitalTwin, Drive, Engine, ServoEngi
 from failuretwin.failure_behavior.fault import FaultValue
 from failuretwin.failure_behavior.injection import Injection
 from failuretwin.failure_behavior.mode import FaultMode
-from failuretwin.failure_behavior.modes import MODES
 from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
+from failuretwin.failure_behavior.registry import MODES
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -132,7 +132,7 @@ class Plan:
             "seed": seed,
             "imperfections": imperfections,
             "movements": movements or RandomMovements(),
-            "modes": MODES if modes is None else modes,
+            "modes": dict(MODES) if modes is None else modes,
             "engine": engine,
         }
         for name, value in given.items():
@@ -149,10 +149,7 @@ class Plan:
                 raise InputError("'unknown' cannot be simulated. Name the faults to simulate.")
             for fault in hypothesis.faults:
                 if fault.mode not in self.modes:
-                    raise InputError(
-                        f"fault mode {fault.mode!r} cannot be simulated. "
-                        f"Expected one of {', '.join(self.modes)}."
-                    )
+                    raise unknown_name("fault mode", fault.mode, self.modes)
                 if self.modes[fault.mode].needs_compliance and self.engine == "servo":
                     self._check_compliance(fault)
 
@@ -351,7 +348,10 @@ def _truth(plan: Plan, runs: Sequence[int], faults: Sequence[Sequence[FaultValue
     magnitude = [values[0].magnitude if values else np.nan for values in faults]
     return Truth(
         fault=[str(plan.hypothesis_of(run)) for run in runs],
-        detail=[{"faults": [value.detail() for value in values]} for values in faults],
+        detail=[
+            {"faults": [value.detail(plan.modes[value.fault.mode].unit) for value in values]}
+            for values in faults
+        ],
         onset=np.array(onset),
         magnitude=np.array(magnitude),
     )

@@ -14,6 +14,7 @@ from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, TypeVar
 
 from failuretwin.core.errors import FailureTwinError, InputError
+from failuretwin.failure_behavior.registry import plugin_files
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -31,7 +32,7 @@ IGNORE_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 @contextmanager
 def dask_client(workers: int, scheduler: str | None) -> Iterator[Client]:
-    """Give a client of a scheduler; leaving the block closes it.
+    """Give a client of a scheduler, whose workers know all modes; leaving the block closes it.
 
     Args:
         workers: Processes of our own on this machine, if there is no scheduler.
@@ -46,13 +47,11 @@ def dask_client(workers: int, scheduler: str | None) -> Iterator[Client]:
         raise InputError(
             f"several workers need Dask ({error}). Install it: pip install 'failuretwin[cluster]'."
         ) from error
-    with _silence():
-        if scheduler is None:
-            with _own_cluster(workers) as client:
-                yield client
-        else:
-            with _connected(scheduler) as client:
-                yield client
+    cluster = _own_cluster(workers) if scheduler is None else _connected(scheduler)
+    with _silence(), cluster as client:
+        for path in plugin_files():
+            client.upload_file(str(path))
+        yield client
 
 
 @contextmanager

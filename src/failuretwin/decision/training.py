@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
 from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
 from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of
 from failuretwin.decision.learned.log_pool import HybridDiagnoser, fit_pool_weights
@@ -55,12 +56,14 @@ class TrainingPlan:
         seed: Seed of all chance.
         validation_runs: Runs of the physics engine; half set temperature and
             weights, half judge.
+        hypotheses: What the network tells apart; None: the paper's classes.
     """
 
     network: str = "cnn"
     iterations: int = 6000
     seed: int = 0
     validation_runs: int = 1800
+    hypotheses: tuple[Hypothesis, ...] | None = None
 
 
 def train(
@@ -111,7 +114,8 @@ def train_network(
         The network, how it does, and how it does pooled with the Bayesian diagnosis.
     """
     encoder = FeatureEncoder("robust", robot, expectation_of(robot, imperfections))
-    data = TrainingData(robot, widened(imperfections, WIDER), plan.seed)
+    hypotheses = plan.hypotheses or paper_hypotheses(robot.motor_names)
+    data = TrainingData(robot, widened(imperfections, WIDER), plan.seed, hypotheses=hypotheses)
     network = LearnedDiagnoser(
         plan.network,
         encoder,
@@ -126,11 +130,11 @@ def train_network(
         standard = Standard.of(next(chunks)[0])
         batches = stream.batches(chunks)
         network.fit_batches(batches, standard, classes, data.movements, on_iteration)
-    other = TrainingData(
-        robot, imperfections, plan.seed + VALIDATION_SEED, data.variants, engine="physics"
+    other = replace(
+        data, imperfections=imperfections, seed=plan.seed + VALIDATION_SEED, engine="physics"
     )
     half = plan.validation_runs // 2
-    bayes = BayesDiagnoser(DigitalTwin(robot), imperfections)
+    bayes = BayesDiagnoser(DigitalTwin(robot), imperfections, hypotheses)
     _calibrate(network, bayes, other.run_set(0, half))
     judges = other.run_set(1, half)
     both = HybridDiagnoser(bayes, network, network.weights_)

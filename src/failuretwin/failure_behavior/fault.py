@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from failuretwin.core.hypothesis import Fault
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import BoolArray, FloatArray
 
 # Courses: how severe a fault is over time, from 0 (not there) to 1 (full magnitude).
 
@@ -159,13 +159,17 @@ class FaultValue:
         """When it begins [s]."""
         return self.course.onset_s
 
-    def detail(self) -> dict[str, Any]:
-        """Return the full truth as a JSON object; what is not known is None."""
+    def detail(self, unit: str) -> dict[str, Any]:
+        """Return the full truth as a JSON object; what is not known is None.
+
+        Args:
+            unit: Unit of its magnitude: that of its mode.
+        """
         return {
             "motor": self.fault.motor,
             "mode": self.fault.mode,
             "magnitude": None if np.isnan(self.magnitude) else self.magnitude,
-            "unit": self.fault.magnitude_unit,
+            "unit": unit,
             "onset_s": self.onset_s,
             "profile": self.course.detail(),
             **{name: values.tolist() for name, values in self.per_movement.items()},
@@ -178,7 +182,7 @@ class FaultGroup:
 
     Attributes:
         magnitude: Size in the mode's unit, (run,).
-        courses: Onset and severity over time, one for each run.
+        courses: Onset and severity over time, one for each run, or one for all.
         per_movement: What was drawn for each movement, (run, movement), by name.
     """
 
@@ -209,3 +213,57 @@ class FaultGroup:
     def accumulated(self, time: FloatArray) -> FloatArray:
         """Return the integral of `effect` up to `time` (time,) [s]: (run, time)."""
         return self.magnitude[:, None] * exposures(self.courses, time)
+
+
+# What a fault acts on, for one motor in many runs: its orders, its motion, where it arrives.
+
+
+@dataclass(frozen=True)
+class MotorOrders:
+    """What one motor is told in many runs.
+
+    Attributes:
+        target: Where to go, (run, movement) [rad].
+        ramp_duration: Time from start to target, (run, movement) [s].
+        start: When movements begin, (run, movement) [s].
+        lost: Commands that do not arrive, (run, movement).
+    """
+
+    target: FloatArray
+    ramp_duration: FloatArray
+    start: FloatArray
+    lost: BoolArray
+
+
+@dataclass(frozen=True)
+class MotorMotion:
+    """What one motor did in many runs.
+
+    Attributes:
+        position: Its angles, (run, time) [rad].
+        time: Grid of all runs, (time,) [s].
+        start: When movements were commanded, (run, movement) [s].
+    """
+
+    position: FloatArray
+    time: FloatArray
+    start: FloatArray
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """Where one motor comes to rest after movements; shapes broadcast against each other.
+
+    Attributes:
+        origin: Where a movement begins [rad].
+        target: Where it leads [rad].
+        direction: Sign of the last travel.
+        since_onset: For how long the fault has been there then [s].
+        sag: How far the load has moved the healthy motor [rad].
+    """
+
+    origin: FloatArray
+    target: FloatArray
+    direction: FloatArray
+    since_onset: FloatArray
+    sag: FloatArray

@@ -21,10 +21,13 @@ from failuretwin.failure_behavior.fault import (
     Course,
     FaultGroup,
     FaultValue,
+    MotorMotion,
+    MotorOrders,
     PerMovement,
 )
-from failuretwin.failure_behavior.mode import FaultMode, MotorMotion, MotorOrders
+from failuretwin.failure_behavior.mode import FaultMode
 from failuretwin.failure_behavior.modes import CHANCE, LOST, OFFSET
+from failuretwin.failure_behavior.registry import MODES
 
 
 @dataclass(frozen=True)
@@ -244,6 +247,7 @@ class ScheduledFault:
         hypothesis = Hypothesis.parse(name, motors)
         if len(hypothesis.faults) != 1:
             raise InputError(f"fault {text!r} names no single fault. Expected {FORM}.")
+        MODES.find(hypothesis.faults[0].mode)
         return cls(hypothesis.faults[0], start, end)
 
 

@@ -1,7 +1,9 @@
-"""What every fault mode is: distributions of its parameters, and stages at which it may act.
+"""What every fault mode is.
 
-A mode never touches the twin. Each stage below does nothing unless a mode says otherwise, and
-works on all runs at once that have the mode at the same motor.
+A mode is one class: how large it is and when it begins, what it does to the motion at each stage,
+where a motor settles with it, what is believed of it beforehand, and its words. Simulation and
+diagnosis ask the same object. It never touches the twin; each stage does nothing unless a mode says
+otherwise, and works on all runs at once that have the mode at the same motor.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from enum import Enum
 from typing import ClassVar
 
 import numpy as np
@@ -21,9 +24,12 @@ from failuretwin.failure_behavior.fault import (
     PROFILES,
     RAMP,
     STEP,
+    Arrival,
     Course,
     FaultGroup,
     FaultValue,
+    MotorMotion,
+    MotorOrders,
     PerMovement,
     draw_episodes,
 )
@@ -31,36 +37,15 @@ from failuretwin.failure_behavior.fault import (
 Range = tuple[float, float]
 
 
-@dataclass(frozen=True)
-class MotorOrders:
-    """What one motor is told in many runs.
+class Signature(Enum):
+    """How a fault shows, which decides how its likelihood is summed."""
 
-    Attributes:
-        target: Where to go, (run, movement) [rad].
-        ramp_duration: Time from start to target, (run, movement) [s].
-        start: When movements begin, (run, movement) [s].
-        lost: Commands that do not arrive, (run, movement).
-    """
-
-    target: FloatArray
-    ramp_duration: FloatArray
-    start: FloatArray
-    lost: BoolArray
-
-
-@dataclass(frozen=True)
-class MotorMotion:
-    """What one motor did in many runs.
-
-    Attributes:
-        position: Its angles, (run, time) [rad].
-        time: Grid of all runs, (time,) [s].
-        start: When movements were commanded, (run, movement) [s].
-    """
-
-    position: FloatArray
-    time: FloatArray
-    start: FloatArray
+    OFFSET = "an offset of each target that one size decides for the whole run"
+    GROWING_OFFSET = "the same, growing with the time since the onset"
+    REDRAWN_OFFSET = "an offset that is drawn anew for each movement"
+    HELD = "an angle that the motor keeps"
+    TRANSIENT = "a way that takes longer or begins later"
+    MISSED = "single movements that are not made"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +69,30 @@ class FaultMode(ABC):
 
     mode: ClassVar[str]
     """Id of the mode."""
+    unit: ClassVar[str]
+    """Unit of its magnitude, such as ``rad``; ``ratio`` for a share."""
+    signature: ClassVar[Signature] = Signature.OFFSET
+    """How it shows."""
+    sizes: ClassVar[Range | None] = None
+    """Magnitudes that diagnosis considers, all as likely; None: those that are drawn."""
+    signed: ClassVar[bool] = False
+    """Whether magnitudes also come with a minus."""
+    misses: ClassVar[tuple[float, float]] = (1.0, 0.0)
+    """Of `MISSED` movements, for each unit of magnitude: the probability that the motor stays where
+    it stood, and that it stands somewhere on the way."""
+    prior_odds: ClassVar[float] = 0.3
+    """Odds against healthy for each motor before a run is seen; 1: as likely."""
+    before_run: ClassVar[float] = 0.9
+    """Probability that the fault was there before the run, if it is there; what wears out rarely
+    does so within the ten seconds of one run."""
+    name: ClassVar[str] = ""
+    """What a person calls it, ``{motor}`` standing for the motor; empty: by its id."""
+    size_words: ClassVar[str] = " ({size:.3g} {unit})"
+    """How a magnitude is told behind the name, in the unit that people read."""
+    mechanisms: ClassVar[tuple[str, ...]] = ()
+    """What breaks."""
+    advice: ClassVar[str] = ""
+    """What to do now."""
     allowed_profiles: ClassVar[tuple[str, ...]] = PROFILES
     """Time profiles that make sense for it."""
     needs_compliance: ClassVar[bool] = False
@@ -190,6 +199,70 @@ class FaultMode(ABC):
         """Return the faults with what only the motion tells: held angles, movements hit."""
         return faults
 
+    # What diagnosis asks; by default it is found from the stages above.
+
+    @property
+    def considered(self) -> Range:
+        """Lowest and highest magnitude that diagnosis considers; NaN where it has none."""
+        drawn: Range = getattr(self, "magnitude", (math.nan, math.nan))
+        return self.sizes or drawn
+
+    def plain_name(self, motor: str) -> str:
+        """Return what a person calls the fault of a motor."""
+        return (self.name or f"{{motor}} {self.mode.replace('_', ' ')}").format(motor=motor)
+
+    def settled_offset(self, size: FloatArray, arrival: Arrival) -> FloatArray:
+        """Return by how much a motor settles beside where it would without the fault [rad].
+
+        Here: what becomes of a motor that stands at the origin, then at the target, once its
+        orders, reference, gear and stiffness have had the fault, at full severity since the onset.
+
+        Args:
+            size: Magnitudes, broadcast against `arrival`.
+            arrival: Where the motor comes to rest.
+
+        Returns:
+            Of the shape of both.
+        """
+        since = np.asarray(arrival.since_onset)
+        size, origin, target, sag, each = np.broadcast_arrays(
+            size, arrival.origin, arrival.target, arrival.sag, since
+        )
+        shape, end = size.shape, max(float(since.max()), 1.0)
+        onset = end - (since if since.size == 1 else each)
+        size, origin, target, sag = (x.reshape(-1, 1) for x in (size, origin, target, sag))
+        faults = FaultGroup(size[:, 0], [Course(STEP, s) for s in np.ravel(onset).tolist()])
+        time, nothing = np.array([0.0, 0.5 * end, end]), np.zeros_like(target)
+        orders = MotorOrders(target, nothing, nothing, np.zeros(target.shape, dtype=bool))
+        followed = self.on_movements(faults, orders)
+        goal = np.where(followed.lost, origin, followed.target)
+        settled = self.on_reference(faults, np.hstack([origin, goal, goal]), time)[:, -1]
+        held, weakness = self.held(faults, time), self.weakness(faults, time)
+        if held is not None:
+            settled = np.where(held[:, -1], origin[:, 0], settled)
+        if weakness is not None:
+            settled = settled + sag[:, 0] * weakness[:, -1] / (1.0 - weakness[:, -1])
+        return np.asarray(settled - target[:, 0]).reshape(shape)
+
+    def amount(self, size: FloatArray) -> FloatArray:
+        """Return what the settled offset is proportional to, if not to the size itself."""
+        return size
+
+    def size_of(self, amount: FloatArray) -> FloatArray:
+        """Return the size that has this `amount`."""
+        return amount
+
+    def ramp_factor(self, size: FloatArray) -> FloatArray:
+        """Return how many times as long as commanded a movement takes, (size,)."""
+        one = np.ones((len(size), 1))
+        orders = MotorOrders(0.0 * one, one, 0.0 * one, one < 0.0)
+        faults = FaultGroup(size, [Course(STEP, 0.0)])
+        return np.asarray(self.on_movements(faults, orders).ramp_duration[:, 0])
+
+    def dead_time(self, size: FloatArray) -> FloatArray:
+        """Return how much later than the others the motor starts, (size,) [s]."""
+        return np.zeros_like(size)
+
 
 # Modes whose magnitude is drawn from a range.
 
@@ -227,8 +300,15 @@ class SignedMode(SizedMode):
     """
 
     lowest: ClassVar[float] = -math.inf
+    signed: ClassVar[bool] = True
 
     both_signs: bool = True
+
+    @property
+    def considered(self) -> Range:
+        """Lowest and highest magnitude that diagnosis considers, whatever their sign."""
+        low, high = self.magnitude
+        return self.sizes or (max(low, -high, 0.0), max(-low, high))
 
     def _draw_magnitude(self, rng: np.random.Generator) -> float:
         size = super()._draw_magnitude(rng)

@@ -26,14 +26,14 @@ from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.fault import FaultValue
 from failuretwin.failure_behavior.injection import Injection, replayed
-from failuretwin.failure_behavior.modes import MODES
+from failuretwin.failure_behavior.mode import Signature
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.evidence import Evidence, SettledEvidence, TransientSamples
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.joint_likelihood import JointLikelihood, movement_likelihoods
 from failuretwin.inference.marginal import change_points, movement_log_likelihoods
-from failuretwin.inference.missed_movements import MISSED_MOVEMENT_FAULTS, log_densities
+from failuretwin.inference.missed_movements import log_densities
 from failuretwin.inference.posterior import (
-    TRANSIENT_FAULTS,
     check_diagnosable,
     fault_model_of,
     motor_of,
@@ -80,7 +80,7 @@ def max_likelihood(
         return np.asarray((likelihood.log_healthy + likelihood.log_transient).sum(axis=1))
     fault = hypothesis.faults[0]
     log_first = log_of(first)[..., None]
-    if fault.mode in MISSED_MOVEMENT_FAULTS:
+    if MODES[fault.mode].signature is Signature.MISSED:
         chain = log_densities(likelihood, motor_of(likelihood, fault), fault.mode)[:, -1]
         return np.asarray((chain + log_first).max(axis=(1, 2)))
     fault_model = fault_model_of(likelihood, fault, priors)
@@ -241,8 +241,9 @@ class ExpectedLogBayesFactor:
     @property
     def _needs_way(self) -> bool:
         """Whether the way counts: only of faults that show there, if the timing is known."""
-        modes = {fault.mode for h in self.hypotheses for fault in h.faults}
-        return not modes.isdisjoint(TRANSIENT_FAULTS) and self.model.knows_timing
+        modes = [MODES[fault.mode] for h in self.hypotheses for fault in h.faults]
+        on_way = any(mode.signature is Signature.TRANSIENT for mode in modes)
+        return on_way and self.model.knows_timing
 
 
 def commanded(runs: xr.Dataset) -> Movements:

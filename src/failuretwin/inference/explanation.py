@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from failuretwin.core.hypothesis import Diagnosis, Fault, Hypothesis, MovementEvidence
-from failuretwin.data_knowledge.failure_modes import failure_modes, plain_name
+from failuretwin.failure_behavior.mode import Signature
+from failuretwin.failure_behavior.registry import MODES
 
 SURE = 0.95
 """Posterior mass that the hypotheses named as possible hold together."""
@@ -41,6 +42,22 @@ def worded(
     )
 
 
+def plain_name(hypothesis: Hypothesis) -> str:
+    """Return a hypothesis as a person would say it, such as ``motor 3 stuck``.
+
+    A fault of a mode that is not known here, such as one from results of elsewhere, is told by the
+    mode's id.
+    """
+    if not hypothesis.known:
+        return "something that none of the known faults explains"
+    return " and ".join(_plain_fault(fault) for fault in hypothesis.faults) or "healthy"
+
+
+def _plain_fault(fault: Fault) -> str:
+    motor, mode = fault.motor.replace("_", " "), MODES.get(fault.mode)
+    return f"{motor} {fault.mode.replace('_', ' ')}" if mode is None else mode.plain_name(motor)
+
+
 def verdict(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> str:
     """Return the diagnosis as one sentence.
 
@@ -62,21 +79,6 @@ def verdict(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> str:
     return text
 
 
-_SIZES = {
-    "stuck": " at {size:z.0f} {unit}",
-    "steady_state_error": " by about {size:.1f} {unit}",
-    "encoder_bias": " by {size:+.1f} {unit}",
-    "backlash": " of {size:.1f} {unit}",
-    "drift": " by {size:+.2f} {unit}",
-    "lag": " by {size:.2f} {unit}",
-    "encoder_scale": " by {size:+.0f} {unit}",
-    "slow": " by {size:.0f} {unit}",
-    "torque_loss": " by {size:.0f} {unit}",
-    "lost_commands": " ({size:.0f} {unit} of them)",
-    "intermittent": " ({size:.0f} {unit} of the time)",
-}
-"""How the magnitude of a mode is told; a mode that is not here has its size in brackets."""
-
 _TOLD_UNITS = {
     "rad": (180.0 / math.pi, "deg"),
     "rad/s": (180.0 / math.pi, "deg/s"),
@@ -92,19 +94,20 @@ def _size_and_onset(diagnosis: Diagnosis, hypothesis: Hypothesis) -> str:
     if len(hypothesis.faults) != 1 or diagnosis.magnitude is None:
         return since if onset else ""
     fault, size = hypothesis.faults[0], diagnosis.magnitude
-    return size_words(fault, size) + (since if onset or fault.mode == "stuck" else "")
+    told = onset or MODES[fault.mode].signature is Signature.HELD
+    return size_words(fault, size) + (since if told else "")
 
 
 def size_words(fault: Fault, size: float) -> str:
     """Return the size of a fault as it is told behind its name, such as `` by about 2.4 deg``.
 
     Args:
-        fault: Any, also of a mode that was registered.
+        fault: Of any known mode.
         size: Its magnitude, in the unit of its mode.
     """
-    factor, unit = _TOLD_UNITS.get(fault.magnitude_unit, (1.0, fault.magnitude_unit))
-    text = _SIZES.get(fault.mode, " ({size:.3g} {unit})")
-    return text.format(size=factor * size, unit=unit)
+    mode = MODES[fault.mode]
+    factor, unit = _TOLD_UNITS.get(mode.unit, (1.0, mode.unit))
+    return mode.size_words.format(size=factor * size, unit=unit)
 
 
 def possible_hypotheses(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> Sequence[Hypothesis]:
@@ -131,11 +134,19 @@ def explanation(
     if len(possible) > 1:
         names = " or ".join(plain_name(h) for h in possible)
         lines.append(f"cannot be told apart in this run: {names}")
-    for fault in ranked[0].faults:
-        mode = failure_modes()[fault.mode]
-        lines.append(f"possible causes: {', '.join(mode.mechanisms)}")
-        lines.append(f"what to do: {mode.advice}")
-    return tuple(lines)
+    return (*lines, *advice_lines(ranked[0]))
+
+
+def advice_lines(hypothesis: Hypothesis) -> list[str]:
+    """Return what may have broken and what to do now, a line each."""
+    lines = []
+    for fault in hypothesis.faults:
+        mode = MODES[fault.mode]
+        if mode.mechanisms:
+            lines.append(f"possible causes: {', '.join(mode.mechanisms)}")
+        if mode.advice:
+            lines.append(f"what to do: {mode.advice}")
+    return lines
 
 
 def _evidence_lines(

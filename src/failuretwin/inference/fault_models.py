@@ -1,24 +1,24 @@
-"""Faults whose size holds for the whole run: encoder faults, play, loss of torque.
+"""From a fault mode to its fault model: nodes over what is unknown, and where each puts the motor.
 
-Each puts the motor off its healthy settled angle by a known multiple of an unknown amount.
+The mode itself says where the motor settles, or how its way changes; what remains is to place
+nodes where the movements point, and to give each its prior.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 
 from failuretwin.core.numerics import log_of, log_sum, log_trapezoid_weights, weighted_quantiles
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.data_knowledge.failure_modes import magnitude_range
 from failuretwin.digital_model.settling import sag
+from failuretwin.failure_behavior.fault import Arrival
+from failuretwin.failure_behavior.mode import FaultMode, Range
 from failuretwin.inference.joint_likelihood import JointLikelihood
 from failuretwin.inference.marginal import FaultModel
 from failuretwin.inference.onset import immediate, next_movement
 from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.settings import Range
 
 # Nodes of an unknown that holds for the whole run: dense where a movement may point.
 
@@ -78,89 +78,42 @@ def pointed(
     return (profile.mode[..., 0] - settled) / safe, spread / np.abs(safe)
 
 
-@dataclass(frozen=True)
-class Amount:
-    """How the magnitude of a mode turns into the amount by which it puts a motor off.
+# An offset that one size decides for the whole run: encoder faults, play, loss of torque.
 
-    Attributes:
-        gain: Offset of the settled angle for each unit of amount, from scene and motor:
-            (run, movement, outcome) [rad].
-        of_size: Amount that belongs to a magnitude.
-        to_size: Magnitude that belongs to an amount.
-        signed: Whether magnitudes have a sign.
-    """
-
-    gain: Callable[[RunLikelihood, int], FloatArray]
-    of_size: Callable[[FloatArray], FloatArray] = lambda size: size
-    to_size: Callable[[FloatArray], FloatArray] = lambda amount: amount
-    signed: bool = True
+LONG_S = 10.0
+"""A fault that does not change has been there for so long when it is asked for its offset [s]."""
 
 
-def _everywhere(likelihood: RunLikelihood, motor: int) -> FloatArray:
-    return np.ones(likelihood.outcomes.base.shape[:3])
-
-
-def _by_angle(likelihood: RunLikelihood, motor: int) -> FloatArray:
-    return np.asarray(likelihood.outcomes.base[..., motor])
-
-
-def _behind(likelihood: RunLikelihood, motor: int) -> FloatArray:
-    """Half of the play, against the direction of the last travel."""
-    return np.asarray(-0.5 * likelihood.outcomes.direction[..., motor])
-
-
-def _by_sag(likelihood: RunLikelihood, motor: int) -> FloatArray:
-    model, outcomes = likelihood.model, likelihood.outcomes
-    pose = model.settle(outcomes.base, outcomes.direction, model.none_held)
-    settling = model.settling
-    yielding = sag(model.twin.robot, pose, np.asarray(settling.compliance), settling.payload)
-    return np.asarray(yielding[..., motor])
-
-
-AMOUNTS: Mapping[str, Amount] = {
-    "encoder_bias": Amount(_everywhere),
-    "encoder_scale": Amount(_by_angle),
-    "backlash": Amount(_behind, signed=False),
-    "torque_loss": Amount(
-        _by_sag,
-        of_size=lambda share: share / (1.0 - share),
-        to_size=lambda amount: amount / (1.0 + amount),
-        signed=False,
-    ),
-}
-"""Modes of a constant magnitude, by id."""
-
-
-def constant_fault_model(
-    likelihood: RunLikelihood, motor: int, mode: str, prior_before_run: float
+def offset_model(
+    likelihood: RunLikelihood, motor: int, mode: FaultMode, prior_before_run: float
 ) -> FaultModel:
-    """Return the fault model of a fault whose magnitude is the same from its onset on.
+    """Return the fault model of a fault whose offset is decided by one size, from its onset on.
 
     Args:
         likelihood: The runs.
         motor: Index of the motor.
-        mode: Id of the mode, one of `AMOUNTS`.
+        mode: Its mode.
         prior_before_run: Probability that the fault was there before the run.
     """
-    amount, profile = AMOUNTS[mode], likelihood.profile(motor)
-    gain = amount.gain(likelihood, motor)
+    profile = likelihood.profile(motor)
+    arrival = _arrival(likelihood, motor, mode, np.array(LONG_S))
+    gain = _gain(mode, arrival)
     settled = profile.faulty_baseline
-    best, width = pointed(profile, settled[..., 0], gain[..., 0])
-    best = np.clip(best, -1e3, 1e3)
-    slope = _slope(amount, best)
+    amount, width = pointed(profile, settled[..., 0], gain[..., 0])
+    amount = np.clip(amount, -1e3, 1e3)
+    best = mode.size_of(amount if mode.signed else np.maximum(amount, 0.0))
     size, log_size = size_nodes(
-        amount.to_size(np.maximum(best, 0.0)) if not amount.signed else best,
-        width / slope,
+        best,
+        width / _slope(mode, best),
         profile.usable & (np.abs(gain[..., 0]) > 1e-9),
-        magnitude_range(mode),
-        amount.signed,
+        mode.considered,
+        mode.signed,
     )
-    offset = gain[:, :, None] * amount.of_size(size)[:, None, :, None]
     stretches = immediate(likelihood.evidence)
     return FaultModel(
         motor=motor,
         held=False,
-        angle=settled[:, :, None] + offset,
+        angle=settled[:, :, None] + _offset(mode, size, arrival, gain),
         log_prior=log_of(stretches.weights(prior_before_run))[..., None] + log_size[:, None],
         size=size,
         onsets=stretches.onsets(prior_before_run),
@@ -168,16 +121,71 @@ def constant_fault_model(
     )
 
 
-def _slope(amount: Amount, at: FloatArray) -> FloatArray:
-    """Return how fast the amount grows with the magnitude."""
-    if amount.signed:
-        return np.ones_like(at)
-    size = amount.to_size(np.maximum(at, 0.0))
+def _arrival(
+    likelihood: RunLikelihood, motor: int, mode: FaultMode, since_onset: FloatArray
+) -> Arrival:
+    """Return where a motor comes to rest, (run, movement, outcome).
+
+    Args:
+        likelihood: The runs.
+        motor: Index of the motor.
+        mode: The mode that will ask; the load counts for those that yield to it alone.
+        since_onset: For how long the fault has been there [s].
+    """
+    model, outcomes = likelihood.model, likelihood.outcomes
+    movements = likelihood.evidence.movements
+    target, direction = outcomes.base[..., motor], outcomes.direction[..., motor]
+    travel = np.nan_to_num(np.abs(movements.target - movements.origin())[..., motor])
+    load = np.zeros(1)
+    if mode.needs_compliance:
+        pose = model.settle(outcomes.base, outcomes.direction, model.none_held)
+        settling = model.settling
+        load = sag(model.twin.robot, pose, np.asarray(settling.compliance), settling.payload)
+        load = load[..., motor]
+    return Arrival(target - direction * travel[..., None], target, direction, since_onset, load)
+
+
+def _by_node(arrival: Arrival, axes: int = 1) -> Arrival:
+    """Return the same with axes for nodes, (run, movement, 1, outcome)."""
+    fields = (arrival.origin, arrival.target, arrival.direction, arrival.since_onset, arrival.sag)
+    new = tuple(range(2, 2 + axes))
+    return Arrival(*(np.expand_dims(x, new) if x.ndim == 3 else x for x in fields))
+
+
+def _gain(mode: FaultMode, arrival: Arrival) -> FloatArray:
+    """Return the offset for each unit of amount, at the smallest size above 0."""
+    low, high = mode.considered
+    size = np.array(low or high)
+    gain = mode.settled_offset(size, arrival) / mode.amount(size)
+    return np.array(np.broadcast_to(gain, arrival.target.shape))
+
+
+def _offset(mode: FaultMode, size: FloatArray, arrival: Arrival, gain: FloatArray) -> FloatArray:
+    """Return the offset at each node, (run, movement, node, outcome) [rad].
+
+    Args:
+        mode: The mode.
+        size: Sizes, (run, node).
+        arrival: Where the motor comes to rest.
+        gain: Offset for each unit of amount at the smallest size; where the mode is seen to keep
+            it at other sizes, that spares asking at every node.
+    """
+    low, high = mode.considered
+    probes = low + np.array([0.31, 0.73, 1.0]) * (high - low)
+    probes = np.concatenate([probes, -probes]) if mode.signed else probes
+    found = [mode.settled_offset(probe, arrival) for probe in probes]
+    if np.allclose(found, [gain * mode.amount(probe) for probe in probes], 1e-9, 1e-12):
+        return gain[:, :, None] * mode.amount(size)[:, None, :, None]
+    return mode.settled_offset(size[:, None, :, None], _by_node(arrival))
+
+
+def _slope(mode: FaultMode, size: FloatArray) -> FloatArray:
+    """Return how fast the amount grows with the size."""
     step = 1e-4
-    return np.asarray((amount.of_size(size + step) - amount.of_size(size)) / step)
+    return (mode.amount(size + step) - mode.amount(size)) / step
 
 
-# Drift: a motor that slips away from its targets at a constant rate, from an unknown onset on.
+# An offset that grows with the time since the onset: drift.
 
 CELLS = 3
 """Parts of a stretch, each with one onset to sum over."""
@@ -187,17 +195,20 @@ WITHIN = np.linspace(-0.4, 0.4, 5) / CELLS
 """Where in its part an onset may be, beside its middle, as shares of the length of the stretch."""
 
 
-def drift_model(likelihood: RunLikelihood, motor: int, prior_before_run: float) -> FaultModel:
-    """Return the fault model of a motor that slips away from its targets at a constant rate.
+def growing_offset_model(
+    likelihood: RunLikelihood, motor: int, mode: FaultMode, prior_before_run: float
+) -> FaultModel:
+    """Return the fault model of a fault whose offset grows from an unknown onset on.
 
     Args:
         likelihood: The runs.
         motor: Index of the motor.
-        prior_before_run: Probability that it slips from the start of the run.
+        mode: Its mode.
+        prior_before_run: Probability that it grows from the start of the run.
     """
     middle = np.nan_to_num(0.5 * (likelihood.evidence.begin + likelihood.evidence.end))
     settled = likelihood.profile(motor).faulty_baseline
-    rate, log_rate = _rates(likelihood, motor, settled, middle)
+    rate, log_rate = _rates(likelihood, motor, mode, settled, middle)
     stretches = immediate(likelihood.evidence)
     onset, share = stretches.samples(prior_before_run, ONSETS)  # (run, movement, onset)
     log_onset = log_of(stretches.weights(prior_before_run)[..., None] * share)
@@ -206,7 +217,9 @@ def drift_model(likelihood: RunLikelihood, motor: int, prior_before_run: float) 
     runs, movements, onsets = onset.shape
     since = np.maximum(middle[:, :, None] - onset.reshape(runs, 1, -1), 0.0)
     # A node is an onset and a rate; each onset belongs to one movement that it spoils first.
-    offset = (since[..., None] * rate[:, None, None]).reshape(runs, movements, -1)
+    arrival = _arrival(likelihood, motor, mode, since[..., None, None])
+    arrival = _by_node(arrival, axes=2)  # (run, movement, onset, rate, outcome)
+    offset = mode.settled_offset(rate[:, None, None, :, None], arrival)
     own = np.repeat(np.eye(movements), onsets, axis=1)
     log_first = log_of(own) + log_onset.reshape(runs, 1, -1)
     log_prior = (log_first[..., None] + log_rate[:, None, None]).reshape(runs, movements, -1)
@@ -222,7 +235,7 @@ def drift_model(likelihood: RunLikelihood, motor: int, prior_before_run: float) 
     return FaultModel(
         motor=motor,
         held=False,
-        angle=settled[:, :, None] + offset[..., None],
+        angle=settled[:, :, None] + offset.reshape(*log_prior.shape, -1),
         log_prior=log_prior,
         size=np.tile(rate, (1, movements * onsets)),
         onsets=of_run,
@@ -230,26 +243,28 @@ def drift_model(likelihood: RunLikelihood, motor: int, prior_before_run: float) 
 
 
 def _rates(
-    likelihood: RunLikelihood, motor: int, settled: FloatArray, since: FloatArray
+    likelihood: RunLikelihood, motor: int, mode: FaultMode, settled: FloatArray, since: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return rates, sorted, and the log of their prior, (run, rate) each.
 
-    They crowd where the movements together point if the motor slips from the start of the run.
+    They crowd where the movements together point if the offset grows from the start of the run.
 
     Args:
         likelihood: The runs.
         motor: Index of the motor.
-        settled: Where it settles apart from what has slipped, (run, movement, outcome) [rad].
-        since: For how long it has slipped then, (run, movement) [s].
+        mode: Its mode.
+        settled: Where it settles apart from what has grown, (run, movement, outcome) [rad].
+        since: For how long it has grown then, (run, movement) [s].
     """
     profile = likelihood.profile(motor)
-    best, width = pointed(profile, settled[..., 0], since)
-    weight = np.where(profile.usable & (since > 0.0), 1.0 / width**2, 0.0)
+    gain = _gain(mode, _arrival(likelihood, motor, mode, since[..., None]))[..., 0]
+    best, width = pointed(profile, settled[..., 0], gain)
+    weight = np.where(profile.usable & (gain != 0.0), 1.0 / width**2, 0.0)
     total = weight.sum(axis=1, keepdims=True)
     some = np.asarray(total > 0.0)
     together = weighted_quantiles(best, weight, (0.5,))
     spread = 1.0 / np.sqrt(np.where(some, total, 1.0))
-    return size_nodes(together, spread, some, magnitude_range("drift"), signed=True)
+    return size_nodes(together, spread, some, mode.considered, mode.signed)
 
 
 # Faults that show on the way: a motor that starts late, a motor that is slow.
@@ -258,51 +273,30 @@ TIMED_NODES = 12
 """Magnitudes to sum over."""
 
 
-def lag_model(likelihood: RunLikelihood, motor: int, prior_before_run: float) -> FaultModel:
-    """Return the fault model of a motor that is late but settles as a healthy one.
-
-    Args:
-        likelihood: The runs.
-        motor: Index of the motor.
-        prior_before_run: Probability that the fault was there before the run.
-    """
-    delay = np.linspace(*magnitude_range("lag"), TIMED_NODES)
-    way = None
-    if likelihood.transients is not None:
-        way = likelihood.transients.delayed_or_slow(motor, np.ones(TIMED_NODES), delay)
-    angle = likelihood.profile(motor).expected[:, :, None]
-    return _law(
-        likelihood, motor, delay, np.repeat(angle, TIMED_NODES, axis=2), way, prior_before_run
-    )
-
-
-def slow_model(likelihood: RunLikelihood, motor: int, prior_before_run: float) -> FaultModel:
-    """Return the fault model of a motor that has lost speed; movements that follow cut it short.
-
-    Args:
-        likelihood: The runs.
-        motor: Index of the motor.
-        prior_before_run: Probability that the fault was there before the run.
-    """
-    share = np.linspace(*magnitude_range("slow"), TIMED_NODES)
-    factor = 1.0 / (1.0 - share)
-    begin, end = _reached(likelihood, motor, factor)
-    way = None
-    if likelihood.transients is not None:
-        way = likelihood.transients.delayed_or_slow(motor, factor, np.zeros(TIMED_NODES), begin)
-    short = end - np.nan_to_num(likelihood.evidence.movements.target[..., motor])[..., None]
-    angle = likelihood.profile(motor).expected[:, :, None] + short[..., None]
-    return _law(likelihood, motor, share, angle, way, prior_before_run)
-
-
-def _law(
-    likelihood: RunLikelihood,
-    motor: int,
-    size: FloatArray,
-    angle: FloatArray,
-    way: FloatArray | None,
-    prior_before_run: float,
+def transient_model(
+    likelihood: RunLikelihood, motor: int, mode: FaultMode, prior_before_run: float
 ) -> FaultModel:
+    """Return the fault model of a motor that starts late or has lost speed.
+
+    Late, it settles as a healthy one; slow, movements that follow cut it short.
+
+    Args:
+        likelihood: The runs.
+        motor: Index of the motor.
+        mode: Its mode.
+        prior_before_run: Probability that the fault was there before the run.
+    """
+    size = np.linspace(*mode.considered, TIMED_NODES)
+    factor, delay = mode.ramp_factor(size), mode.dead_time(size)
+    angle, begin, way = likelihood.profile(motor).expected[:, :, None], None, None
+    if (factor != 1.0).any():
+        begin, end = _reached(likelihood, motor, factor)
+        target = np.nan_to_num(likelihood.evidence.movements.target[..., motor])
+        angle = angle + (end - target[..., None])[..., None]
+    else:
+        angle = np.repeat(angle, TIMED_NODES, axis=2)
+    if likelihood.transients is not None:
+        way = likelihood.transients.delayed_or_slow(motor, factor, delay, begin)
     stretches = next_movement(likelihood.evidence.movements)
     log_first = log_of(stretches.weights(prior_before_run)) - np.log(TIMED_NODES)
     return FaultModel(
@@ -335,39 +329,46 @@ def _reached(
     return begin, end
 
 
-# A steady-state error: an unknown offset from the target, drawn anew for each movement.
+# An offset that is drawn anew for each movement: a steady-state error.
 
 ERROR_NODES = 36
 """Sizes to sum over on each side of zero, up to the largest error considered."""
 
 
-def steady_state_error_model(
-    likelihood: RunLikelihood, motor: int, ranges: Sequence[Range], prior_before_run: float
+def redrawn_offset_model(
+    likelihood: RunLikelihood,
+    motor: int,
+    mode: FaultMode,
+    ranges: Sequence[Range],
+    prior_before_run: float,
 ) -> FaultModel:
-    """Return the fault model of `motor` having a steady-state error.
+    """Return the fault model of a fault whose size is drawn anew for each movement.
 
     Args:
         likelihood: The runs.
         motor: Index of the motor.
-        ranges: Run-level ranges of the error's size [rad], equally likely.
+        mode: Its mode.
+        ranges: Run-level ranges of the size, equally likely.
         prior_before_run: Probability that it was there before the run.
     """
-    offset, log_weight = offset_nodes(ranges)
+    size, log_weight = offset_nodes(ranges)
+    arrival = _by_node(_arrival(likelihood, motor, mode, np.array(LONG_S)))
+    offset = mode.settled_offset(size[:, None], arrival)
     stretches = next_movement(likelihood.evidence.movements)
     log_first = log_of(stretches.weights(prior_before_run))
     return FaultModel(
         motor=motor,
         held=False,
-        angle=likelihood.profile(motor).faulty_baseline[:, :, None] + offset[:, None],
+        angle=likelihood.profile(motor).faulty_baseline[:, :, None] + offset,
         log_prior=np.repeat(log_first[..., None] - np.log(len(ranges)), len(ranges), axis=2),
-        size=offset[None],
+        size=size[None],
         onsets=stretches.onsets(prior_before_run),
         redrawn=log_weight,
     )
 
 
 def offset_nodes(ranges: Sequence[Range]) -> tuple[FloatArray, FloatArray]:
-    """Return signed sizes (node,) [rad] and their log weights in each range (range, node)."""
+    """Return signed sizes (node,) and their log weights in each range (range, node)."""
     largest = max(high for _, high in ranges)
     smallest = min(low for low, _ in ranges)
     step = (largest - smallest) / (ERROR_NODES - 1) if largest > smallest else 0.0

@@ -20,7 +20,6 @@ from failuretwin.core.hypothesis import (
 from failuretwin.core.movements import find_movements
 from failuretwin.core.runs import RunTable
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
-from failuretwin.data_knowledge.failure_modes import magnitude_range
 from failuretwin.digital_model.nonidealities import (
     GENERIC_SCATTER_RAD,
     Imperfections,
@@ -30,7 +29,7 @@ from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.fault import STEP, FaultValue
 from failuretwin.failure_behavior.mode import FaultMode, SizedMode
-from failuretwin.failure_behavior.modes import MODES
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.expected_bayes_factors import ExpectedLogBayesFactor
 from failuretwin.inference.healthy_model import HealthyModel
@@ -291,12 +290,10 @@ def _motions(twin: DigitalTwin, command: ArrayLike, time: ArrayLike) -> xr.Datas
 
 def _sizes(hypothesis: Hypothesis, priors: Priors) -> tuple[float, float]:
     """Return smallest and largest size that is considered; NaN where there is none."""
-    if hypothesis.is_healthy or hypothesis.faults[0].mode == "stuck":
+    if hypothesis.is_healthy:
         return np.nan, np.nan
-    if hypothesis.faults[0].mode == "steady_state_error":
-        lows, highs = zip(*priors.error_ranges, strict=True)
-        return min(lows), max(highs)
-    return magnitude_range(hypothesis.faults[0].mode)
+    lows, highs = zip(*priors.ranges_of(MODES[hypothesis.faults[0].mode]), strict=True)
+    return min(lows), max(highs)
 
 
 def _typical(low: float, high: float) -> float:

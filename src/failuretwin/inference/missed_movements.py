@@ -13,7 +13,7 @@ import numpy as np
 
 from failuretwin.core.numerics import Weighted, log_of, log_sum
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.failure_modes import magnitude_range
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.marginal import ChangePointPosterior, Estimate, MarginalLikelihood
 from failuretwin.inference.onset import next_movement
 from failuretwin.inference.run_likelihood import RunLikelihood
@@ -24,28 +24,6 @@ WAY = np.linspace(0.05, 0.95, 12)
 """Places on the way to a target at which a motor may have stuck."""
 
 
-@dataclass(frozen=True)
-class Misses:
-    """How a fault of a given magnitude makes a motor miss a movement.
-
-    Attributes:
-        stay: Probability of standing where it stood, for each unit of magnitude.
-        midway: Probability of standing somewhere on the way, for each unit of magnitude.
-    """
-
-    stay: float
-    midway: float
-
-
-MISSED_MOVEMENT_FAULTS = {
-    "lost_commands": Misses(1.0, 0.0),
-    # Held for 0.5 to 2 s at a time, uniformly: at the end of a movement of 2 s with a ramp of 0.6
-    # to 1.0 s, a held motor was on the plateau when the episode began in 6 of 10 cases, on the
-    # ramp in 3, not yet on its way in 1.
-    "intermittent": Misses(0.1, 0.3),
-}
-
-
 def missed_movements_likelihood(
     likelihood: RunLikelihood, motor: int, mode: str, prior_before_run: float
 ) -> MarginalLikelihood:
@@ -54,7 +32,7 @@ def missed_movements_likelihood(
     Args:
         likelihood: The runs.
         motor: Index of the motor.
-        mode: Id of the mode, one of `MISSED_MOVEMENT_FAULTS`.
+        mode: Id of the mode, whose signature is `MISSED`.
         prior_before_run: Probability that the fault was there before the run.
     """
     sizes = _sizes(mode)
@@ -88,16 +66,14 @@ def log_densities(likelihood: RunLikelihood, motor: int, mode: str) -> FloatArra
     Args:
         likelihood: The runs.
         motor: Index of the motor.
-        mode: Id of the mode, one of `MISSED_MOVEMENT_FAULTS`.
+        mode: Id of the mode, whose signature is `MISSED`.
     """
     healthy = likelihood.log_healthy + likelihood.log_transient
-    return _chain(
-        _densities(likelihood, motor), healthy, MISSED_MOVEMENT_FAULTS[mode], _sizes(mode)
-    )
+    return _chain(_densities(likelihood, motor), healthy, MODES[mode].misses, _sizes(mode))
 
 
 def _sizes(mode: str) -> FloatArray:
-    return np.linspace(*magnitude_range(mode), SHARES)
+    return np.linspace(*MODES[mode].considered, SHARES)
 
 
 @dataclass(frozen=True)
@@ -131,14 +107,14 @@ def _densities(likelihood: RunLikelihood, motor: int) -> _Places:
 
 
 def _chain(
-    place: _Places, log_healthy: FloatArray, misses: Misses, sizes: FloatArray
+    place: _Places, log_healthy: FloatArray, misses: tuple[float, float], sizes: FloatArray
 ) -> FloatArray:
     """Return the log density of all movements up to each one, (run, movement, first, size).
 
     The state is the place of the last movement made, and one for a motor that stands on the way.
     """
     runs, count = log_healthy.shape
-    stay, midway = misses.stay * sizes, misses.midway * sizes
+    stay, midway = misses[0] * sizes, misses[1] * sizes
     log_stay, log_midway = log_of(stay), log_of(midway)
     log_arrive = log_of(np.maximum(1.0 - stay - midway, 1e-6))
     first = np.arange(count)

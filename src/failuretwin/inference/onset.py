@@ -10,7 +10,7 @@ import numpy as np
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.failure_modes import failure_modes
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.evidence import SettledEvidence
 
 QUADRATURE = np.linspace(0.05, 0.95, 10)
@@ -24,7 +24,7 @@ class OnsetPrior:
     Attributes:
         prior_before_run: Probability that the fault was there before the run; of a stuck motor,
             that it was stuck before the run or gets stuck on its first ramp. The rest is spread
-            evenly over the time after that. None: as the table of failure modes says.
+            evenly over the time after that. None: as the mode says.
         free: Probability that the held angle of a stuck motor is unrelated to the commands,
             anywhere in range.
         known_s: The onset of a stuck motor, where it is known [s].
@@ -46,11 +46,7 @@ class OnsetPrior:
 
     def before_run(self, mode: str) -> float:
         """Return the probability that a fault of this mode was there before the run."""
-        return (
-            failure_modes()[mode].before_run
-            if self.prior_before_run is None
-            else self.prior_before_run
-        )
+        return MODES[mode].before_run if self.prior_before_run is None else self.prior_before_run
 
 
 @dataclass(frozen=True)

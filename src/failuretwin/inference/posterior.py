@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -18,18 +19,17 @@ from failuretwin.core.hypothesis import (
 )
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.data_knowledge.failure_modes import prior_odds
+from failuretwin.failure_behavior.mode import FaultMode, Signature
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.double_faults import double_fault_likelihood
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.explanation import worded
 from failuretwin.inference.fault_models import (
-    AMOUNTS,
     LOCAL_STEPS,
-    constant_fault_model,
-    drift_model,
-    lag_model,
-    slow_model,
-    steady_state_error_model,
+    growing_offset_model,
+    offset_model,
+    redrawn_offset_model,
+    transient_model,
 )
 from failuretwin.inference.log_quality import LogQuality
 from failuretwin.inference.marginal import (
@@ -38,67 +38,41 @@ from failuretwin.inference.marginal import (
     MarginalLikelihood,
     marginal_likelihood,
 )
-from failuretwin.inference.missed_movements import (
-    MISSED_MOVEMENT_FAULTS,
-    missed_movements_likelihood,
-)
+from failuretwin.inference.missed_movements import missed_movements_likelihood
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.stuck import stuck_model
 from failuretwin.inference.two_joint_likelihood import two_joint_likelihood
 from failuretwin.inference.unknown import unknown_likelihood
 
-# From a hypothesis to what runs say of it: the one place that knows the law of each mode.
+# From a hypothesis to what runs say of it.
 
 UNKNOWN_ODDS = 1.0
 """Odds of `unknown` against healthy where nothing is seen; each explanation of what is seen has
 odds of its own in its evidence, none has more."""
 MOST_FAULTS = 2
 """Faults that can be weighed at once."""
-
-
-def _lasting(mode: str) -> Callable[[RunLikelihood, int, Priors], FaultModel]:
-    return lambda likelihood, motor, priors: constant_fault_model(
-        likelihood, motor, mode, priors.onset.before_run(mode)
-    )
-
-
-FAULT_MODELS: Mapping[str, Callable[[RunLikelihood, int, Priors], FaultModel]] = {
-    "stuck": lambda likelihood, motor, priors: stuck_model(likelihood, motor, priors.onset),
-    "steady_state_error": lambda likelihood, motor, priors: steady_state_error_model(
-        likelihood, motor, priors.error_ranges, priors.onset.before_run("steady_state_error")
-    ),
-    "drift": lambda likelihood, motor, priors: drift_model(
-        likelihood, motor, priors.onset.before_run("drift")
-    ),
-    **{mode: _lasting(mode) for mode in AMOUNTS},
-}
-"""Fault model of each mode that makes a motor settle beside its target."""
-TRANSIENT_FAULTS: Mapping[str, Callable[[RunLikelihood, int, float], FaultModel]] = {
-    "lag": lag_model,
-    "slow": slow_model,
-}
-"""Fault model of each mode that shows on the way."""
-DIAGNOSABLE_MODES = (*FAULT_MODELS, *TRANSIENT_FAULTS, *MISSED_MOVEMENT_FAULTS)
-"""Modes that can be weighed."""
+NOT_IN_PAIRS = (Signature.TRANSIENT, Signature.MISSED)
+"""Faults that leave the motor at its target, or at times: they are not weighed beside another."""
 
 
 def check_diagnosable(hypothesis: Hypothesis) -> None:
     """Refuse a hypothesis that cannot be weighed.
 
     Raises:
-        InputError: If a mode cannot be weighed, or not together with another.
+        InputError: If a mode is not known, or cannot be weighed together with another.
     """
+    modes = [MODES.find(fault.mode) for fault in hypothesis.faults]
     if len(hypothesis.faults) > MOST_FAULTS:
         raise InputError(
             f"hypothesis '{hypothesis}' has {len(hypothesis.faults)} faults. Expected "
             f"{MOST_FAULTS} at most."
         )
-    known = DIAGNOSABLE_MODES if len(hypothesis.faults) == 1 else tuple(FAULT_MODELS)
-    for fault in hypothesis.faults:
-        if fault.mode not in known:
+    for mode in modes if len(modes) > 1 else ():
+        if mode.signature in NOT_IN_PAIRS:
+            known = [name for name, m in MODES.items() if m.signature not in NOT_IN_PAIRS]
             raise InputError(
-                f"fault mode {fault.mode!r} cannot be weighed in '{hypothesis}'. Expected one of "
+                f"fault mode {mode.mode!r} cannot be weighed in '{hypothesis}'. Expected one of "
                 f"{', '.join(known)}."
             )
 
@@ -106,8 +80,13 @@ def check_diagnosable(hypothesis: Hypothesis) -> None:
 def shows_in_transients(hypothesis: Hypothesis) -> bool:
     """Return whether a hypothesis shows in how the motors move more than in where they settle."""
     return not hypothesis.known or any(
-        fault.mode in TRANSIENT_FAULTS for fault in hypothesis.faults
+        MODES[fault.mode].signature is Signature.TRANSIENT for fault in hypothesis.faults
     )
+
+
+def prior_odds(hypothesis: Hypothesis) -> float:
+    """Return the odds of a hypothesis against healthy; faults of several motors multiply."""
+    return math.prod((MODES[fault.mode].prior_odds for fault in hypothesis.faults), start=1.0)
 
 
 def log_prior(hypotheses: Sequence[Hypothesis], priors: Priors) -> FloatArray:
@@ -135,7 +114,7 @@ def marginal_likelihoods(
 def unlisted(likelihood: RunLikelihood, known: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Return the single faults that can be weighed but are not among the known hypotheses."""
     names = likelihood.model.twin.robot.motor_names
-    return [h for h in single_faults(names, DIAGNOSABLE_MODES) if h.faults and h not in known]
+    return [h for h in single_faults(names, MODES) if h.faults and h not in known]
 
 
 def marginal_likelihood_of(
@@ -151,11 +130,9 @@ def marginal_likelihood_of(
             likelihoods, [_fault_models_of_two(alone, one, two, priors) for alone in likelihoods]
         )
     fault = hypothesis.faults[0]
-    if fault.mode in MISSED_MOVEMENT_FAULTS:
-        prior_before_run = priors.onset.before_run(fault.mode)
-        return missed_movements_likelihood(
-            likelihood, motor_of(likelihood, fault), fault.mode, prior_before_run
-        )
+    if MODES[fault.mode].signature is Signature.MISSED:
+        motor, early = motor_of(likelihood, fault), priors.onset.before_run(fault.mode)
+        return missed_movements_likelihood(likelihood, motor, fault.mode, early)
     return marginal_likelihood(likelihood, fault_model_of(likelihood, fault, priors))
 
 
@@ -164,12 +141,23 @@ def motor_of(likelihood: RunLikelihood, fault: Fault) -> int:
     return likelihood.model.motor_names.index(fault.motor)
 
 
+MODELS: Mapping[Signature, Callable[[RunLikelihood, int, FaultMode, float], FaultModel]] = {
+    Signature.OFFSET: offset_model,
+    Signature.GROWING_OFFSET: growing_offset_model,
+    Signature.TRANSIENT: transient_model,
+}
+"""Fault models that need to know nothing but the mode."""
+
+
 def fault_model_of(likelihood: RunLikelihood, fault: Fault, priors: Priors) -> FaultModel:
-    """Return the fault model of a fault, of any mode but those of `MISSED_MOVEMENT_FAULTS`."""
-    motor = motor_of(likelihood, fault)
-    if fault.mode in TRANSIENT_FAULTS:
-        return TRANSIENT_FAULTS[fault.mode](likelihood, motor, priors.onset.before_run(fault.mode))
-    return FAULT_MODELS[fault.mode](likelihood, motor, priors)
+    """Return the fault model of a fault, of any mode but those of missed movements."""
+    motor, mode = motor_of(likelihood, fault), MODES[fault.mode]
+    early = priors.onset.before_run(fault.mode)
+    if mode.signature is Signature.HELD:
+        return stuck_model(likelihood, motor, priors.onset)
+    if mode.signature is Signature.REDRAWN_OFFSET:
+        return redrawn_offset_model(likelihood, motor, mode, priors.ranges_of(mode), early)
+    return MODELS[mode.signature](likelihood, motor, mode, early)
 
 
 def _fault_models_of_two(
@@ -182,7 +170,7 @@ def _fault_models_of_two(
     )
 
     def fault_model(fault: Fault) -> FaultModel:
-        if fault.mode != "stuck":
+        if MODES[fault.mode].signature is not Signature.HELD:
             return fault_model_of(likelihood, fault, priors)
         motor = motor_of(likelihood, fault)
         at = seen.pair.index(motor)
@@ -431,10 +419,8 @@ def compute_posterior(
         hypotheses: What may be the case.
         priors: Beliefs about onset and size.
     """
-    weights, prior = (
-        marginal_likelihoods(likelihood, hypotheses, priors),
-        log_prior(hypotheses, priors),
-    )
+    weights = marginal_likelihoods(likelihood, hypotheses, priors)
+    prior = log_prior(hypotheses, priors)
     log_joint = np.stack([weight.log_evidence for weight in weights], axis=1) + prior
     log_posterior = log_joint - log_sum(log_joint, axis=1)[:, None]
     return Posterior(likelihood, hypotheses, prior, log_posterior, weights)
@@ -445,14 +431,14 @@ def _with_estimate(
 ) -> Diagnosis:
     """Return the diagnosis with onset and magnitude of the fault that is most probable."""
     if estimate.onset is not None:
-        prior_before_run, middle, late = (place.begin_s + estimate.onset.quantiles(LEVELS)).tolist()
-        diagnosis = replace(diagnosis, onset_s=middle, onset_90=(prior_before_run, late))
+        early, middle, late = (place.begin_s + estimate.onset.quantiles(LEVELS)).tolist()
+        diagnosis = replace(diagnosis, onset_s=middle, onset_90=(early, late))
         known = place.known_onset(hypothesis)
         if known is not None:
             diagnosis = replace(diagnosis, onset_s=known.onset_s, onset_90=known.onset_90)
     if estimate.size is not None:
         low, half, high = estimate.size.quantiles(LEVELS).tolist()
-        unit = hypothesis.faults[0].magnitude_unit
+        unit = MODES[hypothesis.faults[0].mode].unit
         diagnosis = replace(
             diagnosis, magnitude=half, magnitude_unit=unit, magnitude_90=(low, high)
         )

@@ -9,8 +9,10 @@ import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.digital_model.robot import Robot
+from failuretwin.failure_behavior.mode import FaultMode, Range
+from failuretwin.failure_behavior.modes import SteadyStateError
 from failuretwin.inference.onset import OnsetPrior
-from failuretwin.inference.settings import USUAL, InferenceSettings, Range
+from failuretwin.inference.settings import USUAL, InferenceSettings
 
 
 @dataclass(frozen=True)
@@ -20,8 +22,8 @@ class Priors:
     Attributes:
         onset: When a motor may have got stuck.
         error_ranges: Run-level ranges of steady-state errors [rad], equally likely.
-        healthy_odds: How many times as probable it is that all is well as the table of failure
-            modes says, which leaves no more for it than for a stuck motor.
+        healthy_odds: How many times as probable it is that all is well as its mode
+            says, which leaves no more for it than for a stuck motor.
 
     Raises:
         InputError: If there is no range, or one or the odds make no sense.
@@ -39,6 +41,10 @@ class Priors:
             )
         if not 0.0 < self.healthy_odds < np.inf:
             raise InputError(f"healthy_odds are {self.healthy_odds:g}, expected above 0.")
+
+    def ranges_of(self, mode: FaultMode) -> Sequence[Range]:
+        """Return the ranges of sizes that are considered of a mode, equally likely."""
+        return self.error_ranges if isinstance(mode, SteadyStateError) else (mode.considered,)
 
 
 MONITORING = Priors(healthy_odds=30.0)

@@ -10,12 +10,11 @@ from failuretwin.core.config import from_table
 from failuretwin.core.errors import check_number
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
+from failuretwin.failure_behavior.mode import Range
 
 NOISE_FACTOR = 3.0
 """Lengths by which rest is told from motion are at least so many times the sensor's noise: the
 distance of a reading from the median of many exceeds that once in 34 times if it is normal."""
-Range = tuple[float, float]
-"""Least and greatest."""
 ERROR_STEPS = (1.0, 1.75, 2.5)
 """Where ranges of steady-state errors begin, in the least error."""
 WIDEST_ERROR = 5.0

@@ -6,7 +6,14 @@ from pathlib import Path
 
 import click
 
-from failuretwin.app.commands.options import PATH, LogOptions, common_options, reading_options
+from failuretwin.app.commands.options import (
+    PATH,
+    HypothesesOption,
+    LogOptions,
+    common_options,
+    plugin_option,
+    reading_options,
+)
 
 
 @click.command("import")
@@ -62,6 +69,7 @@ def import_(
 )
 @click.option(
     "--hypotheses",
+    cls=HypothesesOption,
     metavar="H,...",
     help="What to simulate, such as healthy,motor_2:stuck. Default: the paper's nine classes.",
 )
@@ -102,6 +110,7 @@ def import_(
     help="Dask scheduler whose workers do the work instead, such as tcp://host:8786. They must "
     "share the folder of --out.",
 )
+@plugin_option
 @common_options
 def simulate(
     out: Path,
@@ -128,7 +137,7 @@ def simulate(
     from failuretwin.data_knowledge.workers import Workforce
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
-    from failuretwin.failure_behavior.modes import MODES, load_modes
+    from failuretwin.failure_behavior.registry import MODES, load_modes
 
     check_destination(out)
     known = load_calibration(imperfections, load_robot(robot))

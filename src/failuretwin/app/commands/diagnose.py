@@ -8,9 +8,11 @@ import click
 
 from failuretwin.app.commands.options import (
     PATH,
+    HypothesesOption,
     LogOptions,
     calibration_option,
     common_options,
+    plugin_option,
     reading_options,
 )
 
@@ -34,6 +36,7 @@ from failuretwin.app.commands.options import (
 )
 @click.option(
     "--hypotheses",
+    cls=HypothesesOption,
     metavar="H,...",
     help="What may be the case, two at least: healthy, MOTOR:MODE, two of these joined by '+', "
     "unknown. Such as healthy,motor_2:stuck. Default: the paper's nine classes.",
@@ -55,6 +58,7 @@ from failuretwin.app.commands.options import (
     help="Write a picture of each run, and index.html with all of them.",
 )
 @reading_options
+@plugin_option
 @common_options
 def diagnose(
     inputs: tuple[Path, ...],
@@ -178,6 +182,7 @@ def diagnose(
 )
 @click.option("--latex", type=PATH, metavar="FILE", help="Write the scores as LaTeX tables.")
 @click.option("--plot", type=PATH, metavar="DIR", help="Write a picture of the reliability.")
+@plugin_option
 @common_options
 def evaluate(
     results: Path,

@@ -8,9 +8,11 @@ import click
 
 from failuretwin.app.commands.options import (
     PATH,
+    HypothesesOption,
     LogOptions,
     calibration_option,
     common_options,
+    plugin_option,
     reading_options,
 )
 
@@ -89,9 +91,23 @@ def calibrate(
     show_default=True,
     help="Batches of 64 runs to learn from.",
 )
+@click.option(
+    "--hypotheses",
+    cls=HypothesesOption,
+    metavar="H,...",
+    help="What the network tells apart, such as healthy,motor_2:stuck. Default: the paper's nine "
+    "classes.",
+)
+@plugin_option
 @common_options
 def train(
-    out: Path, calibration: Path | None, network: str, iterations: int, robot: str, seed: int
+    out: Path,
+    calibration: Path | None,
+    network: str,
+    iterations: int,
+    hypotheses: str | None,
+    robot: str,
+    seed: int,
 ) -> None:
     """Train a network on the imperfect twin, for `diagnose --method MODEL`.
 
@@ -105,6 +121,7 @@ def train(
     from failuretwin.digital_model.robot import load_robot
 
     check_learning()
+    from failuretwin.app.inputs import parse_cli_hypotheses
     from failuretwin.decision.learned.storage import check_network_file, save_network
     from failuretwin.decision.training import TrainingPlan, train_network
 
@@ -112,7 +129,8 @@ def train(
     check_writable(out)
     model = load_robot(robot)
     known = load_calibration(calibration, model)
-    plan = TrainingPlan(network, iterations, seed)
+    chosen = parse_cli_hypotheses(hypotheses, model)
+    plan = TrainingPlan(network, iterations, seed, hypotheses=chosen)
     with progress_bar("training", iterations) as advance:
         diagnoser, alone, both = train_network(
             plan, known.robot, known.imperfections, lambda done: advance(1)

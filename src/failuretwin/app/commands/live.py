@@ -16,6 +16,7 @@ from failuretwin.app.commands.options import (
     calibration_option,
     common_options,
     live_options,
+    plugin_option,
 )
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     help="Record readings, commands and diagnoses; Foxglove, PlotJuggler and failuretwin read it.",
 )
 @live_options
+@plugin_option
 @common_options
 def watch(
     source: str,
@@ -96,6 +98,7 @@ the last fault has begun or been repaired [s]."""
     "until 20 s after the last fault has begun or been repaired, unless --duration says otherwise.",
 )
 @live_options
+@plugin_option
 @common_options
 def emulate(
     target: str,

@@ -88,6 +88,39 @@ calibration_option = click.option(
 )
 
 
+class HypothesesOption(click.Option):
+    """`--hypotheses`, whose help names all modes that are known, those of plugins too."""
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Return the name of the option and its help."""
+        from failuretwin.failure_behavior.registry import MODES
+
+        record = super().get_help_record(ctx)
+        return record and (record[0], f"{record[1]} Modes: {', '.join(MODES)}.")
+
+
+def plugin_option(command: F) -> F:
+    """Add `--plugin`, which makes fault modes known before anything else is read or told."""
+
+    def load(context: click.Context, option: click.Parameter, plugins: tuple[str, ...]) -> None:
+        if plugins:
+            from failuretwin.failure_behavior.registry import load_plugin
+
+            for plugin in plugins:
+                load_plugin(plugin)
+
+    return click.option(
+        "--plugin",
+        multiple=True,
+        is_eager=True,
+        expose_value=False,
+        callback=load,
+        metavar="MODULE|FILE.py",
+        help="Module with fault modes of your own, see docs/fault_modes.md. Can be given several "
+        "times.",
+    )(command)
+
+
 def reading_options(command: F) -> F:
     """Add what says how raw logs become runs; the command gets it as `reading`."""
     command = _gathered(command, LogOptions, "reading")

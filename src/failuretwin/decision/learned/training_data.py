@@ -12,8 +12,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,8 +27,9 @@ from failuretwin.decision.learned.networks import epoch
 from failuretwin.digital_model.nonidealities import SETTLING_LISTS, Imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import FaultMode
-from failuretwin.failure_behavior.modes import MODES, SteadyStateError, Stuck
+from failuretwin.failure_behavior.modes import SteadyStateError, Stuck
 from failuretwin.failure_behavior.random_movements import RandomMovements
+from failuretwin.failure_behavior.registry import MODES
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -79,6 +79,8 @@ class TrainingData:
         seed: Seed of all chance.
         variants: Kinds of runs, equally frequent.
         engine: What moves the robot; see `Plan`.
+        hypotheses: The classes; none: the paper's.
+        modes: Fault modes by id; a variant says how large the paper's are and when they begin.
     """
 
     robot: Robot
@@ -86,11 +88,12 @@ class TrainingData:
     seed: int = 0
     variants: tuple[Variant, ...] = VARIANTS
     engine: str = "servo"
+    hypotheses: tuple[Hypothesis, ...] = ()
+    modes: Mapping[str, FaultMode] = field(default_factory=lambda: dict(MODES))
 
-    @cached_property
-    def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """The classes: those of the paper."""
-        return paper_hypotheses(self.robot.motor_names)
+    def __post_init__(self) -> None:
+        if not self.hypotheses:
+            object.__setattr__(self, "hypotheses", paper_hypotheses(self.robot.motor_names))
 
     @property
     def movements(self) -> tuple[int, int]:
@@ -142,15 +145,14 @@ class TrainingData:
             seed=self.seed,
             imperfections=self.imperfections,
             movements=RandomMovements(),
-            modes=_modes(variant),
+            modes={**self.modes, **_modes_of(variant)},
             engine=self.engine,
         )
 
 
-def _modes(variant: Variant) -> Mapping[str, FaultMode]:
+def _modes_of(variant: Variant) -> Mapping[str, FaultMode]:
     low, high = variant.error_counts
     return {
-        **MODES,
         "stuck": Stuck(onset_s=variant.onset_s),
         "steady_state_error": SteadyStateError(magnitude=(low * COUNT_RAD, high * COUNT_RAD)),
     }

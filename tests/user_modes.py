@@ -1,0 +1,43 @@
+"""Fault modes of a user: the one that the page on fault modes offers for copying."""
+
+from __future__ import annotations
+
+import re
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+from failuretwin.failure_behavior.registry import MODES, load_plugin
+
+PAGE = Path(__file__).parents[1] / "docs" / "fault_modes.md"
+
+
+def code_on_the_page():
+    text = PAGE.read_text("utf-8").partition("## A mode of your own")[2]
+    return re.search(r"```python\n(.*?)```", text, re.DOTALL)[1]
+
+
+@contextmanager
+def forgotten_afterwards():
+    """Forget the modes, modules and folders that a plugin has added meanwhile."""
+    before, modules, folders = dict(MODES), set(sys.modules), list(sys.path)
+    try:
+        yield
+    finally:
+        for name in MODES.keys() - before.keys():
+            module = type(MODES._modes.pop(name)).__module__
+            if module not in modules:
+                sys.modules.pop(module, None)
+        sys.path[:] = folders
+
+
+@contextmanager
+def registered_from(code, folder, name="mode_from_the_page"):
+    """Give the mode that a module of this code registers."""
+    path = folder / f"{name}.py"
+    path.write_text(code)
+    with forgotten_afterwards():
+        before = set(MODES)
+        load_plugin(str(path))
+        (mode,) = MODES.keys() - before
+        yield MODES[mode]
