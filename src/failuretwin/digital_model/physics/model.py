@@ -16,13 +16,13 @@ brake is part of the gear and not limited. Friction of the gear is a spring that
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 from xml.etree import ElementTree
 
 import numpy as np
 
-from failuretwin.core.config import from_table, read_toml
+from failuretwin.core.config import AtLeastZero, Bounded, Bounds, from_table, read_toml
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.digital_model.robot import Robot
@@ -30,12 +30,11 @@ from failuretwin.digital_model.urdf import Urdf, read_root, read_urdf
 
 # What the physics engine needs to know of motors and gears, and where it is written down.
 
-MAY_BE_ZERO = ("derivative", "damping", "friction", "flex_damping")
-MAY_BE_INFINITE = ("torque_limit",)
+AboveZero = Annotated[float, Bounds(1e-12, 1e12)]
 
 
 @dataclass(frozen=True)
-class MotorPhysics:
+class MotorPhysics(Bounded):
     """A motor with its servo and its gear. For a sliding joint read N for N m and m for rad.
 
     Servo: torque = stiffness * (s - q) + derivative * (s' - q'), within the torque limit, with q
@@ -61,27 +60,17 @@ class MotorPhysics:
     """
 
     name: str
-    stiffness: float
-    derivative: float
-    filter_s: float
-    damping: float
-    armature: float
-    friction: float
-    friction_yield: float
-    torque_limit: float
-    flex_stiffness: float
-    flex_damping: float
-    flex_inertia: float
-
-    def __post_init__(self) -> None:
-        for field in fields(self)[1:]:
-            value = getattr(self, field.name)
-            fits = value >= 0.0 if field.name in MAY_BE_ZERO else value > 0.0
-            if not fits or (math.isinf(value) and field.name not in MAY_BE_INFINITE):
-                raise InputError(
-                    f"motor {self.name!r}: {field.name} is {value}, expected a finite number "
-                    f"{'of zero or more' if field.name in MAY_BE_ZERO else 'above zero'}."
-                )
+    stiffness: AboveZero
+    derivative: AtLeastZero
+    filter_s: AboveZero
+    damping: AtLeastZero
+    armature: AboveZero
+    friction: AtLeastZero
+    friction_yield: AboveZero
+    torque_limit: Annotated[float, Bounds(1e-12, math.inf)]
+    flex_stiffness: AboveZero
+    flex_damping: AtLeastZero
+    flex_inertia: AboveZero
 
     @property
     def compliance(self) -> float:
