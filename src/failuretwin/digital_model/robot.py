@@ -16,12 +16,16 @@ import numpy as np
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.types import FloatArray, ServoUnits, frozen_array
-from failuretwin.digital_model.gravity import Loads, loads_of
-from failuretwin.digital_model.kinematics import SerialChain
+from failuretwin.digital_model.kinematics import (
+    CANNOT_MOVE,
+    Loads,
+    SerialChain,
+    has_range,
+    levers,
+)
 from failuretwin.digital_model.servo import ServoLoop
-from failuretwin.digital_model.urdf import UrdfJoint, read_links, read_root, read_urdf
+from failuretwin.digital_model.urdf import UrdfJoint, read_urdf
 from failuretwin.digital_model.urdf_check import JointReport, UrdfReport
-from failuretwin.digital_model.urdf_findings import CANNOT_MOVE, has_range, levers
 
 POSES = ("log", "physical")
 
@@ -205,8 +209,7 @@ def _load_profile(path: Path) -> Robot:
     _check_unique([motor.name for motor in profile.motors], "motor name", path)
     joints = [motor.joint for motor in profile.motors]
     _check_unique(joints, "joint", path)
-    urdf_file = path.parent / profile.urdf
-    urdf = read_urdf(urdf_file)
+    urdf = read_urdf(path.parent / profile.urdf)
     chain = urdf.chain(profile.base_link, profile.tool_link, joints)
     order = [joint.name for joint in chain.joints]
     if joints != order:
@@ -220,8 +223,7 @@ def _load_profile(path: Path) -> Robot:
                 f"{path}: motor {motor.name!r} ({motor.joint}) cannot move the tool point, so no "
                 "tool path can tell of it. Leave it out, or choose another tool_link."
             )
-    links = read_links(read_root(urdf_file))
-    return Robot(profile, chain, loads_of(urdf, links, profile.base_link, chain), path.parent)
+    return Robot(profile, chain, urdf.loads(profile.base_link, chain), path.parent)
 
 
 def _check_unique(names: Sequence[str], kind: str, path: Path) -> None:
