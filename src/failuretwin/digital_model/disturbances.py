@@ -15,6 +15,7 @@ from failuretwin.core.movements import Movements
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.nonidealities import Imperfections, Readings, vary
 from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.servo import first_order_lag
 from failuretwin.digital_model.settling import Settling
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -207,19 +208,12 @@ def lagged(reference: FloatArray, time: FloatArray, lag: FloatArray) -> FloatArr
         time: Uniform grid, (time,) [s].
         lag: Time constant of each run, (run,) [s]; 0 leaves a run as it is.
     """
-    from scipy.signal import lfilter
-
     if not lag.any():
         return reference
     out = reference.copy()
-    step = time[1] - time[0]
     for run in np.flatnonzero(lag):
-        kept = np.exp(-step / lag[run])
-        mean = lag[run] / step * (1.0 - kept)
-        moved = reference[run] - reference[run, :1]
-        out[run] = reference[run, :1] + lfilter(
-            [1.0 - mean, mean - kept], [1.0, -kept], moved, axis=0
-        )
+        first, step = reference[run, 0], float(time[1] - time[0])
+        out[run] = first_order_lag(reference[run].T, first, step, lag[run]).T
     return out
 
 

@@ -46,7 +46,7 @@ class DigitalTwin:
                 f"`command` has shape {command.shape}, expected (..., {len(grid)} times, motor)."
             )
         loops = [motor.loop for motor in self.robot.motors]
-        return servo.respond(loops, command, _uniform_step(grid))
+        return servo.respond(loops, command, uniform_step(grid))
 
     def path(self, position: ArrayLike) -> FloatArray:
         """Return what the tool sensor sees of motor angles.
@@ -80,12 +80,11 @@ class DigitalTwin:
         return position * self.robot.sensor_sense
 
 
-def _uniform_step(time: FloatArray) -> float:
+def uniform_step(time: FloatArray) -> float:
+    """Return the step of a uniform grid [s]; raise InputError for any other."""
     steps = np.diff(time)
     if len(steps) == 0 or steps.min() <= 0 or np.ptp(steps) > 1e-3 * steps.mean():
-        raise InputError(
-            "`time` is not a uniform, increasing grid. Resample the commands onto one."
-        )
+        raise InputError("`time` is not a uniform, increasing grid. Resample onto one.")
     return float((time[-1] - time[0]) / len(steps))
 
 
