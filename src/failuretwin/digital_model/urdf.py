@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -79,21 +79,6 @@ class LinkFacts:
 
 
 @dataclass(frozen=True)
-class Leaf:
-    """A link at the end of a branch, which may be the tool.
-
-    Attributes:
-        link: Its name.
-        moving: Joints between base and link that a motor can move.
-        length: Length of the way along the joint frames [m].
-    """
-
-    link: str
-    moving: int
-    length: float
-
-
-@dataclass(frozen=True)
 class Urdf:
     """The joints and links of a URDF file.
 
@@ -117,32 +102,29 @@ class Urdf:
         children = {joint.child for joint in self.joints}
         return [link for link in dict.fromkeys(self.links) if link not in children]
 
-    def carried(self, link: str, *types: str) -> list[str]:
-        """Return `link` and all links beyond it, by joints of `types` alone if any are given."""
-        found = [link]
-        for name in found:
-            onward = [j for j in self.joints if j.parent == name and (not types or j.type in types)]
-            found += [joint.child for joint in onward if joint.child not in found]
-        return found
+    def ways(self, base: str) -> dict[str, tuple[UrdfJoint, ...]]:
+        """Return the joints from `base` to each link that hangs from it, `base` itself first."""
+        ways: dict[str, tuple[UrdfJoint, ...]] = {base: ()}
+        waiting = [base]
+        for link in waiting:
+            onward = [j for j in self.joints if j.parent == link and j.child not in ways]
+            ways |= {joint.child: (*ways[link], joint) for joint in onward}
+            waiting += dict.fromkeys(joint.child for joint in onward)
+        return ways
 
-    def leaves(self, base: str) -> list[Leaf]:
-        """Return the ends of all branches above `base`, the best candidate for the tool first.
+    def tools(self, base: str) -> dict[str, int]:
+        """Return the ends of all branches above `base` and how many motors are on the way there.
 
-        That is the one with the most motors on the way to it and, among equals, the longest way.
+        The best candidate for the tool, that with the most motors, comes first and, among equals,
+        the one with the longest way along the joint frames.
         """
-        found, open_ways, seen = [], [Leaf(base, 0, 0.0)], set()
-        while open_ways:
-            here = open_ways.pop()
-            if here.link in seen:
-                continue
-            seen.add(here.link)
-            joints = [joint for joint in self.joints if joint.parent == here.link]
-            for joint in joints:
-                length = here.length + float(np.linalg.norm(joint.T_pc[:3, 3]))
-                open_ways.append(Leaf(joint.child, here.moving + joint.has_motor, length))
-            if not joints and here.link in self.links:
-                found.append(here)
-        return sorted(found, key=lambda leaf: (-leaf.moving, -round(leaf.length, 9), leaf.link))
+        ends = set(self.links) - {joint.parent for joint in self.joints}
+        rank = {}
+        for link, way in self.ways(base).items():
+            length = sum(float(np.linalg.norm(joint.T_pc[:3, 3])) for joint in way)
+            if link in ends:
+                rank[link] = -sum(joint.has_motor for joint in way), -round(length, 9), link
+        return {link: -rank[link][0] for link in sorted(rank, key=rank.__getitem__)}
 
     def path(self, base_link: str, tool_link: str) -> tuple[UrdfJoint, ...]:
         """Return the joints from `base_link` to `tool_link`, in that order.
@@ -153,18 +135,13 @@ class Urdf:
         for link in (base_link, tool_link):
             if link not in self.links:
                 raise InputError(f"{self.source}: {unknown_name('link', link, self.links)}")
-        by_child = {joint.child: joint for joint in self.joints}
-        path: list[UrdfJoint] = []
-        link = tool_link
-        while link != base_link:
-            if link not in by_child or len(path) > len(self.joints):
-                raise InputError(
-                    f"{self.source}: no chain of joints leads from {base_link!r} to {tool_link!r}; "
-                    f"it ends at {link!r}. Name a base link that carries the tool."
-                )
-            path.append(by_child[link])
-            link = path[-1].parent
-        return tuple(reversed(path))
+        way = self.ways(base_link).get(tool_link)
+        if way is None:
+            raise InputError(
+                f"{self.source}: no chain of joints leads from {base_link!r} to {tool_link!r}. "
+                "Name a base link that carries the tool."
+            )
+        return way
 
     def chain(self, base_link: str, tool_link: str, moving: Collection[str]) -> SerialChain:
         """Return the chain to the tool link in which the joints `moving` move.
@@ -196,33 +173,21 @@ class Urdf:
         """
         names = [joint.name for joint in chain.joints]
         mass, moment = np.zeros(len(names)), np.zeros((len(names), 3))
-        for link, (segment, T_jl) in self._segments(base_link, names).items():
+        for link, way in self.ways(base_link).items():
+            carriers = [k for k, joint in enumerate(way) if joint.name in names]
             fact = self.facts.get(link)
-            if segment >= 0 and fact is not None and fact.mass is not None:
-                mass[segment] += fact.mass
-                moment[segment] += fact.mass * (T_jl[:3, :3] @ fact.centre + T_jl[:3, 3])
+            if not carriers or fact is None or fact.mass is None:
+                continue
+            first = carriers[-1]
+            at = np.array(fact.centre)
+            for joint in reversed(way[first + 1 :]):
+                at = joint.T_pc[:3, :3] @ at + joint.T_pc[:3, 3]
+            segment = names.index(way[first].name)
+            mass[segment] += fact.mass
+            moment[segment] += fact.mass * (at @ rotation_to_z(way[first].axis))
         weighs = mass[:, None] > 0
         centre = np.divide(moment, mass[:, None], out=np.zeros_like(moment), where=weighs)
         return Loads(chain, mass, centre)
-
-    def _segments(self, base_link: str, names: Sequence[str]) -> dict[str, tuple[int, FloatArray]]:
-        """Return for each link the joint that carries it (-1: none), and its pose there."""
-        found: dict[str, tuple[int, FloatArray]] = {base_link: (-1, np.eye(4))}
-        waiting = [base_link]
-        while waiting:
-            parent = waiting.pop()
-            segment, T = found[parent]
-            for joint in self.joints:
-                if joint.parent != parent or joint.child in found:
-                    continue
-                if joint.name in names:
-                    T_jl = np.eye(4)
-                    T_jl[:3, :3] = rotation_to_z(joint.axis).T
-                    found[joint.child] = (names.index(joint.name), T_jl)
-                else:
-                    found[joint.child] = (segment, T @ joint.T_pc)
-                waiting.append(joint.child)
-        return found
 
     def _check_movable(self, name: str, path: tuple[UrdfJoint, ...]) -> None:
         names = [joint.name for joint in path]

@@ -146,10 +146,10 @@ def check_urdf(path: Path, base: str | None = None, tool: str | None = None) -> 
 
 def _with_chain(report: UrdfReport, urdf: Urdf, base: str | None, tool: str | None) -> UrdfReport:
     base_link = urdf.roots[0] if base is None else base
-    ends = urdf.leaves(base_link) if base_link in urdf.links else []
-    tool_link = tool if tool is not None else next((leaf.link for leaf in ends), base_link)
+    tools = urdf.tools(base_link)
+    tool_link = tool if tool is not None else next(iter(tools), base_link)
     path = urdf.path(base_link, tool_link)
-    candidates = [f"{leaf.link} ({leaf.moving} moving)" for leaf in ends]
+    candidates = [f"{link} ({moving} moving)" for link, moving in tools.items()]
     report = replace(report, base_link=base_link, tool_link=tool_link).with_findings(
         [
             *_loop_findings(urdf, path),
@@ -168,7 +168,7 @@ def _with_motors(report: UrdfReport, urdf: Urdf, path: Sequence[UrdfJoint]) -> U
     motion = mobility(urdf.chain(report.base_link, report.tool_link, names))
     reached = zip(names, motion.lever.tolist(), motion.moves, strict=True)
     levers = {name: lever for name, lever, moves in reached if moves}
-    moving = urdf.carried(motors[0].child)
+    moving = urdf.ways(motors[0].child)
     return replace(
         report,
         joints=_joint_reports(urdf, path, list(levers)),
@@ -338,7 +338,11 @@ def _mass_findings(urdf: Urdf, path: Sequence[UrdfJoint]) -> Iterator[Finding]:
     Links held together by fixed joints are one body, so a frame without mass on a heavy link is
     fine; what a moving joint carries has to weigh something.
     """
-    bodies = [urdf.carried(joint.child, "fixed") for joint in path if joint.type != "fixed"]
+    bodies = [
+        [link for link, way in urdf.ways(j.child).items() if all(k.type == "fixed" for k in way)]
+        for j in path
+        if j.type != "fixed"
+    ]
     facts = {n: urdf.facts[n] for body in bodies for n in body if n in urdf.facts}
     mass = {name: fact.mass for name, fact in facts.items() if fact.mass is not None}
     not_positive = [name for name in mass if mass[name] <= 0.0]
