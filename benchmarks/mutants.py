@@ -16,7 +16,7 @@ GUARD = 1e-5
 """Numbers below this only keep a division or a logarithm from failing."""
 PLAIN_KEYWORDS = {"axis", "keepdims", "dtype", "strict", "initial", "compare", "init", "repr"}
 """Arguments that are no part of a formula."""
-SPOKEN = {"debug", "info", "warning", "print", "check_number", "check_range", "check_share"}
+SPOKEN = {"debug", "info", "warning", "print", "check"}
 """Calls that only speak or refuse."""
 ARITHMETIC: Mapping[type[ast.operator], type[ast.operator]] = {
     ast.Add: ast.Sub,

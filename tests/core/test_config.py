@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import pytest
 
-from failuretwin.core.config import from_table, read_toml
+from failuretwin.core.config import Bounded, Bounds, from_table, read_toml
 from failuretwin.core.errors import InputError
 
 
@@ -85,6 +87,41 @@ def test_wrong_tables_say_where_and_what_is_expected(change, message):
     with pytest.raises(InputError) as error:
         from_table(Cart, {"name": "a"} | change, "cart.toml")
     assert str(error.value) == message
+
+
+@dataclass(frozen=True)
+class Road(Bounded):
+    slope: Annotated[float, Bounds(-0.5, 0.5)] = 0.0
+    widths: Annotated[tuple[float, ...], Bounds(2.0, 9.0)] = ()
+    speed: Annotated[tuple[float, float], Bounds(0.0, 100.0, in_order=True)] = (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"slope": -0.6}, "slope is -0.6, expected a number from -0.5 to 0.5."),
+        ({"slope": math.nan}, "slope is nan, expected a number from -0.5 to 0.5."),
+        ({"widths": [3.0, 1.5]}, "widths is 1.5, expected a number from 2 to 9."),
+        (
+            {"speed": [50.0, 30.0]},
+            "speed is [50, 30], expected the lowest and the highest value, in order, "
+            "from 0 to 100.",
+        ),
+        (
+            {"speed": [50, 101]},
+            "speed is [50, 101], expected the lowest and the highest value, in order, "
+            "from 0 to 100.",
+        ),
+    ],
+)
+def test_numbers_outside_their_bounds_are_refused(table, message):
+    with pytest.raises(InputError) as error:
+        from_table(Road, table, "road.toml")
+    assert str(error.value) == f"road.toml: {message}"
+
+
+def test_bounds_themselves_are_allowed():
+    assert Road(0.5, (2.0, 9.0), (100.0, 100.0)).slope == 0.5
 
 
 def test_toml_file_is_read(tmp_path):

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from failuretwin import DigitalTwin, load_robot
+from failuretwin.digital_model.kinematics import mobility
 from failuretwin.digital_model.robot import bundled_folder, bundled_robots, profile_text
 from failuretwin.digital_model.urdf import read_urdf
 from failuretwin.digital_model.urdf_check import check_urdf
-from failuretwin.digital_model.urdf_findings import mobility
 
 NEW = ("panda", "so101", "ur5e")
 SAME_PLACE_M = 1e-9

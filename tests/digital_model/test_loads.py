@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from failuretwin import load_robot
-from failuretwin.digital_model.gravity import loads_of
 from failuretwin.digital_model.robot import bundled_robots
-from failuretwin.digital_model.urdf import read_links, read_root, read_urdf
+from failuretwin.digital_model.urdf import read_urdf
 
 SLIDER = """<robot name="slider">
   <link name="base"/>
@@ -67,7 +66,7 @@ def test_slanting_axes_sliders_and_side_branches(tmp_path):
     file.write_text(SLIDER)
     urdf, joints = read_urdf(file), ["turn", "slide"]
     chain = urdf.chain("base", "rod", joints)
-    loads = loads_of(urdf, read_links(read_root(file)), "base", chain)
+    loads = urdf.loads("base", chain)
     poses = np.random.default_rng(1).uniform(-0.2, 0.2, (50, 2)) * [10.0, 1.0]
     expected = mujoco_torque(file, joints, poses)
     np.testing.assert_allclose(loads.torque(poses), expected, rtol=0, atol=1e-9)

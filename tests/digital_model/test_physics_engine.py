@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from failuretwin import load_robot
 from failuretwin.core.errors import InputError
 from failuretwin.digital_model.nonidealities import Schedule
-from failuretwin.digital_model.physics import batch, engine
+from failuretwin.digital_model.physics import engine
 from failuretwin.digital_model.physics.engine import PhysicsEngine
 from failuretwin.digital_model.physics.model import load_parameters
 from failuretwin.digital_model.robot import bundled_robots
@@ -380,7 +380,7 @@ def test_bytes_depend_on_neither_threads_nor_chunks_nor_neighbours(armpi, monkey
     alone = Drive(reference[1:2], held[1:2], drive.weakness[1:2], payload=drive.payload[1:2])
     np.testing.assert_array_equal(PhysicsEngine(armpi).angles(alone, TIME), whole[1:2])
     monkeypatch.setattr(engine, "RUNS_AT_ONCE", 2)
-    monkeypatch.setattr(batch, "SAMPLES_AT_ONCE", 37)
+    monkeypatch.setattr(engine, "SAMPLES_AT_ONCE", 37)
     np.testing.assert_array_equal(PhysicsEngine(armpi).angles(drive, TIME), whole)
 
 

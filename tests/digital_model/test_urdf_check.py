@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from failuretwin.core.errors import InputError
+from failuretwin.digital_model.kinematics import mobility
 from failuretwin.digital_model.robot import (
     bundled_folder,
     load_robot,
@@ -13,7 +14,6 @@ from failuretwin.digital_model.robot import (
 )
 from failuretwin.digital_model.urdf import read_urdf
 from failuretwin.digital_model.urdf_check import check_urdf
-from failuretwin.digital_model.urdf_findings import mobility
 
 
 def link(name, mass="0.5", moment="1e-4", more=""):

@@ -25,9 +25,9 @@ from failuretwin.decision.evaluation import (
     as_unknown_line,
     score_line,
 )
+from failuretwin.digital_model.kinematics import has_range
 from failuretwin.digital_model.urdf import UrdfJoint
 from failuretwin.digital_model.urdf_check import JointReport, UrdfReport
-from failuretwin.digital_model.urdf_findings import has_range
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.explanation import plain_name, size_words
 from failuretwin.inference.isolability import IsolabilityReport, isolability

@@ -1,4 +1,4 @@
-"""Tables from TOML files into frozen dataclasses: a wrong key or type is always an error."""
+"""Tables from TOML files into frozen dataclasses: a wrong key, type or number is an error."""
 
 from __future__ import annotations
 
@@ -8,14 +8,60 @@ import json
 import tomllib
 import types
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from failuretwin.core.errors import InputError, unknown_name
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Where a number lies, or every number of a tuple: from `low` to `high`, which NaN is not.
+
+    Of numbers `in_order` the first is the lowest and the second the highest.
+    """
+
+    low: float = 0.0
+    high: float = 1e6
+    in_order: bool = False
+
+    def check(self, name: str, value: float | tuple[float, ...]) -> None:
+        """Raise InputError unless `value` lies within."""
+        values = value if isinstance(value, tuple) else (value,)
+        outside = [number for number in values if not self.low <= number <= self.high]
+        span = f"from {self.low:g} to {self.high:g}"
+        if self.in_order and (outside or values[0] > values[1]):
+            raise InputError(
+                f"{name} is [{values[0]:g}, {values[1]:g}], expected the lowest and the highest "
+                f"value, in order, {span}."
+            )
+        if outside:
+            raise InputError(f"{name} is {outside[0]:g}, expected a number {span}.")
+
+
+Share = Annotated[float, Bounds(0.0, 1.0)]
+AtLeastZero = Annotated[float, Bounds()]
+
+
+class Bounded:
+    """Base of dataclasses whose numbers stay within the `Bounds` that annotate their fields."""
+
+    def __post_init__(self) -> None:
+        for name, bounds in _bounds_of(type(self)):  # type: ignore[arg-type]
+            bounds.check(name, getattr(self, name))
+
+
+@cache
+def _bounds_of(cls: type) -> list[tuple[str, Bounds]]:
+    hints = get_type_hints(cls, include_extras=True)
+    marks = [(name, mark) for name, hint in hints.items() for mark in get_args(hint)[1:]]
+    return [(name, mark) for name, mark in marks if isinstance(mark, Bounds)]
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -42,7 +88,7 @@ def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
         where: Name of the file and table for error texts.
 
     Raises:
-        InputError: For an unknown key, a missing key or a value of the wrong type.
+        InputError: For an unknown or missing key, a wrong type or what `cls` itself refuses.
     """
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
     for key in table:
@@ -55,27 +101,27 @@ def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
             values[name] = _convert(hints[name], table[name], f"{where}: {name}")
         elif _required(field):
             raise InputError(f"{where}: key {name!r} is missing. Add it.")
-    return cls(**values)
+    try:
+        return cls(**values)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
 
 
 def _required(field: dataclasses.Field[Any]) -> bool:
-    missing = dataclasses.MISSING
-    return field.default is missing and field.default_factory is missing
+    return field.default is field.default_factory is dataclasses.MISSING
 
 
 def _convert(hint: Any, value: Any, where: str) -> Any:
     origin, args = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
         return _convert(next(a for a in args if a is not type(None)), value, where)
-    if dataclasses.is_dataclass(hint):
-        if not isinstance(value, dict):
-            raise _wrong(where, value, "a table")
-        return from_table(hint, value, where)  # type: ignore[arg-type]
     if origin is tuple:
         return _convert_tuple(args, value, where)
+    if (dataclasses.is_dataclass(hint) or origin is dict) and not isinstance(value, dict):
+        raise _wrong(where, value, "a table")
+    if dataclasses.is_dataclass(hint):
+        return from_table(hint, value, where)  # type: ignore[arg-type]
     if origin is dict:
-        if not isinstance(value, dict):
-            raise _wrong(where, value, "a table")
         return {key: _convert(args[1], item, f"{where}.{key}") for key, item in value.items()}
     return _convert_plain(hint, value, where)
 

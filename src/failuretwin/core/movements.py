@@ -16,8 +16,6 @@ from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 
-# Sampled references as few straight lines: rounding and uneven sampling leave no false corners.
-
 Corner = tuple[float, float]
 """Time and value."""
 
@@ -27,92 +25,6 @@ a degree: half a count of a coarse servo, well below any fault that can be found
 
 LEAST_STEPS = 10
 """Changes from which a quantum can be read; fewer may share one by chance."""
-
-
-def simplify(
-    time: FloatArray, value: FloatArray, tolerance: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return the corners of a polyline that stays within `tolerance` of the samples.
-
-    Douglas and Peucker's algorithm (1973), then lines that rise by less than the tolerance are
-    made level, so that a plateau is a plateau.
-
-    Args:
-        time: Increasing times, (sample,) [s].
-        value: Samples, (sample,); NaN where there is none.
-        tolerance: Largest distance from the samples, in the unit of `value`.
-
-    Returns:
-        Times and values of the corners, (corner,).
-    """
-    known = np.isfinite(value)
-    time, value = time[known], value[known]
-    tolerance = max(tolerance, 0.75 * resolution(value))
-    kept = np.zeros(len(time), dtype=bool)
-    kept[[0, -1]] = True
-    stack = [(0, len(time) - 1)]
-    while stack:
-        first, last = stack.pop()
-        inner = slice(first + 1, last)
-        line = np.interp(time[inner], time[[first, last]], value[[first, last]])
-        distance = np.abs(value[inner] - line)
-        if len(distance) and distance.max() > tolerance:
-            worst = first + 1 + int(np.argmax(distance))
-            kept[worst] = True
-            stack += [(first, worst), (worst, last)]
-    time, value = _sharpen(np.flatnonzero(kept), time, value)
-    return time, _level(value, 2.0 * tolerance)
-
-
-def resolution(value: FloatArray) -> float:
-    """Return the quantum that samples are rounded to, 0 if there is none to be seen."""
-    steps = np.abs(np.diff(value))
-    steps = steps[steps > 1e-9]
-    if len(steps) < LEAST_STEPS:
-        return 0.0
-    multiples = steps / steps.min()
-    return float(steps.min()) if np.all(np.abs(multiples - np.rint(multiples)) < 0.02) else 0.0
-
-
-def _sharpen(kept: IntArray, time: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return corners with those that lie between two samples put where their lines meet.
-
-    Args:
-        kept: Samples that are corners of the polyline, (corner,).
-        time: Times of all samples, (sample,) [s].
-        value: All samples, (sample,).
-    """
-    corners = [(float(time[i]), float(value[i])) for i in kept]
-    sharp, i = corners[:1], 1
-    while i < len(corners):
-        between = i + 2 < len(corners) and kept[i + 1] - kept[i] == 1
-        met = _meet(sharp[-1], corners[i], corners[i + 1], corners[i + 2]) if between else None
-        sharp.append(met or corners[i])
-        i += 2 if met else 1
-    return np.array(sharp).T[0], np.array(sharp).T[1]
-
-
-def _meet(a: Corner, b: Corner, c: Corner, d: Corner) -> Corner | None:
-    """Return where the lines a-b and c-d meet, None unless that is between b and c."""
-    before = (b[1] - a[1]) / (b[0] - a[0])
-    after = (d[1] - c[1]) / (d[0] - c[0])
-    if before == after:
-        return None
-    at = (c[1] - b[1] + before * b[0] - after * c[0]) / (before - after)
-    slack = 0.05 * (c[0] - b[0])
-    if not b[0] - slack <= at <= c[0] + slack:
-        return None
-    return at, b[1] + before * (at - b[0])
-
-
-def _level(value: FloatArray, tolerance: float) -> FloatArray:
-    """Return corner values with each almost level line made level, at the value it begins with."""
-    value = value.copy()
-    for i in range(1, len(value)):
-        if abs(value[i] - value[i - 1]) <= tolerance:
-            value[i] = value[i - 1]
-    return value
-
 
 CORNER_TOLERANCE_RAD = 1e-7
 """Change of a reference from one step to the next [rad] that is rounding and no corner."""
@@ -172,11 +84,9 @@ class Movements(ArrayStruct):
             return np.repeat(self.initial[:, None], len(time), axis=1)
         knot_time, knot_value = self._knots()
         reference = np.empty((runs, motors, len(time)))
-        for run in range(runs):
-            for motor in range(motors):
-                reference[run, motor] = np.interp(
-                    time, knot_time[run, :, motor], knot_value[run, :, motor]
-                )
+        for at in np.ndindex(runs, motors):
+            knots = (at[0], slice(None), at[1])
+            reference[at] = np.interp(time, knot_time[knots], knot_value[knots])
         return reference.transpose(0, 2, 1)
 
     def _knots(self) -> tuple[FloatArray, FloatArray]:
@@ -191,21 +101,13 @@ class Movements(ArrayStruct):
         reached = np.where(np.isinf(following)[..., None], self.target, reached)
         times = np.stack([start, end], axis=2).reshape(runs, 2 * count, motors)
         values = np.stack([origin, reached], axis=2).reshape(runs, 2 * count, motors)
-        return _hold_padding(times, values, self.initial)
-
-
-def _hold_padding(
-    times: FloatArray, values: FloatArray, initial: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Replace padded knots by repeats of the last real one, so that the reference holds."""
-    last = np.where(np.isfinite(times[:, 0]), -np.inf, 0.0)
-    held = initial
-    for knot in range(times.shape[1]):
-        missing = ~np.isfinite(times[:, knot])
-        times[:, knot] = np.where(missing, last, times[:, knot])
-        values[:, knot] = np.where(missing, held, values[:, knot])
-        last, held = times[:, knot], values[:, knot]
-    return times, values
+        # Padded knots repeat the last real one, so that the reference holds.
+        last, held = np.where(np.isfinite(times[:, 0]), -np.inf, 0.0), self.initial
+        for knot in range(2 * count):
+            missing = ~np.isfinite(times[:, knot])
+            times[:, knot] = last = np.where(missing, last, times[:, knot])
+            values[:, knot] = held = np.where(missing, held, values[:, knot])
+        return times, values
 
 
 def find_movements(command: FloatArray, time: FloatArray) -> Movements:
@@ -232,12 +134,10 @@ def find_movements(command: FloatArray, time: FloatArray) -> Movements:
     count = max((len(start) for start, _, _ in found), default=0)
     runs, _, motors = command.shape
     start = np.full((runs, count), np.nan)
-    target = np.full((runs, count, motors), np.nan)
-    ramp = np.full((runs, count, motors), np.nan)
-    for i, (run_start, run_target, run_ramp) in enumerate(found):
-        start[i, : len(run_start)] = run_start
-        target[i, : len(run_start)] = run_target
-        ramp[i, : len(run_start)] = run_ramp
+    target, ramp = np.full((2, runs, count, motors), np.nan)
+    for i, of_run in enumerate(found):
+        until = len(of_run[0])
+        start[i, :until], target[i, :until], ramp[i, :until] = of_run
     return Movements(np.array(command[:, 0]), target, ramp, start)
 
 
@@ -310,19 +210,18 @@ def _lines(reference: FloatArray) -> list[tuple[int, int]] | None:
     bends = np.abs(steps[1:] - steps[:-1]) > CORNER_TOLERANCE_RAD
     edges = [0, *(np.flatnonzero(bends[1:] != bends[:-1]) + 1).tolist(), len(bends)]
     stretches = list(pairwise(edges)) if len(bends) else []
-    bent = stretches[0 if len(bends) and bends[0] else 1 :: 2]
-    if any(last - first > LONGEST_CORNER for first, last in bent):
+    bent = int(len(bends) == 0 or not bends[0])  # stretches are bent and straight in turn
+    if any(last - first > LONGEST_CORNER for first, last in stretches[bent::2]):
         return None
-    straight = stretches[1 if len(bends) and bends[0] else 0 :: 2]
-    return [(first, last + 1) for first, last in straight]
+    return [(first, last + 1) for first, last in stretches[1 - bent :: 2]]
 
 
 def _merge_starts(starts: FloatArray) -> FloatArray:
     """Return the first of each group of starts that lie within `SAME_MOVEMENT_S`."""
     kept: list[float] = []
-    for start in starts:
+    for start in starts.tolist():
         if not kept or start - kept[-1] > SAME_MOVEMENT_S:
-            kept.append(float(start))
+            kept.append(start)
     return np.array(kept)
 
 
@@ -344,3 +243,82 @@ def _ramps(corners: _Corners, start: FloatArray, end: FloatArray) -> tuple[Float
             duration[m] = abs(target[m] - origin) / speed if speed > 0.0 else 0.0
         origin = target[m]
     return target, duration
+
+
+def simplify(
+    time: FloatArray, value: FloatArray, tolerance: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the corners of a polyline that stays within `tolerance` of the samples.
+
+    Douglas and Peucker's algorithm (1973), then lines that rise by less than the tolerance are
+    made level, so that a plateau is a plateau; rounding leaves no false corners.
+
+    Args:
+        time: Increasing times, (sample,) [s].
+        value: Samples, (sample,); NaN where there is none.
+        tolerance: Largest distance from the samples, in the unit of `value`.
+
+    Returns:
+        Times and values of the corners, (corner,).
+    """
+    known = np.isfinite(value)
+    time, value = time[known], value[known]
+    tolerance = max(tolerance, 0.75 * resolution(value))
+    kept = np.zeros(len(time), dtype=bool)
+    kept[[0, -1]] = True
+    stack = [(0, len(time) - 1)]
+    while stack:
+        first, last = stack.pop()
+        inner = slice(first + 1, last)
+        line = np.interp(time[inner], time[[first, last]], value[[first, last]])
+        distance = np.abs(value[inner] - line)
+        if len(distance) and distance.max() > tolerance:
+            worst = first + 1 + int(np.argmax(distance))
+            kept[worst] = True
+            stack += [(first, worst), (worst, last)]
+    time, value = _sharpen(np.flatnonzero(kept), time, value)
+    return time, _level(value, 2.0 * tolerance)
+
+
+def resolution(value: FloatArray) -> float:
+    """Return the quantum that samples are rounded to, 0 if there is none to be seen."""
+    steps = np.abs(np.diff(value))
+    steps = steps[steps > 1e-9]
+    if len(steps) < LEAST_STEPS:
+        return 0.0
+    multiples = steps / steps.min()
+    return float(steps.min()) if np.all(np.abs(multiples - np.rint(multiples)) < 0.02) else 0.0
+
+
+def _sharpen(kept: IntArray, time: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the corners `kept` of samples, those between two samples where their lines meet."""
+    corners = [(float(time[i]), float(value[i])) for i in kept]
+    sharp, i = corners[:1], 1
+    while i < len(corners):
+        between = i + 2 < len(corners) and kept[i + 1] - kept[i] == 1
+        met = _meet(sharp[-1], corners[i], corners[i + 1], corners[i + 2]) if between else None
+        sharp.append(met or corners[i])
+        i += 2 if met else 1
+    return np.array(sharp).T[0], np.array(sharp).T[1]
+
+
+def _meet(a: Corner, b: Corner, c: Corner, d: Corner) -> Corner | None:
+    """Return where the lines a-b and c-d meet, None unless that is between b and c."""
+    before = (b[1] - a[1]) / (b[0] - a[0])
+    after = (d[1] - c[1]) / (d[0] - c[0])
+    if before == after:
+        return None
+    at = (c[1] - b[1] + before * b[0] - after * c[0]) / (before - after)
+    slack = 0.05 * (c[0] - b[0])
+    if not b[0] - slack <= at <= c[0] + slack:
+        return None
+    return at, b[1] + before * (at - b[0])
+
+
+def _level(value: FloatArray, tolerance: float) -> FloatArray:
+    """Return corner values with each almost level line made level, at the value it begins with."""
+    value = value.copy()
+    for i in range(1, len(value)):
+        if abs(value[i] - value[i - 1]) <= tolerance:
+            value[i] = value[i - 1]
+    return value

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, unknown_name
@@ -106,12 +107,7 @@ def load_calibration(name_or_path: str | Path | None, robot: Robot) -> Calibrate
     table = read_toml(path)
     record = _record(table.pop(CALIBRATION_TABLE, {}), path)
     _check_robot(record.robot, robot, path)
-    try:
-        imperfections = from_table(Imperfections, table, str(path))
-    except InputError as error:
-        where = "" if str(error).startswith(str(path)) else f"{path}: "
-        raise InputError(f"{where}{error}") from error
-    imperfections = _completed(imperfections, len(robot.motors))
+    imperfections = _completed(from_table(Imperfections, table, str(path)), len(robot.motors))
     _check_fit(imperfections, robot, path)
     return CalibratedRobot(with_loops(robot, record.loops), imperfections)
 
@@ -142,15 +138,10 @@ def _completed(imperfections: Imperfections, motors: int) -> Imperfections:
     settling = imperfections.settling
     if settling is None:
         return imperfections
-    zero = (0.0,) * motors
-    whole = replace(
-        settling,
-        bias=settling.bias or zero,
-        compliance=settling.compliance or zero,
-        friction=settling.friction or zero,
-        scatter=settling.scatter or zero,
-    )
-    return replace(imperfections, settling=whole)
+    whole: dict[str, Any] = {
+        name: getattr(settling, name) or (0.0,) * motors for name in SETTLING_LISTS
+    }
+    return replace(imperfections, settling=replace(settling, **whole))
 
 
 @dataclass(frozen=True)
@@ -178,27 +169,16 @@ def _check_robot(owner: str, robot: Robot, path: Path) -> None:
 
 def _check_fit(imperfections: Imperfections, robot: Robot, path: Path) -> None:
     count = len(robot.motors)
-    for name, values in _motor_lists(imperfections).items():
+    lists = [(t, name) for t in ("settling", "variation") for name in SETTLING_LISTS]
+    for table, name in [*lists, ("readings", "glitch_rate")]:
+        values = getattr(getattr(imperfections, table), name, ())
         if len(values) not in (0, count):
             raise InputError(
-                f"{path}: {name} has {len(values)} values, expected {count}, one for each motor "
-                f"of {robot.name!r}."
+                f"{path}: {table}: {name} has {len(values)} values, expected {count}, one for each "
+                f"motor of {robot.name!r}."
             )
-    for lost in imperfections.lost_commands:
-        for motor in lost.motors:
-            if motor not in robot.motor_names:
-                raise InputError(
-                    f"{path}: lost_commands: {unknown_name('motor', motor, robot.motor_names)}"
-                )
-
-
-def _motor_lists(imperfections: Imperfections) -> dict[str, tuple[float, ...]]:
-    """Return every figure that has one value for each motor, by the name of its key."""
-    lists: dict[str, tuple[float, ...]] = {}
-    for table in ("settling", "variation"):
-        value = getattr(imperfections, table)
-        if value is not None:
-            lists |= {f"{table}: {name}": getattr(value, name) for name in SETTLING_LISTS}
-    if imperfections.readings is not None:
-        lists["readings: glitch_rate"] = imperfections.readings.glitch_rate
-    return lists
+    for motor in (motor for lost in imperfections.lost_commands for motor in lost.motors):
+        if motor not in robot.motor_names:
+            raise InputError(
+                f"{path}: lost_commands: {unknown_name('motor', motor, robot.motor_names)}"
+            )

@@ -15,6 +15,7 @@ from failuretwin.core.movements import Movements
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.nonidealities import Imperfections, Readings, vary
 from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.servo import first_order_lag
 from failuretwin.digital_model.settling import Settling
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -78,9 +79,8 @@ def draw_disturbances(
     imperfections = vary(imperfections, rng)
     timing, motors = imperfections.timing, len(robot.motors)
     settling = imperfections.settling or Settling.ideal(motors)
-    late = np.where(
-        rng.random(movements) < timing.late_rate, rng.uniform(*timing.late_s, movements), 0.0
-    )
+    is_late = rng.random(movements) < timing.late_rate
+    late = np.where(is_late, rng.uniform(*timing.late_s, movements), 0.0)
     late[:1] = 0.0
     times, glitch, noise = _draw_readings(imperfections.readings, motors, duration, rng)
     return Disturbances(
@@ -127,12 +127,11 @@ def _draw_losses(
 def _draw_scatter(
     settling: Settling | None, rows: int, motors: int, rng: np.random.Generator
 ) -> FloatArray:
+    shape = (rows, motors)
     if settling is None:
-        return np.zeros((rows, motors))
-    if np.isinf(settling.tail_dof):
-        unit = rng.standard_normal((rows, motors))
-    else:
-        unit = rng.standard_t(settling.tail_dof, (rows, motors))
+        return np.zeros(shape)
+    gaussian = np.isinf(settling.tail_dof)
+    unit = rng.standard_normal(shape) if gaussian else rng.standard_t(settling.tail_dof, shape)
     return unit * np.asarray(settling.scatter)
 
 
@@ -146,9 +145,9 @@ def _draw_readings(
     times[1:] += rng.normal(0.0, readings.jitter_s, count - 1) if readings.jitter_s else 0.0
     spoilt = rng.random((count, motors)) < np.asarray(readings.glitch_rate or [0.0] * motors)
     glitch = np.where(spoilt, rng.integers(-32768, 32768, (count, motors)), np.nan)
-    noise = (
-        rng.normal(0.0, readings.noise_m, (count, 3)) if readings.noise_m else np.zeros((count, 3))
-    )
+    noise = np.zeros((count, 3))
+    if readings.noise_m:
+        noise = rng.normal(0.0, readings.noise_m, (count, 3))
     return np.maximum.accumulate(times), glitch, noise
 
 
@@ -180,17 +179,14 @@ def actual_movements(movements: Movements, chance: Disturbances) -> Movements:
         Movements with lost commands, bias, friction and scatter in their targets, and with late
         starts, delay and early ramp ends in their times.
     """
-    here = movements.initial + chance.bias + chance.scatter[:, 0]
-    initial = here
-    target = np.empty_like(movements.target)
-    commanded = movements.initial
+    initial = here = movements.initial + chance.bias + chance.scatter[:, 0]
+    target, commanded = np.empty_like(movements.target), movements.initial
     for m in range(target.shape[1]):
         wanted = movements.target[:, m]
         short = chance.friction * np.sign(wanted - commanded)
         settled = wanted + chance.bias - short + chance.scatter[:, 1 + m]
-        target[:, m] = np.where(chance.lost[:, m], here, settled)
+        target[:, m] = here = np.where(chance.lost[:, m], here, settled)
         commanded = np.where(chance.lost[:, m], commanded, wanted)
-        here = target[:, m]
     return Movements(
         initial=initial,
         target=target,
@@ -207,19 +203,12 @@ def lagged(reference: FloatArray, time: FloatArray, lag: FloatArray) -> FloatArr
         time: Uniform grid, (time,) [s].
         lag: Time constant of each run, (run,) [s]; 0 leaves a run as it is.
     """
-    from scipy.signal import lfilter
-
     if not lag.any():
         return reference
     out = reference.copy()
-    step = time[1] - time[0]
     for run in np.flatnonzero(lag):
-        kept = np.exp(-step / lag[run])
-        mean = lag[run] / step * (1.0 - kept)
-        moved = reference[run] - reference[run, :1]
-        out[run] = reference[run, :1] + lfilter(
-            [1.0 - mean, mean - kept], [1.0, -kept], moved, axis=0
-        )
+        first, step = reference[run, 0], float(time[1] - time[0])
+        out[run] = first_order_lag(reference[run].T, first, step, lag[run]).T
     return out
 
 
@@ -263,11 +252,9 @@ def sense(
     angles = np.where(missing[..., None] | spoilt, np.nan, read)
     nearest = np.rint(chance.reading_time / (time[1] - time[0])).astype(np.int64)
     inside = nearest < len(time)
-    run = np.broadcast_to(np.arange(len(position))[:, None], nearest.shape)
-    measured = np.full((*position.shape[:2], 3), np.nan)
-    measured[run[inside], nearest[inside]] = points[inside]
-    angle = np.full(position.shape, np.nan)
-    angle[run[inside], nearest[inside]] = angles[inside]
+    where = np.nonzero(inside)[0], nearest[inside]
+    measured, angle = np.full((*position.shape[:2], 3), np.nan), np.full(position.shape, np.nan)
+    measured[where], angle[where] = points[inside], angles[inside]
     return measured, angle
 
 
@@ -292,21 +279,15 @@ def _in_gap(chance: Disturbances, start: FloatArray) -> BoolArray:
 
 
 def _draw_out(
-    twin: DigitalTwin,
-    read: FloatArray,
-    chance: Disturbances,
-    missing: BoolArray,
-    time: FloatArray,
+    twin: DigitalTwin, read: FloatArray, chance: Disturbances, missing: BoolArray, time: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return path and angles drawn out to the grid by straight lines, as published."""
     units = twin.robot.servo_units
     counts = np.where(np.isfinite(chance.glitch), chance.glitch, units.to_counts(read))
     filled = np.empty((len(read), len(time), read.shape[-1]))
-    for run in range(len(read)):
+    for run, motor in np.ndindex(len(read), read.shape[-1]):
         kept = ~missing[run]
-        for motor in range(read.shape[-1]):
-            filled[run, :, motor] = np.interp(
-                time, chance.reading_time[run, kept], counts[run, kept, motor]
-            )
+        known = chance.reading_time[run, kept]
+        filled[run, :, motor] = np.interp(time, known, counts[run, kept, motor])
     angle = units.to_rad(filled)
     return twin.path(angle), angle

@@ -1,4 +1,4 @@
-"""Kinematics of a serial chain, batched: tool position and its Jacobian.
+"""A serial chain, batched: tool position and its Jacobian, gravity's torques, and its reach.
 
 Every joint turns about (or slides along) the z axis of its own frame; what lies between two such
 frames is a constant transform. The tool point is carried from the tip to the base as three
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.core.types import FloatArray, as_floats, frozen_array
 
 # Vectors of three coordinates, each a number or an array over poses.
 
@@ -21,16 +21,19 @@ Scalar = float | FloatArray
 """A coordinate: the same for every pose (float) or one per pose (array)."""
 Vector = tuple[Scalar, Scalar, Scalar]
 
+GRAVITY = 9.81
+"""Acceleration of free fall, along -z of the base [m/s2]."""
+
 CHUNK = 8000
 """Poses at a time: 64 kB an array, so that the working set stays in the second-level cache."""
 
 
-def chunks(count: int) -> Iterator[slice]:
+def _chunks(count: int) -> Iterator[slice]:
     """Return slices of `CHUNK` that cover `count` poses."""
     return (slice(start, start + CHUNK) for start in range(0, count, CHUNK))
 
 
-def scale(factor: float, value: Scalar) -> Scalar:
+def _scale(factor: float, value: Scalar) -> Scalar:
     """Return `factor` times `value`."""
     if factor == 0.0 or (isinstance(value, float) and value == 0.0):
         return 0.0
@@ -39,7 +42,7 @@ def scale(factor: float, value: Scalar) -> Scalar:
     return -value if factor == -1.0 else factor * value
 
 
-def add(a: Scalar, b: Scalar) -> Scalar:
+def _add(a: Scalar, b: Scalar) -> Scalar:
     """Return `a` plus `b`."""
     if isinstance(a, float) and a == 0.0:
         return b
@@ -48,21 +51,29 @@ def add(a: Scalar, b: Scalar) -> Scalar:
     return a + b
 
 
-def turn(T: FloatArray, v: Vector) -> Vector:
-    """Return the direction `v` turned by the constant transform `T`."""
-    rows = T[:3, :3].tolist()
-    x, y, z = (add(add(scale(r[0], v[0]), scale(r[1], v[1])), scale(r[2], v[2])) for r in rows)
+def _times(factor: Scalar, vector: FloatArray) -> Vector:
+    x, y, z = (factor * value if value else 0.0 for value in vector.tolist())
     return x, y, z
 
 
-def move(T: FloatArray, v: Vector) -> Vector:
+def _plus(a: Vector, b: Vector) -> Vector:
+    return _add(a[0], b[0]), _add(a[1], b[1]), _add(a[2], b[2])
+
+
+def _turn(T: FloatArray, v: Vector) -> Vector:
+    """Return the direction `v` turned by the constant transform `T`."""
+    rows = T[:3, :3].tolist()
+    x, y, z = (_add(_add(_scale(r[0], v[0]), _scale(r[1], v[1])), _scale(r[2], v[2])) for r in rows)
+    return x, y, z
+
+
+def _move(T: FloatArray, v: Vector) -> Vector:
     """Return the point `v` moved by the constant transform `T`."""
-    x, y, z = turn(T, v)
-    offset = T[:3, 3].tolist()
-    return add(x, offset[0]), add(y, offset[1]), add(z, offset[2])
+    x, y, z = T[:3, 3].tolist()
+    return _plus(_turn(T, v), (x, y, z))
 
 
-def spin(c: FloatArray, s: FloatArray, v: Vector) -> Vector:
+def _spin(c: FloatArray, s: FloatArray, v: Vector) -> Vector:
     """Return `v` turned about z by the angles with cosine `c` and sine `s`."""
     x, y, z = v
     x_zero = isinstance(x, float) and x == 0.0
@@ -122,7 +133,7 @@ class SerialChain:
         """
         flat = self._flatten(q)
         out = np.empty((len(flat), 3))
-        for rows in chunks(len(flat)):
+        for rows in _chunks(len(flat)):
             point, _ = self._carry(flat[rows].T.copy(), derivatives=False)
             for axis in range(3):
                 out[rows, axis] = point[axis]
@@ -140,7 +151,7 @@ class SerialChain:
         flat = self._flatten(q)
         point_out = np.empty((len(flat), 3))
         jacobian = np.empty((len(flat), 3, len(self.joints)))
-        for rows in chunks(len(flat)):
+        for rows in _chunks(len(flat)):
             point, columns = self._carry(flat[rows].T.copy(), derivatives=True)
             for axis in range(3):
                 point_out[rows, axis] = point[axis]
@@ -168,18 +179,18 @@ class SerialChain:
         columns: list[Vector] = []
         for joint, value in zip(reversed(self.joints), q[::-1], strict=True):
             if joint.prismatic:
-                columns = [turn(joint.T_pj, column) for column in columns]
+                columns = [_turn(joint.T_pj, column) for column in columns]
                 if derivatives:
-                    columns.insert(0, turn(joint.T_pj, (0.0, 0.0, 1.0)))
-                point = move(joint.T_pj, (point[0], point[1], add(point[2], value)))
+                    columns.insert(0, _turn(joint.T_pj, (0.0, 0.0, 1.0)))
+                point = _move(joint.T_pj, (point[0], point[1], _add(point[2], value)))
             else:
                 c, s = np.cos(value), np.sin(value)
-                turned = spin(c, s, point)
-                columns = [turn(joint.T_pj, spin(c, s, column)) for column in columns]
+                turned = _spin(c, s, point)
+                columns = [_turn(joint.T_pj, _spin(c, s, column)) for column in columns]
                 if derivatives:
-                    tangent = (scale(-1.0, turned[1]), turned[0], 0.0)
-                    columns.insert(0, turn(joint.T_pj, tangent))
-                point = move(joint.T_pj, turned)
+                    tangent = (_scale(-1.0, turned[1]), turned[0], 0.0)
+                    columns.insert(0, _turn(joint.T_pj, tangent))
+                point = _move(joint.T_pj, turned)
         return point, columns
 
 
@@ -194,3 +205,142 @@ def rotation_to_z(axis: Sequence[float]) -> FloatArray:
     x = helper - z * (helper @ z)
     x /= np.linalg.norm(x)
     return np.column_stack([x, np.cross(z, x), z])
+
+
+@dataclass(frozen=True)
+class Loads:
+    """Masses carried by the joints of a chain.
+
+    Attributes:
+        chain: The chain from base to tool.
+        mass: Mass that moves with each joint and none beyond it, (joint,) [kg].
+        centre: Its centre in the frame that turns with the joint, (joint, 3) [m].
+    """
+
+    chain: SerialChain
+    mass: FloatArray
+    centre: FloatArray
+
+    def torque(self, q: FloatArray, payload: FloatArray | float = 0.0) -> FloatArray:
+        """Return the torque with which gravity drives every joint.
+
+        Args:
+            q: Joint values in the physical sense, (..., joint) [rad or m].
+            payload: Mass at the tool point, () or as many leading axes as `q` [kg].
+
+        Returns:
+            (..., joint) [N m, or N for a joint that slides]; positive drives the joint up.
+        """
+        q = as_floats(q)
+        flat = q.reshape(-1, q.shape[-1])
+        carried = np.broadcast_to(payload, q.shape[:-1]).reshape(-1) if np.any(payload) else None
+        out = np.empty_like(flat)
+        for rows in _chunks(len(flat)):
+            extra = 0.0 if carried is None else carried[rows]
+            for joint, value in enumerate(self._carry(flat[rows].T.copy(), extra)):
+                out[rows, joint] = value
+        return out.reshape(q.shape)
+
+    def _carry(self, q: FloatArray, payload: Scalar) -> list[Scalar]:
+        """Return the torque of each joint for `q` (joint, pose).
+
+        Gravity is carried from base to tip, mass times position from tip to base; at each joint
+        their cross product about its axis is the torque.
+        """
+        cosine, sine = np.cos(q), np.sin(q)
+        down = self._gravity(cosine, sine)
+        mass = payload
+        moment = _times(payload, self.chain.T_jt[:3, 3])
+        torque: list[Scalar] = []
+        for j in reversed(range(len(q))):
+            joint = self.chain.joints[j]
+            mass = _add(mass, float(self.mass[j]))
+            moment = _plus(moment, _times(float(self.mass[j]), self.centre[j]))
+            if joint.prismatic:
+                torque.append(mass * down[j][2])
+                moment = (moment[0], moment[1], _add(moment[2], mass * q[j]))
+            else:
+                moment = _spin(cosine[j], sine[j], moment)
+                torque.append(_add(moment[0] * down[j][1], -(moment[1] * down[j][0])))
+            moment = _plus(_turn(joint.T_pj, moment), _times(mass, joint.T_pj[:3, 3]))
+        return torque[::-1]
+
+    def _gravity(self, cosine: FloatArray, sine: FloatArray) -> list[Vector]:
+        """Return gravity in the frame of each joint before the joint turns [m/s2]."""
+        here: Vector = (0.0, 0.0, -GRAVITY)
+        seen = []
+        for joint, c, s in zip(self.chain.joints, cosine, sine, strict=True):
+            here = _turn(joint.T_pj.T, here)
+            seen.append(here)
+            if not joint.prismatic:
+                here = _spin(c, -s, here)
+        return seen
+
+
+# Which joints can move the tool point, and how far it gets: by trying poses.
+
+POSES = 256
+SEED = 0
+"""The poses are the same each time, so that a report can be repeated."""
+
+CANNOT_MOVE = 1e-9
+"""A lever arm below this at every pose is rounding, not motion [m/rad or m/m]."""
+
+FREE_RANGE = np.pi
+"""Range tried on either side of zero for a joint without limits [rad or m]."""
+
+ASCENT_STEPS = 100
+
+
+def has_range(low: float, high: float) -> bool:
+    """Return whether limits are a range; exporters write 0 and 0 for ones they do not know."""
+    return bool(np.isfinite(low) and np.isfinite(high) and low < high)
+
+
+@dataclass(frozen=True)
+class Mobility:
+    """What the joints of a chain do to its tool point, by random poses within their limits.
+
+    Attributes:
+        lever: Largest speed of the tool for unit speed of each joint over all poses tried,
+            (joint,) [m/rad or m/m].
+        reach: Farthest distance of the tool from the base frame's origin that was found [m].
+    """
+
+    lever: FloatArray
+    reach: float
+
+    @property
+    def moves(self) -> list[bool]:
+        """Whether each joint can move the tool point."""
+        return (self.lever >= CANNOT_MOVE).tolist()
+
+
+def levers(chain: SerialChain) -> FloatArray:
+    """Return the largest speed of the tool for unit speed of each joint, (joint,) [m/rad, m/m]."""
+    _, jacobian = chain.position_and_jacobian(_poses(chain)[2])
+    return np.linalg.norm(jacobian, axis=-2).max(axis=0)
+
+
+def mobility(chain: SerialChain) -> Mobility:
+    """Return what the joints do; poses climb together to where the tool is farthest away."""
+    low, high, poses = _poses(chain)
+    point, jacobian = chain.position_and_jacobian(poses)
+    scale = float(np.linalg.norm(point, axis=-1).max()) or 1.0
+    farthest = 0.0
+    for step in np.linspace(1.0, 0.01, ASCENT_STEPS):
+        distance = np.linalg.norm(point, axis=-1)
+        farthest = max(farthest, float(distance.max()))
+        outward = point / np.maximum(distance, 1e-12)[:, None]
+        slope = np.einsum("pa,paj->pj", outward, jacobian)
+        poses = np.clip(poses + step * slope / scale, low, high)
+        point, jacobian = chain.position_and_jacobian(poses)
+    return Mobility(frozen_array(levers(chain)), farthest)
+
+
+def _poses(chain: SerialChain) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return lowest and highest joint values (joint,) and random poses between (pose, joint)."""
+    limits = [(joint.low, joint.high) for joint in chain.joints]
+    tried = [span if has_range(*span) else (-FREE_RANGE, FREE_RANGE) for span in limits]
+    low, high = np.array(tried).T
+    return low, high, np.random.default_rng(SEED).uniform(low, high, (POSES, len(low)))

@@ -8,15 +8,19 @@ each movement or reading.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 
-from failuretwin.core.errors import InputError, check_number, check_range, check_share, unknown_name
+from failuretwin.core.config import AtLeastZero, Bounded, Bounds, Share
+from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling
 
-Range = tuple[float, float]
+Range = Annotated[tuple[float, float], Bounds(in_order=True)]
+"""Lowest and highest value, from zero on."""
+Spreads = Annotated[tuple[float, ...], Bounds()]
 
 PROTOCOLS = ("P0", "P0c", "P1", "P2")
 """How much real data was used: none, healthy logs, unlabelled or labelled runs of the test set."""
@@ -25,7 +29,7 @@ SETTLING_LISTS = ("bias", "compliance", "friction", "scatter")
 
 
 @dataclass(frozen=True)
-class Timing:
+class Timing(Bounded):
     """How motions run late against their commands.
 
     Attributes:
@@ -38,23 +42,16 @@ class Timing:
             come back with the late start.
     """
 
-    delay_s: Range = (0.0, 0.0)
+    delay_s: Annotated[tuple[float, float], Bounds(-1.0, in_order=True)] = (0.0, 0.0)
     lag_s: Range = (0.0, 0.0)
-    ramp_shortening: Range = (0.0, 0.0)
-    late_rate: float = 0.0
+    ramp_shortening: Annotated[tuple[float, float], Bounds(-1.0, 0.99, in_order=True)] = (0.0, 0.0)
+    late_rate: Share = 0.0
     late_s: Range = (0.0, 0.0)
     gap_start_s: Range = (0.0, 0.0)
 
-    def __post_init__(self) -> None:
-        check_range("timing: delay_s", self.delay_s, low=-1.0)
-        check_range("timing: ramp_shortening", self.ramp_shortening, low=-1.0, high=0.99)
-        check_share("timing: late_rate", self.late_rate)
-        for name in ("lag_s", "late_s", "gap_start_s"):
-            check_range(f"timing: {name}", getattr(self, name))
-
 
 @dataclass(frozen=True)
-class LostCommand:
+class LostCommand(Bounded):
     """A set of motors that lose a command together and stay where they are for one movement.
 
     Attributes:
@@ -64,16 +61,12 @@ class LostCommand:
     """
 
     motors: tuple[str, ...]
-    rate: float
-    rate_when_late: float
-
-    def __post_init__(self) -> None:
-        check_share("lost_commands: rate", self.rate)
-        check_share("lost_commands: rate_when_late", self.rate_when_late)
+    rate: Share
+    rate_when_late: Share
 
 
 @dataclass(frozen=True)
-class Schedule:
+class Schedule(Bounded):
     """When movements are commanded and on what scale.
 
     Attributes:
@@ -83,16 +76,12 @@ class Schedule:
     """
 
     first_start_s: Range = (0.0, 0.0)
-    period_s: Range = (2.0, 2.0)
+    period_s: Annotated[tuple[float, float], Bounds(0.05, in_order=True)] = (2.0, 2.0)
     whole_counts: bool = False
-
-    def __post_init__(self) -> None:
-        check_range("schedule: first_start_s", self.first_start_s)
-        check_range("schedule: period_s", self.period_s, low=0.05)
 
 
 @dataclass(frozen=True)
-class Readings:
+class Readings(Bounded):
     """How the tool sensor samples the motion; without it, every grid time has a sample.
 
     Attributes:
@@ -106,23 +95,16 @@ class Readings:
             grid time, and gaps and glitches missing.
     """
 
-    rate_hz: float
-    jitter_s: float = 0.0
+    rate_hz: Annotated[float, Bounds(0.1, 1e5)]
+    jitter_s: AtLeastZero = 0.0
     whole_counts: bool = False
-    glitch_rate: tuple[float, ...] = ()
-    noise_m: float = 0.0
+    glitch_rate: Annotated[tuple[float, ...], Bounds(0.0, 1.0)] = ()
+    noise_m: AtLeastZero = 0.0
     drawn_out: bool = False
-
-    def __post_init__(self) -> None:
-        check_number("readings: rate_hz", self.rate_hz, low=0.1, high=1e5)
-        check_number("readings: jitter_s", self.jitter_s)
-        check_number("readings: noise_m", self.noise_m)
-        for rate in self.glitch_rate:
-            check_share("readings: glitch_rate", rate)
 
 
 @dataclass(frozen=True)
-class Variation:
+class Variation(Bounded):
     """How far a robot may differ from the figures: drawn anew for every run.
 
     One value for each motor in chain order, or none at all for no variation.
@@ -137,19 +119,12 @@ class Variation:
         payload: Range of a payload on top of the known one [kg].
     """
 
-    bias: tuple[float, ...] = ()
-    compliance: tuple[float, ...] = ()
-    friction: tuple[float, ...] = ()
-    scatter: tuple[float, ...] = ()
-    rates: float = 0.0
+    bias: Spreads = ()
+    compliance: Spreads = ()
+    friction: Spreads = ()
+    scatter: Spreads = ()
+    rates: AtLeastZero = 0.0
     payload: Range = (0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        for name in SETTLING_LISTS:
-            for value in getattr(self, name):
-                check_number(f"variation: {name}", value)
-        check_number("variation: rates", self.rates)
-        check_range("variation: payload", self.payload)
 
 
 @dataclass(frozen=True)
@@ -181,12 +156,16 @@ class Imperfections:
     def __post_init__(self) -> None:
         if self.protocol not in PROTOCOLS:
             raise unknown_name("protocol", self.protocol, PROTOCOLS)
-        for late in (False, True):
-            rates = [e.rate_when_late if late else e.rate for e in self.lost_commands]
-            if sum(rates) > 1.0 + 1e-9:
-                raise InputError(
-                    f"lost_commands: the rates add up to {sum(rates):g}, expected 1 at most."
-                )
+        if self.highest_loss > 1.0 + 1e-9:
+            raise InputError(
+                f"lost_commands: the rates add up to {self.highest_loss:g}, expected 1 at most."
+            )
+
+    @property
+    def highest_loss(self) -> float:
+        """Share of movements in which some command is lost: punctual or late ones, the larger."""
+        losses = self.lost_commands
+        return max(sum(e.rate for e in losses), sum(e.rate_when_late for e in losses))
 
 
 NO_IMPERFECTIONS = Imperfections("none", "the published twin")
@@ -199,9 +178,10 @@ GENERIC_SCATTER_RAD = 0.01
 
 def generic_imperfections(robot: Robot) -> Imperfections:
     """Return wide healthy offsets for a robot whose own have not been measured."""
-    zero = (0.0,) * len(robot.motors)
-    scatter = (GENERIC_SCATTER_RAD,) * len(robot.motors)
-    settling = Settling(zero, zero, zero, scatter, 4.0, "assumed, no calibration")
+    motors = len(robot.motors)
+    scatter = (GENERIC_SCATTER_RAD,) * motors
+    ideal = Settling.ideal(motors)
+    settling = replace(ideal, scatter=scatter, tail_dof=4.0, source="assumed, no calibration")
     return Imperfections(GENERIC_NAME, "assumed", settling=settling)
 
 
@@ -223,12 +203,7 @@ def vary(imperfections: Imperfections, rng: np.random.Generator) -> Imperfection
     if settling is not None:
         settling = _vary_settling(settling, variation, rng)
     factor = float(np.exp(variation.rates * rng.standard_normal()))
-    return replace(
-        _scale_rates(imperfections, factor),
-        name=imperfections.name,
-        settling=settling,
-        variation=None,
-    )
+    return replace(_scale_rates(imperfections, factor), settling=settling, variation=None)
 
 
 def _vary_settling(settling: Settling, variation: Variation, rng: np.random.Generator) -> Settling:
@@ -248,11 +223,7 @@ def _vary_settling(settling: Settling, variation: Variation, rng: np.random.Gene
 def _scale_rates(imperfections: Imperfections, factor: float) -> Imperfections:
     """Return the imperfections with every rate multiplied by `factor`, as far as shares can be."""
     timing, readings = imperfections.timing, imperfections.readings
-    losses = imperfections.lost_commands
-    most = max(
-        sum(entry.rate for entry in losses), sum(entry.rate_when_late for entry in losses), 1e-9
-    )
-    share = min(factor, HIGHEST_LOSS / most)
+    share = min(factor, HIGHEST_LOSS / max(imperfections.highest_loss, 1e-9))
     if readings is not None:
         glitch_rate = tuple(min(1.0, factor * rate) for rate in readings.glitch_rate)
         readings = replace(readings, glitch_rate=glitch_rate)
@@ -261,7 +232,7 @@ def _scale_rates(imperfections: Imperfections, factor: float) -> Imperfections:
         timing=replace(timing, late_rate=min(1.0, factor * timing.late_rate)),
         lost_commands=tuple(
             replace(entry, rate=share * entry.rate, rate_when_late=share * entry.rate_when_late)
-            for entry in losses
+            for entry in imperfections.lost_commands
         ),
         readings=readings,
     )

@@ -10,18 +10,23 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
+from string import Template
 
 import numpy as np
 
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.types import FloatArray, ServoUnits, frozen_array
-from failuretwin.digital_model.gravity import Loads, loads_of
-from failuretwin.digital_model.kinematics import SerialChain
+from failuretwin.digital_model.kinematics import (
+    CANNOT_MOVE,
+    Loads,
+    SerialChain,
+    has_range,
+    levers,
+)
 from failuretwin.digital_model.servo import ServoLoop
-from failuretwin.digital_model.urdf import UrdfJoint, read_links, read_root, read_urdf
+from failuretwin.digital_model.urdf import UrdfJoint, read_urdf
 from failuretwin.digital_model.urdf_check import JointReport, UrdfReport
-from failuretwin.digital_model.urdf_findings import CANNOT_MOVE, has_range, levers
 
 POSES = ("log", "physical")
 
@@ -212,8 +217,7 @@ def _load_profile(path: Path) -> Robot:
     _check_unique([motor.name for motor in profile.motors], "motor name", path)
     joints = [motor.joint for motor in profile.motors]
     _check_unique(joints, "joint", path)
-    urdf_file = path.parent / profile.urdf
-    urdf = read_urdf(urdf_file)
+    urdf = read_urdf(path.parent / profile.urdf)
     chain = urdf.chain(profile.base_link, profile.tool_link, joints)
     order = [joint.name for joint in chain.joints]
     if joints != order:
@@ -227,8 +231,7 @@ def _load_profile(path: Path) -> Robot:
                 f"{path}: motor {motor.name!r} ({motor.joint}) cannot move the tool point, so no "
                 "tool path can tell of it. Leave it out, or choose another tool_link."
             )
-    links = read_links(read_root(urdf_file))
-    return Robot(profile, chain, loads_of(urdf, links, profile.base_link, chain), path.parent)
+    return Robot(profile, chain, urdf.loads(profile.base_link, chain), path.parent)
 
 
 def _check_unique(names: Sequence[str], kind: str, path: Path) -> None:
@@ -248,8 +251,9 @@ def shown_unit(unit: str, robot: Robot) -> tuple[float, str]:
 
 # A commented robot profile, written from what a URDF states and plain assumptions elsewhere.
 
-TYPICAL_LOOP = ServoLoop(P=0.3, I=40.0, filter_s=0.01)
-"""Gains near those published for the bus servos of the ArmPi FPV."""
+PROFILE_TEMPLATE = "profile.template"
+"""A profile with $placeholders, the last table being that of one motor. Its gains are near those
+published for the bus servos of the ArmPi FPV."""
 
 ASSUMED_SPEED = math.pi
 """Speed limit where the URDF states none [rad/s or m/s]."""
@@ -275,97 +279,48 @@ def profile_text(report: UrdfReport, profile: Path) -> str:
         InputError: If the report holds an error.
     """
     report.raise_errors()
-    blocks = [
-        _head(report, profile),
-        _sources(report.motors),
-        *(_motor(motor) for motor in report.motors),
-    ]
-    return "\n".join(blocks)
+    template = (bundled_folder() / PROFILE_TEMPLATE).read_text(encoding="utf-8")
+    head, start, motor = template.partition("[[motors]]")
+    speeds = [m.motor or "" for m in report.motors if m.joint.velocity is None]
+    ranges = [m.motor or "" for m in report.motors if not has_range(m.joint.low, m.joint.high)]
+    common = Template(head).substitute(
+        name=_quote(report.name or report.source.stem),
+        urdf=_quote(_relative(report.source, profile.parent)),
+        base=_quote(report.base_link),
+        tool=_quote(report.tool_link),
+        unmoved=_unmoved(report.others),
+        speeds=_quote(_origin("URDF", speeds)),
+        ranges=_quote(_origin("URDF limits, narrowed to keep plateaus", ranges)),
+    )
+    return common + "\n".join(_motor(start + motor, one) for one in report.motors)
 
 
-def _head(report: UrdfReport, profile: Path) -> str:
-    tool, base = _quote(report.tool_link), _quote(report.base_link)
-    return f"""\
-# Robot profile for failuretwin, made from the URDF by `failuretwin robot init`.
-# Angles in rad, lengths in m, times in s. Go through the lines that say "assumed" and put in
-# what you know of your robot; everything else was read from the URDF.
-
-# What the robot is called in results.
-name = {_quote(report.name or report.source.stem)}
-
-# Kinematics: a URDF file, relative to this profile.
-urdf = {_quote(relative(report.source, profile.parent))}
-
-# Link that carries the base frame, in which tool positions are measured.
-base_link = {base}
-
-# Link whose origin is the tool point, the point that your sensor watches. Another tool point may
-# be moved by other motors: run `failuretwin robot init` again with --tool LINK to change it.
-tool_link = {tool}
-
-# Which angles belong to the tool path: "physical" when a sensor watches the real tool, "log" when
-# the path was computed from the angles in the log.
-sensor_pose = "physical"
-{_unmoved(report.others)}
-# Raw logs in servo counts need a table such as this; delete it if your logs are in rad.
-# Angle in degrees = zero_deg - deg_per_count * counts, for counts from low to high.
-# [servo_units]
-# zero_deg = 120.0
-# deg_per_count = 0.24
-# low = 0.0
-# high = 1000.0
-"""
+def _motor(template: str, report: JointReport) -> str:
+    joint = report.joint
+    low, high, range_note = movement_range(joint)
+    return Template(template).substitute(
+        name=_quote(report.motor or ""),
+        joint=_quote(joint.name),
+        unit="m" if joint.type == "prismatic" else "rad",
+        speed=speed_limit(joint),
+        speed_note="Assumed." if joint.velocity is None else "From the URDF.",
+        low=low,
+        high=high,
+        range_note=range_note,
+    )
 
 
 def _unmoved(others: Sequence[JointReport]) -> str:
     if not others:
         return "\n# Every joint of the file can move the tool point, so each has a motor below.\n"
-    lines = [f"#   {_quote(other.joint.name)}: {_plain(other.reason)}" for other in others]
+    reasons = ((_quote(other.joint.name), " ".join(other.reason.split())) for other in others)
+    lines = [f"#   {name}: {reason}" for name, reason in reasons]
     head = "# Joints without a motor below, since they cannot move the tool point:"
     return "\n".join(["", head, *lines, ""])
 
 
-def _sources(motors: Sequence[JointReport]) -> str:
-    speeds = [m.motor or "" for m in motors if m.joint.velocity is None]
-    ranges = [m.motor or "" for m in motors if not has_range(m.joint.low, m.joint.high)]
-    return f"""\
-# Where each group of numbers comes from.
-[sources]
-kinematics = "URDF"
-loop = "assumed: typical position servo"
-speed_limit = {_quote(_origin("URDF", speeds))}
-movement_range = {_quote(_origin("URDF limits, narrowed to keep plateaus", ranges))}
-sense = "assumed: commands and logs turn the way the URDF turns"
-"""
-
-
 def _origin(stated: str, assumed: Sequence[str]) -> str:
     return f"{stated}; assumed for {', '.join(assumed)}" if assumed else stated
-
-
-def _motor(report: JointReport) -> str:
-    joint = report.joint
-    low, high, range_note = movement_range(joint)
-    speed = speed_limit(joint)
-    loop = TYPICAL_LOOP
-    return f"""\
-[[motors]]
-# Name in run sets and diagnoses.
-name = {_quote(report.motor or "")}
-# Joint of the URDF that it turns.
-joint = {_quote(joint.name)}
-# +1, or -1 if commands and logs turn against the URDF. Assumed.
-sense = 1.0
-# How the motor follows its command: gains P [-] and I [1/s], time constant of the input filter
-# [s]. Assumed: typical position servo.
-loop = {{ P = {loop.P}, I = {loop.I}, filter_s = {loop.filter_s} }}
-# Largest speed [{_unit(joint)}/s]. {"Assumed." if joint.velocity is None else "From the URDF."}
-speed_limit = {speed!r}
-# Lowest and highest target of random movements [{_unit(joint)}].
-# {range_note}
-# Nothing here knows of tables and cables: narrow it to what is safe on your robot.
-movement_range = [{low!r}, {high!r}]
-"""
 
 
 def speed_limit(joint: UrdfJoint) -> float:
@@ -391,7 +346,7 @@ def movement_range(joint: UrdfJoint) -> tuple[float, float, str]:
     return middle - half, middle + half, note
 
 
-def relative(target: Path, folder: Path) -> str:
+def _relative(target: Path, folder: Path) -> str:
     """Return the way from `folder` to the file `target` with forward slashes."""
     try:
         way = os.path.relpath(target.resolve(), folder.resolve())
@@ -400,15 +355,6 @@ def relative(target: Path, folder: Path) -> str:
     return Path(way).as_posix()
 
 
-def _unit(joint: UrdfJoint) -> str:
-    return "m" if joint.type == "prismatic" else "rad"
-
-
 def _quote(text: str) -> str:
     """Return `text` as a TOML string; its escapes are those of JSON."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _plain(text: str) -> str:
-    """Return `text` on one line, fit for a comment."""
-    return " ".join(text.split())

@@ -71,6 +71,32 @@ def respond(loops: Sequence[ServoLoop], command: FloatArray, step: float) -> Flo
     return np.swapaxes(response, -1, -2)
 
 
+def first_order_lag(
+    reference: FloatArray, before: FloatArray, step: float, tau: float
+) -> FloatArray:
+    """Return references behind a first-order lag; exact for straight lines between samples.
+
+    Args:
+        reference: (..., time), sampled every `step` [s].
+        before: What the lag has put out at the first sample, (...).
+        step: Time between samples [s].
+        tau: Time constant [s].
+
+    Returns:
+        (..., time), beginning with `before`.
+    """
+    from scipy.signal import lfilter
+
+    kept = np.exp(-step / tau)
+    mean = (1.0 - kept) * tau / step
+    out = np.empty_like(reference)
+    out[..., 0] = before
+    memory = (mean - kept) * reference[..., :1] + kept * before[..., None]
+    weights = [1.0 - mean, mean - kept]
+    out[..., 1:], _ = lfilter(weights, [1.0, -kept], reference[..., 1:], zi=memory)
+    return out
+
+
 # The servo loop of a motor that can turn no faster than its speed limit.
 
 

@@ -1,18 +1,19 @@
-"""Where a healthy motor settles, relative to its command: bias, gravity sag and friction."""
+"""Where motors come to rest: bias, gravity sag, friction, and gears that hold them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-from failuretwin.core.errors import check_number
+from failuretwin.core.config import AtLeastZero, Bounded, Bounds
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
 
 
 @dataclass(frozen=True)
-class Settling:
+class Settling(Bounded):
     """Settled error of each motor and its scatter; one value for each motor in chain order.
 
     A motor gives way under the load torque of the links and the payload in the pose that the arm
@@ -28,20 +29,13 @@ class Settling:
         payload: Mass carried at the tool point beside what the URDF knows [kg].
     """
 
-    bias: tuple[float, ...] = ()
-    compliance: tuple[float, ...] = ()
-    friction: tuple[float, ...] = ()
-    scatter: tuple[float, ...] = ()
-    tail_dof: float = np.inf
+    bias: Annotated[tuple[float, ...], Bounds(-7.0, 1e3)] = ()
+    compliance: Annotated[tuple[float, ...], Bounds(-1e3, 1e3)] = ()
+    friction: Annotated[tuple[float, ...], Bounds(-7.0, 1e3)] = ()
+    scatter: Annotated[tuple[float, ...], Bounds(0.0, 1e3)] = ()
+    tail_dof: Annotated[float, Bounds(0.1, np.inf)] = np.inf
     source: str = ""
-    payload: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name, low in (("bias", -7.0), ("compliance", -1e3), ("friction", -7.0), ("scatter", 0)):
-            for value in getattr(self, name):
-                check_number(f"settling: {name}", value, low=low, high=1e3)
-        check_number("settling: tail_dof", self.tail_dof, low=0.1, high=np.inf)
-        check_number("settling: payload", self.payload)
+    payload: AtLeastZero = 0.0
 
     @classmethod
     def ideal(cls, motors: int) -> Settling:
@@ -61,10 +55,9 @@ class Settling:
             Settled angle minus commanded angle in the log's sense, (..., motor) [rad].
         """
         offset = np.asarray(self.bias) - np.asarray(self.friction) * direction
-        compliance = np.asarray(self.compliance)
-        if not compliance.any():
+        if not any(self.compliance):
             return offset
-        return offset + sag(robot, pose, compliance, self.payload)
+        return offset + sag(robot, pose, np.asarray(self.compliance), self.payload)
 
 
 def loads_in_range(robot: Robot, payload: float) -> FloatArray:
@@ -80,10 +73,7 @@ def largest_load(robot: Robot, payload: float) -> FloatArray:
 
 
 def sag(
-    robot: Robot,
-    pose: FloatArray,
-    compliance: FloatArray,
-    payload: FloatArray | float,
+    robot: Robot, pose: FloatArray, compliance: FloatArray, payload: FloatArray | float
 ) -> FloatArray:
     """Return how far gravity moves every motor, (..., motor) [rad], log's sense.
 
@@ -94,9 +84,6 @@ def sag(
         payload: Mass at the tool point, () or the leading axes of `pose` [kg].
     """
     return robot.sense * compliance * robot.loads.torque(pose * robot.sense, payload)
-
-
-# Motors held by their gear: they keep their angle, and catch up once they are let go.
 
 
 def hold(
@@ -129,13 +116,7 @@ def hold(
 
 
 def _let_go(position: FloatArray, held: BoolArray, reach: FloatArray) -> FloatArray:
-    """Return the angles (time, case) of motors that are let go at least once.
-
-    Args:
-        position: Free motion, (time, case) [rad].
-        held: When a motor is held, (time, case).
-        reach: Farthest way in one step, (case,) [rad].
-    """
+    """Return `hold` of motors (time, case) let go at least once, with (case,) `reach` a step."""
     followed = np.empty_like(position)
     here = followed[0] = position[0]
     behind = np.zeros(len(reach), dtype=bool)

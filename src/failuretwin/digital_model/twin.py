@@ -47,7 +47,7 @@ class DigitalTwin:
                 f"`command` has shape {command.shape}, expected (..., {len(grid)} times, motor)."
             )
         loops = [motor.loop for motor in self.robot.motors]
-        return servo.respond(loops, command, _uniform_step(grid))
+        return servo.respond(loops, command, uniform_step(grid))
 
     def path(self, position: ArrayLike) -> FloatArray:
         """Return what the tool sensor sees of motor angles.
@@ -83,12 +83,11 @@ class DigitalTwin:
         return None if np.all(sense == 1.0) else sense
 
 
-def _uniform_step(time: FloatArray) -> float:
+def uniform_step(time: FloatArray) -> float:
+    """Return the step of a uniform grid [s]; raise InputError for any other."""
     steps = np.diff(time)
     if len(steps) == 0 or steps.min() <= 0 or np.ptp(steps) > 1e-3 * steps.mean():
-        raise InputError(
-            "`time` is not a uniform, increasing grid. Resample the commands onto one."
-        )
+        raise InputError("`time` is not a uniform, increasing grid. Resample onto one.")
     return float((time[-1] - time[0]) / len(steps))
 
 

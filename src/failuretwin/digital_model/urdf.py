@@ -1,11 +1,10 @@
-"""Serial chains out of URDF files."""
+"""URDF files: their links and joints, how these hang together, and serial chains out of them."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -14,10 +13,12 @@ import numpy as np
 
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.types import FloatArray
-from failuretwin.digital_model.kinematics import Joint, SerialChain, rotation_to_z
+from failuretwin.digital_model.kinematics import Joint, Loads, SerialChain, rotation_to_z
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 HELD_TYPES = ("fixed", "floating", "planar")
+
+Triple = tuple[float, float, float]
 
 _XML_COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
 _XACRO = re.compile(rb"<xacro:|\$\{|\$\((?:find|arg|eval|env|optenv)\b")
@@ -47,22 +48,83 @@ class UrdfJoint:
     parent: str
     child: str
     T_pc: FloatArray
-    axis: tuple[float, float, float]
+    axis: Triple
     low: float
     high: float
     velocity: float | None = None
     effort: float | None = None
     mimic: str | None = None
 
+    @property
+    def has_motor(self) -> bool:
+        """Whether a motor of its own can move it."""
+        return self.type in MOVING_TYPES and self.mimic is None
+
+
+@dataclass(frozen=True)
+class LinkFacts:
+    """What a file says of one link.
+
+    Attributes:
+        mass: Its mass [kg]; None where the file states none that can be read.
+        centre: Centre of the mass in the link's frame [m]; the frame's origin where none is stated.
+        has_inertia: Whether all three moments of inertia are stated and above zero.
+        meshes: Mesh files as the file names them.
+    """
+
+    mass: float | None
+    centre: Triple
+    has_inertia: bool
+    meshes: tuple[str, ...]
+
 
 @dataclass(frozen=True)
 class Urdf:
-    """The joints and links of a URDF file."""
+    """The joints and links of a URDF file.
+
+    Attributes:
+        source: The file.
+        links: Names of the links, as often as the file has them.
+        joints: Its joints.
+        name: Name of the robot.
+        facts: What it says of each link, by name.
+    """
 
     source: str
     links: tuple[str, ...]
     joints: tuple[UrdfJoint, ...]
-    name: str = ""
+    name: str
+    facts: Mapping[str, LinkFacts]
+
+    @property
+    def roots(self) -> list[str]:
+        """Links that hang from no other."""
+        children = {joint.child for joint in self.joints}
+        return [link for link in dict.fromkeys(self.links) if link not in children]
+
+    def ways(self, base: str) -> dict[str, tuple[UrdfJoint, ...]]:
+        """Return the joints from `base` to each link that hangs from it, `base` itself first."""
+        ways: dict[str, tuple[UrdfJoint, ...]] = {base: ()}
+        waiting = [base]
+        for link in waiting:
+            onward = [j for j in self.joints if j.parent == link and j.child not in ways]
+            ways |= {joint.child: (*ways[link], joint) for joint in onward}
+            waiting += dict.fromkeys(joint.child for joint in onward)
+        return ways
+
+    def tools(self, base: str) -> dict[str, int]:
+        """Return the ends of all branches above `base` and how many motors are on the way there.
+
+        The best candidate for the tool, that with the most motors, comes first and, among equals,
+        the one with the longest way along the joint frames.
+        """
+        ends = set(self.links) - {joint.parent for joint in self.joints}
+        rank = {}
+        for link, way in self.ways(base).items():
+            length = sum(float(np.linalg.norm(joint.T_pc[:3, 3])) for joint in way)
+            if link in ends:
+                rank[link] = -sum(joint.has_motor for joint in way), -round(length, 9), link
+        return {link: -rank[link][0] for link in sorted(rank, key=rank.__getitem__)}
 
     def path(self, base_link: str, tool_link: str) -> tuple[UrdfJoint, ...]:
         """Return the joints from `base_link` to `tool_link`, in that order.
@@ -73,18 +135,13 @@ class Urdf:
         for link in (base_link, tool_link):
             if link not in self.links:
                 raise InputError(f"{self.source}: {unknown_name('link', link, self.links)}")
-        by_child = {joint.child: joint for joint in self.joints}
-        path: list[UrdfJoint] = []
-        link = tool_link
-        while link != base_link:
-            if link not in by_child or len(path) > len(self.joints):
-                raise InputError(
-                    f"{self.source}: no chain of joints leads from {base_link!r} to {tool_link!r}; "
-                    f"it ends at {link!r}. Name a base link that carries the tool."
-                )
-            path.append(by_child[link])
-            link = path[-1].parent
-        return tuple(reversed(path))
+        way = self.ways(base_link).get(tool_link)
+        if way is None:
+            raise InputError(
+                f"{self.source}: no chain of joints leads from {base_link!r} to {tool_link!r}. "
+                "Name a base link that carries the tool."
+            )
+        return way
 
     def chain(self, base_link: str, tool_link: str, moving: Collection[str]) -> SerialChain:
         """Return the chain to the tool link in which the joints `moving` move.
@@ -104,17 +161,33 @@ class Urdf:
             if joint.name in moving:
                 turn = np.eye(4)
                 turn[:3, :3] = rotation_to_z(joint.axis)
-                joints.append(
-                    Joint(
-                        joint.name,
-                        joint.type == "prismatic",
-                        _snap(T @ turn),
-                        joint.low,
-                        joint.high,
-                    )
-                )
+                slides, T_pj = joint.type == "prismatic", _snap(T @ turn)
+                joints.append(Joint(joint.name, slides, T_pj, joint.low, joint.high))
                 T = turn.T
         return SerialChain(tuple(joints), _snap(T))
+
+    def loads(self, base_link: str, chain: SerialChain) -> Loads:
+        """Return what each joint of the `chain` from `base_link` carries; others are at zero.
+
+        Links without a mass weigh nothing.
+        """
+        names = [joint.name for joint in chain.joints]
+        mass, moment = np.zeros(len(names)), np.zeros((len(names), 3))
+        for link, way in self.ways(base_link).items():
+            carriers = [k for k, joint in enumerate(way) if joint.name in names]
+            fact = self.facts.get(link)
+            if not carriers or fact is None or fact.mass is None:
+                continue
+            first = carriers[-1]
+            at = np.array(fact.centre)
+            for joint in reversed(way[first + 1 :]):
+                at = joint.T_pc[:3, :3] @ at + joint.T_pc[:3, 3]
+            segment = names.index(way[first].name)
+            mass[segment] += fact.mass
+            moment[segment] += fact.mass * (at @ rotation_to_z(way[first].axis))
+        weighs = mass[:, None] > 0
+        centre = np.divide(moment, mass[:, None], out=np.zeros_like(moment), where=weighs)
+        return Loads(chain, mass, centre)
 
     def _check_movable(self, name: str, path: tuple[UrdfJoint, ...]) -> None:
         names = [joint.name for joint in path]
@@ -140,15 +213,16 @@ def _snap(T: FloatArray) -> FloatArray:
 
 
 def read_urdf(path: Path) -> Urdf:
-    """Read links and joints of a URDF file; meshes and inertias are not needed here.
+    """Read links and joints of a URDF file.
 
     Raises:
         InputError: If the file is missing, not XML, not a URDF, or a joint is malformed.
     """
     root = read_root(path)
+    facts = {link.get("name", ""): _read_link(link) for link in root.findall("link")}
     links = tuple(link.get("name", "") for link in root.findall("link"))
     joints = tuple(_read_joint(joint, path) for joint in root.findall("joint"))
-    return Urdf(str(path), links, joints, root.get("name", ""))
+    return Urdf(str(path), links, joints, root.get("name", ""), facts)
 
 
 def read_root(path: Path) -> ElementTree.Element:
@@ -213,22 +287,22 @@ def _read_joint(element: ElementTree.Element, path: Path) -> UrdfJoint:
     )
 
 
-def _triple(
-    element: ElementTree.Element | None,
-    key: str,
-    default: tuple[float, float, float],
-    where: str,
-) -> tuple[float, float, float]:
+def _triple(element: ElementTree.Element | None, key: str, default: Triple, where: str) -> Triple:
     text = None if element is None else element.get(key)
     if text is None:
         return default
+    values = _three_numbers(text)
+    if values is None:
+        raise InputError(f"{where}: {key}={text!r}, expected three finite numbers.")
+    return values
+
+
+def _three_numbers(text: str) -> Triple | None:
     try:
         x, y, z = (float(part) for part in text.split())
     except ValueError:
-        x = y = z = math.nan
-    if not math.isfinite(x + y + z):
-        raise InputError(f"{where}: {key}={text!r}, expected three finite numbers.")
-    return x, y, z
+        return None
+    return (x, y, z) if math.isfinite(x + y + z) else None
 
 
 def _number(element: ElementTree.Element | None, key: str, where: str) -> float:
@@ -245,7 +319,7 @@ def _above_zero(element: ElementTree.Element | None, key: str, where: str) -> fl
     return value if 0.0 < value < math.inf else None
 
 
-def transform(xyz: tuple[float, float, float], rpy: tuple[float, float, float]) -> FloatArray:
+def transform(xyz: Triple, rpy: Triple) -> FloatArray:
     """Return the pose (4, 4) at `xyz` [m], turned by roll, pitch and yaw `rpy` [rad]."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
     T = np.eye(4)
@@ -258,139 +332,22 @@ def transform(xyz: tuple[float, float, float], rpy: tuple[float, float, float]) 
     return T
 
 
-# What the links of a URDF carry beside the joints: masses and meshes.
-
-MOMENTS = ("ixx", "iyy", "izz")
-
-
-@dataclass(frozen=True)
-class LinkFacts:
-    """What a file says of one link.
-
-    Attributes:
-        name: Name of the link.
-        mass: Its mass [kg]; None where the file states none that can be read.
-        centre: Centre of the mass in the link's frame [m]; the frame's origin where none is stated.
-        has_inertia: Whether all three moments of inertia are stated and above zero.
-        meshes: Mesh files as the file names them.
-    """
-
-    name: str
-    mass: float | None
-    centre: tuple[float, float, float]
-    has_inertia: bool
-    meshes: tuple[str, ...]
-
-
-def read_links(root: ElementTree.Element) -> dict[str, LinkFacts]:
-    """Return the links below the <robot> element `root` by their names."""
-    facts = (_read_link(link) for link in root.findall("link"))
-    return {fact.name: fact for fact in facts}
-
-
 def _read_link(link: ElementTree.Element) -> LinkFacts:
-    inertia = link.find("inertial/inertia")
-    moments = [_number_or_none(inertia, key) for key in MOMENTS]
+    """Return what is said of a link; figures that cannot be read are as good as none."""
+    inertia, origin = link.find("inertial/inertia"), link.find("inertial/origin")
+    moments = [_stated(inertia, key) for key in ("ixx", "iyy", "izz")]
+    at = "" if origin is None else origin.get("xyz", "")
     return LinkFacts(
-        name=link.get("name", ""),
-        mass=_number_or_none(link.find("inertial/mass"), "value"),
-        centre=_centre(link.find("inertial/origin")),
+        mass=_stated(link.find("inertial/mass"), "value"),
+        centre=_three_numbers(at) or (0.0, 0.0, 0.0),
         has_inertia=all(moment is not None and moment > 0.0 for moment in moments),
         meshes=tuple(mesh.get("filename", "") for mesh in link.iter("mesh")),
     )
 
 
-def _centre(origin: ElementTree.Element | None) -> tuple[float, float, float]:
-    text = "0 0 0" if origin is None else origin.get("xyz", "0 0 0")
-    try:
-        x, y, z = (float(part) for part in text.split())
-    except ValueError:
-        return 0.0, 0.0, 0.0
-    return x, y, z
-
-
-def _number_or_none(element: ElementTree.Element | None, key: str) -> float | None:
+def _stated(element: ElementTree.Element | None, key: str) -> float | None:
     try:
         value = float("nan" if element is None else element.get(key, "nan"))
     except ValueError:
         return None
     return value if math.isfinite(value) else None
-
-
-# How the links of a URDF hang together: roots, leaves and the way to the tool.
-
-
-@dataclass(frozen=True)
-class Leaf:
-    """A link at the end of a branch, which may be the tool.
-
-    Attributes:
-        link: Its name.
-        moving: Joints between base and link that a motor can move.
-        length: Length of the way along the joint frames [m].
-    """
-
-    link: str
-    moving: int
-    length: float
-
-
-def is_motor_joint(joint: UrdfJoint) -> bool:
-    """Return whether a motor of its own can move `joint`."""
-    return joint.type in MOVING_TYPES and joint.mimic is None
-
-
-def roots(urdf: Urdf) -> list[str]:
-    """Return the links that hang from no other."""
-    children = {joint.child for joint in urdf.joints}
-    return [link for link in dict.fromkeys(urdf.links) if link not in children]
-
-
-def twice_carried(urdf: Urdf) -> list[str]:
-    """Return the links that are the child of several joints, which closes a loop."""
-    counts = Counter(joint.child for joint in urdf.joints)
-    return [link for link, count in counts.items() if count > 1]
-
-
-def leaves(urdf: Urdf, base: str) -> list[Leaf]:
-    """Return the ends of all branches above `base`, the best candidate for the tool first.
-
-    That is the one with the most motors on the way to it and, among equals, the longest way.
-    """
-    by_parent: dict[str, list[UrdfJoint]] = {}
-    for joint in urdf.joints:
-        by_parent.setdefault(joint.parent, []).append(joint)
-    found, open_ways, seen = [], [(Leaf(base, 0, 0.0))], set()
-    while open_ways:
-        leaf = open_ways.pop()
-        if leaf.link in seen:
-            continue
-        seen.add(leaf.link)
-        joints = by_parent.get(leaf.link, [])
-        open_ways += [_step(leaf, joint) for joint in joints]
-        if not joints and leaf.link in urdf.links:
-            found.append(leaf)
-    return sorted(found, key=lambda leaf: (-leaf.moving, -round(leaf.length, 9), leaf.link))
-
-
-def _step(leaf: Leaf, joint: UrdfJoint) -> Leaf:
-    length = float(np.linalg.norm(joint.T_pc[:3, 3]))
-    return Leaf(joint.child, leaf.moving + is_motor_joint(joint), leaf.length + length)
-
-
-def rigid_body(urdf: Urdf, link: str) -> list[str]:
-    """Return `link` and all links that fixed joints hold to it further out."""
-    body = [link]
-    for name in body:
-        fixed = (j for j in urdf.joints if j.parent == name and j.type == "fixed")
-        body += [joint.child for joint in fixed if joint.child not in body]
-    return body
-
-
-def links_beyond(urdf: Urdf, joints: Sequence[UrdfJoint]) -> list[str]:
-    """Return all links that the first motor of `joints` carries."""
-    first = next((joint for joint in joints if is_motor_joint(joint)), None)
-    carried = [] if first is None else [first.child]
-    for name in carried:
-        carried += [j.child for j in urdf.joints if j.parent == name and j.child not in carried]
-    return carried

@@ -1,27 +1,53 @@
-"""A URDF looked over before use: its chain, its motors, and what may be wrong with it."""
+"""A URDF looked over before use: its chain, its motors, and what may be wrong with it.
+
+An error keeps the file from being used; a warning tells of something that will be missing or
+assumed; a note tells what was decided.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from xml.etree import ElementTree
+from typing import Literal
 
-from failuretwin.core.errors import InputError
-from failuretwin.digital_model import urdf_findings as look
+from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.digital_model.kinematics import has_range, mobility
 from failuretwin.digital_model.urdf import (
+    HELD_TYPES,
+    MOVING_TYPES,
     LinkFacts,
     Urdf,
     UrdfJoint,
-    is_motor_joint,
-    leaves,
-    links_beyond,
-    read_links,
     read_root,
     read_urdf,
-    roots,
 )
-from failuretwin.digital_model.urdf_findings import Finding, Mobility, Severity, mobility
+
+Severity = Literal["error", "warning", "note"]
+SEVERITIES = ("error", "warning", "note")
+
+SHORT_LEVER_M = 0.01
+"""A motor that moves the tool by less for each radian can hardly be watched [m/rad]."""
+
+NAMES_SHOWN = 4
+PICTURE = "Only the picture is missing; kinematics works."
+
+FRAME_MASS_KG = 1e-6
+"""Exporters give frames that are no bodies a mass below this and no inertia [kg]."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One matter that the user should know.
+
+    Attributes:
+        severity: ``error``, ``warning`` or ``note``.
+        message: What was found and what to do about it.
+    """
+
+    severity: Severity
+    message: str
 
 
 @dataclass(frozen=True)
@@ -57,7 +83,7 @@ class UrdfReport:
     """
 
     source: Path
-    findings: tuple[Finding, ...]
+    findings: tuple[Finding, ...] = ()
     name: str = ""
     base_link: str = ""
     tool_link: str = ""
@@ -74,6 +100,12 @@ class UrdfReport:
     def others(self) -> list[JointReport]:
         """Joints that cannot move the tool point."""
         return [joint for joint in self.joints if joint.motor is None]
+
+    def with_findings(self, more: Iterable[Finding]) -> UrdfReport:
+        """Return the report with more findings, sorted by severity."""
+        known = [*self.findings, *more]
+        known.sort(key=lambda finding: SEVERITIES.index(finding.severity))
+        return replace(self, findings=tuple(known))
 
     def having(self, severity: Severity) -> list[str]:
         """Return the messages of one severity."""
@@ -103,78 +135,50 @@ def check_urdf(path: Path, base: str | None = None, tool: str | None = None) -> 
         InputError: If the file cannot be read, is not XML, is a xacro template or not a URDF, or
             there is no chain from `base` to `tool`. All else becomes findings.
     """
-    root = read_root(path)
-    findings = _file_findings(path, root)
-    if any(finding.severity == "error" for finding in findings):
-        return UrdfReport(path, _sorted(findings))
+    report = UrdfReport(path).with_findings(_file_findings(path))
+    if report.having("error"):
+        return report
     urdf = read_urdf(path)
-    findings += look.name_findings(urdf) + look.root_findings(urdf, base)
-    report = UrdfReport(path, _sorted(findings), urdf.name)
-    if report.having("error"):
-        return report
-    return _with_chain(report, urdf, read_links(root), base, tool)
+    report = replace(report, name=urdf.name)
+    report = report.with_findings([*_name_findings(urdf), *_root_findings(urdf, base)])
+    return report if report.having("error") else _with_chain(report, urdf, base, tool)
 
 
-def _file_findings(path: Path, root: ElementTree.Element) -> list[Finding]:
-    findings = look.joint_type_findings(root)
-    if path.suffix == ".xacro":
-        message = "the name ends in .xacro but the file holds no xacro tags. Taken as a URDF."
-        findings.append(Finding("note", message))
-    return findings
-
-
-def _with_chain(
-    report: UrdfReport,
-    urdf: Urdf,
-    links: Mapping[str, LinkFacts],
-    base: str | None,
-    tool: str | None,
-) -> UrdfReport:
-    base_link = base if base is not None else roots(urdf)[0]
-    candidates = leaves(urdf, base_link) if base_link in urdf.links else []
-    tool_link = tool if tool is not None else next((leaf.link for leaf in candidates), base_link)
+def _with_chain(report: UrdfReport, urdf: Urdf, base: str | None, tool: str | None) -> UrdfReport:
+    base_link = urdf.roots[0] if base is None else base
+    tools = urdf.tools(base_link)
+    tool_link = tool if tool is not None else next(iter(tools), base_link)
     path = urdf.path(base_link, tool_link)
-    findings = [
-        *report.findings,
-        *look.loop_findings(urdf, path),
-        *look.tool_findings(candidates, tool_link, tool is not None),
-        *look.joint_findings(path),
-        *look.mimic_findings(urdf, path),
-        *look.mass_findings(urdf, path, links),
-        *look.mesh_findings(links, report.source.parent),
-    ]
-    report = replace(report, base_link=base_link, tool_link=tool_link, findings=_sorted(findings))
-    if report.having("error"):
-        return report
-    names = [joint.name for joint in path if is_motor_joint(joint)]
-    chain = urdf.chain(base_link, tool_link, names)
-    motion = mobility(chain)
-    levers = dict(zip(names, motion.lever.tolist(), strict=True))
-    movers = {name: levers[name] for name in _movers(names, motion)}
-    if not movers:
-        message = (
-            f"no motor can move the tool point, the origin of link {tool_link!r}: the axes of all "
-            "of them run through it. Name a link farther out with --tool LINK."
-        )
-        findings.append(Finding("error", message))
+    candidates = [f"{link} ({moving} moving)" for link, moving in tools.items()]
+    report = replace(report, base_link=base_link, tool_link=tool_link).with_findings(
+        [
+            *_loop_findings(urdf, path),
+            *(_tool_findings(candidates, tool_link) if tool is None else []),
+            *_joint_findings(urdf, path),
+            *_mass_findings(urdf, path),
+            *_mesh_findings(urdf.facts.values(), report.source.parent),
+        ]
+    )
+    return report if report.having("error") else _with_motors(report, urdf, path)
+
+
+def _with_motors(report: UrdfReport, urdf: Urdf, path: Sequence[UrdfJoint]) -> UrdfReport:
+    motors = [joint for joint in path if joint.has_motor]
+    names = [joint.name for joint in motors]
+    motion = mobility(urdf.chain(report.base_link, report.tool_link, names))
+    reached = zip(names, motion.lever.tolist(), motion.moves, strict=True)
+    levers = {name: lever for name, lever, moves in reached if moves}
+    moving = urdf.ways(motors[0].child)
     return replace(
         report,
-        findings=_sorted([*findings, *look.lever_findings(movers)]),
-        joints=_joint_reports(urdf, path, list(movers), links),
+        joints=_joint_reports(urdf, path, list(levers)),
         reach=motion.reach,
-        moving_mass=sum(links[n].mass or 0.0 for n in links_beyond(urdf, path) if n in links),
-    )
-
-
-def _movers(names: Sequence[str], motion: Mobility) -> list[str]:
-    return [name for name, moves in zip(names, motion.moves, strict=True) if moves]
+        moving_mass=sum(urdf.facts[n].mass or 0.0 for n in moving if n in urdf.facts),
+    ).with_findings(_lever_findings(levers, report.tool_link))
 
 
 def _joint_reports(
-    urdf: Urdf,
-    path: Sequence[UrdfJoint],
-    movers: Sequence[str],
-    links: Mapping[str, LinkFacts],
+    urdf: Urdf, path: Sequence[UrdfJoint], movers: Sequence[str]
 ) -> tuple[JointReport, ...]:
     on_path = {joint.name for joint in path}
     ordered = [*path, *(joint for joint in urdf.joints if joint.name not in on_path)]
@@ -183,7 +187,7 @@ def _joint_reports(
             joint=joint,
             motor=f"motor_{movers.index(joint.name) + 1}" if joint.name in movers else None,
             reason="" if joint.name in movers else _reason(joint, joint.name in on_path),
-            mass=links[joint.child].mass if joint.child in links else None,
+            mass=urdf.facts[joint.child].mass if joint.child in urdf.facts else None,
         )
         for joint in ordered
     )
@@ -196,11 +200,175 @@ def _reason(joint: UrdfJoint, on_path: bool) -> str:
         return "not on the way to the tool"
     if joint.mimic is not None:
         return f"follows {joint.mimic}, held at zero"
-    if not is_motor_joint(joint):
+    if not joint.has_motor:
         return f"{joint.type}, held at zero"
     return "its axis runs through the tool point"
 
 
-def _sorted(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    order = ("error", "warning", "note")
-    return tuple(sorted(findings, key=lambda finding: order.index(finding.severity)))
+# What may be wrong, each matter in one clear sentence or two.
+
+
+def _of_names(severity: Severity, names: Collection[str], text: str) -> list[Finding]:
+    """Return a finding with the names where `text` says NAMES; none if there are no names."""
+    quoted = [repr(name) for name in names]
+    more = len(quoted) - NAMES_SHOWN
+    listed = ", ".join(quoted[:NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
+    return [Finding(severity, text.replace("NAMES", listed))] if quoted else []
+
+
+def _file_findings(path: Path) -> Iterator[Finding]:
+    valid = MOVING_TYPES + HELD_TYPES
+    for joint in read_root(path).findall("joint"):
+        name, type_ = joint.get("name", ""), joint.get("type", "")
+        if type_ not in valid:
+            error = unknown_name("joint type", type_, valid)
+            yield Finding("error", f"joint {name!r}: {error}")
+    if path.suffix == ".xacro":
+        message = "the name ends in .xacro but the file holds no xacro tags. Taken as a URDF."
+        yield Finding("note", message)
+
+
+def _name_findings(urdf: Urdf) -> Iterator[Finding]:
+    text = " NAMES stands in the file twice. Give each its own name."
+    yield from _of_names("error", _repeated(urdf.links), "link" + text)
+    yield from _of_names("error", _repeated(joint.name for joint in urdf.joints), "joint" + text)
+    ends = (link for joint in urdf.joints for link in (joint.parent, joint.child))
+    absent = [link for link in dict.fromkeys(ends) if link not in urdf.links]
+    text = "link NAMES is named by a joint but has no <link> element. Add it."
+    yield from _of_names("warning", absent, text)
+
+
+def _repeated(names: Iterable[str]) -> list[str]:
+    return [name for name, count in Counter(names).items() if count > 1]
+
+
+def _root_findings(urdf: Urdf, base: str | None) -> Iterator[Finding]:
+    if not urdf.roots and base is None:
+        yield Finding(
+            "error",
+            "no link is a root: every link is the child of a joint, so the joints close a loop. "
+            "Name the base with --base LINK, or remove the joint that closes the loop.",
+        )
+    if len(urdf.roots) > 1:
+        text = f"{len(urdf.roots)} links hang from no joint: NAMES. A URDF has one root. "
+        fix = "Name the base with --base LINK." if base is None else f"The base is {base!r}."
+        yield from _of_names("error" if base is None else "warning", urdf.roots, text + fix)
+
+
+def _loop_findings(urdf: Urdf, path: Sequence[UrdfJoint]) -> Iterator[Finding]:
+    twice = _repeated(joint.child for joint in urdf.joints)
+    on_path = [joint.child for joint in path if joint.child in twice]
+    text = (
+        "link NAMES is the child of several joints, which closes a loop on the way to the tool; "
+        "only serial chains can be used. Remove all but one of them."
+    )
+    yield from _of_names("error", on_path, text)
+    beside = [link for link in twice if link not in on_path]
+    text = "link NAMES is the child of several joints; not on the way to the tool, so it "
+    yield from _of_names("warning", beside, text + "changes nothing.")
+
+
+def _tool_findings(candidates: Sequence[str], tool: str) -> Iterator[Finding]:
+    if len(candidates) > 1:
+        yield Finding(
+            "note",
+            f"several branches end in a link that could be the tool: {', '.join(candidates)}. Took "
+            f"{tool!r}, the one with the most moving joints before it; choose another with --tool "
+            "LINK.",
+        )
+
+
+def _joint_findings(urdf: Urdf, path: Sequence[UrdfJoint]) -> Iterator[Finding]:
+    if not any(joint.has_motor for joint in path):
+        yield Finding(
+            "error",
+            "no joint on the way to the tool moves, so there is no motor to watch. Name another "
+            "tool with --tool LINK, or check the joint types.",
+        )
+    for joint in path:
+        for severity, text in _oddities(joint):
+            yield Finding(severity, f"joint {joint.name!r} {text}")
+    beside = [joint.name for joint in urdf.joints if joint.mimic is not None and joint not in path]
+    text = "joint NAMES follows another joint (mimic), so it is no motor."
+    yield from _of_names("note", beside, text)
+
+
+def _oddities(joint: UrdfJoint) -> Iterator[tuple[Severity, str]]:
+    if joint.type in ("floating", "planar"):
+        yield "warning", f"is {joint.type} and is held at zero: no single motor can move it."
+    elif joint.type != "fixed" and joint.mimic is not None:
+        yield (
+            "warning",
+            f"follows joint {joint.mimic!r} (mimic), so it is no motor. It lies on the way to the "
+            "tool and is held at zero: the tool path is right only where it is zero. Choose a tool "
+            "before it with --tool LINK.",
+        )
+    elif joint.has_motor:
+        if joint.type == "prismatic":
+            yield "warning", "slides: its angles and faults are in m where others are in rad."
+        if joint.type == "continuous":
+            yield "note", "turns without end, so a range will be assumed."
+        elif not has_range(joint.low, joint.high):
+            stated = "has no limits" if joint.low == -float("inf") else "has no room in its limits"
+            limit = "<limit lower=... upper=... velocity=... effort=.../>"
+            yield "warning", f"{stated}: a range will be assumed. Add {limit} to it."
+
+
+def _lever_findings(levers: Mapping[str, float], tool_link: str) -> Iterator[Finding]:
+    """Yield what is wrong with the largest lever arms of the motors, by joint [m/rad or m/m]."""
+    if not levers:
+        yield Finding(
+            "error",
+            f"no motor can move the tool point, the origin of link {tool_link!r}: the axes of all "
+            "of them run through it. Name a link farther out with --tool LINK.",
+        )
+    for name, lever in levers.items():
+        if lever < SHORT_LEVER_M:
+            yield Finding(
+                "note",
+                f"joint {name!r} moves the tool by {1e3 * lever:.2g} mm for each rad at most, so "
+                "faults of its motor will hardly show. A tool point farther from its axis would "
+                "help.",
+            )
+
+
+def _mass_findings(urdf: Urdf, path: Sequence[UrdfJoint]) -> Iterator[Finding]:
+    """Yield what gravity cannot be computed of.
+
+    Links held together by fixed joints are one body, so a frame without mass on a heavy link is
+    fine; what a moving joint carries has to weigh something.
+    """
+    bodies = [
+        [link for link, way in urdf.ways(j.child).items() if all(k.type == "fixed" for k in way)]
+        for j in path
+        if j.type != "fixed"
+    ]
+    facts = {n: urdf.facts[n] for body in bodies for n in body if n in urdf.facts}
+    mass = {name: fact.mass for name, fact in facts.items() if fact.mass is not None}
+    not_positive = [name for name in mass if mass[name] <= 0.0]
+    weightless = [body[0] for body in bodies if not any(mass.get(n, 0.0) > 0.0 for n in body)]
+    text = "the mass of link NAMES is not above zero: gravity cannot be computed for it. "
+    yield from _of_names("warning", not_positive, text + "Kinematics works.")
+    weightless = [name for name in weightless if name not in not_positive]
+    text = "link NAMES has no <inertial> mass: gravity cannot be computed for it. "
+    yield from _of_names("warning", weightless, text + "Kinematics works.")
+    heavy = [name for name in mass if mass[name] > FRAME_MASS_KG]
+    text = "link NAMES has a mass but no moments of inertia above zero: fast motion cannot be "
+    no_inertia = [name for name in heavy if not facts[name].has_inertia]
+    yield from _of_names("warning", no_inertia, text + "computed for it.")
+
+
+def _mesh_findings(links: Iterable[LinkFacts], folder: Path) -> Iterator[Finding]:
+    """Yield what cannot be shown: meshes change no number."""
+    meshes = dict.fromkeys(mesh for link in links for mesh in link.meshes)
+    remote = [mesh for mesh in meshes if "://" in mesh and not mesh.startswith("file://")]
+    text = " named by a package address that only ROS can resolve (NAMES). "
+    yield from _of_names("note", remote, _counted(remote) + text + PICTURE)
+    local = [mesh for mesh in meshes if mesh not in remote]
+    missing = [m for m in local if not (folder / m.removeprefix("file://")).is_file()]
+    text = f" not found (NAMES), looked for from {folder}. "
+    yield from _of_names("warning", missing, _counted(missing) + text + PICTURE)
+
+
+def _counted(meshes: Sequence[str]) -> str:
+    return "1 mesh is" if len(meshes) == 1 else f"{len(meshes)} meshes are"

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from failuretwin.core.config import from_table
-from failuretwin.core.errors import check_number
+from failuretwin.core.config import AtLeastZero, Bounded, from_table
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import Range
@@ -22,7 +21,7 @@ WIDEST_ERROR = 5.0
 
 
 @dataclass(frozen=True)
-class InferenceSettings:
+class InferenceSettings(Bounded):
     """Lengths and angles that belong to an arm and its sensor.
 
     The defaults are those of the ArmPi FPV, one count of whose servos moves the tool by 1 mm.
@@ -43,17 +42,13 @@ class InferenceSettings:
             just above its healthy scatter.
     """
 
-    moving_spread_m: float = 0.004
-    nearly_still_m: float = 0.003
-    same_place_m: float = 0.002
-    unmoved_m: float = 0.02
-    update_m: float = 0.0005
-    path_roughness_m: float = 0.002
-    least_error_rad: float = 4 * np.deg2rad(0.24)
-
-    def __post_init__(self) -> None:
-        for entry in fields(self):
-            check_number(f"inference: {entry.name}", getattr(self, entry.name), low=0.0)
+    moving_spread_m: AtLeastZero = 0.004
+    nearly_still_m: AtLeastZero = 0.003
+    same_place_m: AtLeastZero = 0.002
+    unmoved_m: AtLeastZero = 0.02
+    update_m: AtLeastZero = 0.0005
+    path_roughness_m: AtLeastZero = 0.002
+    least_error_rad: AtLeastZero = 4 * np.deg2rad(0.24)
 
     @property
     def error_ranges(self) -> tuple[Range, ...]:

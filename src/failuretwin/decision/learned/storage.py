@@ -42,7 +42,7 @@ from failuretwin.decision.learned.feature_encoder import (
 )
 from failuretwin.decision.learned.log_pool import PoolWeights
 from failuretwin.decision.learned.networks import Standard, build_network
-from failuretwin.digital_model.gravity import GRAVITY
+from failuretwin.digital_model.kinematics import GRAVITY
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from failuretwin.digital_model.robot import Robot, load_robot
 

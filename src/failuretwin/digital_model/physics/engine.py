@@ -1,125 +1,38 @@
-"""The physics engine: many runs of a robot that no inference of ours owns."""
+"""The physics engine: many runs of a robot by MuJoCo, a motion that no inference of ours owns."""
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.digital_model.physics.batch import SAMPLES_AT_ONCE, Batch, chunks, strength_of
 from failuretwin.digital_model.physics.model import (
     MotorPhysics,
+    PhysicsModel,
     PhysicsParameters,
-    arm_spec,
+    build_model,
+    default_parameters,
     load_mujoco,
     load_parameters,
 )
-from failuretwin.digital_model.robot import Motor, Robot
-from failuretwin.digital_model.twin import Drive
-from failuretwin.digital_model.urdf import read_urdf
-
-# Motors and gears for a robot of which only URDF and profile are known: assumed, not measured.
-
-SAG_RAD = math.radians(0.5)
-"""How far a joint gives way under its largest load, at most."""
-FRICTION_RAD = math.radians(0.1)
-"""How far from its set-point friction lets a drive come to rest, at most."""
-YIELD_RAD = FRICTION_RAD
-FLEX_SHARE = 1.0 / 3.0
-"""Share of the sag that comes from the gear's output side, the rest from the servo."""
-FULL_TORQUE_RAD = math.radians(20.0)
-"""Error at which a servo gives all its torque, at most."""
-SERVO_RAD_S = 40.0
-"""Natural frequency of a servo that moves its joint's largest inertia, at least."""
-RINGING_RAD_S = 150.0
-"""Rotors and gears are given enough inertia to ring no faster than this by themselves."""
-FILTER_S = 0.03
-"""Time constant of the set-point filter, at least [s]; slower where the torque that is left under
-the largest load would not bring the largest inertia to the speed of a fast ramp within it."""
-FAST_RAMP_S = 0.6
-"""Time of a fast ramp from zero or through the movement range: the shortest that the paper draws
-(arXiv 2411.01360)."""
-FLEX_DAMPING_RATIO = 0.3
-BACK_EMF_SHARE = 0.2
-"""Share of its torque that a motor needs to turn at its largest speed."""
-ROTOR_SHARE = 0.2
-"""Inertia of a rotor behind its gear over the largest inertia of the joint, at least."""
-SPARE_TORQUE = 2.0
-"""Torque of a motor over its largest load, at least; a URDF that states less has a placeholder."""
-POSES = 500
-
-
-def default_parameters(robot: Robot) -> PhysicsParameters:
-    """Return parameters derived from the robot's URDF and movement ranges.
-
-    Raises:
-        InputError: If mujoco is missing or cannot use the URDF.
-    """
-    load, inertia, effort = _arm_facts(robot)
-    figures = np.stack([load, inertia, effort], axis=1).tolist()
-    motors = tuple(
-        _motor(motor, *of_motor) for motor, of_motor in zip(robot.motors, figures, strict=True)
-    )
-    return PhysicsParameters("assumed: derived from masses and limits of the URDF", motors)
-
-
-def _motor(motor: Motor, load: float, inertia: float, effort: float) -> MotorPhysics:
-    stiffness = max(
-        load / SAG_RAD / (1.0 - FLEX_SHARE),
-        (1.0 + ROTOR_SHARE) * inertia * SERVO_RAD_S**2,
-        effort / FULL_TORQUE_RAD if math.isfinite(effort) else 0.0,
-    )
-    flex_stiffness = stiffness * (1.0 - FLEX_SHARE) / FLEX_SHARE
-    friction = stiffness * FRICTION_RAD
-    springs = stiffness + flex_stiffness + friction / YIELD_RAD
-    armature = max(ROTOR_SHARE * inertia, springs / RINGING_RAD_S**2)
-    travel = max(motor.movement_range[1], 0.0) - min(motor.movement_range[0], 0.0)
-    fast = min(motor.speed_limit, travel / FAST_RAMP_S)
-    flex_inertia = flex_stiffness / RINGING_RAD_S**2
-    return MotorPhysics(
-        name=motor.name,
-        stiffness=stiffness,
-        derivative=2.0 * math.sqrt(stiffness * (inertia + armature)),
-        filter_s=max(FILTER_S, (inertia + armature) * fast / (effort - load)),
-        damping=BACK_EMF_SHARE * effort / motor.speed_limit if math.isfinite(effort) else 0.0,
-        armature=armature,
-        friction=friction,
-        friction_yield=YIELD_RAD,
-        torque_limit=effort,
-        flex_stiffness=flex_stiffness,
-        flex_damping=2.0 * FLEX_DAMPING_RATIO * math.sqrt(flex_stiffness * flex_inertia),
-        flex_inertia=flex_inertia,
-    )
-
-
-def _arm_facts(robot: Robot) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return largest load [N m], inertia [kg m2] and effort [N m] of each motor, (motor,) each."""
-    mujoco = load_mujoco()
-    model = arm_spec(robot).compile()
-    data = mujoco.MjData(model)
-    low, high = np.array([motor.movement_range for motor in robot.motors]).T
-    poses = np.random.default_rng(0).uniform(low, high, (POSES, len(low))) * robot.sense
-    load, inertia = np.zeros((2, len(low)))
-    mass = np.zeros((model.nv, model.nv))
-    for pose in poses:
-        data.qpos[:] = pose
-        mujoco.mj_forward(model, data)
-        mujoco.mj_fullM(model, data, mass)
-        load = np.maximum(load, np.abs(data.qfrc_bias))
-        inertia = np.maximum(inertia, np.diag(mass))
-    limits = {joint.name: joint.effort or math.inf for joint in read_urdf(robot.urdf_file).joints}
-    effort = np.array([limits[motor.joint] for motor in robot.motors])
-    return load, inertia, np.maximum(effort, SPARE_TORQUE * load)
-
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.servo import first_order_lag
+from failuretwin.digital_model.twin import Drive, uniform_step
 
 STEP_S = 0.005
 """Default step [s]; see docs/engines.md for its error."""
 RUNS_AT_ONCE = 64
+SAMPLES_AT_ONCE = 250
+"""Bounds what is in memory: states and controls of 64 runs at two steps each take about 10 MB."""
 WEAKEST = 0.99
 """Largest weakness; a servo with less left does not carry the arm."""
+ITERATIONS = 200
+AT_REST_RAD = 1e-13
 
 
 @dataclass(frozen=True)
@@ -154,6 +67,16 @@ class PhysicsEngine:
         """What the engine is called on the command line."""
         return "physics"
 
+    @cached_property
+    def motors(self) -> tuple[MotorPhysics, ...]:
+        """Motors and gears that it simulates."""
+        given = self.parameters or load_parameters(self.robot)
+        return (given or default_parameters(self.robot)).motors
+
+    def figures(self, name: str) -> FloatArray:
+        """Return one figure of every motor, (motor,)."""
+        return np.array([getattr(motor, name) for motor in self.motors])
+
     def angles(self, drive: Drive, time: FloatArray) -> FloatArray:
         """Return the angles that the output sides take, (run, time, motor) [rad], log's sense.
 
@@ -170,62 +93,19 @@ class PhysicsEngine:
                 step is too long for the stiffness of the robot.
         """
         mujoco = load_mujoco()
-        batch = self.batch(_check(drive, time, len(self.robot.motors)))
-        out = np.empty(drive.reference.shape)
-        pool_size = 0 if self.threads == 1 else self.threads
-        with mujoco.rollout.Rollout(nthread=pool_size) as pool:
-            for rows in chunks(len(out), RUNS_AT_ONCE):
-                batch.run(_rows(drive, rows), pool, self.threads, out[rows])
+        _check(drive, len(time), len(self.robot.motors))
+        step = uniform_step(time)
+        reference, strength = drive.reference * self.robot.sense, _strength(drive)
+        payload = np.zeros(len(reference)) if drive.payload is None else drive.payload
+        out = np.empty(reference.shape)
+        with mujoco.rollout.Rollout(nthread=0 if self.threads == 1 else self.threads) as pool:
+            for rows in _chunks(len(out), RUNS_AT_ONCE):
+                told, share = reference[rows], strength[rows]
+                arms = _Arms(self, step, told[:, 0], share[:, 0], payload[rows], pool)
+                held = None if drive.held is None else drive.held[rows, :-1]
+                out[rows, 0] = arms.angle
+                out[rows, 1:] = arms.follow(told[:, 1:], held, share[:, 1:])
         return out * self.robot.sense
-
-    def batch(self, grid_step: float) -> Batch:
-        """Return how runs on a time grid with steps of `grid_step` [s] are simulated."""
-        substeps = max(1, int(np.ceil(grid_step / self.step_s - 1e-9)))
-        parameters = self.parameters or load_parameters(self.robot)
-        return Batch(self.robot, parameters or default_parameters(self.robot), grid_step, substeps)
-
-
-def _rows(drive: Drive, rows: slice) -> Drive:
-    return replace(
-        drive,
-        reference=drive.reference[rows],
-        held=None if drive.held is None else drive.held[rows],
-        weakness=None if drive.weakness is None else drive.weakness[rows],
-        payload=None if drive.payload is None else drive.payload[rows],
-    )
-
-
-def _check(drive: Drive, time: FloatArray, motors: int) -> float:
-    """Return the step of the grid [s]."""
-    shape = drive.reference.shape
-    if len(shape) != 3 or shape[1:] != (len(time), motors):
-        raise InputError(
-            f"`reference` has shape {shape}, expected (run, {len(time)} times, {motors} motors)."
-        )
-    if not np.isfinite(drive.reference).all():
-        raise InputError("`reference` holds values that are not finite. Hold the last angle.")
-    if drive.held is not None:
-        _check_values("held", drive.held, shape, highest=1.0)
-    if drive.weakness is not None:
-        _check_values("weakness", drive.weakness, shape, highest=WEAKEST)
-    if drive.payload is not None:
-        _check_values("payload", drive.payload, shape[:1], highest=np.inf)
-    steps = np.diff(time)
-    if len(steps) == 0 or steps.min() <= 0 or np.ptp(steps) > 1e-3 * steps.mean():
-        raise InputError("`time` is not a uniform, increasing grid. Resample onto one.")
-    return float((time[-1] - time[0]) / len(steps))
-
-
-def _check_values(
-    name: str, values: FloatArray | BoolArray, shape: tuple[int, ...], highest: float
-) -> None:
-    if values.shape != shape:
-        raise InputError(f"`{name}` has shape {values.shape}, expected {shape}.")
-    if not ((values >= 0) & (values <= highest) & np.isfinite(values)).all():
-        raise InputError(f"`{name}` must lie between 0 and {highest}.")
-
-
-# One arm of the physics engine that is moved on stretch by stretch, for as long as one likes.
 
 
 class LiveArm:
@@ -247,19 +127,16 @@ class LiveArm:
     def __init__(
         self, engine: PhysicsEngine, reference: FloatArray, step_s: float, payload: float = 0.0
     ) -> None:
-        self._batch = engine.batch(step_s)
         self._sense = engine.robot.sense
-        self._last = (reference * self._sense)[None]
+        stand, whole = (reference * self._sense)[None], np.ones((1, len(reference)))
         pool = load_mujoco().rollout.Rollout(nthread=0)
-        self._arms = self._batch.at_rest(
-            self._last, np.ones_like(self._last), np.array([payload]), pool, 1
-        )
-        self._strength = np.ones_like(self._last)
+        alone = replace(engine, threads=1)
+        self._arms = _Arms(alone, step_s, stand, whole, np.array([payload]), pool)
 
     @property
     def angle(self) -> FloatArray:
         """Where the arm stands, (motor,) [rad]."""
-        return self._batch.angle(self._arms)[0] * self._sense
+        return self._arms.angle[0] * self._sense
 
     def follow(
         self, reference: FloatArray, held: BoolArray | None, weakness: FloatArray | None
@@ -275,16 +152,217 @@ class LiveArm:
         Raises:
             InputError: If the simulation becomes unstable.
         """
-        told = np.concatenate([self._last, reference * self._sense])[None]
-        limited = self._batch.limited(told)
-        drive = Drive(reference[None], weakness=None if weakness is None else weakness[None])
-        strength = np.concatenate([self._strength[None], strength_of(drive)], axis=1)
-        self._last, self._strength = limited[:, -1], strength[:, -1]
-        angles = np.empty_like(reference)
-        for part in chunks(len(reference), SAMPLES_AT_ONCE):
+        strength = _strength(Drive(reference, weakness=weakness))[None]
+        brake = None if held is None else held[None]
+        return self._arms.follow((reference * self._sense)[None], brake, strength)[0] * self._sense
+
+
+class _Arms:
+    """Arms at rest that then follow whatever they are told next, in the physical sense.
+
+    Args:
+        engine: What moves them.
+        grid_step: Step of the references to come [s].
+        reference: Where they are told to stand, (run, motor) [rad].
+        strength: Shares of their stiffness that the servos have, (run, motor).
+        payload: Mass at the tool points, (run,) [kg].
+        pool: A `mujoco.rollout.Rollout` with the threads of the engine.
+    """
+
+    def __init__(
+        self,
+        engine: PhysicsEngine,
+        grid_step: float,
+        reference: FloatArray,
+        strength: FloatArray,
+        payload: FloatArray,
+        pool: Any,
+    ) -> None:
+        self._engine, self._grid_step, self._pool = engine, grid_step, pool
+        self._substeps = max(1, int(np.ceil(grid_step / engine.step_s - 1e-9)))
+        self._step = grid_step / self._substeps
+        masses, which = np.unique(payload, return_inverse=True)
+        models = [build_model(engine.robot, engine.motors, self._step, float(m)) for m in masses]
+        self._models = [models[i] for i in which]
+        mujoco = load_mujoco()
+        self._data = [mujoco.MjData(models[0].compiled) for _ in range(engine.threads)]
+        each = zip(self._models, reference, strength, strict=True)
+        self._state = np.array([_rest_state(engine, self._data[0], *of_run) for of_run in each])
+        self._setpoint = self._last = reference
+        self._strength = strength
+
+    @property
+    def angle(self) -> FloatArray:
+        """Where the output sides stand, (run, motor) [rad]."""
+        return self._angle(self._state)
+
+    def _angle(self, states: FloatArray) -> FloatArray:
+        """Return the output sides' angles, (..., motor), of states (..., state)."""
+        model, before = self._models[0], 1  # a state begins with the time
+        return states[..., before + model.drive] + states[..., before + model.flex]
+
+    def follow(
+        self, reference: FloatArray, held: BoolArray | None, strength: FloatArray
+    ) -> FloatArray:
+        """Move on and return the output sides' angles at the same instants.
+
+        Args:
+            reference: What the servos are told from one step later on, (run, time, motor) [rad].
+            held: Whether gears are held on the way there, (run, time, motor); None: never.
+            strength: Shares of their stiffness that the servos have, like `reference`.
+
+        Returns:
+            (run, time, motor) [rad].
+
+        Raises:
+            InputError: If the simulation becomes unstable.
+        """
+        told = np.concatenate([self._last[:, None], reference], axis=1)
+        speed = np.array([motor.speed_limit for motor in self._engine.robot.motors])
+        told = limit_speed(told, self._grid_step, speed)
+        strength = np.concatenate([self._strength[:, None], strength], axis=1)
+        self._last, self._strength = told[:, -1], strength[:, -1]
+        out = np.empty_like(reference)
+        for part in _chunks(out.shape[1], SAMPLES_AT_ONCE):
             span = slice(part.start, part.stop + 1)
-            brake = None if held is None else held[None, part]
-            angles[part] = self._batch.advance(
-                self._arms, limited[:, span], strength[:, span], brake
-            )[0]
-        return angles * self._sense
+            brake = None if held is None else held[:, part]
+            out[:, part] = self._advance(told[:, span], brake, strength[:, span])
+        return out
+
+    def _advance(
+        self, reference: FloatArray, held: BoolArray | None, strength: FloatArray
+    ) -> FloatArray:
+        """Return angles (run, time, motor) [rad] for references at both ends of every sample."""
+        control = self._control(reference, held, strength)
+        compiled = [model.compiled for model in self._models]
+        states, _ = self._pool.rollout(compiled, self._data, self._state, control)
+        if any(warning.number for thread in self._data for warning in thread.warning):
+            raise InputError(
+                f"the physics engine became unstable at a step of {self._step} s. Give a smaller "
+                "step_s, or parameters with more inertia or less stiffness."
+            )
+        self._state = states[:, -1].copy()
+        return self._angle(states[:, self._substeps - 1 :: self._substeps])
+
+    def _control(
+        self, reference: FloatArray, held: BoolArray | None, strength: FloatArray
+    ) -> FloatArray:
+        """Return controls (run, step, 3 * motor) and move the set-points on."""
+        names = ("stiffness", "derivative", "filter_s")
+        stiffness, derivative, filter_s = (self._engine.figures(name) for name in names)
+        fine = refine(reference, self._substeps)
+        followed = np.empty_like(fine)
+        for k, tau in enumerate(filter_s):
+            before = self._setpoint[:, k]
+            followed[..., k] = first_order_lag(fine[..., k], before, self._step, tau)
+        self._setpoint = followed[:, -1]
+        share = refine(strength, self._substeps)[:, :-1]
+        control = np.zeros((*share.shape[:2], 3, share.shape[2]))
+        if held is not None:  # the servo would only push against the brake
+            brake = np.repeat(held, self._substeps, axis=1)
+            control[:, :, 2] = brake
+            share = np.where(brake, 0.0, share)
+        speed = (fine - followed)[:, :-1] / filter_s
+        control[:, :, 0] = share * (stiffness * followed[:, :-1] + derivative * speed)
+        control[:, :, 1] = share
+        return control.reshape(*control.shape[:2], -1)
+
+
+def _rest_state(
+    engine: PhysicsEngine,
+    data: Any,
+    model: PhysicsModel,
+    setpoint: FloatArray,
+    strength: FloatArray,
+) -> FloatArray:
+    """Return the full physics state (state,) of an arm at rest, as `mujoco.rollout` takes it.
+
+    Servo and flex balance the weight, the gears' friction is relaxed.
+
+    Args:
+        engine: The engine.
+        data: A `mujoco.MjData` of the model, overwritten.
+        model: The model of the run.
+        setpoint: Set-points in the physical sense, (motor,) [rad].
+        strength: Share of its stiffness that each servo has, (motor,).
+    """
+    mujoco = load_mujoco()
+    give_drive = 1.0 / (strength * engine.figures("stiffness"))
+    give_flex = 1.0 / engine.figures("flex_stiffness")
+    mujoco.mj_resetData(model.compiled, data)
+    load, before, share = np.zeros_like(setpoint), np.zeros_like(setpoint), 1.0
+    for _ in range(ITERATIONS):
+        data.qpos[model.drive] = setpoint - give_drive * load
+        data.qpos[model.flex] = -give_flex * load
+        mujoco.mj_forward(model.compiled, data)
+        change = data.qfrc_bias[model.drive] - load
+        if np.abs(change * (give_drive + give_flex)).max() < AT_REST_RAD:
+            break
+        # Soft servos give way so far that the load swings to and fro: smaller steps converge.
+        share *= 0.5 if change @ before < -0.5 * before @ before else 1.0
+        load, before = load + share * change, change
+    sticks = model.friction >= 0
+    data.plastic[model.friction[sticks]] = data.qpos[model.drive[sticks]]
+    full = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    state = np.empty(mujoco.mj_stateSize(model.compiled, full))
+    mujoco.mj_getState(model.compiled, data, state, full)
+    return state
+
+
+def limit_speed(reference: FloatArray, step: float, speed: FloatArray) -> FloatArray:
+    """Return references that chase the given ones no faster than each motor can.
+
+    Args:
+        reference: (run, time, motor) [rad].
+        step: Time between samples [s].
+        speed: Largest speed of each motor, (motor,) [rad/s].
+    """
+    largest = speed * step * (1.0 + 1e-9)  # a ramp at exactly this speed is left as it is
+    limited = reference.copy()
+    # Only runs that ask for more are touched, so that none depends on the others by rounding.
+    fast = (np.abs(np.diff(reference, axis=1)) > largest).any(axis=(1, 2))
+    for i in range(1, reference.shape[1]):
+        change = np.clip(reference[fast, i] - limited[fast, i - 1], -largest, largest)
+        limited[fast, i] = limited[fast, i - 1] + change
+    return limited
+
+
+def refine(samples: FloatArray, substeps: int) -> FloatArray:
+    """Return `samples` (run, time, motor) with straight lines between, `substeps` times finer.
+
+    The result has (time - 1) * substeps + 1 instants.
+    """
+    share = (np.arange(substeps) / substeps)[:, None]
+    low, high = samples[:, :-1, None], samples[:, 1:, None]
+    fine = low + share * (high - low)
+    fine = fine.reshape(len(samples), -1, samples.shape[-1])
+    return np.concatenate([fine, samples[:, -1:]], axis=1)
+
+
+def _chunks(count: int, size: int) -> Iterator[slice]:
+    """Return slices of at most `size` that cover `count`."""
+    return (slice(start, min(start + size, count)) for start in range(0, count, size))
+
+
+def _strength(drive: Drive) -> FloatArray:
+    """Return the share of its stiffness that each servo has, (..., time, motor)."""
+    return np.ones_like(drive.reference) if drive.weakness is None else 1.0 - drive.weakness
+
+
+def _check(drive: Drive, times: int, motors: int) -> None:
+    shape = drive.reference.shape
+    if len(shape) != 3 or shape[1:] != (times, motors):
+        raise InputError(
+            f"`reference` has shape {shape}, expected (run, {times} times, {motors} motors)."
+        )
+    if not np.isfinite(drive.reference).all():
+        raise InputError("`reference` holds values that are not finite. Hold the last angle.")
+    rows = (("held", shape, 1.0), ("weakness", shape, WEAKEST), ("payload", shape[:1], np.inf))
+    for name, expected, highest in rows:
+        values = getattr(drive, name)
+        if values is not None and values.shape != expected:
+            raise InputError(f"`{name}` has shape {values.shape}, expected {expected}.")
+        if values is not None and not np.all(
+            (values >= 0) & (values <= highest) & (values < np.inf)
+        ):
+            raise InputError(f"`{name}` must lie between 0 and {highest}.")

@@ -16,26 +16,27 @@ brake is part of the gear and not limited. Friction of the gear is a spring that
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
 from xml.etree import ElementTree
 
 import numpy as np
 
-from failuretwin.core.config import from_table, read_toml
+from failuretwin.core.config import AtLeastZero, Bounded, Bounds, from_table, read_toml
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray, IntArray
-from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.kinematics import GRAVITY
+from failuretwin.digital_model.robot import Motor, Robot
 from failuretwin.digital_model.urdf import Urdf, read_root, read_urdf
 
 # What the physics engine needs to know of motors and gears, and where it is written down.
 
-MAY_BE_ZERO = ("derivative", "damping", "friction", "flex_damping")
-MAY_BE_INFINITE = ("torque_limit",)
+AboveZero = Annotated[float, Bounds(1e-12, 1e12)]
 
 
 @dataclass(frozen=True)
-class MotorPhysics:
+class MotorPhysics(Bounded):
     """A motor with its servo and its gear. For a sliding joint read N for N m and m for rad.
 
     Servo: torque = stiffness * (s - q) + derivative * (s' - q'), within the torque limit, with q
@@ -61,27 +62,17 @@ class MotorPhysics:
     """
 
     name: str
-    stiffness: float
-    derivative: float
-    filter_s: float
-    damping: float
-    armature: float
-    friction: float
-    friction_yield: float
-    torque_limit: float
-    flex_stiffness: float
-    flex_damping: float
-    flex_inertia: float
-
-    def __post_init__(self) -> None:
-        for field in fields(self)[1:]:
-            value = getattr(self, field.name)
-            fits = value >= 0.0 if field.name in MAY_BE_ZERO else value > 0.0
-            if not fits or (math.isinf(value) and field.name not in MAY_BE_INFINITE):
-                raise InputError(
-                    f"motor {self.name!r}: {field.name} is {value}, expected a finite number "
-                    f"{'of zero or more' if field.name in MAY_BE_ZERO else 'above zero'}."
-                )
+    stiffness: AboveZero
+    derivative: AtLeastZero
+    filter_s: AboveZero
+    damping: AtLeastZero
+    armature: AboveZero
+    friction: AtLeastZero
+    friction_yield: AboveZero
+    torque_limit: Annotated[float, Bounds(1e-12, math.inf)]
+    flex_stiffness: AboveZero
+    flex_damping: AtLeastZero
+    flex_inertia: AboveZero
 
     @property
     def compliance(self) -> float:
@@ -151,7 +142,6 @@ def load_mujoco() -> Any:
 
 # A URDF as a rigid arm in MuJoCo: only the motors' joints move, nothing collides.
 
-GRAVITY_M_S2 = 9.81
 TOOL = "tool point"
 """Name of the site at the tool point."""
 
@@ -185,7 +175,7 @@ def arm_spec(robot: Robot, payload: float = 0.0) -> Any:
     spec.compiler.fusestatic = True
     spec.compiler.balanceinertia = True
     spec.compiler.boundmass = spec.compiler.boundinertia = NEXT_TO_NOTHING
-    spec.option.gravity = -GRAVITY_M_S2 * _up(read_urdf(path), robot.profile.base_link)
+    spec.option.gravity = -GRAVITY * _up(read_urdf(path), robot.profile.base_link)
     spec.option.disableflags |= (
         mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
     )
@@ -214,14 +204,12 @@ def _strip(root: ElementTree.Element, moving: set[str]) -> None:
 
 def _up(urdf: Urdf, base_link: str) -> FloatArray:
     """Return the z axis of the base frame in the frame of the URDF's root, (3,)."""
-    parent = {joint.child: joint.parent for joint in urdf.joints}
-    root = base_link
-    while root in parent:
-        root = parent[root]
-    T_rb = np.eye(4)
-    for joint in urdf.path(root, base_link):
-        T_rb = T_rb @ joint.T_pc
-    return T_rb[:3, 2]
+    by_child = {joint.child: joint for joint in urdf.joints}
+    up, link = np.array([0.0, 0.0, 1.0]), base_link
+    while link in by_child:
+        up = by_child[link].T_pc[:3, :3] @ up
+        link = by_child[link].parent
+    return up
 
 
 BRAKE_S = 2e4
@@ -251,13 +239,13 @@ class PhysicsModel:
 
 
 def build_model(
-    robot: Robot, parameters: PhysicsParameters, step: float, payload: float = 0.0
+    robot: Robot, motors: Sequence[MotorPhysics], step: float, payload: float = 0.0
 ) -> PhysicsModel:
     """Return the model of a robot.
 
     Args:
         robot: The robot.
-        parameters: Its motors.
+        motors: Its motors and gears.
         step: Time step [s].
         payload: Mass carried at the tool point [kg].
 
@@ -270,37 +258,18 @@ def build_model(
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     spec.compiler.degree = False
-    joints = [motor.joint for motor in robot.motors]
-    for joint, motor in zip(joints, parameters.motors, strict=True):
+    gears = dict(zip((motor.joint for motor in robot.motors), motors, strict=True))
+    for joint, motor in gears.items():
         _add_gear(spec, joint, motor, step)
-        _add_tendon(spec, joint, motor.torque_limit)
-    for add in (_add_setpoint, _add_feedback, _add_brake):
-        for joint, motor in zip(joints, parameters.motors, strict=True):
-            add(mujoco, spec, joint, motor)
+    _add_actuators(spec, gears)
     try:
         compiled = spec.compile()
     except ValueError as error:
         raise InputError(f"{robot.urdf_file}: MuJoCo cannot use it ({error}).") from error
-    return _with_addresses(compiled, joints)
-
-
-def _with_addresses(compiled: Any, joints: list[str]) -> PhysicsModel:
-    drive = [compiled.joint(name).id for name in joints]
-    flex = [compiled.joint(_flex(name)).id for name in joints]
-    return PhysicsModel(
-        compiled,
-        compiled.jnt_qposadr[drive].astype(int),
-        compiled.jnt_qposadr[flex].astype(int),
-        compiled.jnt_plasticadr[drive].astype(int),
-    )
-
-
-def _flex(joint: str) -> str:
-    return f"{joint} flex"
-
-
-def _motor(joint: str) -> str:
-    return f"{joint} motor"
+    drive = [compiled.joint(joint).id for joint in gears]
+    flex = [compiled.joint(f"{joint} flex").id for joint in gears]
+    positions, plastic = compiled.jnt_qposadr.astype(int), compiled.jnt_plasticadr.astype(int)
+    return PhysicsModel(compiled, positions[drive], positions[flex], plastic[drive])
 
 
 def _inertia(inertia: float, damping: float, step: float) -> float:
@@ -321,7 +290,7 @@ def _add_gear(spec: Any, joint: str, motor: MotorPhysics, step: float) -> None:
         drive.stiffness = [motor.friction / motor.friction_yield, 0.0, 0.0]
         drive.springyield = motor.friction_yield
     drive.parent.add_joint(
-        name=_flex(joint),
+        name=f"{joint} flex",
         type=drive.type,
         axis=drive.axis,
         pos=drive.pos,
@@ -329,30 +298,118 @@ def _add_gear(spec: Any, joint: str, motor: MotorPhysics, step: float) -> None:
         damping=[motor.flex_damping, 0.0, 0.0],
         armature=_inertia(motor.flex_inertia, motor.flex_damping, step),
     )
-
-
-def _add_tendon(spec: Any, joint: str, limit: float) -> None:
-    tendon = spec.add_tendon(name=_motor(joint))
+    tendon = spec.add_tendon(name=f"{joint} motor")
     tendon.wrap_joint(joint, 1.0)
-    if limit < float("inf"):
+    if motor.torque_limit < math.inf:
         tendon.actfrclimited = True
-        tendon.actfrcrange = [-limit, limit]
+        tendon.actfrcrange = [-motor.torque_limit, motor.torque_limit]
 
 
-def _add_setpoint(mujoco: Any, spec: Any, joint: str, motor: MotorPhysics) -> None:
-    actuator = spec.add_actuator(name=f"{joint} set-point", target=_motor(joint))
-    actuator.trntype = mujoco.mjtTrn.mjTRN_TENDON
+def _add_actuators(spec: Any, gears: Mapping[str, MotorPhysics]) -> None:
+    """Add all set-points, then all feedbacks, then all brakes: the order of the controls."""
+    mujoco = load_mujoco()
+    tendon, own = mujoco.mjtTrn.mjTRN_TENDON, mujoco.mjtTrn.mjTRN_JOINT
+    for kind in ("set-point", "feedback", "brake"):
+        for joint, motor in gears.items():
+            target, type_ = (joint, own) if kind == "brake" else (f"{joint} motor", tendon)
+            actuator = spec.add_actuator(name=f"{joint} {kind}", target=target)
+            actuator.trntype = type_
+            if kind != "set-point":
+                actuator.gaintype = mujoco.mjtGain.mjGAIN_AFFINE
+                feedback = [0.0, -motor.stiffness, -motor.derivative]
+                brake = [0.0, 0.0, -BRAKE_S * motor.stiffness]
+                actuator.gainprm[:3] = feedback if kind == "feedback" else brake
 
 
-def _add_feedback(mujoco: Any, spec: Any, joint: str, motor: MotorPhysics) -> None:
-    actuator = spec.add_actuator(name=f"{joint} feedback", target=_motor(joint))
-    actuator.trntype = mujoco.mjtTrn.mjTRN_TENDON
-    actuator.gaintype = mujoco.mjtGain.mjGAIN_AFFINE
-    actuator.gainprm[:3] = [0.0, -motor.stiffness, -motor.derivative]
+# Motors and gears for a robot of which only URDF and profile are known: assumed, not measured.
+
+SAG_RAD = math.radians(0.5)
+"""How far a joint gives way under its largest load, at most."""
+FRICTION_RAD = math.radians(0.1)
+"""How far from its set-point friction lets a drive come to rest, at most."""
+YIELD_RAD = FRICTION_RAD
+FLEX_SHARE = 1.0 / 3.0
+"""Share of the sag that comes from the gear's output side, the rest from the servo."""
+FULL_TORQUE_RAD = math.radians(20.0)
+"""Error at which a servo gives all its torque, at most."""
+SERVO_RAD_S = 40.0
+"""Natural frequency of a servo that moves its joint's largest inertia, at least."""
+RINGING_RAD_S = 150.0
+"""Rotors and gears are given enough inertia to ring no faster than this by themselves."""
+FILTER_S = 0.03
+"""Time constant of the set-point filter, at least [s]; slower where the torque that is left under
+the largest load would not bring the largest inertia to the speed of a fast ramp within it."""
+FAST_RAMP_S = 0.6
+"""Time of a fast ramp from zero or through the movement range: the shortest that the paper draws
+(arXiv 2411.01360)."""
+FLEX_DAMPING_RATIO = 0.3
+BACK_EMF_SHARE = 0.2
+"""Share of its torque that a motor needs to turn at its largest speed."""
+ROTOR_SHARE = 0.2
+"""Inertia of a rotor behind its gear over the largest inertia of the joint, at least."""
+SPARE_TORQUE = 2.0
+"""Torque of a motor over its largest load, at least; a URDF that states less has a placeholder."""
+POSES = 500
 
 
-def _add_brake(mujoco: Any, spec: Any, joint: str, motor: MotorPhysics) -> None:
-    actuator = spec.add_actuator(name=f"{joint} brake", target=joint)
-    actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
-    actuator.gaintype = mujoco.mjtGain.mjGAIN_AFFINE
-    actuator.gainprm[:3] = [0.0, 0.0, -BRAKE_S * motor.stiffness]
+def default_parameters(robot: Robot) -> PhysicsParameters:
+    """Return parameters derived from the robot's URDF and movement ranges.
+
+    Raises:
+        InputError: If mujoco is missing or cannot use the URDF.
+    """
+    load, inertia, effort = _arm_facts(robot)
+    figures = np.stack([load, inertia, effort], axis=1).tolist()
+    motors = tuple(
+        _assumed(motor, *of_motor) for motor, of_motor in zip(robot.motors, figures, strict=True)
+    )
+    return PhysicsParameters("assumed: derived from masses and limits of the URDF", motors)
+
+
+def _assumed(motor: Motor, load: float, inertia: float, effort: float) -> MotorPhysics:
+    stiffness = max(
+        load / SAG_RAD / (1.0 - FLEX_SHARE),
+        (1.0 + ROTOR_SHARE) * inertia * SERVO_RAD_S**2,
+        effort / FULL_TORQUE_RAD if math.isfinite(effort) else 0.0,
+    )
+    flex_stiffness = stiffness * (1.0 - FLEX_SHARE) / FLEX_SHARE
+    friction = stiffness * FRICTION_RAD
+    springs = stiffness + flex_stiffness + friction / YIELD_RAD
+    armature = max(ROTOR_SHARE * inertia, springs / RINGING_RAD_S**2)
+    travel = max(motor.movement_range[1], 0.0) - min(motor.movement_range[0], 0.0)
+    fast = min(motor.speed_limit, travel / FAST_RAMP_S)
+    flex_inertia = flex_stiffness / RINGING_RAD_S**2
+    return MotorPhysics(
+        name=motor.name,
+        stiffness=stiffness,
+        derivative=2.0 * math.sqrt(stiffness * (inertia + armature)),
+        filter_s=max(FILTER_S, (inertia + armature) * fast / (effort - load)),
+        damping=BACK_EMF_SHARE * effort / motor.speed_limit if math.isfinite(effort) else 0.0,
+        armature=armature,
+        friction=friction,
+        friction_yield=YIELD_RAD,
+        torque_limit=effort,
+        flex_stiffness=flex_stiffness,
+        flex_damping=2.0 * FLEX_DAMPING_RATIO * math.sqrt(flex_stiffness * flex_inertia),
+        flex_inertia=flex_inertia,
+    )
+
+
+def _arm_facts(robot: Robot) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return largest load [N m], inertia [kg m2] and effort [N m] of each motor, (motor,) each."""
+    mujoco = load_mujoco()
+    model = arm_spec(robot).compile()
+    data = mujoco.MjData(model)
+    low, high = np.array([motor.movement_range for motor in robot.motors]).T
+    poses = np.random.default_rng(0).uniform(low, high, (POSES, len(low))) * robot.sense
+    load, inertia = np.zeros((2, len(low)))
+    mass = np.zeros((model.nv, model.nv))
+    for pose in poses:
+        data.qpos[:] = pose
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, mass)
+        load = np.maximum(load, np.abs(data.qfrc_bias))
+        inertia = np.maximum(inertia, np.diag(mass))
+    limits = {joint.name: joint.effort or math.inf for joint in read_urdf(robot.urdf_file).joints}
+    effort = np.array([limits[motor.joint] for motor in robot.motors])
+    return load, inertia, np.maximum(effort, SPARE_TORQUE * load)
