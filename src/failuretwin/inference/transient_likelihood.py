@@ -331,10 +331,7 @@ class TransientLikelihood:
         delay: FloatArray | None = None,
         spread_m: float = 0.0,
     ) -> FloatArray:
-        """Return log densities of all movements of runs, (run, movement, case); 0 without readings.
-
-        Arguments as for `log_density`, with axes of runs and movements.
-        """
+        """Return `log_density` of all movements, (run, movement, case); 0 without readings."""
         item = np.nonzero(self.moving.seen.any(axis=-1))
         found = np.zeros(origin.shape[:-1])
         lasts = None if duration is None else duration[item]
