@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 import failuretwin as ft
 from failuretwin.app.calibration_tables import mean_gain
-from failuretwin.connection.calibration.calibrate import calibrate
-from failuretwin.connection.calibration.validation import predict, typical_size
+from failuretwin.connection.calibration.calibrate import fit_calibration
+from failuretwin.connection.calibration.cross_validation import predict, robust_scale
 from failuretwin.data_knowledge.raw_sessions import find_sessions
 from failuretwin.digital_model.robot import Robot
 
@@ -44,11 +44,11 @@ def campaigns(folder: Path, robot: Robot) -> dict[str, xr.Dataset]:
 
 def row(learned: xr.Dataset, judged: xr.Dataset | None, robot: Robot) -> str:
     """Return sizes and gain; without `judged` runs, of each session by a fit to the others."""
-    found = calibrate(learned, robot, "trial", "campaigns", judged=judged)
+    found = fit_calibration(learned, robot, "trial", "campaigns", judged=judged)
     told = predict(found, learned if judged is None else judged, robot)
     kept = told.counts.all(axis=1)
     count = abs(robot.servo_units.rad_per_count)
-    sizes = typical_size((told.error - told.expected)[kept]) / count
+    sizes = robust_scale((told.error - told.expected)[kept]) / count
     gain, half = mean_gain(found.held_out)
     cells = " ".join(f"{size:5.2f}" for size in sizes)
     return f"{int(kept.sum()):4d} {cells}   {gain:+.2f} +- {half:.2f}"

@@ -21,10 +21,11 @@ import numpy as np
 from killian_truth import TrueRun, read_list
 
 import failuretwin as ft
-from failuretwin.connection.calibrating import learn_robot
-from failuretwin.core.hypothesis import Hypothesis, single_faults
-from failuretwin.decision.metrics.probability import wilson_interval
-from failuretwin.decision.results import Record, score_line, score_records, write_json_lines
+from failuretwin.connection.calibration.calibrate import calibrate
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis, single_faults
+from failuretwin.decision.evaluation import Judged, score_line
+from failuretwin.decision.metrics import wilson_interval
+from failuretwin.decision.results import write_json_lines
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
@@ -50,10 +51,10 @@ def main() -> None:
     for name in bundled():
         imperfections = load_calibration(name, robot).imperfections
         report(name, listed, diagnose(known, robot, imperfections, hypotheses))
-    records = with_own_calibration(runs, robot, hypotheses)
-    report("learned from the healthy runs of the campaign", listed, records)
+    found = with_own_calibration(runs, robot, hypotheses)
+    report("learned from the healthy runs of the campaign", listed, found)
     if options.json is not None:
-        write_json_lines(records, options.json)
+        write_json_lines(found, options.json)
 
 
 def bundled() -> list[str]:
@@ -71,47 +72,45 @@ def read_campaign(folder: Path, listed: Sequence[TrueRun], robot: Robot) -> xr.D
 
 def diagnose(
     runs: xr.Dataset, robot: Robot, healthy: Imperfections, hypotheses: Sequence[Hypothesis]
-) -> list[Record]:
+) -> list[Diagnosis]:
     """Return the results of some runs."""
     diagnoser = ft.BayesDiagnoser(ft.DigitalTwin(robot), healthy, hypotheses)
-    return [diagnosis.to_record() for diagnosis in diagnoser.diagnose(runs)]
+    return diagnoser.diagnose(runs)
 
 
 def with_own_calibration(
     runs: xr.Dataset, robot: Robot, hypotheses: Sequence[Hypothesis]
-) -> list[Record]:
+) -> list[Diagnosis]:
     """Return the results with what the healthy runs teach, each healthy run left out for itself."""
     healthy = np.flatnonzero(runs["fault"].values == "healthy")
     faulty = np.flatnonzero(runs["fault"].values != "healthy")
-    results: dict[int, Record] = {}
+    results: dict[int, Diagnosis] = {}
     for judged in (faulty, *(healthy[k : k + 1] for k in range(len(healthy)))):
         learning = runs.isel(run=np.setdiff1d(healthy, judged))
-        found = learn_robot(learning, robot, "campaign", "healthy runs of the campaign", None)[0]
+        found = calibrate(learning, robot, "campaign", "healthy runs of the campaign")
         blind = runs.isel(run=judged).drop_vars("position")
-        records = diagnose(blind, robot, found.imperfections, hypotheses)
-        results |= dict(zip(judged.tolist(), records, strict=True))
+        diagnoses = diagnose(blind, robot, found.imperfections, hypotheses)
+        results |= dict(zip(judged.tolist(), diagnoses, strict=True))
     return [results[run] for run in range(len(results))]
 
 
-def report(name: str, listed: Sequence[TrueRun], records: Sequence[Record]) -> None:
+def report(name: str, listed: Sequence[TrueRun], diagnoses: Sequence[Diagnosis]) -> None:
     """Print how many are right, by kind of fault, and the wrong ones."""
-    judged = [r for run, r in zip(listed, records, strict=True) if run.judged]
+    judged = Judged.of(d for run, d in zip(listed, diagnoses, strict=True) if run.judged)
     print(f"{name}: {score_line(judged)}")
-    scores = score_records(judged)
-    assert scores is not None
-    for row in scores.by_class():
+    for row in judged.scores.by_class():
         if row.runs:
             hits = round(row.recall * row.runs)
             low, high = wilson_interval(hits, row.runs)
             print(f"  {row.name}: {hits} of {row.runs} ({100 * low:.0f} to {100 * high:.0f} %)")
-    healthy = [r for r in records if r["truth"] == "healthy"]
-    alarms = sum(r["diagnosis"] not in ("healthy", None) for r in healthy)
-    silent = sum(r["diagnosis"] is None for r in healthy)
+    healthy = [d for d in diagnoses if d.truth == "healthy"]
+    alarms = sum(d.diagnosis not in ("healthy", None) for d in healthy)
+    silent = sum(d.diagnosis is None for d in healthy)
     print(f"  {len(healthy)} healthy runs: {alarms} false alarms, {silent} without a verdict")
-    for run, record in zip(listed, records, strict=True):
-        if record["diagnosis"] != record["truth"]:
+    for run, diagnosis in zip(listed, diagnoses, strict=True):
+        if diagnosis.diagnosis != diagnosis.truth:
             asked = "" if run.judged or run.truth == "healthy" else " (not judged)"
-            print(f"  {run.run}{asked}: {run.truth}, said: {record['verdict']}")
+            print(f"  {run.run}{asked}: {run.truth}, said: {diagnosis.verdict}")
 
 
 if __name__ == "__main__":

@@ -16,22 +16,19 @@ import torch
 from failuretwin import load_robot
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.decision.learned.data import Recipe
 from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
-from failuretwin.decision.learned.export import export_numpy, export_onnx
-from failuretwin.decision.learned.features import Encoder, expectation_of, signals_of
+from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of, signals_of
 from failuretwin.decision.learned.networks import (
-    CHUNK_RUNS,
     NETWORKS,
-    Chunk,
     Pace,
     Shape,
     Standard,
-    Stream,
     build_network,
     shuffled_batches,
     training,
 )
+from failuretwin.decision.learned.storage import export_numpy, export_onnx
+from failuretwin.decision.learned.training_data import CHUNK_RUNS, Chunk, Stream, TrainingData
 from failuretwin.digital_model.calibrated_robot import load_calibration
 
 PAPER_ITERATIONS, PAPER_JOBS = 5050, 20
@@ -60,12 +57,12 @@ def paper_training(cores: int) -> float:
     return (time.perf_counter() - begun) / timed * PAPER_ITERATIONS
 
 
-def share_waited(name: str, encoder: Encoder, recipe: Recipe) -> tuple[float, float]:
+def share_waited(name: str, encoder: FeatureEncoder, data: TrainingData) -> tuple[float, float]:
     """Return the time of an iteration [s] and the share of it that training waits for runs.
 
     Of a training that has been going on: the first chunk, which it waits for once, is left out.
     """
-    stream = Stream(recipe, encoder)
+    stream = Stream(data, encoder)
     waits: list[float] = []
 
     def timed(chunks: Iterator[Chunk]) -> Iterator[Chunk]:
@@ -80,9 +77,9 @@ def share_waited(name: str, encoder: Encoder, recipe: Recipe) -> tuple[float, fl
         for _ in range(stream.uses):  # until as many chunks are in use as there ever are
             next(chunks)
         diagnoser = LearnedDiagnoser(name, encoder, iterations=STREAMED, random_state=0)
-        classes = [str(h) for h in recipe.hypotheses]
+        classes = [str(h) for h in data.hypotheses]
         begun = time.perf_counter()
-        diagnoser.fit_batches(stream.batches(timed(chunks)), standard, classes, recipe.movements)
+        diagnoser.fit_batches(stream.batches(timed(chunks)), standard, classes, data.movements)
         whole = time.perf_counter() - begun - waits[0]
     return whole / STREAMED, sum(waits[1:]) / whole
 
@@ -98,7 +95,7 @@ def milliseconds(work: Callable[[], object], times: int = 50) -> float:
     return 1000.0 * float(np.median(taken))
 
 
-def exported(name: str, encoder: Encoder, folder: Path) -> tuple[float, float]:
+def exported(name: str, encoder: FeatureEncoder, folder: Path) -> tuple[float, float]:
     """Return the time to classify one run by ONNX and by the NumPy file, features included [ms]."""
     robot = encoder.robot
     runs = simulate(Plan(robot, paper_hypotheses(robot.motor_names), 2))
@@ -124,19 +121,19 @@ def main() -> None:
     torch.set_num_threads(1)
     robot = load_robot("armpi_fpv")
     imperfect = load_calibration("armpi_fpv", robot).imperfections
-    encoder = Encoder("robust", robot, expectation_of(robot, imperfect))
-    recipe = Recipe(robot, imperfect)
+    encoder = FeatureEncoder("robust", robot, expectation_of(robot, imperfect))
+    data = TrainingData(robot, imperfect)
     one, two = paper_training(1), paper_training(2)
     print(f"the paper's LSTM, 5050 iterations: {one:.0f} s on one core, {two:.0f} s on two")
     print(f"so the whole study takes {PAPER_JOBS * one / 2 / 60:.0f} minutes on two cores")
     begun = time.perf_counter()
-    recipe.chunk(0, CHUNK_RUNS, encoder)
+    data.chunk(0, CHUNK_RUNS, encoder)
     each = 1000.0 * (time.perf_counter() - begun) / CHUNK_RUNS
     print(f"a training run with its features: {each:.2f} ms on one core\n")
     print(f"{'network':12s}{'iteration':>12s}{'waits':>8s}{'ONNX':>10s}{'NumPy file':>13s}")
     with tempfile.TemporaryDirectory() as folder:
         for name in NETWORKS:
-            iteration, waits = share_waited(name, encoder, recipe)
+            iteration, waits = share_waited(name, encoder, data)
             by_onnx, by_numpy = exported(name, encoder, Path(folder))
             print(
                 f"{name:12s}{1000 * iteration:9.1f} ms{100 * waits:6.0f} %{by_onnx:7.2f} ms"

@@ -16,16 +16,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 import failuretwin as ft
 from failuretwin.app.plots import plot_runs
-from failuretwin.connection.calibrating import learn_robot
+from failuretwin.connection.calibration.calibrate import calibrate
 from failuretwin.connection.calibration.result import Calibration
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.data_knowledge.raw_sessions import find_sessions
-from failuretwin.decision.metrics import log_score, log_score_gain, mcnemar
-from failuretwin.decision.results import Record, score_line, write_json_lines
+from failuretwin.decision.evaluation import Judged, compare, score_line
+from failuretwin.decision.results import write_json_lines
 from failuretwin.digital_model.nonidealities import generic_imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.priors import priors_of
@@ -44,13 +42,13 @@ class Method:
         name: What to call it.
         calibrated: Whether it knows the robot; else generic offsets.
         whole_run: Whether readings on the way count.
-        records: Its results so far.
+        found: Its diagnoses so far.
     """
 
     name: str
     calibrated: bool = True
     whole_run: bool = True
-    records: list[Record] = field(default_factory=list)
+    found: list[Diagnosis] = field(default_factory=list)
 
 
 def main() -> None:
@@ -80,24 +78,23 @@ def main() -> None:
         runs = ft.read_runs(session, robot, ft.ReadOptions(published_labels=True))
         for method in (judged, *beside):
             found = _diagnose(runs, robot, known[others], priors, method)
-            method.records += [diagnosis.to_record() for diagnosis in found]
+            method.found += found
             if method is judged and options.plot is not None:
                 _plot_wrong(found, runs, robot, options.plot)
-    print(f"{judged.name}: {score_line(judged.records)}")
+    print(f"{judged.name}: {score_line(Judged.of(judged.found))}")
     for method in beside:
-        print(f"{method.name}: {score_line(method.records)}")
-        print(f"  {_compare(method.records, judged.records)}")
-    for record in judged.records:
-        if record["diagnosis"] != record["truth"]:
-            print(f"  {record['run']}: {record['truth']}, said: {record['verdict']}")
+        print(f"{method.name}: {score_line(Judged.of(method.found))}")
+        print(f"  {_compare(method.found, judged.found)}")
+    for diagnosis in judged.found:
+        if diagnosis.diagnosis != diagnosis.truth:
+            print(f"  {diagnosis.run}: {diagnosis.truth}, said: {diagnosis.verdict}")
     if options.json is not None:
-        write_json_lines(judged.records, options.json)
+        write_json_lines(judged.found, options.json)
 
 
 def _learn(sessions: tuple[Path, ...], robot: Robot) -> Calibration:
     runs = ft.read_runs(list(sessions), robot)
-    found, _ = learn_robot(runs, robot, "held out", "sessions that are not judged", None)
-    return found
+    return calibrate(runs, robot, "held out", "sessions that are not judged")
 
 
 def _diagnose(
@@ -112,16 +109,13 @@ def _diagnose(
     return diagnoser.diagnose(runs)
 
 
-def _compare(first: Sequence[Record], second: Sequence[Record]) -> str:
+def _compare(first: Sequence[Diagnosis], second: Sequence[Diagnosis]) -> str:
     """Return what the second saves over the first, on the same runs."""
-    truth = [str(record["truth"]) for record in first]
-    nats = [log_score(truth, [r["posterior"] for r in records]).nats for records in (first, second)]
-    gain = log_score_gain(nats[0], nats[1], np.random.default_rng(0))
-    right = [np.array([r["diagnosis"] == r["truth"] for r in rs]) for rs in (first, second)]
-    low, high = gain.interval
+    found = compare(first, second)
+    low, high = found.gain.interval
     return (
-        f"calibrated, whole run saves {gain.mean:.4f} nats a run over it (95 % interval {low:.4f} "
-        f"to {high:.4f}); exact McNemar p = {mcnemar(right[0], right[1]).p:.3g}"
+        f"calibrated, whole run saves {found.gain.mean:.4f} nats a run over it (95 % interval "
+        f"{low:.4f} to {high:.4f}); exact McNemar p = {found.split.p:.3g}"
     )
 
 

@@ -78,12 +78,12 @@ def watch_state(robot: Robot, state: str, speed: float, seconds: float, seed: in
             shadow.step(0.1)
             if child.poll() is not None:
                 deadline = min(deadline, time.monotonic() + LAST_WORDS_S)
-            answer = shadow.moment.answer
+            answer = shadow.snapshot.answer
             if answer.diagnosis is None or answer.diagnosis.undecided:
                 continue
             right = answer.diagnosis.posterior[state] >= SURE
             sure_since = (answer.time if np.isnan(sure_since) else sure_since) if right else np.nan
-    diagnosis = shadow.moment.answer.diagnosis
+    diagnosis = shadow.snapshot.answer.diagnosis
     last = None if diagnosis is None else diagnosis.diagnosis
     zero = commands.sent[0].time - FIRST_COMMAND_S
     return Outcome(last, sure_since, commands.ramp_ends(zero + ONSET_S))

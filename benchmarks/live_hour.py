@@ -18,11 +18,10 @@ from can_show import CanShow
 from kept_commands import KeptCommands
 
 from failuretwin import DigitalTwin, load_robot
-from failuretwin.app.live import EmulationOptions, emulated_robot
 from failuretwin.app.shadow import Shadow
-from failuretwin.connection.emulated_arm import Emulation
+from failuretwin.connection.emulated_arm import Emulation, emulated
 from failuretwin.connection.links.base import Pace
-from failuretwin.connection.links.diagnostics import SURE
+from failuretwin.connection.links.ros_messages import SURE
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.decision.streaming.diagnoser import monitor
 from failuretwin.digital_model.calibrated_robot import load_calibration
@@ -68,15 +67,16 @@ def live(
     """Return what was said, all commands, and the memory taken in between [MB]."""
     robot = load_robot("armpi_fpv")
     twin = DigitalTwin(robot)
-    texts = [f"{one.fault}@{one.start_s}-{one.end_s}" for one in schedule]
-    options = EmulationOptions(texts, None, seconds, seed)
+    emulation = Emulation(
+        robot, load_calibration(robot.name, robot).imperfections, tuple(schedule), seed
+    )
     commands = KeptCommands()
     said: list[Said] = []
     memory: list[float] = []
-    with emulated_robot(robot, options, Pace(speed)) as source:
+    with emulated(emulation, Pace(speed), seconds) as source:
         shadow = Shadow(source, monitor(twin), twin, [commands])
         while shadow.step(0.1):
-            answer = shadow.moment.answer
+            answer = shadow.snapshot.answer
             if answer.time > 600.0 * (len(memory) + 1):
                 memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0)
             if answer.diagnosis is None or answer.diagnosis.undecided:

@@ -131,7 +131,7 @@ def stream_answers(session: RawSession, robot: Robot) -> list[str | None]:
         shadow = Shadow(source, StreamingDiagnoser(BayesDiagnoser(twin)), twin)
         while shadow.step(0.0):
             pass
-        diagnosis = shadow.moment.answer.diagnosis
+        diagnosis = shadow.snapshot.answer.diagnosis
         found.append(None if diagnosis is None else diagnosis.diagnosis)
     return found
 

@@ -41,64 +41,67 @@ WARM = ("scipy.integrate", "scipy.optimize", "scipy.special", "h5netcdf", "xarra
 GOLDEN = "tests/golden"
 """Stored posteriors; the first to run, where they are there."""
 AREAS: dict[str, tuple[str, ...]] = {
-    "decision/evidence": (
-        "tests/decision/test_motor_profile.py",
-        "tests/decision/test_ramps.py",
-        "tests/decision/test_off_anyhow.py",
-        "tests/decision/test_pairs.py",
-        "tests/decision/test_bayes.py",
+    "inference/readings.py": ("tests/data_knowledge/test_true_readings.py",),
+    "inference/log_quality.py": ("tests/data_knowledge/test_log_quality.py",),
+    "inference/evidence.py": (
+        "tests/data_knowledge/test_settled_evidence.py",
+        "tests/data_knowledge/test_moving_evidence.py",
     ),
-    "decision/hypotheses": (
-        "tests/decision/test_law.py",
-        "tests/decision/test_onsets.py",
-        "tests/decision/test_size_nodes.py",
-        "tests/decision/test_laws.py",
-        "tests/decision/test_off_anyhow.py",
-        "tests/decision/test_pairs.py",
+    "inference/healthy_model.py": (
         "tests/connection/test_healthy.py",
-        "tests/decision/test_bayes.py",
-    ),
-    "decision/telling_apart": (
-        "tests/decision/test_separation.py",
-        "tests/decision/test_ambiguity.py",
-    ),
-    "decision/*.py": (
-        "tests/decision/test_wording.py",
-        "tests/decision/test_bayes.py",
-        "tests/decision/test_properties.py",
-    ),
-    "connection/healthy.py": (
-        "tests/connection/test_healthy.py",
+        "tests/decision/test_likelihood_terms.py",
         "tests/decision/test_motor_profile.py",
         "tests/decision/test_ramps.py",
     ),
-    "connection/lost_commands.py": (
+    "inference/command_loss.py": (
+        "tests/connection/test_losses_in_a_row.py",
         "tests/connection/test_alternatives.py",
         "tests/connection/test_healthy.py",
         "tests/connection/test_late_starts.py",
     ),
-    "connection/losses_in_a_row.py": (
-        "tests/connection/test_losses_in_a_row.py",
-        "tests/connection/test_alternatives.py",
+    "inference/*joint_likelihood.py": (
+        "tests/decision/test_motor_profile.py",
+        "tests/decision/test_likelihood_terms.py",
+        "tests/decision/test_off_anyhow.py",
+        "tests/decision/test_pairs.py",
+        "tests/decision/test_bayes.py",
     ),
-    "connection/run_evidence.py": ("tests/connection/test_tracker.py",),
-    "connection/wear.py": (
-        "tests/connection/test_tracker_history.py",
-        "tests/connection/test_tracker.py",
+    "inference/transient*.py": (
+        "tests/decision/test_ramps.py",
+        "tests/decision/test_likelihood_way.py",
+        "tests/decision/test_bayes.py",
     ),
-    "connection/tracker*.py": (
+    "inference/isolability.py": (
+        "tests/decision/test_separation.py",
+        "tests/decision/test_isolability.py",
+    ),
+    "inference/expected_bayes_factors.py": (
+        "tests/decision/test_separation.py",
+        "tests/decision/test_isolability.py",
+    ),
+    "inference/explanation.py": ("tests/decision/test_wording.py",),
+    "inference": (
+        "tests/decision/test_law.py",
+        "tests/decision/test_onsets.py",
+        "tests/decision/test_size_nodes.py",
+        "tests/decision/test_likelihood_stuck.py",
+        "tests/decision/test_likelihood_terms.py",
+        "tests/decision/test_laws.py",
+        "tests/decision/test_off_anyhow.py",
+        "tests/decision/test_pairs.py",
+        "tests/decision/test_bayes.py",
+    ),
+    "connection/wear*.py": (
         "tests/connection/test_tracker_history.py",
         "tests/connection/test_tracker.py",
     ),
     "connection/calibration/step_*.py": ("tests/connection/test_step_fit.py",),
+    "connection/calibration/servo_loops.py": ("tests/connection/test_step_fit.py",),
     "connection/calibration": (
         "tests/connection/test_loops.py",
         "tests/connection/test_calibration_intervals.py",
         "tests/connection/test_calibration_parts.py",
     ),
-    "data_knowledge/settled_evidence.py": ("tests/data_knowledge/test_settled_evidence.py",),
-    "data_knowledge/moving_evidence.py": ("tests/data_knowledge/test_moving_evidence.py",),
-    "data_knowledge/true_readings.py": ("tests/data_knowledge/test_true_readings.py",),
 }
 """Files and folders of the inference, as patterns inside the package, and the tests of each,
 cheapest first; of a file that two patterns name, the first."""
@@ -197,12 +200,15 @@ class Bench:
         """
         process = multiprocessing.get_context("fork").Process(target=self._child, args=(tests,))
         process.start()
-        process.join(timeout_s)
-        hung = process.is_alive()
-        if process.pid is not None:
-            with suppress(ProcessLookupError, PermissionError):
-                os.killpg(process.pid, signal.SIGKILL)
-        process.join()
+        try:
+            process.join(timeout_s)
+            hung = process.is_alive()
+        finally:  # whatever the tests have started ends with them
+            if process.pid is not None:
+                with suppress(ProcessLookupError, PermissionError):
+                    os.killpg(process.pid, signal.SIGKILL)
+            process.kill()
+            process.join()
         if hung:
             return "hung", ""
         if process.exitcode == 0:

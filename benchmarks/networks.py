@@ -16,7 +16,7 @@ from failuretwin import BayesDiagnoser, DigitalTwin, Plan, ReadOptions, load_rob
 from failuretwin.core.hypothesis import Diagnosis, paper_hypotheses
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.generate import simulate
-from failuretwin.decision.learned.diagnoser import HybridDiagnoser
+from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.decision.learned.networks import NETWORKS
 from failuretwin.decision.learned.storage import load_network, save_network
 from failuretwin.decision.metrics import (
@@ -59,7 +59,7 @@ def judged(diagnoses: Sequence[Diagnosis]) -> tuple[float, float, float]:
 
 
 def nats_of(diagnoses: Sequence[Diagnosis]) -> FloatArray:
-    """Return the surprise at the truth of each run [nats]."""
+    """Return the log score of each run [nats]."""
     truth = [str(d.truth) for d in diagnoses]
     return log_score(truth, [d.posterior for d in diagnoses]).nats
 

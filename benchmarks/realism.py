@@ -19,9 +19,9 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 import failuretwin as ft
-from failuretwin.connection.calibration.calibrate import calibrate
+from failuretwin.connection.calibration.calibrate import fit_calibration
 from failuretwin.connection.calibration.observations import observe, session_names
-from failuretwin.connection.calibration.timing import movements_of
+from failuretwin.connection.calibration.timing_fit import movements_of
 from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.generate import Plan, simulate
@@ -86,7 +86,7 @@ def table(real: object, simulated: object, robot: Robot) -> None:
             low, high = np.quantile(draws, [0.025, 0.975])
             name = f"settled error of {motor}, {what} [counts]"
             print(f"{name:44s} {values[0]:9.2f} {low:9.2f} to {high:7.2f} {values[1]:10.2f}")
-    learned = [calibrate(runs, robot, "x", "x", thorough=False) for runs in (real, simulated)]
+    learned = [fit_calibration(runs, robot, "x", "x", thorough=False) for runs in (real, simulated)]
     other = {(p.name, p.motor): p for p in learned[1].parameters}
     for p in learned[0].parameters:
         match = other.get((p.name, p.motor))

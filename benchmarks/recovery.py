@@ -18,11 +18,11 @@ from functools import partial
 import numpy as np
 
 import failuretwin as ft
-from failuretwin.connection.calibration.calibrate import calibrate
+from failuretwin.connection.calibration.calibrate import fit_calibration
 from failuretwin.connection.calibration.observations import observe
-from failuretwin.connection.calibration.settling import (
-    fit_settled_part,
+from failuretwin.connection.calibration.settling_fit import (
     probably_arrived,
+    sort_and_fit,
     sort_movements,
 )
 from failuretwin.core.hypothesis import HEALTHY
@@ -86,7 +86,7 @@ def try_robot(name: str, runs: int, seed: int) -> dict[Key, tuple[bool, bool]]:
     true = random_robot(robot, seed)
     logs = ft.simulate(ft.Plan(robot, [HEALTHY], runs, seed, true))
     known, found = truths(true, robot), {}
-    parameters = calibrate(logs, robot, "trial", "simulated", thorough=False).parameters
+    parameters = fit_calibration(logs, robot, "trial", "simulated", thorough=False).parameters
     told_apart = any(p.name == "lost commands when late" for p in parameters)
     for p in parameters:
         if p.name == "lost commands" and not told_apart:
@@ -108,7 +108,7 @@ def on_physics(robot: Robot, runs: int) -> None:
     learning, unseen = (observe(logs) for logs in sets)
     scatters = []
     for source in (learning, unseen):
-        settling = fit_settled_part(source, robot).fit.settling("fit")
+        settling = sort_and_fit(source, robot).fit.settling("fit")
         assert unseen.position is not None
         lost, odd = sort_movements(unseen, robot, settling)
         expected = unseen.target + settling.offset(robot, unseen.position, unseen.direction)

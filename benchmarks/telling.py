@@ -8,7 +8,7 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.decision.metrics.probability import (
+from failuretwin.decision.metrics import (
     Share,
     calibrated_error,
     equal_edges,

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
-from failuretwin.connection.calibration.calibrate import calibrate
-from failuretwin.connection.tracking import Tracked, diagnose_tracked
-from failuretwin.connection.wear_history import History
+from failuretwin.connection.calibration.calibrate import fit_calibration
+from failuretwin.connection.tracked_diagnosis import History, Tracked, diagnose_tracked
 from failuretwin.connection.wear_tracker import Tracker
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import concatenate
@@ -245,7 +244,7 @@ def main() -> None:
     robot = load_robot("armpi_fpv")
     world = World(robot, load_calibration("armpi_fpv", robot).imperfections)
     healthy = Plan(robot, [Hypothesis()], CALIBRATION_RUNS, SEED + 1, world.fresh)
-    learned = calibrate(
+    learned = fit_calibration(
         simulate(healthy), robot, "fresh", "simulated", use_readings=False, thorough=False
     )
     diagnoser = BayesDiagnoser(DigitalTwin(robot), learned.imperfections)

@@ -11,9 +11,11 @@ import numpy as np
 
 from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
 from failuretwin.app.plots import run_figure
-from failuretwin.app.tables import print_diagnoses, print_scores, progress_bar
+from failuretwin.app.reports import print_diagnoses, print_scores
+from failuretwin.app.tables import progress_bar
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.decision.evaluation import Judged
 from failuretwin.digital_model.calibrated_robot import load_calibration
 
 RUNS_PER_CLASS = 10
@@ -33,7 +35,7 @@ with progress_bar("simulating", plan.size) as advance:
 twin = DigitalTwin(robot)
 diagnoses = BayesDiagnoser(twin).diagnose(runs)
 print_diagnoses(diagnoses)
-print_scores([diagnosis.to_record() for diagnosis in diagnoses])
+print_scores(Judged.of(diagnoses))
 
 shown = next(i for i, d in enumerate(diagnoses) if d.truth == d.diagnosis == "motor_3:stuck")
 run = runs.isel(run=shown)

@@ -154,8 +154,9 @@ PRINT_MODULES = "\nimport sys; print(*sys.modules)"
         "import failuretwin",
         EVERYTHING_IN_CORE,
         "from failuretwin import DigitalTwin, load_robot; DigitalTwin(load_robot('armpi_fpv'))",
+        "import failuretwin, failuretwin.app.inputs",
     ],
-    ids=["failuretwin", "core", "twin"],
+    ids=["failuretwin", "core", "twin", "diagnose"],
 )
 def test_importing_loads_no_extras(code):
     loaded = set(run_python(code + PRINT_MODULES))

@@ -30,6 +30,7 @@ from failuretwin.connection.calibration.result import (
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.data_knowledge.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import save_run_set
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import generic_imperfections
 
 COUNT = np.deg2rad(0.24)
@@ -363,7 +364,7 @@ def test_a_robot_has_its_own_calibration(failuretwin, learned, two_days, small, 
 def test_imperfections_are_no_calibration(armpi, tmp_path):
     path = tmp_path / "typed.toml"
     path.write_text('name = "typed"\nsource = "by hand"\n')
-    assert read_calibration(str(path), armpi).imperfections.name == "typed"
+    assert load_calibration(path, armpi).imperfections.name == "typed"
     with pytest.raises(InputError, match="holds imperfections without a calibration"):
         read_calibration(path, armpi)
 
@@ -382,7 +383,7 @@ def test_a_file_holds_what_was_learned_and_is_read_as_imperfections(small, armpi
             before, value=0.0, low=0.0, high=0.0
         )
     assert replace(found, parameters=()) == replace(full, parameters=())
-    assert read_calibration(str(tmp_path / "twin.toml"), armpi).imperfections == found.imperfections
+    assert load_calibration(tmp_path / "twin.toml", armpi) == found.applied_to(armpi)
 
 
 def test_a_write_that_dies_leaves_the_old_file(small, armpi, tmp_path, listing, monkeypatch):

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from failuretwin.app.evaluation_tables import escaped, latex_table
+from failuretwin.app.tables import Table, escaped, latex
 from failuretwin.core.runs import RunTable, Truth
 from failuretwin.data_knowledge.store import save_run_set
 
@@ -228,7 +228,7 @@ def test_tables_for_a_paper(evaluate, folder):
 def test_every_letter_that_latex_reads_as_a_command_is_escaped():
     assert escaped("a_b & 5 %") == r"a\_b \& 5 \%"
     assert escaped("\\{~^}$#") == r"\textbackslash{}\{\textasciitilde{}\textasciicircum{}\}\$\#"
-    assert latex_table("lr", ("a_b", "n"), [("x", "1")]).splitlines() == [
+    assert latex(Table(("a_b", "n"), [("x", "1")], "lr")).splitlines() == [
         r"\begin{tabular}{lr}",
         r"\toprule",
         r"a\_b & n \\",

@@ -12,7 +12,7 @@ from failuretwin import BayesDiagnoser, load_robot, read_runs
 from failuretwin.app.cli import cli
 from failuretwin.core.errors import FailureTwinError, InputError
 from failuretwin.decision import training
-from failuretwin.decision.learned.posteriors import blended
+from failuretwin.decision.learned.log_pool import log_pool
 from failuretwin.decision.learned.storage import load_network, save_network
 
 
@@ -66,7 +66,7 @@ def test_a_network_is_blended_with_bayes(network, simulated, tmp_path, armpi, tw
     runs, loaded = read_runs(simulated), load_network(path, armpi)
     classes = loaded.classes_.tolist()
     bayes = [[d.posterior[c] for c in classes] for d in BayesDiagnoser(twin).diagnose(runs)]
-    expected = blended(np.array(bayes), loaded.predict_proba(runs), loaded.weights_)
+    expected = log_pool(np.array(bayes), loaded.predict_proba(runs), loaded.weights_)
     got = [[record["posterior"][c] for c in classes] for record in records]
     np.testing.assert_allclose(got, expected, atol=1e-6)  # single precision
     assert records[0]["method"].startswith("blended: bayes")

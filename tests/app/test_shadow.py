@@ -12,7 +12,7 @@ from failuretwin.app import shadow as shadow_module
 from failuretwin.app.live import View, watch_until_end
 from failuretwin.app.shadow import Changes, Shadow
 from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, LinkCounts, Reading
-from failuretwin.connection.links.live_commands import SampledCommands
+from failuretwin.connection.links.live_events import SampledCommands
 from failuretwin.connection.links.ros_messages import RosTopics
 from failuretwin.core.hypothesis import Diagnosis
 
@@ -145,18 +145,18 @@ def test_silence_is_never_healthy(twin, clock):
     states = []
     for _ in range(15):
         shadow.step(0.0)
-        states.append(shadow.moment.answer.state)
+        states.append(shadow.snapshot.answer.state)
         clock[0] += 0.6
     assert states[0] == OK
     assert states[1:8] == [OK] * 7
     assert states[9:] == [STALE] * 6  # more than 5 s
-    assert shadow.moment.answer.diagnosis is HEALTHY  # what was known is not forgotten
+    assert shadow.snapshot.answer.diagnosis is HEALTHY  # what was known is not forgotten
     times = [time for time, _, _ in notebook.told]
     assert times == sorted(times)  # the diagnoser was told that time went on
     assert times[-1] > 5.0
     script.events.appendleft(reading(9.0))
     shadow.step(0.0)
-    assert shadow.moment.answer.state == OK
+    assert shadow.snapshot.answer.state == OK
 
 
 def test_commands_alone_are_silence(twin, clock):
@@ -166,7 +166,7 @@ def test_commands_alone_are_silence(twin, clock):
         clock[0] += 1.0
     script.events.extend([None, None])
     shadow.step(0.0)
-    assert shadow.moment.answer.state == STALE
+    assert shadow.snapshot.answer.state == STALE
 
 
 def test_the_user_is_told_how_late_commands_come(twin, armpi):
@@ -197,7 +197,7 @@ def test_motor_readings_alone_are_silence(twin, clock):
     for _ in range(9):
         shadow.step(0.0)
         clock[0] += 1.0
-    assert shadow.moment.answer.state == STALE
+    assert shadow.snapshot.answer.state == STALE
 
 
 def test_a_robot_that_is_silent_at_first_is_waited_for(twin, clock):
@@ -218,7 +218,7 @@ def test_a_robot_that_is_silent_at_first_is_waited_for(twin, clock):
 
 def test_before_any_data_nothing_is_known_and_our_clock_stands_in(twin):
     before = time.time()
-    answer = Shadow(Script([]), Notebook(), twin).moment.answer
+    answer = Shadow(Script([]), Notebook(), twin).snapshot.answer
     assert (answer.state, answer.diagnosis) == (STALE, None)
     assert before <= answer.time <= time.time()
 
@@ -233,7 +233,7 @@ def test_a_clock_that_jumps_leaves_the_diagnosers_time_as_it_was(twin, clock, ju
         clock[0] += 0.1
     np.testing.assert_allclose([t for t, _, _ in notebook.told], 0.1 * np.arange(100), atol=1e-6)
     assert shadow.clock_jumps == 1
-    assert shadow.moment.answer.time == pytest.approx(5009.9 + jump)
+    assert shadow.snapshot.answer.time == pytest.approx(5009.9 + jump)
 
 
 def test_sinks_get_events_and_answers_by_the_robots_clock(twin):
@@ -256,7 +256,7 @@ def test_the_residual_is_the_distance_from_the_reference(twin):
     offset = np.array([0.0, 0.01, 0.0])
     shadow = Shadow(Script([reading(0.0, at_rest + offset)]), Notebook(), twin)
     run(shadow)
-    np.testing.assert_allclose(shadow.moment.residual, offset, atol=1e-12)
+    np.testing.assert_allclose(shadow.snapshot.residual, offset, atol=1e-12)
 
 
 def lines(changes, moments, counts=None, troubles=()):
@@ -269,7 +269,7 @@ def lines(changes, moments, counts=None, troubles=()):
 
 def moment(time, state, diagnosis):
     answer = Answer(time, state, diagnosis)
-    return shadow_module.Moment(answer, time, np.full(3, np.nan), 0.001)
+    return shadow_module.Snapshot(answer, time, np.full(3, np.nan), 0.001)
 
 
 def test_what_changes_is_told_once(armpi):

@@ -16,6 +16,11 @@ from waiting import WAIT_S
 COMMAND = ("simulate", "--runs-per-class", 40, "--imperfections", "armpi_fpv", "--out")
 
 
+def remarks(stderr):
+    """Return what is said beside progress, which only slow machines show."""
+    return "".join(line for line in stderr.splitlines(True) if not line.startswith("simulating: "))
+
+
 def contents(folder):
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     return {str(file.relative_to(folder)): file.read_bytes() for file in files}
@@ -26,14 +31,14 @@ def made_by_one(failuretwin, tmp_path_factory):
     """A run set in four pieces, made by one process."""
     path = tmp_path_factory.mktemp("one") / "runs.zarr"
     answer = failuretwin(*COMMAND, path)
-    assert (answer.returncode, answer.stderr) == (0, "")
+    assert (answer.returncode, remarks(answer.stderr)) == (0, "")
     assert answer.stdout == f"360 runs written to {path}\n"
     return path
 
 
 def test_two_workers_write_the_same_bytes(failuretwin, tmp_path, made_by_one):
     answer = failuretwin(*COMMAND, tmp_path / "two.zarr", "--workers", 2)
-    assert (answer.returncode, answer.stderr) == (0, "")
+    assert (answer.returncode, remarks(answer.stderr)) == (0, "")
     assert contents(tmp_path / "two.zarr") == contents(made_by_one)
 
 
@@ -52,13 +57,13 @@ def test_interrupted_work_is_kept_and_continued(failuretwin, tmp_path, workers):
         assert os.getpgid(process.pid) == process.pid
         os.killpg(process.pid, signal.SIGINT)
         assert process.wait(WAIT_S) == 1
-        told, _, rest = process.stderr.read().partition("\n")
+        told, _, rest = remarks(process.stderr.read()).partition("\n")
     assert "of 900 runs are kept in" in told
     assert rest.split() == ["interrupted"]
     kept = told.split()[0]
     assert not (tmp_path / "runs.zarr").exists()
     again = failuretwin(*arguments)
-    assert again.stderr == f"continuing: {kept} of 900 runs were there\n"
+    assert remarks(again.stderr) == f"continuing: {kept} of 900 runs were there\n"
     assert load_run_set(tmp_path / "runs.zarr").sizes["run"] == 900
     assert [path.name for path in tmp_path.iterdir()] == ["runs.zarr"]
 

@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from failuretwin.app.cli import cli
 from failuretwin.app.inputs import learn_loops, split_step_tests, with_step_tests
-from failuretwin.connection.calibration.calibrate import calibrate
+from failuretwin.connection.calibration.calibrate import fit_calibration
 from failuretwin.connection.calibration.result import save_calibration
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.read import read_runs
@@ -137,7 +137,9 @@ def test_diagnose_expects_the_loops_of_real_step_tests(tmp_path, data, armpi, ex
     tests, _ = split_step_tests([data / "motor_step_tests", folder], None)
     steps = learn_loops(tests, armpi)
     runs = read_runs([folder / f"label_{k}" for k in range(3)], steps.robot)
-    found = calibrate(runs, steps.robot, "own", "labels 0 to 2 and step tests", thorough=False)
+    found = fit_calibration(
+        runs, steps.robot, "own", "labels 0 to 2 and step tests", thorough=False
+    )
     save_calibration(with_step_tests(found, steps), armpi, tmp_path / "own.toml")
     lag = expected_lag("diagnose", folder / "label_0", "--calibration", tmp_path / "own.toml")
     assert lag == pytest.approx(0.059, abs=0.002)

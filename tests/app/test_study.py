@@ -12,18 +12,20 @@ import pytest
 from click.testing import CliRunner
 
 from failuretwin.app.cli import cli
-from failuretwin.app.study.page import TABLE_2, TABLE_3, class_ratios, mean_confusion, spread_of
-from failuretwin.app.study.study import PLAN_FILE, WORK, check_folder, run_study
-from failuretwin.app.study.trainings import (
+from failuretwin.app.study import (
     FEATURES,
-    Checkpoint,
+    PLAN_FILE,
+    WORK,
     Exam,
     Job,
     StudyPlan,
     Training,
+    check_folder,
     quick_plan,
+    run_study,
     stand_in_test_set,
 )
+from failuretwin.app.study_page import TABLE_2, TABLE_3, class_ratios, mean_confusion, spread_of
 from failuretwin.core.errors import InputError
 from waiting import WAIT_S, wait_for, workers_of
 
@@ -45,9 +47,7 @@ def studied(armpi, exam, tmp_path_factory):
 
 
 def result(confusion):
-    return Training(
-        Job("augmented", 1e-3, 0), (Checkpoint(1, 1.0, 1.0, 1.0),), tuple(map(tuple, confusion)), 1
-    )
+    return Training(Job("augmented", 1e-3, 0), {"test": (1.0,)}, tuple(map(tuple, confusion)), 1)
 
 
 def test_the_plan_is_the_papers():
@@ -113,7 +113,7 @@ def test_what_is_done_is_not_done_again(armpi, exam, studied):
     told = []
     run_study(TINY, armpi, exam, folder, told.append)
     again = json.loads(one.read_text())
-    assert again["checkpoints"] == before["checkpoints"]
+    assert again["accuracies"] == before["accuracies"]
     assert {path: path.stat().st_mtime_ns for path in others} == stamps
     assert told[0] == len(others) * TINY.iterations
 

@@ -131,7 +131,7 @@ def test_a_fault_is_told_and_not_learned(track, calibration, failuretwin, tmp_pa
     assert "learning is stopped: runs look faulty one after another" in answer.stdout
     rows = rows_of(calibration)
     assert rows[-1]["bias"] == rows[0]["bias"]
-    assert not any(fate == "learned" for row in rows for _, fate in row["fates"])
+    assert not any(outcome == "learned" for row in rows for _, outcome in row["fates"])
 
 
 def test_it_takes_a_calibration_of_ones_own(failuretwin, few, listing, tmp_path):

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from failuretwin.core.movements import Movements
 from failuretwin.digital_model.nonidealities import Imperfections, LostCommand, Timing
-from failuretwin.inference.command_loss import OUTLIER_RATE, RARE
 from failuretwin.inference.healthy_model import HealthyModel
+
+OUTLIER_RATE = 0.01
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 SETS = [s for size in (1, 2, 3) for s in combinations(MOTORS, size)]
@@ -94,7 +95,7 @@ def test_motors_may_lose_every_command(twin, share, count):
 
 
 def test_rare_losses_in_a_row_are_left_out(twin):
-    rate = 0.9 * np.sqrt(RARE)
+    rate = 0.9 * np.sqrt(1e-4)
     found = model(twin, [(("motor_1",), rate, rate)], 0.0).outcomes(movements([False] * 3))
     assert found.lost.tolist() == [[False] * 4, [True, False, False, False]]
 

@@ -6,19 +6,21 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from failuretwin.connection.calibration.calibrate import calibrate, untrusted
+from failuretwin.connection.calibration.calibrate import exclude_suspect_runs, fit_calibration
 from failuretwin.connection.calibration.observations import log_rounded_student
 from failuretwin.connection.calibration.parameters import (
+    Rate,
     rate_parameter,
     settling_parameters,
     spring_remarks,
 )
-from failuretwin.connection.calibration.rates import Rate
-from failuretwin.connection.calibration.settling import SettledFit
-from failuretwin.connection.calibration.timing import LAGS_S, joint_doubt
+from failuretwin.connection.calibration.settling_fit import SettlingPosterior
+from failuretwin.connection.calibration.timing_fit import joint_doubt
 from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.nonidealities import Timing
+
+LAGS_S = np.linspace(0.0, 0.08, 11)
 
 COUNT = np.deg2rad(0.24)
 
@@ -60,7 +62,7 @@ def test_what_was_never_seen_is_bounded_but_not_called_identified():
 def tails(dof, log_deviation, armpi):
     mode, deviation = np.zeros(17), np.full(17, 1e-3)
     mode[-1], deviation[-1] = np.log(dof), log_deviation
-    fit = SettledFit(mode, np.diag(deviation**2), np.ones(17), 0.0)
+    fit = SettlingPosterior(mode, np.diag(deviation**2), np.ones(17), 0.0)
     return settling_parameters(fit, armpi, 0.0)[-1]
 
 
@@ -84,7 +86,7 @@ def test_tails_may_be_those_of_a_normal_scatter(armpi):
 def test_a_compliance_below_zero_is_remarked_upon(armpi):
     mode, deviation = np.zeros(17), np.full(17, 1e-3)
     mode[4:8] = [-1e-12, -0.05, 0.1, -0.2]  # gravity does not load motor 1
-    fit = SettledFit(mode, np.diag(deviation**2), np.ones(17), 0.0)
+    fit = SettlingPosterior(mode, np.diag(deviation**2), np.ones(17), 0.0)
     remarks = spring_remarks(settling_parameters(fit, armpi, 0.0))
     assert [remark.partition(":")[0] for remark in remarks] == [
         "compliance of motor_2",
@@ -100,7 +102,7 @@ def test_a_session_with_many_suspect_runs_is_left_out_as_a_whole():
     doubt[[0, 1]] = 0.95  # two of ten: by chance
     doubt[[10, 14, 17]] = 0.9
     doubt[20] = 1.0
-    found = untrusted(names, sessions, doubt)
+    found = exclude_suspect_runs(names, sessions, doubt)
     assert [entry.run for entry in found] == ["a/0", "a/1", *names[10:20], "alone"]
     assert {entry.movement for entry in found} == {0}
     assert found[0].reason == found[-1].reason == "looks faulty"
@@ -109,7 +111,7 @@ def test_a_session_with_many_suspect_runs_is_left_out_as_a_whole():
 
 def test_a_perfect_arm_is_seen_to_be_one_by_its_tool_alone(armpi):
     runs = simulate(Plan(armpi, [HEALTHY], 8, 1)).drop_vars("position", errors="ignore")
-    found = calibrate(runs, armpi, "ideal", "made up", thorough=False)
+    found = fit_calibration(runs, armpi, "ideal", "made up", thorough=False)
     settling = found.imperfections.settling
     assert np.max(np.abs([settling.bias, settling.friction])) < 0.01 * COUNT
     assert max(settling.scatter) < 0.3 * COUNT
@@ -165,7 +167,7 @@ def test_sag_on_the_way_is_not_taken_for_delay(armpi, measured_armpi, tool):
         readings=replace(measured_armpi.readings, whole_counts=False, glitch_rate=()),
     )
     runs = simulate(Plan(armpi, [HEALTHY], 15, 3, real))
-    found = calibrate(runs, armpi, "trial", "made up", use_readings=not tool, thorough=False)
+    found = fit_calibration(runs, armpi, "trial", "made up", use_readings=not tool, thorough=False)
     by_name = {p.name: p for p in found.parameters}
     # As if sag were spread evenly over a ramp, they would be off by up to 2.5, 1.3 ms and 0.3 %.
     assert by_name["lag"].value == pytest.approx(0.03, abs=1e-3)

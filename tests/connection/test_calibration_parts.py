@@ -7,34 +7,32 @@ import pytest
 from scipy import stats
 
 from failuretwin import DigitalTwin
-from failuretwin.connection.calibration.observations import Observations, rounding, stayed
-from failuretwin.connection.calibration.rates import (
+from failuretwin.connection.calibration.cross_validation import cross_validate, judge
+from failuretwin.connection.calibration.observations import Observations, lost_command, rounding
+from failuretwin.connection.calibration.parameters import (
     Rate,
+    glitch_rates,
     loss_rates,
     median_interval,
     spread_of,
 )
-from failuretwin.connection.calibration.settling import fit_settled_part, fit_settling
-from failuretwin.connection.calibration.timing import (
+from failuretwin.connection.calibration.settling_fit import (
+    best_payload,
+    sense_remarks,
+    settling_posterior,
+    sort_and_fit,
+)
+from failuretwin.connection.calibration.timing_fit import (
     Transients,
     fit_timing,
     gap_starts,
-    glitch_rates,
     lateness,
-)
-from failuretwin.connection.calibration.validation import (
-    best_payload,
-    held_out_sessions,
-    judge,
-    sense_remarks,
 )
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
 from failuretwin.digital_model.disturbances import lagged
-from failuretwin.digital_model.nonidealities import GENERIC_SCATTER_RAD
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.healthy_model import PATH_NOISE_M
 
 COUNT = np.deg2rad(0.24)
 NAMES = ["motor_1", "motor_2", "motor_3", "motor_4"]
@@ -241,14 +239,14 @@ def test_motors_that_stay_are_seen(settle, armpi, twin, readings):
     held[0, 0] = held[1, 1] = held[2, 2] = held[3, :2] = True
     pose = np.where(held, seen.origin, seen.position)
     moved = replace(seen, point=twin.path(pose), position=pose if readings else None)
-    np.testing.assert_array_equal(stayed(moved, armpi, seen.target), held)
+    np.testing.assert_array_equal(lost_command(moved, armpi, seen.target), held)
 
 
 def test_a_motor_that_hardly_had_to_move_lost_nothing(settle, armpi):
     seen = settle(TYPICAL, seed=5, movements=1)
     target = seen.origin + np.array([[0.02, -0.02, 0.5, -0.5]])
     near = replace(seen, target=target, position=seen.origin)
-    np.testing.assert_array_equal(stayed(near, armpi, target), [[False, False, True, True]])
+    np.testing.assert_array_equal(lost_command(near, armpi, target), [[False, False, True, True]])
 
 
 # Where motors settle
@@ -257,7 +255,7 @@ def test_a_motor_that_hardly_had_to_move_lost_nothing(settle, armpi):
 @pytest.mark.parametrize(("readings", "shares"), [(True, 1.0), (False, 1.6)])
 def test_settling_of_a_known_robot_comes_back(settle, armpi, readings, shares):
     seen = settle(TYPICAL, seed=2, movements=600, readings=readings)
-    fit = fit_settling(seen, armpi, np.ones((600, 4)))
+    fit = settling_posterior(seen, armpi, np.ones((600, 4)))
     found = fit.settling("fit")
     # Four standard errors of a mean, and of a slope over the loads that the movements meet.
     error = 4.0 * shares * np.asarray(TYPICAL.scatter) * np.sqrt(5.0 / 3.0) / np.sqrt(600)
@@ -277,7 +275,7 @@ def test_settling_intervals_hold_the_truth(settle, armpi, readings, draws):
     for seed in range(draws):
         truth = random_settling(seed)
         seen = settle(truth, 1000 + seed, movements=80, readings=readings)
-        fit = fit_settling(seen, armpi, np.ones((80, 4)))
+        fit = settling_posterior(seen, armpi, np.ones((80, 4)))
         told = fit.deviation < 0.3 * fit.prior_deviation
         told[4] = False  # gravity does not load motor 1
         off = np.abs(fit.mode - as_vector(truth)) / fit.deviation
@@ -287,13 +285,13 @@ def test_settling_intervals_hold_the_truth(settle, armpi, readings, draws):
 
 
 def test_what_the_logs_do_not_say_keeps_its_prior(settle, armpi):
-    fit = fit_settling(settle(TYPICAL, seed=3, movements=40), armpi, np.ones((40, 4)))
+    fit = settling_posterior(settle(TYPICAL, seed=3, movements=40), armpi, np.ones((40, 4)))
     share = fit.deviation / fit.prior_deviation
     assert share[4] == pytest.approx(1.0, rel=1e-3)  # compliance of motor 1
     assert share[[5, 6, 7]].max() < 0.3
     idle = np.ones((40, 4))
     idle[:, 2] = 0.0
-    fit = fit_settling(settle(TYPICAL, seed=3, movements=40), armpi, idle)
+    fit = settling_posterior(settle(TYPICAL, seed=3, movements=40), armpi, idle)
     share = (fit.deviation / fit.prior_deviation)[:-1].reshape(4, 4)
     np.testing.assert_allclose(share[:, 2], 1.0, rtol=1e-3)
     assert share[:, 3].max() < 0.4
@@ -301,14 +299,14 @@ def test_what_the_logs_do_not_say_keeps_its_prior(settle, armpi):
 
 def test_lost_commands_and_odd_movements_do_not_bend_the_fit(settle, armpi, twin):
     seen = settle(TYPICAL, seed=4, movements=80)
-    clean = fit_settled_part(seen, armpi)
+    clean = sort_and_fit(seen, armpi)
     pose = seen.position.copy()
     far = np.flatnonzero(np.abs(seen.target - seen.origin)[:, 0] > 0.3)
     stay = far[np.append(True, np.diff(far) > 1)][:6]  # none missed two in a row
     pose[stay, 0] = seen.origin[stay, 0]
     odd = np.setdiff1d(np.arange(80), stay)[:5]
     pose[odd, 2] += 0.2
-    part = fit_settled_part(replace(seen, position=pose, point=twin.path(pose)), armpi)
+    part = sort_and_fit(replace(seen, position=pose, point=twin.path(pose)), armpi)
     assert {(e.motor, e.reason) for e in part.left_out(armpi)} == {
         ("motor_1", "did not get its command"),
         ("", "is far off its target"),
@@ -323,14 +321,14 @@ def test_commands_lost_on_short_ways_do_not_make_the_tails(settle, armpi):
     seen = settle(rigid, seed=7, movements=200)
     none_follows = {"run": np.arange(200), "number": np.zeros(200, dtype=int)}
     seen = replace(seen, **none_follows)
-    clean = fit_settled_part(seen, armpi)
+    clean = sort_and_fit(seen, armpi)
     way = np.abs(seen.target - seen.origin)
     rate = np.where(way < 25 * COUNT, 0.3, 0.15)
     stay = (way > 8 * COUNT) & (np.random.default_rng(7).random((200, 4)) < rate)
     short = stay & (way < 25 * COUNT)
     assert short.sum() > 8
     pose = seen.position + np.where(stay, seen.origin - seen.target, 0.0)
-    part = fit_settled_part(replace(seen, position=pose), armpi)
+    part = sort_and_fit(replace(seen, position=pose), armpi)
     assert np.mean(part.arrived[short]) < 0.2
     assert np.mean(part.arrived[~stay]) > 0.98
     moved = np.abs(part.fit.mode - clean.fit.mode)[12:] / clean.fit.deviation[12:]
@@ -339,7 +337,7 @@ def test_commands_lost_on_short_ways_do_not_make_the_tails(settle, armpi):
 
 def test_too_few_movements_are_refused(settle, armpi):
     with pytest.raises(InputError, match=r"only 5 of 5 movements .* expected 6 at least"):
-        fit_settled_part(settle(TYPICAL, seed=6, movements=5), armpi)
+        sort_and_fit(settle(TYPICAL, seed=6, movements=5), armpi)
 
 
 # Timing
@@ -401,7 +399,7 @@ def test_two_runs_tell_no_timing(armpi):
 
 
 def test_senses_of_the_profile_are_confirmed(settle, armpi):
-    remarks = sense_remarks(fit_settled_part(settle(TYPICAL, seed=9), armpi), armpi)
+    remarks = sense_remarks(sort_and_fit(settle(TYPICAL, seed=9), armpi), armpi)
     assert remarks[0] == "sense of motor_1: cannot be told, gravity does not load it"
     for remark, sense in zip(remarks[1:], ("+1", "-1", "+1"), strict=True):
         assert f"{sense} as in the profile" in remark
@@ -411,7 +409,7 @@ def test_a_wrong_sense_is_found_and_blames_no_other_motor(settle, armpi):
     motors = tuple(replace(motor, sense=1.0) for motor in armpi.motors)
     straight = replace(armpi, profile=replace(armpi.profile, motors=motors))
     seen = settle(TYPICAL, seed=9, robot=straight)
-    remarks = sense_remarks(fit_settled_part(seen, armpi), armpi)
+    remarks = sense_remarks(sort_and_fit(seen, armpi), armpi)
     assert "motor_3: the logs speak for +1" in remarks[2]
     assert "the profile says -1; check it" in remarks[2]
     assert "+1 as in the profile" in remarks[1]
@@ -419,16 +417,14 @@ def test_a_wrong_sense_is_found_and_blames_no_other_motor(settle, armpi):
 
 
 def test_no_payload_is_told_where_there_is_none(settle, armpi):
-    payload, told = best_payload(fit_settled_part(settle(TYPICAL, seed=10), armpi), armpi)
+    payload, told = best_payload(sort_and_fit(settle(TYPICAL, seed=10), armpi), armpi)
     assert payload == 0.0
     assert "do not tell one from a softer motor" in told
 
 
 def test_a_heavy_payload_on_a_precise_arm_is_told(settle, armpi):
     loaded = replace(TYPICAL, compliance=(0.0, 0.05, 0.05, 0.05), scatter=(3e-4,) * 4, payload=0.5)
-    payload, told = best_payload(
-        fit_settled_part(settle(loaded, seed=10, movements=300), armpi), armpi
-    )
+    payload, told = best_payload(sort_and_fit(settle(loaded, seed=10, movements=300), armpi), armpi)
     assert payload == 0.5
     assert "about 0.5 kg at the tool point" in told
 
@@ -437,7 +433,7 @@ def test_a_heavy_payload_on_a_precise_arm_is_told(settle, armpi):
 
 
 def test_unseen_sessions_are_left_with_the_scatter_alone(settle, armpi):
-    entries = held_out_sessions(settle(TYPICAL, seed=11, movements=450, sessions=3), armpi)
+    entries = cross_validate(settle(TYPICAL, seed=11, movements=450, sessions=3), armpi)
     assert [entry.session for entry in entries] == ["day_0", "day_1", "day_2"]
     # 1.48 times the median size of a Student t of this scale, plus what counts round off.
     size = 1.4826 * stats.t.ppf(0.75, TYPICAL.tail_dof)
@@ -450,10 +446,10 @@ def test_unseen_sessions_are_left_with_the_scatter_alone(settle, armpi):
 
 
 def test_gain_is_the_mean_difference_of_log_densities(settle, armpi, twin):
-    part = fit_settled_part(settle(TYPICAL, seed=12), armpi)
+    part = sort_and_fit(settle(TYPICAL, seed=12), armpi)
     seen = settle(TYPICAL, seed=13, movements=40)
     entry = judge(seen, part, armpi, "other day")
-    generic = Settling((0.0,) * 4, (0.0,) * 4, (0.0,) * 4, (GENERIC_SCATTER_RAD,) * 4, 4.0, "")
+    generic = Settling((0.0,) * 4, (0.0,) * 4, (0.0,) * 4, (0.01,) * 4, 4.0, "")
     gain = log_densities(seen, part.settling, armpi, twin) - log_densities(
         seen, generic, armpi, twin
     )
@@ -468,7 +464,7 @@ def log_densities(seen, settling, robot, twin):
     pose = seen.target + settling.offset(robot, near, direction)
     mean, jacobian = twin.path_and_jacobian(pose)
     spread = jacobian @ np.diag(np.square(settling.scatter)) @ jacobian.transpose(0, 2, 1)
-    spread += PATH_NOISE_M**2 * np.eye(3)
+    spread += 0.001**2 * np.eye(3)
     return np.array(
         [
             stats.multivariate_t(m, s, df=settling.tail_dof).logpdf(x)
@@ -478,7 +474,7 @@ def log_densities(seen, settling, robot, twin):
 
 
 def test_a_shift_of_the_whole_session_counts_as_error(settle, armpi, twin):
-    part = fit_settled_part(settle(TYPICAL, seed=12), armpi)
+    part = sort_and_fit(settle(TYPICAL, seed=12), armpi)
     shifted = replace(TYPICAL, bias=tuple(np.add(TYPICAL.bias, 0.03)))
     entry = judge(settle(shifted, seed=13), part, armpi, "shifted")
     np.testing.assert_allclose(entry.after, 0.03 * 1.4826, rtol=0.15)
@@ -488,13 +484,13 @@ def test_a_shift_of_the_whole_session_counts_as_error(settle, armpi, twin):
 def test_a_fit_to_another_robot_does_not_beat_none(settle, armpi):
     ideal = Settling((0.0,) * 4, (0.0,) * 4, (0.0,) * 4, (0.003,) * 4, 10.0, "straight")
     soft = replace(TYPICAL, compliance=(0.0, 0.3, 0.3, 0.3))
-    part = fit_settled_part(settle(soft, seed=14), armpi)
+    part = sort_and_fit(settle(soft, seed=14), armpi)
     entry = judge(settle(ideal, seed=15), part, armpi, "another robot")
     assert entry.gain + 1.96 * entry.gain_error < 0.0
 
 
 def test_one_session_or_one_movement_judges_nothing(settle, armpi):
     seen = settle(TYPICAL, seed=16)
-    assert held_out_sessions(seen, armpi) == ()
-    part = fit_settled_part(seen, armpi)
+    assert cross_validate(seen, armpi) == ()
+    part = sort_and_fit(seen, armpi)
     assert judge(seen[np.array([0])], part, armpi, "short") is None

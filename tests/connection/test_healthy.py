@@ -12,13 +12,20 @@ from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.core.numerics import log_student
-from failuretwin.digital_model.nonidealities import Imperfections, LostCommand, Timing, Variation
+from failuretwin.digital_model.nonidealities import (
+    Imperfections,
+    LostCommand,
+    Readings,
+    Timing,
+    Variation,
+)
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.command_loss import OUTLIER_RATE
 from failuretwin.inference.evidence import settled_evidence
-from failuretwin.inference.healthy_model import PATH_NOISE_M, HealthyModel
+from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.onset import OnsetPrior
 from failuretwin.inference.priors import priors_of
+
+PATH_NOISE_M, OUTLIER_RATE = 0.001, 0.01
 
 COUNT = np.deg2rad(0.24)
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
@@ -188,6 +195,45 @@ def test_doubt_about_the_robot_widens_the_scatter(armpi, twin):
     )
     extra = np.array([0.003, 0.004, 0.0, 0.0])
     np.testing.assert_allclose(unsure.scatter, np.hypot(sure.scatter, extra), rtol=1e-12)
+
+
+@pytest.mark.parametrize("doubt", [0.2, 0.5])
+def test_doubt_about_the_scatter_counts_by_its_mean_square(twin, doubt):
+    """A scatter known to a factor e^(doubt z), z normal: its square is averaged over z."""
+    variation = Variation(scatter=(doubt,) * 4)
+    model = HealthyModel(
+        twin, Imperfections("made up", "test", settling=SETTLING, variation=variation)
+    )
+    factor, _ = integrate.quad(
+        lambda z: np.exp(doubt * z) ** 2 * stats.norm.pdf(z), -12.0, 12.0, epsabs=1e-12
+    )
+    expected = np.sqrt(factor) * np.array(SETTLING.scatter)
+    np.testing.assert_allclose(model.scatter, expected, rtol=1e-9)
+
+
+def test_what_whole_counts_round_off_adds_to_the_scatter(twin):
+    """Uniform over a count of 0.24 deg: its deviation is the count over the root of twelve."""
+    readings = Readings(10.0, noise_m=0.0004, whole_counts=True)
+    model = HealthyModel(
+        twin, Imperfections("made up", "test", settling=SETTLING, readings=readings)
+    )
+    np.testing.assert_allclose(
+        model.scatter, np.hypot(SETTLING.scatter, COUNT / np.sqrt(12.0)), rtol=1e-9
+    )
+    assert model.path_noise == pytest.approx(np.hypot(0.0004, 0.0003))
+    wide = replace(model, scatter_factor=3.0)
+    np.testing.assert_allclose(wide.scatter, 3.0 * model.scatter)
+    assert wide.path_noise == pytest.approx(3.0 * model.path_noise)
+
+
+def test_timing_of_the_healthy_robot_is_that_of_its_means(twin):
+    """A loop follows a ramp one over its integral gain late: 0.025 s at 40/s."""
+    timing = Timing(delay_s=(0.01, 0.05), lag_s=(0.0, 0.02), ramp_shortening=(0.1, 0.3))
+    model = HealthyModel(twin, Imperfections("made up", "test", settling=SETTLING, timing=timing))
+    loops = np.mean([1.0 / motor.loop.I for motor in twin.robot.motors])
+    assert loops == pytest.approx(0.025, rel=0.05)
+    assert model.lag_s == pytest.approx(loops + 0.03 + 0.01)
+    assert model.shortening == pytest.approx(0.2)
 
 
 def test_doubt_about_stiffness_counts_by_the_load(armpi, twin):

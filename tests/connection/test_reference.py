@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from failuretwin.connection.links.base import CommandSent
-from failuretwin.connection.links.live_commands import LiveReference, SampledCommands
+from failuretwin.connection.links.live_events import LiveReference, SampledCommands
 from failuretwin.core.movements import Movements
 
 

@@ -34,8 +34,12 @@ def random_motor(rng):
 
 
 def covered(folder, armpi, motors, seed):
-    """Return which intervals hold the truth, (motor, parameter), and which are identified."""
-    inside, learned = np.zeros((2, motors, len(NAMES)), dtype=bool)
+    """Return which intervals hold the truth, which are identified and how far off values are.
+
+    (motor, parameter) each, the latter in deviations: 1.96 on either side are an interval of 95 %.
+    """
+    off, learned = np.zeros((motors, len(NAMES))), np.zeros((motors, len(NAMES)), dtype=bool)
+    inside = learned.copy()
     for k in range(motors):
         rng = np.random.default_rng([seed, k])
         truth = random_motor(rng)
@@ -43,7 +47,8 @@ def covered(folder, armpi, motors, seed):
         for j, (name, true) in enumerate(zip(NAMES, truth, strict=True)):
             inside[k, j] = found[name].low <= true <= found[name].high
             learned[k, j] = found[name].identified
-    return inside, learned
+            off[k, j] = 3.92 * (found[name].value - true) / (found[name].high - found[name].low)
+    return inside, learned, off
 
 
 def test_intervals_cover_the_truth(tmp_path, armpi):
@@ -54,7 +59,7 @@ def test_intervals_cover_the_truth(tmp_path, armpi):
 
 @pytest.mark.slow
 def test_intervals_cover_the_truth_at_the_stated_rate(tmp_path, armpi):
-    inside, _ = covered(tmp_path, armpi, motors=120, seed=2)
+    inside, _, _ = covered(tmp_path, armpi, motors=120, seed=2)
     assert np.all(inside.mean(axis=0) > 0.89)
     assert 0.92 < inside.mean() < 0.99
 

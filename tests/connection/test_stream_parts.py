@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
+import textwrap
 import threading
 from dataclasses import replace
 
@@ -16,19 +19,23 @@ from failuretwin.connection.links.base import (
     EventQueue,
     Pace,
     Reading,
+    Sink,
+    Source,
     StreamClock,
+    source_from_text,
 )
-from failuretwin.connection.links.diagnostics import (
+from failuretwin.connection.links.live_events import ReorderBuffer
+from failuretwin.connection.links.ros_messages import (
     LEVEL_ERROR,
     LEVEL_OK,
     LEVEL_STALE,
     LEVEL_WARN,
-    Beat,
+    RateLimiter,
+    RosTopics,
     Status,
+    load_topics,
     statuses,
 )
-from failuretwin.connection.links.live_commands import Sequencer
-from failuretwin.connection.links.ros_messages import RosTopics, load_topics
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 
@@ -76,8 +83,8 @@ def test_a_queue_wakes_who_waits():
 @pytest.mark.parametrize("jump", [YEAR_S, -YEAR_S, 3600.0, -30.0])
 def test_a_clock_that_is_set_does_not_move_the_stream(jump):
     clock = StreamClock()
-    placed = [clock.place(100.0 + 0.1 * k, 0.1 * k) for k in range(50)]
-    placed += [clock.place(100.0 + jump + 0.1 * k, 0.1 * k) for k in range(50, 100)]
+    placed = [clock.to_stream_time(100.0 + 0.1 * k, 0.1 * k) for k in range(50)]
+    placed += [clock.to_stream_time(100.0 + jump + 0.1 * k, 0.1 * k) for k in range(50, 100)]
     np.testing.assert_allclose(placed, 0.1 * np.arange(100), atol=1e-6)
     assert clock.jumps == 1
 
@@ -85,13 +92,13 @@ def test_a_clock_that_is_set_does_not_move_the_stream(jump):
 def test_one_senseless_stamp_does_not_move_the_stream():
     clock = StreamClock()
     stamps = [0.0, 0.1, 1e12, 0.3, 0.4]
-    placed = [clock.place(stamp, 0.1 * k) for k, stamp in enumerate(stamps)]
+    placed = [clock.to_stream_time(stamp, 0.1 * k) for k, stamp in enumerate(stamps)]
     np.testing.assert_allclose(placed, 0.1 * np.arange(5), atol=1e-3)
 
 
 def test_late_messages_and_silences_are_no_jumps():
     clock = StreamClock()
-    placed = [clock.place(stamp, 0.0) for stamp in (50.0, 52.0, 50.5, 80.0)]
+    placed = [clock.to_stream_time(stamp, 0.0) for stamp in (50.0, 52.0, 50.5, 80.0)]
     assert placed == [0.0, 2.0, 0.5, 30.0]
     assert clock.jumps == 0
     assert clock.stamp(30.0) == 80.0
@@ -99,12 +106,12 @@ def test_late_messages_and_silences_are_no_jumps():
 
 def test_without_events_the_stream_goes_on_by_our_own_clock():
     clock = StreamClock()
-    clock.place(100.0, 7.0)
+    clock.to_stream_time(100.0, 7.0)
     assert clock.at(10.0) == 3.0
 
 
 def test_commands_that_come_late_take_their_place():
-    sequencer = Sequencer(hold_s=2.0)
+    sequencer = ReorderBuffer(hold_s=2.0)
     for event in (reading(0.0), reading(1.0), reading(2.0), command(0.5), reading(3.0)):
         sequencer.add(event)
     assert [event.time for event in sequencer.ready(3.0)] == [0.0, 0.5, 1.0]
@@ -112,7 +119,7 @@ def test_commands_that_come_late_take_their_place():
 
 
 def test_a_command_goes_before_a_reading_of_its_time():
-    sequencer = Sequencer()
+    sequencer = ReorderBuffer()
     sequencer.add(reading(1.0))
     sequencer.add(command(1.0))
     assert [type(event) for event in sequencer.ready(1.0)] == [CommandSent, Reading]
@@ -179,7 +186,7 @@ def test_a_run_that_cannot_be_judged_is_a_warning():
 
 
 def test_reports_come_every_second_and_at_once_when_it_gets_worse():
-    beat = Beat()
+    beat = RateLimiter()
 
     def due(level, now_s):
         return beat.due([Status("arm", 0, "", {}), Status("motor_1", level, "", {})], now_s)
@@ -224,3 +231,58 @@ def test_topics_that_make_no_sense_are_refused(tmp_path, text, match):
     with pytest.raises(InputError, match=match) as caught:
         load_topics(path)
     assert str(path) in str(caught.value)
+
+
+# Sources and sinks of other people
+
+PREAMBLE = """
+from __future__ import annotations
+import numpy as np
+from failuretwin.connection.links.base import *
+"""
+
+
+@pytest.fixture
+def own_module(tmp_path, monkeypatch):
+    """Write the example of a docstring as the module `own_link`."""
+
+    def write(documented):
+        example = textwrap.dedent((documented.__doc__ or "").partition("::\n")[2])
+        (tmp_path / "own_link.py").write_text(
+            f"from __future__ import annotations\n{PREAMBLE}{example}"
+        )
+        monkeypatch.syspath_prepend(tmp_path)
+        monkeypatch.delitem(sys.modules, "own_link", raising=False)
+
+    return write
+
+
+def test_the_documented_source_is_one(own_module, armpi):
+    own_module(Source)
+    with source_from_text("own_link:Replayed", armpi) as source:
+        events = [source.poll(0.0) for _ in range(11)]
+        assert source.ended
+    assert [event.time for event in events[:-1]] == pytest.approx(0.1 * np.arange(10))
+    assert events[-1] is None
+
+
+def test_the_documented_sink_is_one(own_module, capsys):
+    own_module(Sink)
+    with importlib.import_module("own_link").Printed() as sink:
+        sink.put(reading(1.0))
+        sink.put(answer({"healthy": 1.0}))
+        assert sink.trouble == ""
+    assert capsys.readouterr().out == "5.0 the verdict\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "trouble"),
+    [
+        ("no_such_module:Robot", "No module named 'no_such_module'"),
+        ("failuretwin.connection.links.base:Nothing", "has no attribute 'Nothing'"),
+        ("failuretwin.digital_model.twin:DigitalTwin", "lacks name, ended, counts, poll"),
+    ],
+)
+def test_what_is_no_source_is_refused(armpi, text, trouble):
+    with pytest.raises(InputError, match=f"source '{text}': .*{trouble}"):
+        source_from_text(text, armpi)

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from worn_robot import CALIBRATION, evidence_of, follow_all, fresh, truth
 
+from failuretwin.connection.tracked_diagnosis import append_history, history_path, read_history
 from failuretwin.connection.wear import RunEvidence, WearLimits
-from failuretwin.connection.wear_history import append_history, history_path, read_history
 from failuretwin.core.errors import InputError, OutputError
 
 RUNS = 90
@@ -47,7 +47,7 @@ def written(path, start, evidence, fault_probability, pieces):
 
 def assert_same(one, other):
     """Compare two trackers, bit for bit."""
-    for name in ("level", "arrived", "learned_at", "alarm"):
+    for name in ("cusum", "arrived", "learned_at", "alarm"):
         assert getattr(one, name) == getattr(other, name)
     states = zip((one.state, *one.past), (other.state, *other.past), strict=True)
     for mine, yours in states:
@@ -83,9 +83,9 @@ def test_a_line_a_run_with_its_name_state_and_deviations(
     assert head["history_of"] == "armpi_fpv"
     assert [row["run"] for row in rows] == [f"run {i}" for i in range(RUNS)]
     assert rows[30]["probability_faulty"] is None
-    fates = dict(tuple(fate) for row in rows for fate in row["fates"])
-    assert fates[1] == "learned"
-    assert fates[13] == fates[31] == fates[55] == "discarded"
+    outcomes = dict(tuple(outcome) for row in rows for outcome in row["fates"])
+    assert outcomes[1] == "learned"
+    assert outcomes[13] == outcomes[31] == outcomes[55] == "discarded"
     variance = np.zeros((8, 8))
     variance[np.tril_indices(8)] = rows[-1]["covariance"]
     deviation = rows[-1]["bias_deviation"] + rows[-1]["compliance_deviation"]
@@ -125,7 +125,7 @@ from pathlib import Path
 import numpy as np
 from failuretwin import load_robot
 from worn_robot import evidence_of, follow_all, fresh, truth
-from failuretwin.connection.wear_history import append_history, read_history
+from failuretwin.connection.tracked_diagnosis import append_history, read_history
 robot = load_robot("armpi_fpv")
 start = fresh(robot)
 evidence = evidence_of(robot, truth(90), 0)
@@ -164,7 +164,7 @@ def test_a_run_that_says_nothing_is_kept_too(armpi, tmp_path):
     _, steps = follow_all(start, [empty])
     append_history(read_history(path, start), steps)
     history = read_history(path, start)
-    assert history.steps[0].fates == ((1, "discarded"),)
+    assert history.steps[0].outcomes == ((1, "discarded"),)
     assert history.keys == {"key"}
 
 

@@ -12,7 +12,6 @@ from failuretwin.connection.wear import run_evidence
 from failuretwin.connection.wear_tracker import Tracker
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.healthy_model import PATH_NOISE_M
 
 COUNT = np.deg2rad(0.24)
 MOVEMENTS = 5
@@ -64,7 +63,7 @@ def observe_wear(robot, wear, rng, readings=False, calibration=CALIBRATION):
         number=np.tile(np.arange(MOVEMENTS), runs),
         origin=origin.reshape(-1, 4),
         target=target.reshape(-1, 4),
-        point=DigitalTwin(robot).path(pose) + rng.normal(0.0, PATH_NOISE_M, (len(pose), 3)),
+        point=DigitalTwin(robot).path(pose) + rng.normal(0.0, 0.001, (len(pose), 3)),
         position=pose if readings else None,
         sessions=("session",),
         runs=tuple(f"run {i}" for i in range(runs)),

@@ -61,6 +61,19 @@ def test_fall_is_that_of_the_standard_density(dof):
     )
 
 
+@pytest.mark.parametrize("dof", DOFS)
+@pytest.mark.parametrize("dims", [1, 2])
+def test_in_fewer_dimensions_it_is_the_margin(dof, dims):
+    """What is left of the 3-variate density once the other directions are integrated over."""
+    margin = student(np.eye(3)[:dims, :dims], dof)
+    along = np.array([0.0, 0.3, 1.0, 4.0, 50.0])
+    points = np.outer(along, [0.6, -0.8][:dims])
+    square = np.sum(points**2, axis=-1)
+    np.testing.assert_allclose(
+        log_norm(dof, dims) + log_fall(square, dof, dims), margin.logpdf(points), rtol=1e-12
+    )
+
+
 def test_many_degrees_of_freedom_are_normal():
     square = np.linspace(0.0, 30.0, 7)
     np.testing.assert_allclose(log_fall(square, 1e9), log_fall(square, np.inf), rtol=1e-6)

@@ -260,3 +260,12 @@ def test_all_modes_can_be_simulated_with_all_imperfections(plan_of, armpi):
 def test_no_workers_are_refused(plan_of):
     with pytest.raises(InputError, match="workers is 0, expected 1 or more"):
         simulate(plan_of(), workers=0)
+
+
+def test_a_plan_takes_text():
+    plan = Plan("ur5e", ["healthy", "motor_2:stuck"], 3)
+    assert plan.robot.name == "ur5e"
+    assert plan.hypotheses == (Hypothesis.parse("healthy"), Hypothesis.parse("motor_2:stuck"))
+    known = load_calibration("armpi_fpv", load_robot("armpi_fpv"))
+    assert Plan(imperfections="armpi_fpv").imperfections == known.imperfections
+    assert len(Plan().hypotheses) == 9

@@ -15,6 +15,27 @@ def test_every_fault_mode_has_a_complete_row():
         assert all((mode.effect, mode.shows, mode.advice.endswith("."), mode.source))
 
 
+def test_beliefs_of_the_modes():
+    """Odds against healthy, probability that it was there before the run, sizes."""
+    believed = {
+        name: (mode.prior_odds, mode.before_run, tuple(mode.sizes))
+        for name, mode in failure_modes().items()
+    }
+    assert believed == {
+        "stuck": (1.0, 0.5, ()),
+        "steady_state_error": (1.0, 0.9, ()),
+        "slow": (0.3, 0.9, (0.15, 0.85)),
+        "lag": (0.3, 0.9, (0.06, 0.4)),
+        "backlash": (0.3, 0.9, (0.02, 0.15)),
+        "drift": (0.2, 0.9, (0.005, 0.06)),
+        "intermittent": (0.2, 0.9, (0.1, 0.9)),
+        "torque_loss": (0.2, 0.9, (0.25, 0.8)),
+        "encoder_bias": (0.3, 0.9, (0.02, 0.85)),
+        "encoder_scale": (0.2, 0.9, (0.03, 0.75)),
+        "lost_commands": (0.2, 0.9, (0.2, 1.0)),
+    }
+
+
 @pytest.mark.parametrize(
     ("text", "plain"),
     [
@@ -33,8 +54,7 @@ def test_states_without_a_fault_have_names_too():
 
 
 def test_odds_of_two_faults_multiply():
-    modes = failure_modes()
     both = Hypothesis.parse("motor_1:slow+motor_2:drift")
 
     assert prior_odds(HEALTHY) == 1.0
-    assert prior_odds(both) == modes["slow"].prior_odds * modes["drift"].prior_odds
+    assert prior_odds(both) == pytest.approx(0.3 * 0.2)

@@ -7,7 +7,9 @@ from hypothesis import strategies as st
 
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
-from failuretwin.inference.evidence import MOST_READINGS, Evidence
+from failuretwin.inference.evidence import Evidence
+
+MOST_READINGS = 12
 
 STARTS = np.array([0.03, 2.05, 4.06])
 TARGETS = np.array([[0.5, -0.3], [-0.4, 0.2], [0.1, 0.6]])

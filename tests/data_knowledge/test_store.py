@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from failuretwin import read_runs
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.runs import RunTable, Truth
-from failuretwin.data_knowledge import store as swap
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
 from failuretwin.digital_model.calibrated_robot import load_calibration
@@ -137,7 +135,6 @@ def test_interrupted_write_leaves_what_was_there(monkeypatch, old):
 
 def test_failure_to_take_the_old_ones_place_leaves_what_was_there(monkeypatch, old):
     before = contents(old)
-    monkeypatch.setattr(swap, "exchange", lambda one, other: False)
     replace, refused = Path.replace, []
 
     def refuse(self, target):
@@ -153,20 +150,13 @@ def test_failure_to_take_the_old_ones_place_leaves_what_was_there(monkeypatch, o
     assert listing(old.parent) == [old.name]
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems need two steps")
-def test_two_folders_change_places_in_one_step(tmp_path):
-    for name in ("one", "other"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / name).touch()
-    assert swap.exchange(tmp_path / "one", tmp_path / "other")
-    assert listing(tmp_path / "one") == ["other"]
-    assert listing(tmp_path / "other") == ["one"]
-
-
-def test_a_system_without_exchange_replaces_a_folder_in_two_steps(monkeypatch, tmp_path):
-    monkeypatch.setattr(swap, "exchange", lambda one, other: False)
+def test_a_folder_that_a_kill_left_aside_is_removed(tmp_path):
     path = tmp_path / "runs.zarr"
+    save_run_set(small(("oldest",)), path)
+    path.rename(tmp_path / ".runs.zarr.old")
     save_run_set(small(("old", "older")), path)
+    assert listing(tmp_path) == [path.name]
+    (tmp_path / ".runs.zarr.old").mkdir()
     save_run_set(small(("new",)), path)
     xr.testing.assert_identical(load_run_set(path), small(("new",)))
     assert listing(tmp_path) == [path.name]

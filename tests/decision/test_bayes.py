@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import xarray as xr
+from scipy import stats
 
 from failuretwin import BayesDiagnoser, DigitalTwin
 from failuretwin.core.errors import InputError
@@ -110,6 +111,12 @@ def test_runs_are_left_as_they_are(twin, few):
     before = few.copy(deep=True)
     BayesDiagnoser(twin).diagnose(few)
     xr.testing.assert_identical(few, before)
+
+
+def assert_nine_in_ten(inside):
+    """Fewer or more would be a chance of one in a thousand each."""
+    low, high = stats.binom.interval(0.998, len(inside), 0.9)
+    assert low <= np.sum(inside) <= high
 
 
 def test_stuck_angle_is_found(imperfect, diagnoses):

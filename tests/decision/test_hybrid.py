@@ -7,8 +7,13 @@ import pytest
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.decision.learned.diagnoser import HybridDiagnoser
-from failuretwin.decision.learned.posteriors import Weights, blended, fit_weights, gated
+from failuretwin.decision.learned.log_pool import (
+    HybridDiagnoser,
+    PoolWeights,
+    fit_pool_weights,
+    gated,
+    log_pool,
+)
 
 CLASSES = ("healthy", "motor_1:stuck", "motor_2:stuck")
 
@@ -38,13 +43,13 @@ class Says:
 def test_weights_of_one_part_give_that_part():
     chances = np.random.default_rng(0).dirichlet([1.0] * 3, 20)
     other = np.roll(chances, 1, axis=1)
-    np.testing.assert_allclose(blended(chances, other, Weights(1.0, 0.0)), chances)
-    np.testing.assert_allclose(blended(chances, other, Weights(0.0, 1.0)), other)
+    np.testing.assert_allclose(log_pool(chances, other, PoolWeights(1.0, 0.0)), chances)
+    np.testing.assert_allclose(log_pool(chances, other, PoolWeights(0.0, 1.0)), other)
 
 
 def test_independent_witnesses_multiply():
     """Bayes' rule for two witnesses who saw different things, with equal prior odds."""
-    made = blended(np.array([[0.8, 0.2]]), np.array([[0.6, 0.4]]), Weights(1.0, 1.0))
+    made = log_pool(np.array([[0.8, 0.2]]), np.array([[0.6, 0.4]]), PoolWeights(1.0, 1.0))
     np.testing.assert_allclose(made, [[0.48 / 0.56, 0.08 / 0.56]])
 
 
@@ -62,9 +67,9 @@ def test_weights_are_recovered():
     """Truths drawn from a blend are surprised least by its weights."""
     rng = np.random.default_rng(1)
     first, second = (rng.dirichlet([0.6] * 3, 20000) for _ in range(2))
-    chances = blended(first, second, Weights(0.9, 0.4))
+    chances = log_pool(first, second, PoolWeights(0.9, 0.4))
     truth = (rng.random((len(chances), 1)) > chances.cumsum(axis=1)).sum(axis=1)
-    found = fit_weights(first, second, truth)
+    found = fit_pool_weights(first, second, truth)
     assert found.bayes == pytest.approx(0.9, abs=0.05)
     assert found.network == pytest.approx(0.4, abs=0.05)
 
@@ -73,7 +78,7 @@ def test_a_useless_witness_gets_no_weight():
     rng = np.random.default_rng(2)
     chances, noise = (rng.dirichlet([0.6] * 3, 20000) for _ in range(2))
     truth = (rng.random((len(chances), 1)) > chances.cumsum(axis=1)).sum(axis=1)
-    found = fit_weights(chances, noise, truth)
+    found = fit_pool_weights(chances, noise, truth)
     assert found.bayes == pytest.approx(1.0, abs=0.05)
     assert found.network < 0.05
 

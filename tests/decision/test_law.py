@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 
-from failuretwin.inference.marginal import change_point_posterior, leave_one_out
+from failuretwin.inference.marginal import ChangePointPosterior, change_points, leave_one_out
 
 
 def problem(seed, movements, cells, ways):
@@ -21,6 +21,11 @@ def problem(seed, movements, cells, ways):
     way = rng.normal(size=(1, movements)), rng.normal(size=(1, movements, ways))
     with np.errstate(divide="ignore"):
         return healthy, density, np.log(prior), way
+
+
+def change_point_posterior(healthy, density, prior, way):
+    """Return the posterior if settled positions and the ways to them say this and that."""
+    return ChangePointPosterior.of(change_points(healthy + way[0], density + way[1], prior))
 
 
 def joint_of(healthy, density, prior, unlisted=()):

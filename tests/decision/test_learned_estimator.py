@@ -12,12 +12,11 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.decision.learned import networks as stream_module
-from failuretwin.decision.learned.data import Recipe
-from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
-from failuretwin.decision.learned.features import Encoder, expectation_of, signals_of
-from failuretwin.decision.learned.networks import CHUNK_RUNS, Standard, Stream
-from failuretwin.decision.learned.posteriors import best_temperature, probabilities
+from failuretwin.decision.learned import training_data as stream_module
+from failuretwin.decision.learned.diagnoser import LearnedDiagnoser, best_temperature, probabilities
+from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of, signals_of
+from failuretwin.decision.learned.networks import Standard
+from failuretwin.decision.learned.training_data import CHUNK_RUNS, Stream, TrainingData
 
 
 @parametrize_with_checks([LearnedDiagnoser(iterations=60, learning_rate=5e-3, random_state=0)])
@@ -27,7 +26,7 @@ def test_it_is_an_estimator(estimator, check):
 
 @pytest.fixture(scope="module")
 def encoder(armpi, measured_armpi):
-    return Encoder("robust", armpi, expectation_of(armpi, measured_armpi))
+    return FeatureEncoder("robust", armpi, expectation_of(armpi, measured_armpi))
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +149,7 @@ def test_calibration_on_unknown_classes_is_refused(runs, trained):
 
 @pytest.fixture(scope="module")
 def stream(armpi, measured_armpi, encoder):
-    return Stream(Recipe(armpi, measured_armpi, 3), encoder, batch_runs=32, uses=2)
+    return Stream(TrainingData(armpi, measured_armpi, 3), encoder, batch_runs=32, uses=2)
 
 
 def counted_chunks(count):
@@ -172,14 +171,14 @@ def test_fresh_runs_come_from_other_processes_in_order(stream, encoder, monkeypa
     with stream.chunks() as chunks:
         streamed = list(itertools.islice(chunks, 2))
     for number, (features, classes) in enumerate(streamed):
-        expected = stream.recipe.chunk(number, 48, encoder)
+        expected = stream.data.chunk(number, 48, encoder)
         np.testing.assert_array_equal(features, expected[0])
         np.testing.assert_array_equal(classes, expected[1])
 
 
 def test_learning_from_a_stream_is_repeatable(stream, encoder, runs):
-    names = [str(h) for h in stream.recipe.hypotheses]
-    chunk = stream.recipe.chunk(0, CHUNK_RUNS, encoder)
+    names = [str(h) for h in stream.data.hypotheses]
+    chunk = stream.data.chunk(0, CHUNK_RUNS, encoder)
 
     def learn():
         diagnoser = LearnedDiagnoser("cnn", encoder, iterations=5, random_state=1)

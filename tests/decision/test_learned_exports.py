@@ -14,11 +14,15 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
-from failuretwin.decision.learned.export import export_numpy, export_onnx
-from failuretwin.decision.learned.features import Encoder, expectation_of, signals_of
+from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of, signals_of
+from failuretwin.decision.learned.log_pool import PoolWeights
 from failuretwin.decision.learned.networks import NETWORKS
-from failuretwin.decision.learned.posteriors import Weights
-from failuretwin.decision.learned.storage import load_network, save_network
+from failuretwin.decision.learned.storage import (
+    export_numpy,
+    export_onnx,
+    load_network,
+    save_network,
+)
 
 ALL = pytest.mark.parametrize("network", list(NETWORKS))
 
@@ -31,11 +35,11 @@ def runs(armpi, measured_armpi):
 @pytest.fixture(scope="module")
 def trained(armpi, measured_armpi, runs):
     """A network of each kind that has learned a little, with a temperature of its own."""
-    encoder = Encoder("robust", armpi, expectation_of(armpi, measured_armpi))
+    encoder = FeatureEncoder("robust", armpi, expectation_of(armpi, measured_armpi))
 
     def make(name):
         diagnoser = LearnedDiagnoser(name, encoder, iterations=8, random_state=1).fit(runs)
-        diagnoser.temperature_, diagnoser.weights_ = 0.7, Weights(0.4, 0.6)
+        diagnoser.temperature_, diagnoser.weights_ = 0.7, PoolWeights(0.4, 0.6)
         return diagnoser
 
     return {name: make(name) for name in NETWORKS}
@@ -63,7 +67,7 @@ def test_a_stored_network_answers_the_same(armpi, trained, runs, network, tmp_pa
     again = load_network(path, armpi)
     np.testing.assert_array_equal(again.predict_proba(runs), trained[network].predict_proba(runs))
     assert again.get_params()["random_state"] == 1
-    assert (again.weights_, again.movements_) == (Weights(0.4, 0.6), (5, 5))
+    assert (again.weights_, again.movements_) == (PoolWeights(0.4, 0.6), (5, 5))
     first, second = (d.diagnose(runs)[0].to_record() for d in (again, trained[network]))
     assert first == second
 
@@ -101,7 +105,7 @@ def test_the_numpy_file_agrees(trained, runs, network, standalone):
 
 @pytest.mark.parametrize("features", ["original", "augmented"])
 def test_the_papers_features_are_in_the_numpy_file(armpi, runs, features, standalone):
-    encoder = Encoder(features, armpi)
+    encoder = FeatureEncoder(features, armpi)
     diagnoser = LearnedDiagnoser("lstm", encoder, iterations=2, random_state=1).fit(runs)
     module, _ = standalone(diagnoser)
     run = runs.isel(run=[3])

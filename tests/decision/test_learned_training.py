@@ -3,10 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from failuretwin.app.commands.train import train as command
 
 from failuretwin.core.errors import InputError
-from failuretwin.decision.learned.data import VARIANTS, Recipe, widened
-from failuretwin.decision.learned.features import Encoder, expectation_of
+from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of
+from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.decision.learned.networks import (
     NETWORKS,
     Pace,
@@ -17,6 +20,8 @@ from failuretwin.decision.learned.networks import (
     shuffled_batches,
     training,
 )
+from failuretwin.decision.learned.training_data import VARIANTS, TrainingData, widened
+from failuretwin.decision.training import TrainingPlan, train
 
 SHAPE = Shape(channels=10, classes=3, motors=2, shared=2)
 ALL = pytest.mark.parametrize("name", list(NETWORKS))
@@ -111,23 +116,25 @@ def test_standardised_channels_have_unit_spread():
 
 
 @pytest.fixture(scope="module")
-def recipe(armpi, measured_armpi):
-    return Recipe(armpi, measured_armpi, seed=4)
+def training_data(armpi, measured_armpi):
+    return TrainingData(armpi, measured_armpi, seed=4)
 
 
-def test_chunks_depend_on_seed_and_number_alone(armpi, measured_armpi, recipe):
-    encoder = Encoder("robust", armpi, expectation_of(armpi, measured_armpi))
-    first, classes = recipe.chunk(0, 12, encoder)
-    again, same = Recipe(armpi, measured_armpi, seed=4).chunk(0, 12, encoder)
+def test_chunks_depend_on_seed_and_number_alone(armpi, measured_armpi, training_data):
+    encoder = FeatureEncoder("robust", armpi, expectation_of(armpi, measured_armpi))
+    first, classes = training_data.chunk(0, 12, encoder)
+    again, same = TrainingData(armpi, measured_armpi, seed=4).chunk(0, 12, encoder)
     np.testing.assert_array_equal(first, again)
     np.testing.assert_array_equal(classes, same)
-    assert not np.array_equal(first, recipe.chunk(1, 12, encoder)[0])
-    assert not np.array_equal(first, Recipe(armpi, measured_armpi, 5).chunk(0, 12, encoder)[0])
+    assert not np.array_equal(first, training_data.chunk(1, 12, encoder)[0])
+    assert not np.array_equal(
+        first, TrainingData(armpi, measured_armpi, 5).chunk(0, 12, encoder)[0]
+    )
 
 
-def test_classes_stay_with_their_runs(armpi, recipe):
+def test_classes_stay_with_their_runs(armpi, training_data):
     """A stuck motor 1 is seen in plain features: its angle at the tool never changes."""
-    features, classes = recipe.chunk(0, 180, Encoder("original", armpi))
+    features, classes = training_data.chunk(0, 180, FeatureEncoder("original", armpi))
     late = features[:, 30:, 4:]
     azimuth = np.arctan2(late[..., 0], -late[..., 1])
     # On a line through the axis: the azimuth is one angle or the one opposite.
@@ -151,3 +158,19 @@ def test_widened_robots_differ_more(armpi):
     np.testing.assert_allclose(wide.variation.bias, 3.0 * np.array(known.variation.bias))
     assert wide.settling == known.settling
     assert widened(wide, 1.0) == wide
+
+
+def test_a_network_is_trained_and_pooled_with_bayes_in_one_call(armpi, measured_armpi):
+    plan = TrainingPlan(iterations=2, validation_runs=36)
+    both = train(armpi, measured_armpi, plan, with_bayes=True)
+    assert isinstance(both, HybridDiagnoser)
+    assert both.weights == both.network.weights_
+    runs = simulate(Plan(armpi, paper_hypotheses(armpi.motor_names)[:1], 1, 2, measured_armpi))
+    (diagnosis,) = both.diagnose(runs)
+    assert diagnosis.method.startswith("blended: bayes")
+
+
+def test_the_command_trains_as_much_as_python_does():
+    given = {option.name: option.default for option in command.params}
+    assert (given["network"], given["iterations"]) == ("cnn", 6000)
+    assert (TrainingPlan().network, TrainingPlan().iterations) == ("cnn", 6000)

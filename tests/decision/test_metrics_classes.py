@@ -75,8 +75,10 @@ def test_scores_are_those_of_scikit_learn(answers):
 
 def test_the_log_score_says_when_the_truth_was_ruled_out(scores):
     assert scores.log_score == np.inf
-    assert scores.surprise.impossible == 1
-    assert scores.surprise.mean_of_rest == pytest.approx(-np.log([0.5, 0.8, 0.25, 0.5, 0.1]).mean())
+    assert scores.log_scores.impossible == 1
+    assert scores.log_scores.mean_of_rest == pytest.approx(
+        -np.log([0.5, 0.8, 0.25, 0.5, 0.1]).mean()
+    )
 
 
 def test_certainty_of_the_truth_costs_nothing():
@@ -89,7 +91,7 @@ def test_truth_that_no_hypothesis_stands_for_counts_as_wrong():
     scores = score(["d"], ["a"], [{"a": 0.9, "b": 0.1}])
     assert (scores.right, scores.runs) == (0, 1)
     assert scores.log_score == np.inf
-    assert np.isnan(scores.surprise.mean_of_rest)
+    assert np.isnan(scores.log_scores.mean_of_rest)
     assert set(scores.classes) == {"a", "b", "d"}
 
 

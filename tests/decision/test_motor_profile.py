@@ -3,13 +3,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import optimize, stats
+from small_arms import SCARA, small_twin
 
-from failuretwin.digital_model.nonidealities import Imperfections, LostCommand
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfections, LostCommand
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.command_loss import OUTLIER_RATE
 from failuretwin.inference.evidence import settled_evidence
-from failuretwin.inference.healthy_model import PATH_NOISE_M, HealthyModel
+from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.run_likelihood import RunLikelihood
+
+PATH_NOISE_M, OUTLIER_RATE = 0.001, 0.01
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 SCATTER = np.array([0.005, 0.006, 0.005, 0.004])
@@ -135,6 +137,18 @@ def test_a_healthy_motor_is_the_healthy_robot(scene_of, motor):
     profile = likelihood.profile(motor)
     found = profile.log_density(profile.expected[:, :, None], False)[..., 0]
     np.testing.assert_allclose(found, likelihood.log_healthy, rtol=0, atol=0.05)
+
+
+@pytest.mark.parametrize("turned", [3.5, 4.5, 2.0 * np.pi, 7.0])
+def test_a_full_turn_makes_no_difference_where_a_motor_may_turn_around(tmp_path, run_of, turned):
+    twin = small_twin(tmp_path, "scara", SCARA, tool="0.2 0 0")
+    targets = np.array([[0.1, 2.0, 0.5], [0.2, -1.5, -0.7]])
+    model = HealthyModel(twin, NO_IMPERFECTIONS)
+    runs = run_of(targets, twin.path(targets), ("motor_1", "motor_2", "motor_3"))
+    profile = RunLikelihood(settled_evidence(runs), model).profile(1)
+    assert profile.around
+    found = [profile.log_terms(profile.mode + off, True) for off in (turned, turned - 2.0 * np.pi)]
+    np.testing.assert_allclose(*found, rtol=1e-9)
 
 
 def test_far_angles_are_left_to_the_outliers(scene_of):

@@ -15,9 +15,8 @@ from failuretwin.digital_model.settling import Settling
 from failuretwin.inference.evidence import SettledEvidence, settled_evidence
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.two_joint_likelihood import two_joint_likelihood
+from failuretwin.inference.two_joint_likelihood import GaussianBelief, two_joint_likelihood
 from failuretwin.inference.unknown import unmodelled_offsets_likelihood
-from failuretwin.inference.unmodelled_offsets import GaussianBelief
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 SCATTER = np.array([0.005, 0.006, 0.005, 0.004])
@@ -54,7 +53,7 @@ def test_two_motors_are_found_where_they_stand(scene_of, pair):
     found = found_angles(likelihood, pair)
     ways = np.isfinite(found.log_weight[0, 0])
     error = found.angle[0, 0, ways] - truth[list(pair)]
-    deviation = np.sqrt(found.covariance[0, 0, ways, :2])
+    deviation = np.sqrt(np.diagonal(found.covariance[0, 0, ways], axis1=1, axis2=2))
     assert (np.abs(error) / deviation).max(axis=1).min() < 0.1
 
 
@@ -85,7 +84,7 @@ def test_any_two_angles_are_as_probable_as_quadrature_says(scene_of, twin, pair)
         return norm * fall / np.sqrt(np.linalg.det(spread))
 
     ways = np.isfinite(found.log_weight[0, 0])
-    around = 8.0 * np.sqrt(found.covariance[0, 0, ways, :2])
+    around = 8.0 * np.sqrt(np.diagonal(found.covariance[0, 0, ways], axis1=1, axis2=2))
     low = (found.angle[0, 0, ways] - around).min(axis=0)
     high = (found.angle[0, 0, ways] + around).max(axis=0)
     axes = [np.linspace(*ends, 501) for ends in zip(low, high, strict=True)]
@@ -103,16 +102,14 @@ def test_a_belief_learns_as_regression_does():
     noise = roots @ np.swapaxes(roots, 1, 2) + 0.1 * np.eye(2)
     variance = np.array([0.5, 2.0])
     error = rng.normal(size=(4, 2))
-    belief = GaussianBelief(np.zeros((1, 1, 2)), np.array([[[*variance, 0.0]]]))
+    belief = GaussianBelief(np.zeros((1, 1, 2)), np.diag(variance)[None, None])
     total = 0.0
     for m in range(4):
-        own = np.array([noise[m, 0, 0], noise[m, 1, 1], noise[m, 0, 1]])
         x = slope[m][None, None]
-        spread = belief.seen_at(x) + own
+        covariance = belief.predict(x[:, :, None])[:, :, 0] + noise[m]
         off = error[m] - slope[m] * belief.mean
-        aa, bb, ab = spread[0, 0]
-        total += stats.multivariate_normal.logpdf(off[0, 0], cov=[[aa, ab], [ab, bb]])
-        belief = belief.after(x, off, spread)
+        total += stats.multivariate_normal.logpdf(off[0, 0], cov=covariance[0, 0])
+        belief = belief.update(x, off, covariance)
     stacked = np.concatenate([np.diag(x) for x in slope])
     whole = stacked @ np.diag(variance) @ stacked.T
     for m in range(4):
@@ -171,6 +168,16 @@ def test_two_slides_that_are_off_are_a_closed_form(tmp_path, run_of):
         chance = 4 * np.log(0.8) - np.log(2 * 16 * 3)
         assert found == pytest.approx(sharp + occam + chance, abs=1.0)
         assert found > healthy + 20.0
+
+
+@pytest.mark.parametrize(("stands", "found"), [(0.28, True), (0.41, True), (0.43, False)])
+def test_two_motors_stand_a_fifth_beyond_their_range_at_most(tmp_path, run_of, stands, found):
+    """A slide from -0.3 m to 0.3 m: no further than 0.42 m."""
+    twin = small_twin(tmp_path, "gantry", GANTRY)
+    names = tuple(motor.name for motor in twin.robot.motors)
+    runs = run_of([[0.1, 0.1, 0.2]], twin.path(np.array([[stands, 0.0, 0.2]])), names)
+    likelihood = RunLikelihood(settled_evidence(runs), HealthyModel(twin, NO_IMPERFECTIONS))
+    assert np.isfinite(found_angles(likelihood, (0, 1)).log_weight).any() == found
 
 
 def test_an_arm_of_one_motor_has_no_pair(tmp_path, run_of):

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
-from failuretwin.inference.onset import OnsetIntervals, OnsetPrior, next_movement
-from failuretwin.inference.priors import Priors
+from failuretwin.inference.onset import OnsetIntervals, OnsetPrior, next_movement, plateau_or_ramp
+from failuretwin.inference.priors import MONITORING, Priors
 
 lengths = st.lists(st.floats(0.0, 5.0), min_size=1, max_size=8)
 earlies = st.floats(0.0, 1.0)
@@ -18,7 +18,7 @@ def stretches(parts, padding=0):
     """Return stretches of these lengths, and as many padded ones as `padding` says."""
     end = np.concatenate([np.cumsum(parts), np.full(padding, np.nan)])[None]
     begin = np.concatenate([np.zeros((1, 1)), end[:, :-1]], axis=1)
-    return OnsetIntervals(begin, end, np.isfinite(end))
+    return OnsetIntervals(begin, end)
 
 
 @given(parts=lengths, early=earlies, padding=st.integers(0, 3))
@@ -43,7 +43,7 @@ def test_what_begins_in_the_run_may_begin_at_any_time(parts, early):
 def test_onsets_are_spread_as_their_prior_says(parts, early):
     """By all samples: the mass before the run, and the mean onset of the rest."""
     some = stretches(parts)
-    onset, share = some.samples(early, 0)
+    onset, share = (values[0] for values in some.samples(early))
     np.testing.assert_allclose(share.sum(axis=1), 1.0, atol=1e-9)
     mass = some.weights(early)[0][:, None] * share
     total = sum(parts)
@@ -63,16 +63,34 @@ def test_a_run_has_the_onsets_that_it_has_among_longer_ones():
     movements = Movements(np.zeros((2, 1)), np.zeros((2, 3, 1)), np.full((2, 3, 1), 0.5), start)
     found = next_movement(movements)
     np.testing.assert_allclose(found.weights(0.4), [[0.4 + 0.15, 0.45, 0.0], [0.4, 0.3, 0.3]])
-    onset, share = found.samples(0.4, 0)
+    onset, share = (values[0] for values in found.samples(0.4))
     assert np.isfinite(onset).all()
     assert np.isfinite(share).all()
+
+
+def test_a_motor_may_get_stuck_on_a_plateau_or_a_ramp():
+    """Ramps at 1 to 2 s and 5 to 7 s: 3 s of plateau and 2 s of ramp come after the first ramp."""
+    found = plateau_or_ramp(np.array([[1.0, 5.0, np.nan]]), np.array([[2.0, 7.0, np.nan]]))
+    wanted = [[[0.2, 0.2], [0.36, 0.24], [0.0, 0.0]]]
+    np.testing.assert_allclose(found.weights(0.4), wanted, atol=1e-12)
+    for onset_s, where in ((0.0, (0, 0)), (1.5, (0, 1)), (2.0, (1, 0)), (6.9, (1, 1)), (9, (2, 1))):
+        assert [tuple(i) for i in np.argwhere(found.holding(onset_s)[0])] == [where]
 
 
 def test_modes_have_their_own_share_before_the_run():
     """What wears out was there before; a motor may well get stuck in the run."""
     usual, told = OnsetPrior(), OnsetPrior(prior_before_run=0.25)
-    assert usual.before_run("backlash") > usual.before_run("stuck")
+    assert (usual.before_run("backlash"), usual.before_run("stuck")) == (0.9, 0.5)
     assert {told.before_run(mode) for mode in ("backlash", "stuck")} == {0.25}
+
+
+def test_usual_beliefs():
+    """Counts of 0.24 deg: 4 to 20, 7 to 35, 10 to 50."""
+    count = np.deg2rad(0.24)
+    expected = [(4 * count, 20 * count), (7 * count, 35 * count), (10 * count, 50 * count)]
+    np.testing.assert_allclose(Priors().error_ranges, expected)
+    assert (Priors().healthy_odds, MONITORING.healthy_odds) == (1.0, 30.0)
+    assert (Priors().onset.free, Priors().onset.known_s) == (0.2, None)
 
 
 @pytest.mark.parametrize(

@@ -11,12 +11,11 @@ from failuretwin.digital_model.settling import Settling
 from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.transient_likelihood import (
-    DOF,
-    GLITCH_RATE,
-    SEEN,
-    UNSEEN,
-)
+
+DOF, GLITCH_RATE, ROUGHNESS_M = 4.0, 0.03, 0.002
+NOISE_M = 0.0003
+"""What is left of the noise where the sensor has none."""
+SEEN, UNSEEN = 0.3, 12.0
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 SCATTER = np.array([0.005, 0.006, 0.005, 0.004])
@@ -150,7 +149,7 @@ def test_a_motor_at_rest_has_a_closed_form(twin, end_seen):
     step = 1e-6 * np.eye(4)
     slopes = ((twin.path(pose + step) - twin.path(pose - step)) / 2e-6).T
     variance = (SEEN if end_seen else UNSEEN) * np.sum((slopes * SCATTER) ** 2) / 3.0
-    variance += case.model.path_noise**2 + 0.002**2
+    variance += NOISE_M**2 + ROUGHNESS_M**2
     points = case.ramps.moving.point[0, 1, case.ramps.moving.seen[0, 1]]
     kind = stats.multivariate_t(twin.path(pose), variance * np.eye(3), DOF)
     anywhere = 1.0 / (4 / 3 * np.pi * REACH_M**3)

@@ -7,7 +7,7 @@ import pytest
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
-from failuretwin.data_knowledge.generate import Plan, simulate, without_chance
+from failuretwin.data_knowledge.generate import Plan, deterministic, simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.failure_behavior.modes import MODES
 from failuretwin.inference.expected_bayes_factors import (
@@ -24,7 +24,7 @@ SETTLED = ("stuck", "encoder_bias", "encoder_scale", "backlash", "torque_loss", 
 
 def quiet(imperfections):
     """Return imperfections without chance, but with their declared scatter."""
-    return dataclasses.replace(without_chance(imperfections), settling=imperfections.settling)
+    return dataclasses.replace(deterministic(imperfections), settling=imperfections.settling)
 
 
 def test_the_truth_is_nearest_to_itself(twin, imperfect):
@@ -65,13 +65,13 @@ def test_readings_count_only_by_being_there(twin, imperfect):
 @pytest.fixture(scope="module")
 def of_all_modes(armpi, measured_armpi):
     """Runs of every mode at motor 2, with all of their profiles, on an arm that never errs."""
-    sure = without_chance(measured_armpi)
+    sure = deterministic(measured_armpi)
     return simulate(Plan(armpi, single_faults(["motor_2"], MODES), 4, 2, sure))
 
 
 def test_runs_are_made_again_as_they_were(twin, armpi, measured_armpi, of_all_modes):
     compute_posterior = ExpectedLogBayesFactor(
-        HealthyModel(twin, without_chance(measured_armpi)), (HEALTHY,), Priors()
+        HealthyModel(twin, deterministic(measured_armpi)), (HEALTHY,), Priors()
     )
     faults = truth_and_faults(of_all_modes)[1]
     again = compute_posterior.noise_free(of_all_modes, faults)
@@ -92,7 +92,7 @@ def test_a_law_puts_the_tool_where_the_simulator_does(twin, armpi, measured_armp
     known = quiet(measured_armpi)
     fault_model = dataclasses.replace(MODES[mode], onset_s=(0.0, 0.0), profiles=("step",))
     runs = simulate(
-        Plan(armpi, [hypothesis], 4, 1, without_chance(known), modes={mode: fault_model})
+        Plan(armpi, [hypothesis], 4, 1, deterministic(known), modes={mode: fault_model})
     )
     compute_posterior = ExpectedLogBayesFactor(
         HealthyModel(twin, known), (hypothesis, HEALTHY), Priors()

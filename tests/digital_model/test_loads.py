@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from failuretwin import load_robot
-from failuretwin.digital_model.gravity import GRAVITY, loads_of
+from failuretwin.digital_model.gravity import loads_of
 from failuretwin.digital_model.robot import bundled_robots
 from failuretwin.digital_model.urdf import read_links, read_root, read_urdf
 
@@ -79,4 +79,4 @@ def test_a_payload_pulls_at_the_tool_point(armpi):
     payload = np.linspace(0.01, 0.5, 20)
     more = armpi.loads.torque(poses, payload) - armpi.loads.torque(poses)
     _, jacobian = armpi.chain.position_and_jacobian(poses)
-    np.testing.assert_allclose(more, -GRAVITY * payload[:, None] * jacobian[:, 2], atol=1e-12)
+    np.testing.assert_allclose(more, -9.81 * payload[:, None] * jacobian[:, 2], atol=1e-12)

@@ -14,9 +14,9 @@ from golden_entry import (
     StreamingFleet,
     Tracker,
     augmented_features,
-    calibrate,
     evidence_of,
     expected_log_bayes_factors,
+    fit_calibration,
     healthy,
     log_quality,
     monitor,
@@ -251,7 +251,7 @@ def separated(runs, hypotheses=None):
 
 def calibrated(use_readings, thorough):
     """Return what healthy runs teach, every figure by its name."""
-    found = calibrate(
+    found = fit_calibration(
         load("sessions"),
         twin().robot,
         "golden",
@@ -294,18 +294,18 @@ def tracked():
     healthy_runs, faulty = (observe(load(n), use_readings=False) for n in ("sessions", "nine"))
     for turn, seen in enumerate((healthy_runs,) * 4 + (faulty,)):
         runs = range(len(seen.runs))
-        fates = []
+        outcomes = []
         for one in run_evidence(seen, robot, tracker.tracked_settling, runs):
             tracker, step = tracker.follow(one, 0.8 if seen is faulty else 0.1)
-            fates += [list(fate) for fate in step.fates]
+            outcomes += [list(outcome) for outcome in step.outcomes]
         state = tracker.state
         found[f"turn {turn}"] = {
             "mean": state.mean,
             "covariance": state.covariance,
-            "level": tracker.level,
+            "level": tracker.cusum,
             "learned at": tracker.learned_at,
             "alarm": tracker.alarm,
-            "fates": fates,
+            "fates": outcomes,
         }
     return found
 

@@ -9,13 +9,13 @@ from unittest import mock
 import numpy as np
 
 import failuretwin as ft
-from failuretwin.connection.calibration.calibrate import calibrate
+from failuretwin.connection.calibration.calibrate import fit_calibration
 from failuretwin.connection.calibration.observations import observe
 from failuretwin.connection.wear import run_evidence
 from failuretwin.connection.wear_tracker import Tracker
 from failuretwin.core.hypothesis import parse_hypotheses
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
-from failuretwin.decision.learned.features import (
+from failuretwin.decision.learned.feature_encoder import (
     RobustFeatures,
     augmented_features,
     expectation_of,
@@ -42,8 +42,8 @@ __all__ = [
     "StreamingFleet",
     "Tracker",
     "augmented_features",
-    "calibrate",
     "expected_log_bayes_factors",
+    "fit_calibration",
     "generic_imperfections",
     "load_run_set",
     "log_quality",

@@ -2,30 +2,33 @@
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from importlib.resources import files
-from io import BytesIO
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from failuretwin import __version__
 from failuretwin.app.calibration_tables import (
+    beats_uncalibrated,
+    channels,
+    held_out_table,
     left_out_line,
-    mean_gain,
     parameter_groups,
     verdict_line,
 )
-from failuretwin.app.plots import BLUE, GREY, RED, clean, environment, figure_class
-from failuretwin.connection.calibration.example_transient import ExampleRamp, example_ramp
+from failuretwin.app.plots import BLUE, GREY, RED, clean, figure_class, png, render_page
+from failuretwin.app.tables import Table
+from failuretwin.connection.calibration.cross_validation import (
+    ExampleTransient,
+    Predictions,
+    example_transient,
+    predict,
+    settling_of,
+)
 from failuretwin.connection.calibration.result import Calibration, HeldOut
-from failuretwin.connection.calibration.validation import Predictions, predict, settling_of
-from failuretwin.core.runs import AXES
 from failuretwin.core.types import FloatArray
-from failuretwin.digital_model.robot import Robot, shown_unit
+from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling
 
 if TYPE_CHECKING:
@@ -33,50 +36,48 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Pictures of a calibration: what it expects, what is left, and how a ramp fits. Needs `plots`.
+# Pictures of a calibration: what it expects, what is left, and how a ramp fits.
 
 MOST_COLUMNS = 4
 PANEL_IN = 3.2
 WIDTH_IN = 11.6
-DPI = 130
 DIRECTIONS = ((1.0, BLUE, "towards larger angles"), (-1.0, RED, "towards smaller angles"))
 LOAD_FLOOR_NM = 1e-3
 """Load torque below which a motor counts as unloaded in the pictures [N m]."""
 
 
-def png(figure: Figure) -> bytes:
-    """Return a figure as a PNG file."""
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI)
-    return buffer.getvalue()
-
-
-def channels(robot: Robot, of_motors: bool) -> tuple[list[str], float, str]:
-    """Return name of each channel, factor and name of the unit that people read."""
-    if not of_motors:
-        return [f"tool {axis}" for axis in AXES], 1e3, "mm"
-    scale, unit = shown_unit("rad", robot)
-    return [name.replace("_", " ") for name in robot.motor_names], scale, unit
-
-
-def _panels(count: int, height: float = PANEL_IN) -> tuple[Figure, list[Axes]]:
+def _panels(names: list[str]) -> tuple[Figure, list[Axes]]:
+    """Return a figure with a panel for each channel, to be handed to `finish`."""
+    count = len(names)
     columns = min(count, MOST_COLUMNS)
     rows = -(-count // columns)
-    figure = figure_class()(figsize=(WIDTH_IN, height * rows + 0.4), layout="constrained")
-    return figure, [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
+    figure = figure_class()(figsize=(WIDTH_IN, PANEL_IN * rows + 0.4), layout="constrained")
+    panels = [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
+    for panel, name in zip(panels, names, strict=True):
+        panel.set_title(name, fontsize=10)
+    return figure, panels
+
+
+def finish(figure: Figure, panels: Sequence[Axes], below: str = "", beside: str = "") -> Figure:
+    """Return a figure with its axes labelled and one legend for all panels."""
+    for panel in panels:
+        if below:
+            panel.set_xlabel(below, fontsize=9)
+        panel.tick_params(labelsize=8)
+        clean(panel)
+    panels[0].set_ylabel(beside)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=9
+    )
+    return figure
 
 
 def load_figure(seen: Predictions, settling: Settling, robot: Robot) -> Figure:
-    """Return the settled error of each motor against its load, with the fitted lines.
-
-    Args:
-        seen: Settled errors of motors.
-        settling: The calibration.
-        robot: The robot.
-    """
+    """Return the settled error of each motor against its load, with the fitted lines."""
     names, scale, unit = channels(robot, True)
-    figure, panels = _panels(len(names))
-    for k, (panel, name) in enumerate(zip(panels, names, strict=True)):
+    figure, panels = _panels(names)
+    for k, panel in enumerate(panels):
         torque = seen.torque[:, k]
         loaded = bool(np.abs(torque).max(initial=0.0) > LOAD_FLOOR_NM)
         x = torque if loaded else np.rad2deg(seen.target[:, k])
@@ -88,21 +89,17 @@ def load_figure(seen: Predictions, settling: Settling, robot: Robot) -> Figure:
             line = settling.bias[k] - settling.friction[k] * sign + slope * ends
             panel.plot(ends, scale * line, color=colour, lw=1.8, label=label)
         panel.axhline(0.0, color=GREY, lw=0.8, zorder=0)
-        panel.set_title(name, fontsize=10)
         panel.set_xlabel("load torque [N m]" if loaded else "target [deg], no load", fontsize=9)
-        _finish(panel)
-    panels[0].set_ylabel(f"settled error [{unit}]")
-    _legend(figure, panels[0])
-    return figure
+    return finish(figure, panels, beside=f"settled error [{unit}]")
 
 
 def expected_figure(seen: Predictions, robot: Robot) -> Figure:
     """Return settled errors against what was expected of them, each channel a panel."""
     names, scale, unit = channels(robot, seen.of_motors)
-    figure, panels = _panels(len(names))
+    figure, panels = _panels(names)
     for k, (panel, name) in enumerate(zip(panels, names, strict=True)):
         kept = seen.counts[:, k]
-        expected, error = scale * seen.expected[kept, k], scale * seen.error[kept, k]
+        expected, error = (scale * e[kept, k] for e in (seen.expected, seen.error))
         reach = _reach(expected, error)
         panel.plot([-reach, reach], [0.0, 0.0], color=GREY, lw=1.5, label="uncalibrated twin")
         panel.plot([-reach, reach], [-reach, reach], color=BLUE, lw=1.5, label="calibrated twin")
@@ -115,11 +112,7 @@ def expected_figure(seen: Predictions, robot: Robot) -> Figure:
             panel.annotate(f"{beyond} beyond", (0.03, 0.94), xycoords="axes fraction", fontsize=8)
         before, after = (1.4826 * float(np.median(np.abs(e))) for e in (error, error - expected))
         panel.set_title(f"{name}: {before:.2f} to {after:.2f} {unit}", fontsize=10)
-        panel.set_xlabel(f"expected error [{unit}]", fontsize=9)
-        _finish(panel)
-    panels[0].set_ylabel(f"settled error [{unit}]")
-    _legend(figure, panels[0])
-    return figure
+    return finish(figure, panels, f"expected error [{unit}]", f"settled error [{unit}]")
 
 
 def _reach(expected: FloatArray, error: FloatArray) -> float:
@@ -132,9 +125,8 @@ def quantile_figure(seen: Predictions, dof: float, robot: Robot) -> Figure:
     """Return quantiles of what is left against those of the fitted Student t distribution."""
     from scipy.stats import beta, t
 
-    names, _, _ = channels(robot, seen.of_motors)
-    figure, panels = _panels(len(names))
-    for k, (panel, name) in enumerate(zip(panels, names, strict=True)):
+    figure, panels = _panels(channels(robot, seen.of_motors)[0])
+    for k, panel in enumerate(panels):
         kept = seen.counts[:, k]
         left = np.sort((seen.error - seen.expected)[kept, k] / seen.scale[kept, k])
         order = np.arange(1, len(left) + 1)
@@ -145,192 +137,111 @@ def quantile_figure(seen: Predictions, dof: float, robot: Robot) -> Figure:
         panel.plot(theory, left, ".", ms=4, color="black", alpha=0.7, label="settled movement")
         reach = 1.08 * float(np.abs(np.concatenate([left, theory, [1.0]])).max())
         panel.set_ylim(-reach, reach)
-        panel.set_title(name, fontsize=10)
-        panel.set_xlabel("expected quantile [scales]", fontsize=9)
-        _finish(panel)
-    panels[0].set_ylabel("what is left [scales]")
-    _legend(figure, panels[0])
-    return figure
+    return finish(figure, panels, "expected quantile [scales]", "what is left [scales]")
 
 
-def ramp_figure(ramp: ExampleRamp, robot: Robot) -> Figure:
+def ramp_figure(ramp: ExampleTransient, robot: Robot) -> Figure:
     """Return one movement: command, twin before and after calibration, and readings."""
     names, scale, unit = channels(robot, ramp.of_motors)
-    figure, panels = _panels(len(names), 3.2)
-    for k, (panel, name) in enumerate(zip(panels, names, strict=True)):
-        panel.plot(ramp.time, scale * ramp.command[:, k], color=GREY, lw=2.2, label="command")
-        panel.plot(
-            ramp.time, scale * ramp.plain[:, k], color=RED, lw=1.2, ls="--", label="uncalibrated"
-        )
-        panel.plot(ramp.time, scale * ramp.calibrated[:, k], color=BLUE, lw=1.4, label="calibrated")
-        panel.plot(ramp.time, scale * ramp.reading[:, k], ".k", ms=6, label="readings")
-        panel.set_title(name, fontsize=10)
-        panel.set_xlabel("time since the command [s]", fontsize=9)
-        _finish(panel)
-    panels[0].set_ylabel(f"{'angle' if ramp.of_motors else 'position'} [{unit}]")
-    _legend(figure, panels[0])
-    return figure
+    figure, panels = _panels(names)
+    lines: tuple[tuple[FloatArray, dict[str, Any]], ...] = (
+        (ramp.command, {"color": GREY, "lw": 2.2, "label": "command"}),
+        (ramp.plain, {"color": RED, "lw": 1.2, "ls": "--", "label": "uncalibrated"}),
+        (ramp.calibrated, {"color": BLUE, "lw": 1.4, "label": "calibrated"}),
+        (ramp.reading, {"color": "black", "ls": "", "marker": ".", "ms": 6, "label": "readings"}),
+    )
+    for k, panel in enumerate(panels):
+        for values, style in lines:
+            panel.plot(ramp.time, scale * values[:, k], **style)
+    what = "angle" if ramp.of_motors else "position"
+    return finish(figure, panels, "time since the command [s]", f"{what} [{unit}]")
 
 
 def session_figure(held_out: Sequence[HeldOut], robot: Robot, of_motors: bool) -> Figure:
     """Return the size of the settled error of each unseen session, before and after."""
     names, scale, unit = channels(robot, of_motors)
-    columns = len(names)
     height = max(1.9, 0.34 * len(held_out) + 1.2)
     figure = figure_class()(figsize=(WIDTH_IN, height), layout="constrained")
-    panels = figure.subplots(1, columns, sharey=True, squeeze=False)[0]
+    panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
     rows = np.arange(len(held_out))[::-1]
-    before, after = (np.array([getattr(e, side) for e in held_out]) for side in ("before", "after"))
+    bars = (
+        (0.19, GREY, "uncalibrated", [entry.before for entry in held_out]),
+        (-0.19, BLUE, "calibrated", [entry.after for entry in held_out]),
+    )
     for k, (panel, name) in enumerate(zip(panels, names, strict=True)):
-        panel.barh(rows + 0.19, scale * before[:, k], 0.36, color=GREY, label="uncalibrated")
-        panel.barh(rows - 0.19, scale * after[:, k], 0.36, color=BLUE, label="calibrated")
+        for shift, colour, label, sizes in bars:
+            size = scale * np.array(sizes)[:, k]
+            panel.barh(rows + shift, size, 0.36, color=colour, label=label)
         panel.set_title(name, fontsize=10)
-        panel.set_xlabel(f"settled error [{unit}]", fontsize=9)
         panel.set_yticks(rows, [entry.session for entry in held_out], fontsize=8)
         panel.tick_params(axis="y", length=0)
         panel.set_ylim(-0.6, len(held_out) - 0.4)
-        _finish(panel)
-    _legend(figure, panels[0])
-    return figure
+    return finish(figure, panels, f"settled error [{unit}]")
 
 
-def _finish(panel: Axes) -> None:
-    panel.tick_params(labelsize=8)
-    clean(panel)
-
-
-def _legend(figure: Figure, panel: Axes) -> None:
-    handles, labels = panel.get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=9
-    )
-
-
-@dataclass(frozen=True)
-class _Picture:
-    """A picture with its words.
-
-    Attributes:
-        title: Heading.
-        caption: How to read it.
-        data: PNG file in base64.
-    """
-
-    title: str
-    caption: str
-    data: str
+# The page.
 
 
 def write_calibration_page(
     found: Calibration, runs: xr.Dataset, robot: Robot, folder: Path
 ) -> None:
-    """Write `index.html` with tables and pictures into `folder`.
-
-    Args:
-        found: The calibration.
-        runs: The runs it was learned from or judged on.
-        robot: The robot.
-        folder: An existing folder.
-
-    Raises:
-        InputError: If jinja2 or matplotlib is missing.
-    """
-    template = (files("failuretwin.app") / "calibration.html.j2").read_text(encoding="utf-8")
-    pictures = dict(_pictures(found, runs, robot))
-    names, scale, unit = channels(robot, found.used_readings)
-    page = environment().from_string(template)
-    text = page.render(
-        found=found,
-        robot=robot.name,
-        version=__version__,
-        verdict=verdict_line(found).rstrip("."),
-        grade=_grade(found),
-        groups=parameter_groups(found, robot),
-        count_deg=_count_degrees(robot),
-        left_out=left_out_line(found),
-        pictures=pictures,
-        channels=names,
-        unit=unit,
-        scale=scale,
-        payload=settling_of(found, robot).payload,
+    """Write `index.html` into an existing folder; the runs are those learned from or judged on."""
+    units, better = robot.profile.servo_units, beats_uncalibrated(found)
+    left_out = [(e.run, str(e.movement or "all"), f"{e.motor} {e.reason}") for e in found.left_out]
+    seen, settling = predict(found, runs, robot), settling_of(found, robot)
+    ramp = example_transient(found, runs, robot)
+    text = render_page(
+        "calibration.html.j2",
+        {
+            "found": found,
+            "robot": robot.name,
+            "verdict": verdict_line(found).rstrip("."),
+            "grade": "unknown" if better is None else "good" if better else "bad",
+            "facts": _facts(found, settling),
+            "sessions": held_out_table(found, robot),
+            "groups": parameter_groups(found, robot),
+            "count_deg": None if units is None else units.deg_per_count,
+            "left_out": Table(("run", "movement", "why"), left_out),
+            "left_out_line": left_out_line(found),
+            "pictures": _pictures(found, seen, settling, ramp, robot),
+            "unseen": seen.unseen,
+            "dof": settling.tail_dof,
+            "ramp": ramp,
+        },
     )
     (folder / "index.html").write_text(text, encoding="utf-8")
 
 
-def _grade(found: Calibration) -> str:
-    """Return whether unseen sessions speak for the calibration: good, bad or unknown."""
-    if not found.held_out:
-        return "unknown"
-    gain, half = mean_gain(found.held_out)
-    return "good" if gain - half > 0.0 else "bad"
+def _facts(found: Calibration, settling: Settling) -> Table:
+    way = "the motors' own readings" if found.used_readings else "the tool path alone"
+    payload, protocol = settling.payload, found.imperfections.protocol
+    rows = [
+        ("learned from", found.imperfections.source),
+        ("sessions", f"{len(found.sessions)}: {', '.join(found.sessions)}"),
+        ("that is", f"{found.movements} settled movements of {found.runs} runs, by {way}"),
+        ("protocol", f"{protocol}: healthy logs only, no recorded failure"),
+        ("payload", f"{payload} kg at the tool point" if payload else "none assumed"),
+        ("made by", f"failuretwin {__version__}"),
+    ]
+    return Table(("", ""), rows, header=False)
 
 
-def _count_degrees(robot: Robot) -> float | None:
-    """Return the size of a servo count [deg], positive if counts run against angles."""
-    units = robot.profile.servo_units
-    return None if units is None else units.deg_per_count
-
-
-def _pictures(found: Calibration, runs: xr.Dataset, robot: Robot) -> Iterator[tuple[str, _Picture]]:
-    seen, settling = predict(found, runs, robot), settling_of(found, robot)
+def _pictures(
+    found: Calibration,
+    seen: Predictions,
+    settling: Settling,
+    ramp: ExampleTransient | None,
+    robot: Robot,
+) -> dict[str, str]:
+    """Return those pictures that there is something to show in, by name."""
+    figures = {}
     if found.held_out:
-        yield (
-            "sessions",
-            _picture(
-                png(session_figure(found.held_out, robot, found.used_readings)),
-                "Size of the settled error by session",
-                "1.48 times the median size of the error, the shorter the better.",
-            ),
-        )
+        figures["sessions"] = session_figure(found.held_out, robot, found.used_readings)
     if seen.counts.any():
-        yield (
-            "expected",
-            _picture(
-                png(expected_figure(seen, robot)),
-                "Settled error against prediction",
-                "The uncalibrated twin expects no error at all (grey line); a perfect calibration "
-                f"puts every point on the blue one. {_who_predicts(seen)} Above each panel: size "
-                "of the error before and after.",
-            ),
-        )
-        yield (
-            "quantiles",
-            _picture(
-                png(quantile_figure(seen, settling.tail_dof, robot)),
-                "Distribution of what is left",
-                f"Against a Student t with {settling.tail_dof:.1f} degrees of freedom. Points that "
-                "leave the band upwards on the right or downwards on the left are larger errors "
-                f"than the calibration allows for. {_who_predicts(seen)}",
-            ),
-        )
-    if seen.of_motors and seen.counts.any():
-        yield (
-            "load",
-            _picture(
-                png(load_figure(seen, settling, robot)),
-                "What the arm's weight and friction do",
-                "Settled error before calibration, one point a movement. The slope of the lines is "
-                "the compliance, half their distance the friction, and their middle at no load the "
-                "bias.",
-            ),
-        )
-    ramp = example_ramp(found, runs, robot)
+        figures["expected"] = expected_figure(seen, robot)
+        figures["quantiles"] = quantile_figure(seen, settling.tail_dof, robot)
+        if seen.of_motors:
+            figures["load"] = load_figure(seen, settling, robot)
     if ramp is not None:
-        yield (
-            "ramp",
-            _picture(
-                png(ramp_figure(ramp, robot)),
-                f"A ramp: {ramp.run}, movement {ramp.movement}",
-                "The movement with the median misfit of the longer half of all that began on time.",
-            ),
-        )
-
-
-def _who_predicts(seen: Predictions) -> str:
-    if seen.unseen:
-        return "Each session is predicted by a fit that has not seen it."
-    return "These movements are those that the fit has seen: there is no other session."
-
-
-def _picture(data: bytes, title: str, caption: str) -> _Picture:
-    return _Picture(title, caption, base64.b64encode(data).decode("ascii"))
+        figures["ramp"] = ramp_figure(ramp, robot)
+    return {name: png(figure) for name, figure in figures.items()}

@@ -1,4 +1,4 @@
-"""What `calibrate` prints: parameters with intervals, held-out sessions, what was left out."""
+"""What `calibrate` says: parameters with intervals, held-out sessions, what was left out."""
 
 from __future__ import annotations
 
@@ -7,65 +7,61 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from rich.table import Table
 
-from failuretwin.app.tables import console
+from failuretwin.app.tables import Table, show
 from failuretwin.connection.calibration.result import Calibration, HeldOut, Parameter
+from failuretwin.core.runs import AXES
 from failuretwin.digital_model.robot import Robot, shown_unit
 
 
 def print_calibration(found: Calibration, robot: Robot) -> None:
     """Print everything that was learned and how far it can be trusted."""
-    out = console()
     way = "motor readings" if found.used_readings else "the tool path alone"
-    out.print(f"{robot.name}: {found.movements} settled movements of {found.runs} runs, {way}\n")
-    out.print(_parameter_table(found.parameters, robot))
-    for parameter in found.parameters:
-        if not parameter.identified:
-            out.print(f"  {_title(parameter)}: {parameter.note}", soft_wrap=True)
-    for remark in found.remarks:
-        out.print(f"  {remark}", soft_wrap=True)
+    show(f"{robot.name}: {found.movements} settled movements of {found.runs} runs, {way}\n")
+    show(_parameter_table(found.parameters, robot))
+    show(*(f"  {_title(p)}: {p.note}" for p in found.parameters if not p.identified))
+    show(*(f"  {remark}" for remark in found.remarks))
     if found.left_out:
-        out.print(f"\nleft out: {left_out_line(found)}", soft_wrap=True)
+        show(f"\nleft out: {left_out_line(found)}")
     if found.held_out:
-        out.print("\nsessions predicted by what the others say (settled error)\n")
-        out.print(_held_out_table(found, robot))
-    out.print(f"\n{verdict_line(found)}", soft_wrap=True)
+        show("\nsessions predicted by what the others say (settled error)\n")
+        show(held_out_table(found, robot))
+    show(f"\n{verdict_line(found)}")
 
 
 def _parameter_table(parameters: tuple[Parameter, ...], robot: Robot) -> Table:
-    table = Table(box=None, pad_edge=False)
-    for column in ("parameter", "value", "95 % interval", "unit", ""):
-        table.add_column(column, overflow="fold")
+    rows = []
     for p in parameters:
         scale, unit = shown_unit(p.unit, robot)
         value, low, high = (f"{scale * x:.4g}" for x in (p.value, p.low, p.high))
         known = "" if p.identified else "not identified"
-        table.add_row(_title(p), value, f"{low} to {high}", unit, known)
-    return table
+        rows.append((_title(p), value, f"{low} to {high}", unit, known))
+    return Table(("parameter", "value", "95 % interval", "unit", ""), rows)
 
 
 def _title(parameter: Parameter) -> str:
     return f"{parameter.name}, {parameter.motor}" if parameter.motor else parameter.name
 
 
-def _held_out_table(found: Calibration, robot: Robot) -> Table:
-    scale, unit = shown_unit("rad", robot) if found.used_readings else (1e3, "mm")
-    names = robot.motor_names if found.used_readings else ["x", "y", "z"]
-    table = Table(box=None, pad_edge=False)
-    table.add_column("session")
-    table.add_column("movements")
-    for name in names:
-        table.add_column(f"{name} [{unit}]")
-    table.add_column("gain [nats a movement]")
+def channels(robot: Robot, of_motors: bool) -> tuple[list[str], float, str]:
+    """Return the name of each motor or tool axis, factor and name of the unit that people read."""
+    if not of_motors:
+        return [f"tool {axis}" for axis in AXES], 1e3, "mm"
+    scale, unit = shown_unit("rad", robot)
+    return [name.replace("_", " ") for name in robot.motor_names], scale, unit
+
+
+def held_out_table(found: Calibration, robot: Robot) -> Table:
+    """Return the settled error of each unseen session, uncalibrated and predicted, and the gain."""
+    names, scale, unit = channels(robot, found.used_readings)
+    rows = []
     for entry in found.held_out:
-        cells = [
-            f"{scale * before:.2f} -> {scale * after:.2f}"
-            for before, after in zip(entry.before, entry.after, strict=True)
-        ]
+        pairs = scale * np.array([entry.before, entry.after]).T
+        cells = (f"{before:.2f} -> {after:.2f}" for before, after in pairs)
         gain = f"{entry.gain:+.2f} +- {1.96 * entry.gain_error:.2f}"
-        table.add_row(entry.session, str(entry.movements), *cells, gain)
-    return table
+        rows.append((entry.session, str(entry.movements), *cells, gain))
+    settled = (f"{name} [{unit}]" for name in names)
+    return Table(("session", "movements", *settled, "gain [nats a movement]"), rows)
 
 
 def left_out_line(found: Calibration) -> str:
@@ -79,27 +75,28 @@ def _counted(count: int, whole_run: bool, motor: str, reason: str) -> str:
     return f"{count} {what}: {motor} {reason}" if motor else f"{count} {what}: {reason}"
 
 
-def beats_uncalibrated(found: Calibration) -> bool:
-    """Return False if unseen sessions say that the calibration is no better than none."""
+def beats_uncalibrated(found: Calibration) -> bool | None:
+    """Return whether unseen sessions say that the calibration is better than none; None: no say."""
     if not found.held_out:
-        return True
+        return None
     gain, error = mean_gain(found.held_out)
     return gain - error > 0.0
 
 
 def verdict_line(found: Calibration) -> str:
     """Return whether the fit beats the uncalibrated twin on sessions that it has not seen."""
-    if not found.held_out:
+    better = beats_uncalibrated(found)
+    if better is None:
         return (
             "not checked on unseen logs: it takes two sessions, each long enough to learn from. "
             "Record another day and calibrate on both."
         )
     gain, error = mean_gain(found.held_out)
-    told = f"{gain:+.2f} nats a movement (95 % interval {gain - error:+.2f} to {gain + error:+.2f})"
-    if beats_uncalibrated(found):
-        return f"on unseen sessions the calibrated twin beats the uncalibrated one: {told}"
+    nats = f"{gain:+.2f} nats a movement (95 % interval {gain - error:+.2f} to {gain + error:+.2f})"
+    if better:
+        return f"on unseen sessions the calibrated twin beats the uncalibrated one: {nats}"
     return (
-        f"on unseen sessions the calibration does NOT beat the uncalibrated twin: {told}. Do not "
+        f"on unseen sessions the calibration does NOT beat the uncalibrated twin: {nats}. Do not "
         "use it; record more healthy logs."
     )
 
@@ -125,9 +122,8 @@ MEANING = {
     "ramp shortening, mean over runs": "share of its time by which a ramp ends early",
     "lag": "time constant of a first-order lag on top of the servo loop",
     "late starts": "movements that start late, all motors together",
-    "late start, least": "the shortest delay of a late start",
-    "late start, most": "the longest delay of a late start",
-    "readings stop before a late start": "time after the movement before; interval of single gaps",
+    "late start, median": "the median delay of a late start",
+    "readings stop, median": "time from a movement to the last reading before a late one",
     "lost commands": "movements on time for which a motor does not get its command",
     "lost commands when late": "the same for movements that start late",
     "spoilt readings": "readings that are missing or out of range",

@@ -13,13 +13,11 @@ import sys
 import click
 
 from failuretwin import __version__
-from failuretwin.app.commands.calibrate import calibrate
 from failuretwin.app.commands.data import import_, simulate
-from failuretwin.app.commands.diagnose import diagnose
-from failuretwin.app.commands.evaluate import evaluate
+from failuretwin.app.commands.diagnose import diagnose, evaluate
+from failuretwin.app.commands.learn import calibrate, study, train
 from failuretwin.app.commands.live import emulate, watch
 from failuretwin.app.commands.robot import robot
-from failuretwin.app.commands.train import study, train
 from failuretwin.core.errors import FailureTwinError
 
 

@@ -24,26 +24,23 @@ from failuretwin.data_knowledge.raw_sessions import SESSION_FILES, As
 from failuretwin.data_knowledge.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.step_tests import find_step_tests, read_step_test
 from failuretwin.data_knowledge.store import replacing
-from failuretwin.decision.learned.diagnoser import Diagnoser, HybridDiagnoser
+from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.digital_model.calibrated_robot import with_loops
 from failuretwin.digital_model.nonidealities import GENERIC_NAME
 from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.protocol import Diagnoser, diagnoser_from_text
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
 
-TOLD_ERROR_M = 1e-6
+REPORTED_ERROR_M = 1e-6
 """Error of recovered commands that the user is told of [m]; exact ones are below 1e-9."""
 
 
-def read_inputs(
-    sources: Sequence[Path],
-    robot: Robot,
-    reading: LogOptions,
-) -> xr.Dataset:
+def read_inputs(sources: Sequence[Path], robot: Robot, reading: LogOptions) -> xr.Dataset:
     """Return the runs of all inputs as one run set."""
     options = ReadOptions(
         cast(As, reading.how), reading.published_labels, approximate=reading.approximate
@@ -52,7 +49,7 @@ def read_inputs(
         options = _with_map(options, reading.columns, sources, robot)
     runs = read_runs(list(sources), robot, options)
     error = float(runs.attrs.get(RECOVERY_ERROR, 0.0))
-    if error > TOLD_ERROR_M:
+    if error > REPORTED_ERROR_M:
         click.echo(
             f"note: approximate commands miss the desired path by up to {1000 * error:.1f} mm "
             f"(worst: {runs.attrs[RECOVERY_WORST]}); a diagnosis can be no better than that",
@@ -61,32 +58,18 @@ def read_inputs(
     return runs
 
 
-def tell_mismatch(runs: xr.Dataset, expected: str) -> None:
-    """Tell the user where simulated runs lack the imperfections that a diagnoser expects.
-
-    Args:
-        runs: The run set.
-        expected: Name of those imperfections.
-    """
-    made_with = _made_with(runs)
-    if made_with is not None and made_with != expected and expected != GENERIC_NAME:
+def warn_mismatch(runs: xr.Dataset, expected: str) -> None:
+    """Tell the user where simulated runs lack the imperfections (by name) that are expected."""
+    try:
+        made_with = json.loads(runs.attrs["configuration"])["imperfections"]
+    except (KeyError, TypeError, ValueError):  # a run set of other people may say anything there
+        return
+    if isinstance(made_with, str) and expected not in (made_with, GENERIC_NAME):
         click.echo(
             f"note: the runs were simulated with imperfections '{made_with}', the diagnosis "
             f"expects '{expected}'; there will be false alarms",
             err=True,
         )
-
-
-def _made_with(runs: xr.Dataset) -> str | None:
-    """Return the imperfections that runs were simulated with; None for any other run set."""
-    try:
-        configuration = json.loads(runs.attrs.get("configuration", ""))
-    except (TypeError, ValueError):  # a run set of other people may say anything there
-        return None
-    if not isinstance(configuration, dict):
-        return None
-    made_with = configuration.get("imperfections")
-    return made_with if isinstance(made_with, str) else None
 
 
 def _with_map(
@@ -139,12 +122,8 @@ BLEND = f"{BAYES}+"
 """What stands before the file of a network that is blended with it."""
 
 
-def told_hypotheses(text: str | None, robot: Robot) -> tuple[Hypothesis, ...] | None:
-    """Return the hypotheses that the user names; None where none are named.
-
-    Args:
-        text: Hypotheses in their text form, separated by commas.
-        robot: The robot, for the names of its motors.
+def parse_cli_hypotheses(text: str | None, robot: Robot) -> tuple[Hypothesis, ...] | None:
+    """Return the hypotheses that the user names, separated by commas; None where none are.
 
     Raises:
         InputError: If one cannot be read, or there is only one, which would always be certain.
@@ -166,55 +145,54 @@ def chosen_diagnoser(
     """Return the diagnoser that the user names.
 
     Args:
-        method: ``bayes``, the file of a network, or ``bayes+`` and that file.
+        method: ``bayes``, the file of a network, ``bayes+`` and that file, or ``module:Class`` of
+            the user's own.
         bayes: The Bayesian diagnoser.
         settings: Options by name that belong to it alone; None where not given.
 
     Raises:
-        InputError: If one of those is given with a network, the file is no network for this robot
-            or was never fitted to be blended, or the extra `learn` is missing.
+        InputError: If one of those is given with another method, the file is no network for this
+            robot or was never fitted to be blended, the extra `learn` is missing, or there is no
+            such class.
     """
     if method == BAYES:
         return bayes
-    network = _network(Path(method.removeprefix(BLEND)), bayes.twin.robot, settings)
-    if not method.startswith(BLEND):
-        return network
+    path = Path(method.removeprefix(BLEND))
+    own = ":" in method and path.suffix != ".npz" and not path.exists()
+    if not own and not path.exists():
+        raise InputError(
+            f"--method {path}: is neither 'bayes', nor a file that exists, nor module:Class. Train "
+            f"a network with `failuretwin train --out {path.with_suffix('.npz')}`."
+        )
+    given = [name for name, value in settings.items() if value is not None]
+    if given:
+        raise InputError(
+            f"{', '.join(given)}: only the Bayesian diagnosis can be told that; a network has "
+            "learned what it knows. Leave that out, or use --method bayes."
+        )
+    if own:
+        return diagnoser_from_text(method, bayes.twin)
+    check_learning()
+    from failuretwin.decision.learned.storage import load_network
+
+    network = load_network(path, bayes.twin.robot)
+    return _pooled(network, bayes, path) if method.startswith(BLEND) else network
+
+
+def _pooled(network: LearnedDiagnoser, bayes: BayesDiagnoser, path: Path) -> HybridDiagnoser:
     if network.weights_ is None:
         raise InputError(
-            f"{method.removeprefix(BLEND)}: how it weighs beside Bayes was never fitted. Train it "
+            f"{path}: how it weighs beside Bayes was never fitted. Train it "
             "with `failuretwin train`, or use it alone."
         )
     return HybridDiagnoser(bayes, network, network.weights_)
 
 
-def _network(path: Path, robot: Robot, settings: Mapping[str, object]) -> LearnedDiagnoser:
-    if not path.exists():
-        raise InputError(
-            f"--method {path}: is neither 'bayes' nor a file that exists. Train a network with "
-            f"`failuretwin train --out {path.with_suffix('.npz')}`."
-        )
-    given = [name for name, value in settings.items() if value is not None]
-    if given:
-        raise InputError(
-            f"{', '.join(given)}: a network has learned what it knows, and cannot be told more. "
-            "Leave that out, or use --method bayes."
-        )
-    check_learning()
-    from failuretwin.decision.learned.storage import load_network
-
-    return load_network(path, robot)
-
-
 def expected_name(diagnoser: Diagnoser, bayes: BayesDiagnoser) -> str:
-    """Return the name of the healthy behaviour that a diagnoser expects.
-
-    Args:
-        diagnoser: As `chosen_diagnoser` gave it.
-        bayes: The Bayesian diagnoser, which is it or a part of it unless it is a network.
-    """
+    """Return the name of the healthy behaviour that a diagnoser of `chosen_diagnoser` expects."""
     encoder = getattr(diagnoser, "encoder", None)
     if encoder is None:
-        return bayes.healthy_model.imperfections.name
+        return GENERIC_NAME  # a class of the user's own: not known, so nothing to warn of
     return encoder.expected.name if encoder.expected else "none"
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
+import sys
 import time
 from collections import deque
 from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -19,17 +20,19 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from failuretwin.app.shadow import SILENCE_S, Change, Changes, Moment, Shadow
-from failuretwin.connection.links.base import LinkCounts, Pace, Sink, Source
-from failuretwin.connection.links.diagnostics import (
+from failuretwin.app.commands.options import LiveOptions
+from failuretwin.app.shadow import SILENCE_S, Change, Changes, Shadow, Snapshot
+from failuretwin.connection.links.base import LinkCounts, Pace, Sink, Source, source_from_text
+from failuretwin.connection.links.ros_messages import (
     LEVEL_ERROR,
     LEVEL_NAMES,
     LEVEL_OK,
     LEVEL_STALE,
     LEVEL_WARN,
+    RosTopics,
+    load_topics,
     statuses,
 )
-from failuretwin.connection.links.ros_messages import RosTopics, load_topics
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.bags.messages import BagTopics
 from failuretwin.digital_model.calibrated_robot import load_calibration
@@ -39,48 +42,34 @@ from failuretwin.failure_behavior.injection import ScheduledFault
 EMULATED, ROS1, ROSBRIDGE = "emulated", "ros1", "rosbridge"
 ROSBRIDGE_PORT = 9090
 """Where rosbridge servers listen unless told otherwise."""
-SOURCES = f"{EMULATED}, {ROS1}, {ROSBRIDGE}://HOST[:PORT], or a log (raw session, bag, .mcap)"
-
-
-@dataclass(frozen=True)
-class EmulationOptions:
-    """What the command line says of an emulated robot.
-
-    Attributes:
-        faults: Faults in text form, such as ``motor_3:stuck@40-80``.
-        imperfections: Name or file; None: those of the robot's profile, if any.
-        duration_s: How long it works [s]; infinity: until it is interrupted.
-        seed: Seed of all chance.
-    """
-
-    faults: Sequence[str] = ()
-    imperfections: str | None = None
-    duration_s: float = math.inf
-    seed: int = 0
+SOURCES = (
+    f"{EMULATED}, {ROS1}, {ROSBRIDGE}://HOST[:PORT], a log (raw session, bag, .mcap), or a source "
+    "of your own, MODULE:CLASS"
+)
+OWN_CLASS = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(:.*)?")
+"""How the class of a source of one's own is named, see `source_from_text`."""
 
 
 def emulated_robot(
-    robot: Robot, options: EmulationOptions, pace: Pace, zero_s: float = 0.0
+    robot: Robot, live: LiveOptions, seed: int, pace: Pace, duration_s: float, zero_s: float = 0.0
 ) -> Source:
-    """Return an emulated robot as a source.
-
-    Args:
-        robot: The robot.
-        options: What the command line says of it.
-        pace: How fast its time passes.
-        zero_s: What its clock says at the start [s].
-    """
+    """Return an emulated robot; it works for `duration_s` and its clock starts at `zero_s` [s]."""
     from failuretwin.connection.emulated_arm import Emulation, emulated
 
     own = "none" if robot.imperfections_file is None else robot.name
-    known = load_calibration(options.imperfections or own, robot)
+    known = load_calibration(live.imperfections or own, robot)
     emulation = Emulation(
         robot=known.robot,
         imperfections=known.imperfections,
-        schedule=tuple(ScheduledFault.parse(text, robot.motor_names) for text in options.faults),
-        seed=options.seed,
+        schedule=schedule_of(live, robot),
+        seed=seed,
     )
-    return emulated(emulation, pace, options.duration_s, zero_s)
+    return emulated(emulation, pace, duration_s, zero_s)
+
+
+def schedule_of(live: LiveOptions, robot: Robot) -> tuple[ScheduledFault, ...]:
+    """Return the faults of an emulated robot."""
+    return tuple(ScheduledFault.parse(text, robot.motor_names) for text in live.faults)
 
 
 def topics_of(path: Path | None) -> RosTopics:
@@ -88,44 +77,27 @@ def topics_of(path: Path | None) -> RosTopics:
     return RosTopics() if path is None else load_topics(path)
 
 
-@dataclass(frozen=True)
-class Connections:
-    """A robot to be watched, and where its diagnosis is published.
-
-    Attributes:
-        source: The robot.
-        sinks: Its network, where it has one.
-    """
-
-    source: Source
-    sinks: tuple[Sink, ...] = ()
-
-
 def connect(
-    text: str,
-    robot: Robot,
-    topics: RosTopics,
-    emulation: EmulationOptions,
-    pace: Pace,
-    stack: ExitStack,
-) -> Connections:
-    """Return what a SOURCE on the command line stands for.
+    text: str, robot: Robot, live: LiveOptions, seed: int, stack: ExitStack
+) -> tuple[Source, list[Sink]]:
+    """Return what a SOURCE on the command line stands for, and where its network publishes.
 
     Args:
         text: One of `SOURCES`.
         robot: The robot.
-        topics: Its topics on a network.
-        emulation: What an emulated robot is like.
-        pace: How fast time passes in logs and emulation.
+        live: Its topics on a network, what an emulated robot is like, and the pace of time.
+        seed: Seed of all chance of an emulated robot.
         stack: Closes everything in the end.
 
     Raises:
         InputError: If it does not exist, cannot be reached, is none of these, or is told what only
             an emulated robot does.
     """
+    topics, pace = topics_of(live.topics), Pace(live.speed)
     if text == EMULATED:
-        return Connections(stack.enter_context(emulated_robot(robot, emulation, pace)))
-    if emulation.faults or emulation.imperfections:
+        source = emulated_robot(robot, live, seed, pace, live.duration or math.inf)
+        return stack.enter_context(source), []
+    if live.faults or live.imperfections:
         raise InputError(
             f"--fault and --imperfections are of an emulated robot, but the source is {text!r}. "
             f"Leave them out, or watch {EMULATED!r}."
@@ -137,25 +109,26 @@ def connect(
     from failuretwin.connection.links.recording import replay
 
     path = Path(text)
+    if OWN_CLASS.fullmatch(text) and not path.exists():
+        sys.path.insert(0, "")  # the user's module may lie in the folder that the user is in
+        return stack.enter_context(source_from_text(text, robot)), []
     if not path.exists():
         raise InputError(f"source {text!r} does not exist. Expected {SOURCES}.")
-    named = None if topics == RosTopics() else _bag_topics(topics)
-    return Connections(stack.enter_context(replay(path, robot, pace, named)))
+    recorded = BagTopics(topics.command, topics.tool or None, topics.position or None)
+    named = None if topics == RosTopics() else recorded
+    return stack.enter_context(replay(path, robot, pace, named)), []
 
 
-def _bag_topics(topics: RosTopics) -> BagTopics:
-    """Return the topics of a network as those of a recording of it."""
-    return BagTopics(topics.command, topics.tool or None, topics.position or None)
-
-
-def _ros1(robot: Robot, topics: RosTopics, stack: ExitStack) -> Connections:
+def _ros1(robot: Robot, topics: RosTopics, stack: ExitStack) -> tuple[Source, list[Sink]]:
     from failuretwin.connection.links.ros1 import Ros1Diagnostics, Ros1Source
 
     source = stack.enter_context(Ros1Source(robot, topics))
-    return Connections(source, (stack.enter_context(Ros1Diagnostics(robot, topics)),))
+    return source, [stack.enter_context(Ros1Diagnostics(robot, topics))]
 
 
-def _rosbridge(text: str, robot: Robot, topics: RosTopics, stack: ExitStack) -> Connections:
+def _rosbridge(
+    text: str, robot: Robot, topics: RosTopics, stack: ExitStack
+) -> tuple[Source, list[Sink]]:
     from failuretwin.connection.links import rosbridge
 
     try:
@@ -169,7 +142,7 @@ def _rosbridge(text: str, robot: Robot, topics: RosTopics, stack: ExitStack) -> 
     stack.callback(rosbridge.disconnect, ros)
     source = stack.enter_context(rosbridge.RosbridgeSource(robot, topics, ros))
     sink = stack.enter_context(rosbridge.RosbridgeDiagnostics(robot, topics, ros))
-    return Connections(source, (sink,))
+    return source, [sink]
 
 
 # The live view on a terminal: motors, residual, posterior over time, what changed.
@@ -193,12 +166,7 @@ SHOWN_CHANGES = 8
 
 
 class View:
-    """Draws what the shadow knows.
-
-    Args:
-        motors: Names of the robot's motors in chain order.
-        source: What the robot is called.
-    """
+    """Draws what the shadow knows."""
 
     def __init__(self, motors: Sequence[str], source: str) -> None:
         self._motors = motors
@@ -206,56 +174,52 @@ class View:
         self._history: deque[dict[str, float]] = deque(maxlen=COLUMNS)
         self._next_s = -np.inf
 
-    def remember(self, moment: Moment) -> None:
-        """Take a moment into the posterior over time; time without any is a gap."""
-        now_s = moment.stream_time
+    def remember(self, snapshot: Snapshot) -> None:
+        """Take a snapshot into the posterior over time; time without any is a gap."""
+        now_s = snapshot.stream_time
         if now_s < self._next_s:
             return
         if np.isfinite(self._next_s):
             missing = int((now_s - self._next_s) / COLUMN_S)
             self._history.extend([{}] * min(missing, COLUMNS))
         self._next_s = now_s + COLUMN_S
-        diagnosis, stale = moment.answer.diagnosis, moment.answer.state != "OK"
+        diagnosis, stale = snapshot.answer.diagnosis, snapshot.answer.state != "OK"
         known = diagnosis is not None and not stale
         self._history.append(dict(diagnosis.posterior) if known and diagnosis else {})
 
-    def draw(self, moment: Moment, counts: LinkCounts, changes: Sequence[Change]) -> RenderableType:
-        """Return the view of a moment.
-
-        Args:
-            moment: What the shadow knows.
-            counts: What the link has seen.
-            changes: What has changed so far, the newest last.
-        """
+    def draw(
+        self, snapshot: Snapshot, counts: LinkCounts, changes: Sequence[Change]
+    ) -> RenderableType:
+        """Return the view of what is known now; of the changes the newest is the last."""
         lines = [Text(str(change)) for change in list(changes)[-SHOWN_CHANGES:]]
         return Group(
-            self._head(moment, counts),
-            self._motor_table(moment),
+            self._head(snapshot, counts),
+            self._motor_table(snapshot),
             Panel(self._posterior(), title=f"posterior, last {COLUMNS} s", title_align="left"),
             Panel(Group(*lines), title="what changed", title_align="left"),
         )
 
-    def _head(self, moment: Moment, counts: LinkCounts) -> Text:
-        arm = statuses(moment.answer, self._motors)[0]
+    def _head(self, snapshot: Snapshot, counts: LinkCounts) -> Text:
+        arm = statuses(snapshot.answer, self._motors)[0]
         head = Text(f"{LEVEL_NAMES[arm.level]:6s}", STYLES[arm.level])
         head.append(f" {arm.message}\n", "default")
-        off = float(np.linalg.norm(moment.residual)) * 1000.0
+        off = float(np.linalg.norm(snapshot.residual)) * 1000.0
         share = 0.0 if np.isnan(off) else min(1.0, off / RESIDUAL_MM)
         said = "no reading" if np.isnan(off) else f"{off:5.1f} mm off the reference"
         head.append(
-            f"{self._source}  {moment.stream_time:.1f} s  {counts.received} events, "
+            f"{self._source}  {snapshot.stream_time:.1f} s  {counts.received} events, "
             f"{counts.garbage} garbage, {counts.dropped} dropped, {counts.reconnects} reconnects, "
-            f"{1000 * moment.seconds:.1f} ms a sample\n",
+            f"{1000 * snapshot.seconds:.1f} ms a sample\n",
             "dim",
         )
         head.append(f"tool   {_bar(share)} {said}", "default")
         return head
 
-    def _motor_table(self, moment: Moment) -> Table:
+    def _motor_table(self, snapshot: Snapshot) -> Table:
         table = Table(box=None, pad_edge=False)
         for name in ("motor", "state", "faulty", "", "how"):
             table.add_column(name)
-        for status in statuses(moment.answer, self._motors)[1:]:
+        for status in statuses(snapshot.answer, self._motors)[1:]:
             probability = float(status.values.get("probability", 0.0))
             table.add_row(
                 status.name,
@@ -310,18 +274,9 @@ def watch_until_end(
     console: Console,
     until_s: float,
 ) -> Changes:
-    """Watch a robot; on a terminal with a live view, else with a line for each change.
+    """Watch a robot until `until_s` of our monotonic clock [s], and return all that has changed.
 
-    Args:
-        shadow: The shadow of the robot.
-        source: The robot.
-        sinks: Where the shadow tells what it knows.
-        motors: Names of the robot's motors in chain order.
-        console: Where to draw.
-        until_s: When to stop, by our own monotonic clock [s].
-
-    Returns:
-        All that has changed.
+    On a terminal there is a live view, else a line for each change.
     """
     changes, view = Changes(motors), View(motors, source.name)
     live = Live(console=console, auto_refresh=False) if console.is_terminal else nullcontext()
@@ -331,14 +286,15 @@ def watch_until_end(
         while going:
             going = shadow.step(POLL_S) and time.monotonic() < until_s
             troubles = _troubles(shadow, source, sinks, time.monotonic() - begun_s)
-            found = changes.notice(shadow.moment, source.counts, shadow.clock_jumps, troubles)
+            found = changes.notice(shadow.snapshot, source.counts, shadow.clock_jumps, troubles)
             if shown is None:
-                _print(found)
+                for change in found:
+                    click.echo(str(change))
                 continue
-            view.remember(shadow.moment)
+            view.remember(shadow.snapshot)
             if not going or time.monotonic() >= drawn_s + REFRESH_S:
                 drawn_s = time.monotonic()
-                picture = view.draw(shadow.moment, source.counts, changes.lines)
+                picture = view.draw(shadow.snapshot, source.counts, changes.lines)
                 shown.update(picture, refresh=True)
     return changes
 
@@ -346,14 +302,7 @@ def watch_until_end(
 def _troubles(
     shadow: Shadow, source: Source, sinks: Sequence[Sink], since_s: float
 ) -> tuple[str, ...]:
-    """Return what keeps the diagnosis from being made or told.
-
-    Args:
-        shadow: The shadow of the robot.
-        source: The robot.
-        sinks: Where the shadow tells what it knows.
-        since_s: For how long the robot has been listened to [s].
-    """
+    """Return what keeps the diagnosis from being made or told, after listening for so long [s]."""
     found = [sink.trouble for sink in sinks if sink.trouble]
     if source.counts.received == 0 and since_s > SILENCE_S:
         found.append(f"nothing comes from {source.name}")
@@ -361,8 +310,3 @@ def _troubles(
         wait = math.ceil(2.0 * shadow.late_s) / 2.0
         found.append(f"commands come late: put commands_late_s = {wait} into the --topics file")
     return tuple(found)
-
-
-def _print(found: Sequence[Change]) -> None:
-    for change in found:
-        click.echo(str(change))

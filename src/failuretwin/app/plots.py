@@ -1,4 +1,4 @@
-"""Pictures of diagnosed runs that a technician understands. Needs the extra `plots`."""
+"""Pictures and the page of diagnosed runs, and what all pages share. Needs the extra `plots`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import base64
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,14 +19,12 @@ from failuretwin.core.runs import AXES, unique_names
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.failure_modes import plain_name
 from failuretwin.data_knowledge.store import filling
-from failuretwin.decision.evaluation import Evaluation
+from failuretwin.decision.evaluation import Evaluation, Judged, as_unknown_line, score_line
 from failuretwin.decision.metrics import Reliability, Share, judged_truth
-from failuretwin.decision.results import as_unknown_line, score_line
 from failuretwin.digital_model.twin import DigitalTwin
 
 if TYPE_CHECKING:
     import xarray as xr
-    from jinja2 import Environment
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -51,20 +49,17 @@ def figure_class() -> Any:
     return Figure
 
 
+def png(figure: Figure) -> str:
+    """Return a figure as a PNG file in base64, as pages hold it."""
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=130)
+    return base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
 def plot_runs(
     runs: xr.Dataset, diagnoses: Sequence[Diagnosis], twin: DigitalTwin, folder: Path
 ) -> list[Path]:
-    """Write a picture of each run into `folder`.
-
-    Args:
-        runs: The run set.
-        diagnoses: Diagnosis of each of its runs, in its order.
-        twin: Kinematics, for the path that the commands ask for.
-        folder: Where the pictures go.
-
-    Raises:
-        InputError: If matplotlib is missing.
-    """
+    """Write a picture of each run into `folder`; diagnoses are in the order of the runs."""
     time = as_floats(runs["time"].values)
     written = []
     stems = unique_names([re.sub(r"[^\w.+-]+", "_", diagnosis.run) for diagnosis in diagnoses])
@@ -80,7 +75,7 @@ def plot_runs(
 def run_figure(
     time: FloatArray, desired: FloatArray, measured: FloatArray, diagnosis: Diagnosis
 ) -> Figure:
-    """Return the picture of one run.
+    """Return the picture of one run: each axis, the distance, and the posterior.
 
     Args:
         time: (time,) [s].
@@ -91,63 +86,39 @@ def run_figure(
     figure = figure_class()(figsize=(11.0, 6.2), layout="constrained")
     seen = np.asarray(np.isfinite(measured).all(axis=1))
     shown = slice(0, len(time) - int(np.argmax(seen[::-1])) if seen.any() else len(time))
-    time, desired, measured, seen = time[shown], desired[shown], measured[shown], seen[shown]
+    time, desired, measured = time[shown], MM_PER_M * desired[shown], MM_PER_M * measured[shown]
+    dense = seen[shown].mean() > 0.95
+    style = {"ls": "-", "lw": 1.2} if dense else {"ls": "none", "marker": ".", "ms": 4}
     grid = figure.add_gridspec(4, 2, width_ratios=[2.1, 1.0])
-    style = {"ls": "-", "lw": 1.2} if seen.mean() > 0.95 else {"ls": "none", "marker": ".", "ms": 4}
-    for row, axis in enumerate(AXES):
-        panel = figure.add_subplot(grid[row, 0])
-        _plot_axis(panel, axis, time, desired[:, row], measured[:, row], style)
-        if row == 0:
-            panel.legend(
-                loc="lower right", bbox_to_anchor=(1.0, 0.98), fontsize=8, ncols=2, frameon=False
-            )
-    _plot_residual(figure.add_subplot(grid[3, 0]), time, desired, measured, diagnosis, style)
+    panels = [figure.add_subplot(grid[row, 0]) for row in range(4)]
+    for row, (panel, axis) in enumerate(zip(panels, AXES, strict=False)):
+        panel.plot(time, desired[:, row], color=GREY, lw=2.0, label="commanded")
+        panel.plot(time, measured[:, row], color=BLUE, label="measured", **style)
+        panel.set_ylabel(f"tool {axis} [mm]")
+        panel.tick_params(labelbottom=False)
+    panels[0].legend(
+        loc="lower right", bbox_to_anchor=(1.0, 0.98), fontsize=8, ncols=2, frameon=False
+    )
+    panels[3].plot(time, np.linalg.norm(measured - desired, axis=1), color=RED, **style)
+    _mark_onset(panels[3], diagnosis.onset_s)
+    for panel in panels:
+        panel.set_xlim(-0.02 * time[-1], 1.02 * time[-1])
+        clean(panel)
     _plot_posterior(figure.add_subplot(grid[:, 1]), diagnosis)
-    truth = "" if diagnosis.truth is None else f"\n(truth: {_plain(diagnosis.truth)})"
+    truth = "" if diagnosis.truth is None else f"\n(truth: {plain(diagnosis.truth)})"
     title = textwrap.fill(diagnosis.verdict, TITLE_COLUMNS) + truth
     figure.suptitle(title, fontsize=12, fontweight="bold")
     return figure
 
 
-def _plot_axis(
-    panel: Axes,
-    axis: str,
-    time: FloatArray,
-    desired: FloatArray,
-    measured: FloatArray,
-    style: Mapping[str, Any],
-) -> None:
-    panel.plot(time, MM_PER_M * desired, color=GREY, lw=2.0, label="commanded")
-    panel.set_xlim(*_span(time))
-    panel.plot(time, MM_PER_M * measured, color=BLUE, label="measured", **style)
-    panel.set_ylabel(f"tool {axis} [mm]")
-    panel.tick_params(labelbottom=False)
-    clean(panel)
-
-
-def _plot_residual(
-    panel: Axes,
-    time: FloatArray,
-    desired: FloatArray,
-    measured: FloatArray,
-    diagnosis: Diagnosis,
-    style: Mapping[str, Any],
-) -> None:
-    distance = MM_PER_M * np.linalg.norm(measured - desired, axis=1)
-    panel.plot(time, distance, color=RED, **style)
-    panel.set_xlim(*_span(time))
+def _mark_onset(panel: Axes, onset_s: float | None) -> None:
     panel.set_ylabel("off by [mm]")
     panel.set_xlabel("time [s]")
     panel.set_ylim(bottom=0.0)
-    if diagnosis.onset_s:
-        panel.axvline(diagnosis.onset_s, color="black", lw=1.0, ls="--")
-        panel.annotate(
-            " fault begins",
-            (diagnosis.onset_s, 0.85),
-            xycoords=("data", "axes fraction"),
-            fontsize=8,
-        )
-    clean(panel)
+    if onset_s:
+        panel.axvline(onset_s, color="black", lw=1.0, ls="--")
+        at = ("data", "axes fraction")
+        panel.annotate(" fault begins", (onset_s, 0.85), xycoords=at, fontsize=8)
 
 
 def _plot_posterior(panel: Axes, diagnosis: Diagnosis) -> None:
@@ -155,7 +126,7 @@ def _plot_posterior(panel: Axes, diagnosis: Diagnosis) -> None:
     values = [100.0 * diagnosis.posterior[name] for name in names]
     colours = [BLUE if name == diagnosis.diagnosis else GREY for name in names]
     panel.barh(range(len(names)), values, color=colours)
-    panel.set_yticks(range(len(names)), [_plain(name) for name in names], fontsize=9)
+    panel.set_yticks(range(len(names)), [plain(name) for name in names], fontsize=9)
     panel.set_xlim(0.0, 115.0)
     panel.set_xticks([0, 50, 100])
     panel.set_xlabel("probability [%]")
@@ -165,13 +136,8 @@ def _plot_posterior(panel: Axes, diagnosis: Diagnosis) -> None:
     clean(panel)
 
 
-def _span(time: FloatArray) -> tuple[float, float]:
-    """Return the limits of the time axis [s], the same for every panel."""
-    margin = 0.02 * float(time[-1])
-    return -margin, float(time[-1]) + margin
-
-
-def _plain(hypothesis: str) -> str:
+def plain(hypothesis: str) -> str:
+    """Return a hypothesis as people say it."""
     return plain_name(Hypothesis.parse(hypothesis))
 
 
@@ -180,69 +146,59 @@ def clean(panel: Axes) -> None:
     panel.spines[["top", "right"]].set_visible(False)
 
 
-# One self-contained HTML page for the runs of a folder. Needs the extra `plots`.
+# Self-contained HTML pages.
 
 
-def write_page(
-    diagnoses: Sequence[Diagnosis], pictures: Sequence[Path], robot: str, path: Path
-) -> None:
-    """Write the page; pictures are part of it.
-
-    Args:
-        diagnoses: Diagnoses of the runs.
-        pictures: PNG file of each run, in the same order.
-        robot: Name of the robot.
-        path: HTML file to write.
-
-    Raises:
-        InputError: If jinja2 is missing.
-    """
-    template = (files("failuretwin.app") / "page.html.j2").read_text(encoding="utf-8")
-    page = environment().from_string(template)
-    records = [d.to_record() for d in diagnoses]
-    text = page.render(
-        runs=[_entry(d, picture) for d, picture in zip(diagnoses, pictures, strict=True)],
-        robot=robot,
-        method=diagnoses[0].method,
-        protocol=diagnoses[0].protocol,
-        version=__version__,
-        known=any(d.truth is not None for d in diagnoses),
-        score=score_line(records),
-        as_unknown=as_unknown_line(records),
-    )
-    path.write_text(text, encoding="utf-8")
-
-
-def environment() -> Environment:
-    """Return what renders the templates of pages; text in them is escaped.
+def render_page(template: str, values: Mapping[str, Any]) -> str:
+    """Return the page of a template beside this module; text in it is escaped.
 
     Raises:
         InputError: If jinja2 is missing.
     """
     try:
-        from jinja2 import Environment, StrictUndefined
+        from jinja2 import Environment, PackageLoader, StrictUndefined
     except ImportError as error:
         raise InputError(
-            f"pages need jinja2 ({error}). Install it: pip install 'failuretwin[plots]'."
+            f"pictures need jinja2 ({error}). Install it: pip install 'failuretwin[plots]'."
         ) from error
-    return Environment(autoescape=True, undefined=StrictUndefined)
+    loader = PackageLoader("failuretwin.app", "")
+    pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
+    return pages.get_template(template).render(values)
 
 
-def _entry(diagnosis: Diagnosis, picture: Path) -> dict[str, Any]:
-    truth = diagnosis.truth
-    return {
-        "name": diagnosis.run,
-        "verdict": diagnosis.verdict,
-        "truth": "" if truth is None else plain_name(Hypothesis.parse(truth)),
-        "wrong": truth is not None
-        and judged_truth(truth, diagnosis.posterior) != diagnosis.diagnosis,
-        "explanation": diagnosis.explanation,
-        "quality": diagnosis.quality,
-        "picture": base64.b64encode(picture.read_bytes()).decode("ascii"),
+def write_page(
+    diagnoses: Sequence[Diagnosis], pictures: Sequence[Path], robot: str, path: Path
+) -> None:
+    """Write the page of some runs, which holds the PNG file of each (in the same order)."""
+    judged = Judged.of(diagnoses)
+    values = {
+        "runs": [
+            (d, *_truth_cell(d), _embedded(p)) for d, p in zip(diagnoses, pictures, strict=True)
+        ],
+        "robot": robot,
+        "method": diagnoses[0].method,
+        "protocol": diagnoses[0].protocol,
+        "version": __version__,
+        "known": any(d.truth is not None for d in diagnoses),
+        "score": score_line(judged),
+        "as_unknown": as_unknown_line(judged),
     }
+    path.write_text(render_page("diagnoses.html.j2", values), encoding="utf-8")
 
 
-# Picture of the reliability diagram. Needs the extra `plots`.
+def _truth_cell(diagnosis: Diagnosis) -> tuple[str, bool]:
+    """Return the truth of a run in plain words, and whether the verdict is another."""
+    if diagnosis.truth is None:
+        return "", False
+    truth = judged_truth(diagnosis.truth, diagnosis.posterior)
+    return plain(diagnosis.truth), truth != diagnosis.diagnosis
+
+
+def _embedded(picture: Path) -> str:
+    return base64.b64encode(picture.read_bytes()).decode("ascii")
+
+
+# Picture of the reliability diagram.
 
 NAME = "reliability.png"
 """Name of the picture in its folder."""
@@ -256,22 +212,14 @@ def write_reliability(evaluation: Evaluation, folder: Path) -> None:
     """
     if evaluation.calibration is None:
         raise InputError("no run got a verdict, so there is no reliability to draw.")
-    title = f"{evaluation.scores.runs} runs, protocol {evaluation.protocol}"
+    title = f"{evaluation.scores.runs} runs, protocol {evaluation.judged.protocol}"
     figure = reliability_figure(evaluation.calibration.equal, title)
     with filling(folder) as partial:
         figure.savefig(partial / NAME, dpi=130)
 
 
 def reliability_figure(bins: Reliability, title: str) -> Figure:
-    """Return how often verdicts are right by how sure they are, and how many there are.
-
-    Args:
-        bins: The reliability diagram.
-        title: What it is of.
-
-    Raises:
-        InputError: If matplotlib is missing.
-    """
+    """Return how often verdicts are right by how sure they are, and how many there are."""
     figure = figure_class()(figsize=(5.6, 6.4), layout="constrained")
     grid = figure.add_gridspec(2, 1, height_ratios=[4.0, 1.0])
     upper = figure.add_subplot(grid[0])
@@ -280,8 +228,8 @@ def reliability_figure(bins: Reliability, title: str) -> Figure:
     lower.bar(bins.edges[:-1], bins.count, np.diff(bins.edges), align="edge", color=GREY, ec="w")
     lower.set_xlabel("stated probability of the verdict")
     lower.set_ylabel("runs")
-    for panel in (upper, lower):
-        panel.spines[["top", "right"]].set_visible(False)
+    clean(upper)
+    clean(lower)
     figure.suptitle(title, fontsize=11)
     return figure
 

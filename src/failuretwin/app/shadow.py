@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from failuretwin.connection.links.base import (
     OK,
@@ -23,10 +21,10 @@ from failuretwin.connection.links.base import (
     Source,
     StreamClock,
 )
-from failuretwin.connection.links.diagnostics import SURE, statuses
-from failuretwin.connection.links.live_commands import LiveReference, Sequencer
-from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.connection.links.live_events import LiveReference, ReorderBuffer
+from failuretwin.connection.links.ros_messages import SURE, statuses
 from failuretwin.core.types import FloatArray
+from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser
 from failuretwin.digital_model.twin import DigitalTwin
 
 SILENCE_S = 5.0
@@ -35,44 +33,8 @@ TICK_S = 0.5
 """Time without an event after which the diagnoser is told that time goes on [s]."""
 
 
-class Believed(Protocol):
-    """What a streaming diagnoser answers."""
-
-    @property
-    def time(self) -> float:
-        """Time of the stream [s]."""
-        ...
-
-    @property
-    def state(self) -> str:
-        """``OK`` or ``STALE``."""
-        ...
-
-    @property
-    def diagnosis(self) -> Diagnosis | None:
-        """The diagnosis; None where there is none yet."""
-        ...
-
-
-class Diagnoser(Protocol):
-    """A streaming diagnoser."""
-
-    def update(
-        self,
-        time: float,
-        command: Mapping[str, float] | ArrayLike | None,
-        measured: ArrayLike | None,
-    ) -> Believed:
-        """Take what is known at a time of the stream and return what is believed then."""
-        ...
-
-    def conclude(self) -> Believed:
-        """Return what is believed when all that has come counts."""
-        ...
-
-
 @dataclass(frozen=True)
-class Moment:
+class Snapshot:
     """What the shadow knows at one time.
 
     Attributes:
@@ -89,20 +51,15 @@ class Moment:
 
 
 class Shadow:
-    """Feeds a diagnoser from a source and tells sinks what was seen and what is believed.
+    """Feeds a diagnoser from a source and publishes what was seen and what is believed.
 
-    Args:
-        source: The robot.
-        diagnoser: The streaming diagnoser.
-        twin: Kinematics of the robot.
-        sinks: Where events and answers go.
-        commands_late_s: How much later than their stamps commands may arrive [s].
+    Commands may arrive `commands_late_s` [s] later than their stamps.
     """
 
     def __init__(
         self,
         source: Source,
-        diagnoser: Diagnoser,
+        diagnoser: StreamingDiagnoser,
         twin: DigitalTwin,
         sinks: Sequence[Sink] = (),
         commands_late_s: float = 0.0,
@@ -112,12 +69,12 @@ class Shadow:
         self._twin = twin
         self._sinks = sinks
         self._clock = StreamClock()
-        self._sequencer = Sequencer(commands_late_s)
+        self._sequencer = ReorderBuffer(commands_late_s)
         self._reference = LiveReference()
         self._read_s = -np.inf
         self._fed_s = time.monotonic()
         self._newest = 0.0
-        self.moment = Moment(
+        self.snapshot = Snapshot(
             Answer(self._clock.stamp(0.0), STALE, None), 0.0, np.full(3, np.nan), 0.0
         )
 
@@ -142,7 +99,7 @@ class Shadow:
             self._take(event)
         elif self._source.ended:
             self._feed_all(np.inf)
-            self._say(self._diagnoser.conclude(), self.moment.residual)
+            self._publish(self._diagnoser.conclude(), self.snapshot.residual)
             return False
         elif time.monotonic() - self._fed_s >= TICK_S:
             self._tick()
@@ -152,11 +109,11 @@ class Shadow:
         now_s = time.monotonic()
         for sink in self._sinks:
             sink.put(event)
-        at = self._clock.place(event.time, now_s)
+        at = self._clock.to_stream_time(event.time, now_s)
         self._newest = max(self._newest, at)
         self._sequencer.add(replace(event, time=at))
         self._feed_all(self._newest)
-        self.moment = replace(self.moment, seconds=time.monotonic() - now_s)
+        self.snapshot = replace(self.snapshot, seconds=time.monotonic() - now_s)
 
     def _tick(self) -> None:
         """Tell the diagnoser that time goes on without data."""
@@ -164,7 +121,7 @@ class Shadow:
         self._fed_s = now_s
         at = self._clock.at(now_s)
         self._feed_all(at)
-        self._say(self._diagnoser.update(at, None, None), self.moment.residual)
+        self._publish(self._diagnoser.update(at, None, None), self.snapshot.residual)
 
     def _feed_all(self, until: float) -> None:
         for event in self._sequencer.ready(until):
@@ -184,20 +141,20 @@ class Shadow:
                 self._diagnoser.update(at, angles, None)
             else:
                 command = angles
-        residual = self.moment.residual
+        residual = self.snapshot.residual
         if seen is not None:
             self._read_s = self._fed_s
             expected = np.full(3, np.nan) if command is None else self._twin.path(command)
             residual = seen - expected
-        self._say(self._diagnoser.update(reading.time, command, seen), residual)
+        self._publish(self._diagnoser.update(reading.time, command, seen), residual)
 
-    def _say(self, believed: Believed, residual: FloatArray) -> None:
+    def _publish(self, answer: Answer, residual: FloatArray) -> None:
         silent = time.monotonic() - self._read_s > SILENCE_S
-        state = STALE if silent or believed.state != OK else OK
-        answer = Answer(self._clock.stamp(believed.time), state, believed.diagnosis)
-        self.moment = Moment(answer, believed.time, residual, self.moment.seconds)
+        state = STALE if silent or answer.state != OK else OK
+        stamped = Answer(self._clock.stamp(answer.time), state, answer.diagnosis)
+        self.snapshot = Snapshot(stamped, answer.time, residual, self.snapshot.seconds)
         for sink in self._sinks:
-            sink.put(answer)
+            sink.put(stamped)
 
 
 # What changes, in words: faults found, repairs noticed, silence, trouble with the link.
@@ -226,11 +183,7 @@ class Change:
 
 
 class Changes:
-    """Notices changes from moment to moment.
-
-    Args:
-        motors: Names of the robot's motors in chain order.
-    """
+    """Notices changes from snapshot to snapshot."""
 
     def __init__(self, motors: list[str]) -> None:
         self.lines: deque[Change] = deque(maxlen=KEPT)
@@ -243,31 +196,24 @@ class Changes:
         self._garbage_at = -GARBAGE_EVERY_S
 
     def notice(
-        self, moment: Moment, counts: LinkCounts, jumps: int, troubles: tuple[str, ...]
+        self, snapshot: Snapshot, counts: LinkCounts, jumps: int, troubles: tuple[str, ...]
     ) -> list[Change]:
-        """Return what has changed since the last call.
-
-        Args:
-            moment: What the shadow knows.
-            counts: What the link has seen.
-            jumps: How often the robot's clock was set.
-            troubles: What keeps sinks from working.
-        """
-        texts = self._link(moment.stream_time, counts, jumps, troubles)
-        texts += self._silence(moment)
-        texts += self._diagnosis(moment)
-        found = [Change(moment.stream_time, text) for text in texts]
+        """Return what has changed since the last call."""
+        texts = self._link(snapshot.stream_time, counts, jumps, troubles)
+        texts += self._silence(snapshot)
+        texts += self._diagnosis(snapshot)
+        found = [Change(snapshot.stream_time, text) for text in texts]
         self.lines.extend(found)
         return found
 
-    def _silence(self, moment: Moment) -> list[str]:
-        before, self._state = self._state, moment.answer.state
+    def _silence(self, snapshot: Snapshot) -> list[str]:
+        before, self._state = self._state, snapshot.answer.state
         if not before or before == self._state:
             return []
         return ["no data any more" if self._state == STALE else "data are coming"]
 
-    def _diagnosis(self, moment: Moment) -> list[str]:
-        answer = moment.answer
+    def _diagnosis(self, snapshot: Snapshot) -> list[str]:
+        answer = snapshot.answer
         if answer.state == STALE or answer.diagnosis is None or answer.diagnosis.undecided:
             return []
         arm = statuses(answer, self._motors)[0]

@@ -11,12 +11,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.connection.calibration.observations import Observations, stayed
+from failuretwin.connection.calibration.observations import (
+    LEAST_SCATTER_RAD,
+    Observations,
+    SettlingRegression,
+    lost_command,
+)
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model.nonidealities import Variation
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, largest_load
-from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.healthy_model import PATH_NOISE_M
 
 # What one run says of the wear of the motors: a linear model with unit scatter.
@@ -24,8 +28,6 @@ from failuretwin.inference.healthy_model import PATH_NOISE_M
 DECIMALS = 6
 """Errors and designs are rounded to this many decimals of the scatter: short in a file, and a run
 read back from it is the run that was written."""
-LEAST_SCATTER_RAD = 1e-5
-"""Scatter assumed of motors that are said to have none [rad]; no reading is as fine."""
 KEY_DIGITS = 16
 
 
@@ -63,49 +65,13 @@ def run_evidence(
     """
     wanted = observations[np.isin(observations.run, np.asarray(runs))]
     expected = wanted.target + settling.offset(robot, wanted.target, wanted.direction)
-    lost = stayed(wanted, robot, expected)
+    kept = ~lost_command(wanted, robot, expected)
     if wanted.position is None:
-        error, design = _by_tool(wanted, robot, settling, expected)
-        kept = np.asarray(~lost.any(axis=1, keepdims=True))
-    else:
-        error, design = _by_readings(wanted, wanted.position, robot, settling)
-        kept = ~lost
+        kept = np.asarray(kept.all(axis=1, keepdims=True))
+    everywhere = np.ones_like(wanted.target)
+    regression = SettlingRegression.of(wanted, robot, everywhere, settling)
+    error, design = regression.whitened(settling, PATH_NOISE_M)
     return [_of_run(wanted, error, design, kept, run) for run in runs]
-
-
-def _by_tool(
-    seen: Observations, robot: Robot, settling: Settling, expected: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return white errors (movement, 1, axis) and designs (movement, 1, axis, 2 motor)."""
-    point, jacobian = DigitalTwin(robot).path_and_jacobian(expected)
-    short = np.asarray(settling.friction) * seen.direction
-    away = expected - seen.target + short
-    error = seen.point - point + np.einsum("iak,ik->ia", jacobian, away)
-    torque = robot.sense * robot.loads.torque(expected * robot.sense, settling.payload)
-    design = np.concatenate([jacobian, jacobian * torque[:, None]], axis=2)
-    scaled = jacobian * np.asarray(settling.scatter)
-    spread = np.einsum("iak,ibk->iab", scaled, scaled) + PATH_NOISE_M**2 * np.eye(3)
-    root = np.linalg.cholesky(spread)
-    white = np.linalg.solve(root, np.concatenate([error[..., None], design], axis=2))
-    return white[:, None, :, 0], white[:, None, :, 1:]
-
-
-def _by_readings(
-    seen: Observations, position: FloatArray, robot: Robot, settling: Settling
-) -> tuple[FloatArray, FloatArray]:
-    """Return white errors (movement, motor, 1) and designs (movement, motor, 1, 2 motor)."""
-    count = 0.0
-    if robot.profile.servo_units is not None:
-        count = abs(robot.servo_units.rad_per_count) / np.sqrt(12.0)
-    scale = np.sqrt(np.asarray(settling.scatter) ** 2 + count**2)
-    scale = np.maximum(scale, LEAST_SCATTER_RAD)
-    torque = robot.sense * robot.loads.torque(position * robot.sense, settling.payload)
-    error = position - seen.target + np.asarray(settling.friction) * seen.direction
-    unit = np.eye(position.shape[1])
-    design = np.concatenate(
-        [np.broadcast_to(unit, (len(seen), *unit.shape)), unit * torque[:, :, None]], axis=2
-    )
-    return (error / scale)[..., None], (design / scale[:, None])[:, :, None]
 
 
 def _of_run(
@@ -247,19 +213,27 @@ def learn(state: WearState, evidence: RunEvidence, dof: float) -> WearState:
     size = evidence.error.size
     if size == 0:
         return state
-    axes = evidence.error.shape[1]
-    design, error = evidence.design.reshape(size, -1), evidence.error.reshape(size)
-    cross = state.covariance @ design.T
-    spread = design @ cross
-    innovation, mean = error - design @ state.mean, state.mean
+    axes, root = evidence.error.shape[1], _root(state)
+    design = evidence.design.reshape(size, -1)
+    off, scaled = evidence.error.reshape(size) - design @ state.mean, design @ root
+    prior, change = np.eye(len(root)), np.zeros(len(root))
     for _ in range(ROUNDS):
-        weight = weights((error - design @ mean).reshape(-1, axes), dof)
-        mean = state.mean + cross @ np.linalg.solve(spread + np.diag(1.0 / weight), innovation)
+        weight = weights((off - scaled @ change).reshape(-1, axes), dof)[:, None]
+        known = (scaled * weight).T @ scaled + prior
+        change = as_floats(np.linalg.solve(known, (scaled * weight).T @ off))
         if np.isinf(dof):
             break
-    known = np.eye(size) / information(axes, dof)
-    covariance = state.covariance - cross @ np.linalg.solve(spread + known, cross.T)
-    return WearState(mean, 0.5 * (covariance + covariance.T))
+    spread = np.linalg.inv(information(axes, dof) * scaled.T @ scaled + prior)
+    covariance = root @ spread @ root.T
+    return WearState(state.mean + root @ change, 0.5 * (covariance + covariance.T))
+
+
+def _root(state: WearState) -> FloatArray:
+    """Return a root R of the covariance R R^T; entries that are known exactly have none."""
+    size = state.deviation
+    unit = np.where(size > 0.0, size, 1.0)
+    share = state.covariance / np.outer(unit, unit) + np.diag(size == 0.0)
+    return as_floats(size[:, None] * np.linalg.cholesky(share))
 
 
 def weights(residual: FloatArray, dof: float) -> FloatArray:
@@ -280,7 +254,7 @@ def information(axes: int, dof: float) -> float:
 
 # Have the latest runs changed as no wear does? Too fast, or too far from the calibration.
 
-FREE = 30.0
+WIDE_PRIOR = 30.0
 """How far a sudden change may go, a standard deviation in scatters: as good as anywhere."""
 CHANCE = 4.0
 """The latest runs may lie this many standard deviations off by chance."""
@@ -288,7 +262,7 @@ FEWEST = 5
 """Runs below which nothing is said of a sudden change."""
 
 
-def unlike_wear(
+def exceeds_wear_limits(
     window: Sequence[RunEvidence],
     references: Sequence[WearState],
     start: WearState,
@@ -345,21 +319,11 @@ def sudden_change(
     Returns:
         Difference to `state`, with the covariance that the scatter of the runs gives it.
     """
-    free = FREE * unit
+    anywhere = WearState(state.mean, np.diag((WIDE_PRIOR * unit) ** 2))
     full = [run for run in window if run.error.size]
     if not full:
-        return WearState(np.zeros_like(free), np.diag(free**2))
-    error, design = (
-        np.concatenate([r.error for r in full]),
-        np.concatenate([r.design for r in full]),
-    )
-    axes = error.shape[1]
-    design = design.reshape(error.size, -1)
-    off, scaled = error.reshape(-1) - design @ state.mean, design * free
-    change = np.zeros_like(free)
-    for _ in range(ROUNDS):
-        weight = weights((off - scaled @ change).reshape(-1, axes), dof)[:, None]
-        known = (scaled * weight).T @ scaled + np.eye(len(free))
-        change = as_floats(np.linalg.solve(known, (scaled * weight).T @ off))
-    known = information(axes, dof) * scaled.T @ scaled + np.eye(len(free))
-    return WearState(change * free, np.linalg.inv(known) * np.outer(free, free))
+        return WearState(np.zeros_like(unit), anywhere.covariance)
+    error = np.concatenate([run.error for run in full])
+    together = RunEvidence("", "", error, np.concatenate([run.design for run in full]))
+    found = learn(anywhere, together, dof)
+    return WearState(found.mean - state.mean, found.covariance)

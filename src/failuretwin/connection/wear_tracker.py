@@ -19,8 +19,8 @@ from failuretwin.connection.wear import (
     WearLimits,
     WearState,
     calibrated_state,
+    exceeds_wear_limits,
     learn,
-    unlike_wear,
     wear_unit,
     worn_settling,
     worn_variation,
@@ -33,13 +33,13 @@ from failuretwin.digital_model.settling import Settling
 
 # What the tracker keeps of a run and what became of it.
 
-Fate = Literal["learned", "frozen", "discarded"]
+RunOutcome = Literal["learned", "frozen", "discarded"]
 """What became of a run: learned; not learned because a fault was suspected when its turn came; not
 learned because it, or a run that it waited for, is faulty."""
 
 
 @dataclass(frozen=True)
-class Waiting:
+class PendingRun:
     """A run of the latest.
 
     Attributes:
@@ -61,9 +61,9 @@ class Step:
         number: How many runs have come with it.
         evidence: What it says.
         fault_probability: Probability that it is faulty; NaN where nothing can be told.
-        level: Sum of what runs say for a fault [nats].
+        cusum: Sum of what runs say for a fault [nats].
         alarm: What is suspected, or empty.
-        fates: What became of earlier runs or of this one, by number.
+        outcomes: What became of earlier runs or of this one, by number.
         learned_at: Number of the last run learned.
         state: Tracked state.
     """
@@ -71,9 +71,9 @@ class Step:
     number: int
     evidence: RunEvidence
     fault_probability: float
-    level: float
+    cusum: float
     alarm: str
-    fates: tuple[tuple[int, Fate], ...]
+    outcomes: tuple[tuple[int, RunOutcome], ...]
     learned_at: int
     state: WearState
 
@@ -103,7 +103,7 @@ class Tracker:
         limits: How fast and how far it may go.
         window: The latest runs, oldest first.
         past: The state after every `DELAY` runs of the last horizon, oldest first.
-        level: Sum of what runs say for a fault [nats].
+        cusum: Sum of what runs say for a fault [nats].
         arrived: Runs so far.
         learned_at: Number of the last run learned; 0 for none.
         alarm: What is suspected, or empty.
@@ -116,9 +116,9 @@ class Tracker:
     start: WearState
     state: WearState
     limits: WearLimits = field(default_factory=WearLimits)
-    window: tuple[Waiting, ...] = ()
+    window: tuple[PendingRun, ...] = ()
     past: tuple[WearState, ...] = ()
-    level: float = 0.0
+    cusum: float = 0.0
     arrived: int = 0
     learned_at: int = 0
     alarm: str = ""
@@ -151,19 +151,19 @@ class Tracker:
         """
         number = self.arrived + 1
         sound = bool(fault_probability < SUSPECT) and evidence.error.size > 0
-        window = (*self.window, Waiting(number, evidence, sound))
-        level = min(max(self.level + _score(fault_probability), 0.0), DECLARED_NATS + MOST_SCORE)
-        fates: list[tuple[int, Fate]] = [] if sound else [(number, "discarded")]
-        alarm = self._declared(window, level)
+        window = (*self.window, PendingRun(number, evidence, sound))
+        cusum = min(max(self.cusum + _score(fault_probability), 0.0), DECLARED_NATS + MOST_SCORE)
+        outcomes: list[tuple[int, RunOutcome]] = [] if sound else [(number, "discarded")]
+        alarm = self._declared(window, cusum)
         if alarm:
-            fates += [(run.number, "discarded") for run in window if run.open]
+            outcomes += [(run.number, "discarded") for run in window if run.open]
             window = tuple(replace(run, open=False) for run in window)
-        elif level >= SUSPECTED_NATS:
+        elif cusum >= SUSPECTED_NATS:
             alarm = "the last runs look faulty"
-        after = replace(self, window=window, level=level, arrived=number, alarm=alarm)
+        after = replace(self, window=window, cusum=cusum, arrived=number, alarm=alarm)
         if len(window) > DELAY:
-            after, fate = after._decide_oldest()
-            fates += fate
+            after, outcome = after._decide_oldest()
+            outcomes += outcome
         if number % DELAY == 0:
             snapshots = (*self.past, after.state)[-(self.limits.horizon // DELAY) :]
             after = replace(after, past=snapshots)
@@ -171,15 +171,15 @@ class Tracker:
             number,
             evidence,
             fault_probability,
-            level,
+            cusum,
             alarm,
-            tuple(fates),
+            tuple(outcomes),
             after.learned_at,
             after.state,
         )
         return after, step
 
-    def _decide_oldest(self) -> tuple[Tracker, list[tuple[int, Fate]]]:
+    def _decide_oldest(self) -> tuple[Tracker, list[tuple[int, RunOutcome]]]:
         """Return the tracker without the oldest run, learned or not, and what became of it."""
         oldest, window = self.window[0], self.window[1:]
         if not oldest.open:
@@ -196,11 +196,11 @@ class Tracker:
         runs = min(number - self.learned_at, self.limits.horizon)
         return runs * (self.limits.rate * self.unit) ** 2
 
-    def _declared(self, window: Sequence[Waiting], level: float) -> str:
+    def _declared(self, window: Sequence[PendingRun], cusum: float) -> str:
         """Return which fault is declared, or nothing."""
-        if level >= DECLARED_NATS:
+        if cusum >= DECLARED_NATS:
             return "runs look faulty one after another"
-        found = unlike_wear(
+        found = exceeds_wear_limits(
             [run.evidence for run in window],
             (self.state, *self.past[:1]),
             self.start,

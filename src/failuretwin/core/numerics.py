@@ -119,44 +119,71 @@ class Ellipsoid:
         """Return the log density at the centre of a Student t with this scale matrix, (...)."""
         return log_norm(dof) - 0.5 * np.log(self.determinant)
 
+    def log_student(self, error: FloatArray, dof: float) -> FloatArray:
+        """Return log t_nu(error; S) of deviations (..., 3), as (...)."""
+        return self.log_norm(dof) + log_fall(self.product(error, error), dof)
 
-def log_norm(dof: float) -> float:
-    """Return the log density at the centre of the standard 3-variate Student t distribution.
+
+# Student t in d dimensions, with nu degrees of freedom and scale S; nu infinite: normal.
+#
+#   log t_nu(x; S) = log c - 1/2 log |S| - (nu + d)/2 log(1 + x^T S^-1 x / nu)
+#   log c = log Gamma((nu + d)/2) - log Gamma(nu/2) - d/2 log(nu pi)
+#
+# Integrated over some of the d directions it is a Student t of the others, with the same nu.
+
+
+def log_norm(dof: float, dims: int = 3) -> float:
+    """Return log c, the log density at the centre of a Student t with S = I.
 
     Args:
-        dof: Degrees of freedom; infinite: normal.
+        dof: nu; infinite: normal.
+        dims: d.
     """
     if np.isinf(dof):
-        return -1.5 * log(2.0 * pi)
-    return lgamma((dof + 3.0) / 2.0) - lgamma(dof / 2.0) - 1.5 * log(dof * pi)
+        return -0.5 * dims * log(2.0 * pi)
+    return lgamma((dof + dims) / 2.0) - lgamma(dof / 2.0) - 0.5 * dims * log(dof * pi)
 
 
-def log_fall(square: FloatArray, dof: float) -> FloatArray:
-    """Return how far the log density of a 3-variate Student t has fallen from its centre.
+def log_fall(square: FloatArray, dof: float, dims: int = 3) -> FloatArray:
+    """Return how far the log density of a Student t has fallen from its centre, (...).
 
     Args:
-        square: Squared distance in scales, (...).
-        dof: Degrees of freedom; infinite: normal.
+        square: x^T S^-1 x, (...).
+        dof: nu; infinite: normal.
+        dims: d.
     """
     if np.isinf(dof):
         return -0.5 * square
-    return -0.5 * (dof + 3.0) * np.log1p(square / dof)
+    fall = np.asarray(square / dof)
+    np.log1p(fall, out=fall)
+    fall *= -0.5 * (dof + dims)
+    return fall
 
 
 def log_student(error: FloatArray, root: FloatArray, noise: float, dof: float) -> FloatArray:
-    """Return log densities of a 3-variate Student t distribution with S = A A^T + noise I.
+    """Return log t_nu(error; A A^T + noise I) in three dimensions, (...).
 
     Args:
         error: Deviations, (..., 3).
         root: A, (..., 3, column).
         noise: Variance added on each axis.
-        dof: Degrees of freedom; infinite: normal.
-
-    Returns:
-        (...).
+        dof: nu; infinite: normal.
     """
-    spread = Ellipsoid.of(root, noise)
-    return spread.log_norm(dof) + log_fall(spread.product(error, error), dof)
+    return Ellipsoid.of(root, noise).log_student(error, dof)
+
+
+def log_normal_2d(error: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return log N(error; 0, S) in two dimensions, (...): in closed form, as LAPACK takes longer.
+
+    Args:
+        error: (..., 2).
+        covariance: S, (..., 2, 2).
+    """
+    (aa, ab), (_, bb) = np.moveaxis(covariance, (-2, -1), (0, 1))
+    a, b = np.moveaxis(error, -1, 0)
+    determinant = aa * bb - ab * ab
+    square = (bb * a * a + aa * b * b - 2.0 * ab * a * b) / determinant
+    return np.asarray(-0.5 * (square + np.log(determinant)) - log(2.0 * pi))
 
 
 # Medians of some of the values, many at once.

@@ -181,7 +181,7 @@ def read_mapped_csv(path: Path, mapping: ColumnMap, robot: Robot) -> list[TimedL
         table = table.apply(lambda c: c.str.replace(mapping.decimal, ".", regex=False))
     if mapping.run is None:
         return [_log(table, path.stem, path, mapping, robot)]
-    _check_columns(table, [mapping.run], path)
+    check_columns(table, [mapping.run], path)
     groups = table.groupby(mapping.run, sort=False)
     return [_log(part, f"{path.stem}/{key}", path, mapping, robot) for key, part in groups]
 
@@ -205,31 +205,44 @@ def load_csv(path: Path, separator: str = ",") -> pd.DataFrame:
     return table
 
 
-def _check_columns(table: pd.DataFrame, columns: Sequence[str], path: Path) -> None:
+def check_columns(table: pd.DataFrame, columns: Sequence[str], path: Path) -> None:
+    """Raise InputError unless a table has some columns."""
     for column in columns:
         if column not in table:
             raise InputError(f"{path}: {unknown_name('column', column, map(str, table))}")
 
 
-def numbers(table: pd.DataFrame, columns: Sequence[str], path: Path) -> FloatArray:
+def numbers(
+    table: pd.DataFrame, columns: Sequence[str], path: Path, *, gaps: bool = True
+) -> FloatArray:
     """Return columns as numbers, (row, column); empty cells are NaN.
 
+    Args:
+        table: Every cell as text.
+        columns: Names of the columns.
+        path: The file, for error texts.
+        gaps: Whether cells may be empty.
+
     Raises:
-        InputError: If a column is missing or a cell is neither empty nor a number.
+        InputError: If a column is missing or a cell is no number.
     """
     import pandas as pd
 
-    _check_columns(table, columns, path)
+    check_columns(table, columns, path)
     part = table[list(columns)]
     values = part.apply(pd.to_numeric, errors="coerce").to_numpy(dtype=np.float64)
-    text = part.notna().to_numpy() & ~np.isfinite(values)
-    text &= ~part.apply(lambda c: c.str.strip().str.lower().isin(["nan", ""])).to_numpy()
-    if text.any():
-        row, column = np.argwhere(text)[0]
+    wrong = ~np.isfinite(values)
+    hint = ""
+    if gaps:
+        wrong &= part.notna().to_numpy()
+        wrong &= ~part.apply(lambda c: c.str.strip().str.lower().isin(["nan", ""])).to_numpy()
+        hint = ' For decimal commas add decimal = "," at the top of the map.'
+    if wrong.any():
+        row, column = np.argwhere(wrong)[0]
         line = int(part.index[row]) + 2
         raise InputError(
             f"{path}: line {line}, column {columns[column]}: got {part.iloc[row, column]!r}, "
-            'expected a number. For decimal commas add decimal = "," at the top of the map.'
+            f"expected a number.{hint}"
         )
     return values
 
@@ -255,7 +268,7 @@ def _times(table: pd.DataFrame, column: TimeColumn, path: Path) -> FloatArray:
         if not np.all(np.isfinite(values)):
             raise InputError(f"{path}: column {column.column} has rows without a time.")
         return as_floats((values - values[0]) * TIME_UNITS[column.unit])
-    _check_columns(table, [column.column], path)
+    check_columns(table, [column.column], path)
     try:
         stamps = pd.to_datetime(table[column.column], format="ISO8601", utc=True)
     except ValueError as error:

@@ -9,10 +9,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import parent_process
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,12 +21,17 @@ import numpy as np
 from failuretwin import __version__
 from failuretwin.core.config import canonical, fingerprint
 from failuretwin.core.errors import InputError, unknown_name
-from failuretwin.core.hypothesis import Fault, Hypothesis
+from failuretwin.core.hypothesis import (
+    Fault,
+    Hypothesis,
+    paper_hypotheses,
+    parse_hypotheses,
+)
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable, Truth
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.timed_log import assemble
 from failuretwin.data_knowledge.workers import Workforce
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.disturbances import (
     Disturbances,
     actual_movements,
@@ -37,7 +43,7 @@ from failuretwin.digital_model.disturbances import (
 )
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfections, Range
 from failuretwin.digital_model.physics.engine import PhysicsEngine
-from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.settling import Settling, loads_in_range
 from failuretwin.digital_model.twin import DigitalTwin, Drive, Engine, ServoEngine
 from failuretwin.failure_behavior.fault import FaultValue
@@ -60,9 +66,9 @@ LEAST_SAG_RAD = 1e-6
 """A motor that its load moves by less than this in any pose counts as rigid [rad]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class Plan:
-    """What to simulate.
+    """What to simulate: ``Plan("armpi_fpv", ["healthy", "motor_1:stuck"], runs_per_class=20)``.
 
     Attributes:
         robot: The robot.
@@ -73,24 +79,71 @@ class Plan:
         movements: How movements are drawn.
         modes: Fault modes with their distributions, by id.
         engine: What moves the robot: ``servo`` (the published loops) or ``physics``.
+
+    Raises:
+        InputError: If a name or a hypothesis cannot be read, a hypothesis cannot be simulated or
+            would not show, or a number makes no sense.
     """
 
     robot: Robot
     hypotheses: Sequence[Hypothesis]
     runs_per_class: int
-    seed: int = 0
-    imperfections: Imperfections = NO_IMPERFECTIONS
-    movements: RandomMovements = field(default_factory=RandomMovements)
-    modes: Mapping[str, FaultMode] = field(default_factory=lambda: MODES)
-    engine: str = "servo"
+    seed: int
+    imperfections: Imperfections
+    movements: RandomMovements
+    modes: Mapping[str, FaultMode]
+    engine: str
 
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        robot: Robot | str | Path = "armpi_fpv",
+        hypotheses: Sequence[Hypothesis | str] | None = None,
+        runs_per_class: int = 1,
+        seed: int = 0,
+        imperfections: Imperfections | str | Path = NO_IMPERFECTIONS,
+        movements: RandomMovements | None = None,
+        modes: Mapping[str, FaultMode] | None = None,
+        engine: str = "servo",
+    ) -> None:
+        """Take values or their text form.
+
+        Args:
+            robot: The robot, its name or the path of its profile.
+            hypotheses: States, as `Hypothesis` or text; None: the paper's nine classes.
+            runs_per_class: Runs of each.
+            seed: Seed of all chance.
+            imperfections: A value, or the name or path of a calibration, whose servo loops the
+                robot then has.
+            movements: None: as in the paper.
+            modes: None: all that are known, with their usual distributions.
+            engine: ``servo`` or ``physics``.
+        """
+        model = load_robot(robot)
+        if not isinstance(imperfections, Imperfections):
+            known = load_calibration(imperfections, model)
+            model, imperfections = known.robot, known.imperfections
+        names = model.motor_names
+        given = {
+            "robot": model,
+            "hypotheses": paper_hypotheses(names)
+            if hypotheses is None
+            else parse_hypotheses(hypotheses, names),
+            "runs_per_class": runs_per_class,
+            "seed": seed,
+            "imperfections": imperfections,
+            "movements": movements or RandomMovements(),
+            "modes": MODES if modes is None else modes,
+            "engine": engine,
+        }
+        for name, value in given.items():
+            object.__setattr__(self, name, value)
+        self._check()
+
+    def _check(self) -> None:
         if self.runs_per_class < 1:
             raise InputError(f"runs per class is {self.runs_per_class}, expected 1 or more.")
         if self.engine not in ENGINES:
             raise unknown_name("engine", self.engine, ENGINES)
-        if len(set(self.hypotheses)) < len(self.hypotheses):
-            raise InputError("a hypothesis is given twice. Give each of them once.")
         for hypothesis in self.hypotheses:
             if not hypothesis.known:
                 raise InputError("'unknown' cannot be simulated. Name the faults to simulate.")
@@ -331,7 +384,7 @@ def simulate(
     on_progress: Callable[[int], None] = lambda runs: None,
     scheduler: str | None = None,
 ) -> xr.Dataset:
-    """Simulate all runs of a plan in memory; `run_factory.produce` has no need to hold them.
+    """Simulate all runs of a plan in memory; `resumable.produce` has no need to hold them.
 
     Args:
         plan: What to simulate.
@@ -347,16 +400,26 @@ def simulate(
         range(first, min(first + CHUNK_RUNS, plan.size))
         for first in range(0, plan.size, CHUNK_RUNS)
     ]
-    with Workforce(workers, scheduler).at_work(partial(simulate_runs, plan), chunks) as results:
-        return assemble(_datasets(results, on_progress), plan.size)
+    work, workforce = partial(simulate_runs, plan), Workforce(workers, scheduler)
+    with workforce.map_unordered(work, chunks) as results:
+        return _assembled(results, plan.size, on_progress)
 
 
-def _datasets(
-    results: Iterator[tuple[range, RunTable]], on_progress: Callable[[int], None]
-) -> Iterator[tuple[int, xr.Dataset]]:
-    for runs, table in results:
-        yield runs[0], table.to_dataset()
-        on_progress(len(runs))
+def _assembled(
+    parts: Iterable[tuple[range, RunTable]], runs: int, on_progress: Callable[[int], None]
+) -> xr.Dataset:
+    """Return one run set in which every part, in any order, has its place; none is held twice."""
+    arrays: dict[Hashable, np.ndarray] = {}
+    for place, table in parts:
+        part = table.to_dataset()
+        for name, variable in part.variables.items():
+            if variable.dims[:1] == ("run",):
+                empty = np.empty((runs, *variable.shape[1:]), variable.dtype)
+                arrays.setdefault(name, empty)[place.start : place.stop] = variable.values
+        on_progress(len(place))
+    shared = part.drop_dims("run").assign_coords(run=arrays.pop("run"))
+    filled = {name: (part[name].dims, array, part[name].attrs) for name, array in arrays.items()}
+    return shared.assign(filled)[list(part.data_vars)]
 
 
 # Runs in which nothing is left to chance: the signature that a fault leaves on the tool.
@@ -383,12 +446,12 @@ def noise_free_path(
     """
     runs, count = movements.start.shape
     rng = np.random.default_rng(0)  # asked, but nothing that it says counts
-    luck = draw_disturbances(without_chance(imperfections), twin.robot, count, 0.0, rng)
+    luck = draw_disturbances(deterministic(imperfections), twin.robot, count, 0.0, rng)
     drive = drive_of(movements, movements.reference(time), time, injection, stack([luck] * runs))
     return twin.path(ServoEngine(twin.robot).angles(drive, time))
 
 
-def without_chance(imperfections: Imperfections) -> Imperfections:
+def deterministic(imperfections: Imperfections) -> Imperfections:
     """Return imperfections that leave nothing to chance; ranges shrink to their middles."""
     timing, settling = imperfections.timing, imperfections.settling
     if settling is not None:

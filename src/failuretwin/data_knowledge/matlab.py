@@ -23,7 +23,7 @@ from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.runs import AXES, RunTable, Truth, truth_of
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.raw_sessions import PUBLISHED_FREEZE, READING_RATE_HZ
-from failuretwin.data_knowledge.recovery.commands import (
+from failuretwin.data_knowledge.recovery import (
     path_error,
     published_time,
     recover_movements,

@@ -16,6 +16,7 @@ from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable, Truth
 from failuretwin.core.types import MS_PER_S, FloatArray, as_floats
+from failuretwin.data_knowledge.csv_log import load_csv, numbers
 from failuretwin.data_knowledge.timed_log import check_clock
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
@@ -130,41 +131,24 @@ def _check_range(
 
 def _read_table(path: Path, columns: Sequence[str]) -> FloatArray:
     """Return stamps and the given columns of a CSV file, (row, 1 + column), checked."""
-    import pandas as pd
-
-    try:
-        table = pd.read_csv(path, dtype=str, skipinitialspace=True)
-    except pd.errors.EmptyDataError:
-        raise InputError(f"{path}: is empty. Expected a header and rows of numbers.") from None
-    except (OSError, UnicodeDecodeError, pd.errors.ParserError) as error:
-        raise InputError(f"{path}: cannot be read as CSV ({error}).") from error
+    table = load_csv(path)
     wanted = ["timestamp", *columns]
     for column in wanted:
         if column not in table:
             raise InputError(
                 f"{path}: missing a column: {unknown_name('column', column, map(str, table))}"
             )
-    for column in wanted:
         if f"{column}.1" in table:  # the reader's name for a second column of that name
             raise InputError(f"{path}: column {column!r} stands there twice. Remove one of them.")
-    if table.empty:
-        raise InputError(f"{path}: has a header but no rows.")
-    numbers = table[wanted].apply(pd.to_numeric, errors="coerce").to_numpy(dtype=np.float64)
-    bad = np.argwhere(~np.isfinite(numbers))
-    if len(bad):
-        row, column = bad[0]
-        text = table[wanted[column]].iloc[row]
-        raise InputError(
-            f"{path}: line {row + 2}, column {wanted[column]}: got {text!r}, expected a number."
-        )
-    steps = np.diff(numbers[:, 0])
+    values = numbers(table, wanted, path, gaps=False)
+    steps = np.diff(values[:, 0])
     if np.any(steps <= 0):
         row = int(np.argmax(steps <= 0))
         raise InputError(
             f"{path}: time runs backwards or stands still at line {row + 3} (from "
-            f"{numbers[row, 0]:.6f} to {numbers[row + 1, 0]:.6f} s). Sort or cut the log."
+            f"{values[row, 0]:.6f} to {values[row + 1, 0]:.6f} s). Sort or cut the log."
         )
-    return numbers
+    return values
 
 
 # Runs out of raw sessions, in two ways.

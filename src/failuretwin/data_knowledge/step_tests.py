@@ -14,6 +14,7 @@ import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import MS_PER_S, BoolArray, FloatArray, ServoUnits, frozen_array
+from failuretwin.data_knowledge.csv_log import load_csv, numbers
 from failuretwin.digital_model.robot import Robot
 
 # What keeps a step of a step test from telling of a healthy motor.
@@ -159,22 +160,8 @@ def read_step_test(path: Path, robot: Robot) -> list[StepTest]:
 
 def _read_table(path: Path) -> FloatArray:
     """Return the rows in order of their stamps, (row, 3): stamp, position, command."""
-    import pandas as pd
-
-    try:
-        table = pd.read_csv(path, dtype=str, usecols=["timestamp", "position", "command"])
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as a step test ({error}).") from error
-    numbers = table.apply(pd.to_numeric, errors="coerce").to_numpy(dtype=np.float64)
-    bad = np.argwhere(~np.isfinite(numbers))
-    if len(bad):
-        row, column = bad[0]
-        got = table.iloc[row, column]
-        raise InputError(
-            f"{path}: line {row + 2}, column {table.columns[column]}: got {got!r}, expected a "
-            "number."
-        )
-    return numbers[np.argsort(numbers[:, 0], kind="stable")]
+    table = numbers(load_csv(path), ["timestamp", "position", "command"], path, gaps=False)
+    return table[np.argsort(table[:, 0], kind="stable")]
 
 
 def _motor(path: Path, robot: Robot) -> tuple[str, str]:

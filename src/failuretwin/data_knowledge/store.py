@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
-import fcntl
 import os
 import shutil
 import socket
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,48 +17,6 @@ from failuretwin.core.runs import check_runs
 if TYPE_CHECKING:
     import xarray as xr
     from zarr.core.buffer import Buffer
-
-# Put something new where something old stands, in one step where the system can.
-
-AT_FDCWD = -100
-RENAME_EXCHANGE = 2
-
-
-def take_place(new: Path, path: Path) -> None:
-    """Put `new` where `path` is; a folder there is kept until the new one stands.
-
-    Raises:
-        OSError: If that cannot be done; `path` is as before.
-    """
-    if not path.is_dir():
-        new.replace(path)
-        return
-    if exchange(new, path):
-        shutil.rmtree(new)
-        return
-    old = path.with_name(f".{path.name}.{os.getpid()}.old")
-    path.replace(old)
-    try:
-        new.replace(path)
-    except OSError:
-        old.replace(path)
-        raise
-    shutil.rmtree(old)
-
-
-def exchange(one: Path, other: Path) -> bool:
-    """Let two paths change places in one step; return False where the system cannot.
-
-    Without it a process that is killed between two renames would leave no folder at all.
-    """
-    try:
-        rename = ctypes.CDLL(None).renameat2
-    except (AttributeError, OSError):
-        return False
-    names = (os.fsencode(one), os.fsencode(other))
-    done: int = rename(AT_FDCWD, names[0], AT_FDCWD, names[1], RENAME_EXCHANGE)
-    return done == 0
-
 
 SUFFIXES = (".nc", ".zarr")
 
@@ -103,26 +59,42 @@ def save_run_set(runs: xr.Dataset, path: Path) -> None:
         OutputError: If it cannot be written; nothing is left behind.
     """
     check_destination(path)
-    with replacing(path) as partial, warnings.catch_warnings():
-        # Zarr warns that text and consolidated metadata are not in its final specification yet.
-        warnings.filterwarnings("ignore", message=".*Zarr (V3|format 3).*")
+    with replacing(path) as partial:
+        # In memory first: on a full disk the HDF5 library can bring the whole process down, and
+        # Zarr's own writes go on after one of them has failed.
         if path.suffix == ".nc":
-            # In memory first: on a full disk the HDF5 library can bring the whole process down.
             partial.write_bytes(runs.to_netcdf(engine="h5netcdf", encoding=_compression(runs)))
         else:
-            _write_zarr(runs, partial)
+            write_files(_zarr_files(runs), partial)
 
 
-def _write_zarr(runs: xr.Dataset, folder: Path) -> None:
-    """Write a Zarr store, in memory first: its own writes go on after one of them has failed."""
+def _zarr_files(runs: xr.Dataset) -> dict[str, Buffer]:
     from zarr.storage import MemoryStore
 
     content: dict[str, Buffer] = {}
-    runs.to_zarr(MemoryStore(content), mode="w", consolidated=True)
+    with quiet_zarr():
+        runs.to_zarr(MemoryStore(content), mode="w", consolidated=True)
+    return content
+
+
+def write_files(content: Mapping[str, Buffer], folder: Path) -> None:
+    """Write the files of a Zarr store in memory to a folder.
+
+    Raises:
+        OSError: If one of them cannot be written.
+    """
     for key, value in content.items():
         file = folder / key
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(value.to_bytes())
+
+
+@contextmanager
+def quiet_zarr() -> Iterator[None]:
+    """Keep to ourselves that text and consolidated metadata are not in Zarr's final text yet."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*Zarr (V3|format 3).*")
+        yield
 
 
 def check_destination(path: Path) -> None:
@@ -135,6 +107,28 @@ def check_destination(path: Path) -> None:
 def _compression(runs: xr.Dataset) -> dict[str, dict[str, object]]:
     large = [n for n in runs.data_vars if "time" in runs[n].dims]
     return {str(name): {"zlib": True, "complevel": 1, "shuffle": True} for name in large}
+
+
+# Something new where something old stands: beside it first, then renamed.
+
+
+def atomic_replace(new: Path, path: Path) -> None:
+    """Put `new` where `path` is; a folder there is kept as `.NAME.old` until the new one stands.
+
+    Raises:
+        OSError: If that cannot be done; `path` is as before.
+    """
+    old = path.with_name(f".{path.name}.old")
+    if path.is_dir():  # no system call of Python replaces a folder that holds something
+        shutil.rmtree(old, ignore_errors=True)
+        path.replace(old)
+    try:
+        new.replace(path)
+    except BaseException:
+        if old.is_dir():
+            old.replace(path)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
 
 
 @contextmanager
@@ -153,7 +147,7 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         check_writable(path)
         yield partial
-        take_place(partial, target)
+        atomic_replace(partial, target)
     except (OSError, RuntimeError) as error:
         raise _output_error(path, error) from error
     finally:
@@ -241,47 +235,29 @@ def sole_writer(path: Path) -> Iterator[None]:
     Raises:
         OutputError: If another process holds it, or if it cannot be made.
     """
+    from filelock import FileLock, Timeout
+
     file = path.with_name(f".{path.name}.lock")
-    handle = _locked(file, path)
+    lock = FileLock(file, timeout=0)
     try:
+        lock.acquire()
+    except Timeout as error:
+        raise OutputError(
+            f"{path}: {_holder(file)} is writing it. Wait until it is done, or choose another name."
+        ) from error
+    except OSError as error:
+        raise OutputError(f"{path}: lock {file} cannot be made ({error.strerror}).") from error
+    try:
+        with suppress(OSError):  # on a full disk it goes without a name
+            file.write_text(f"process {os.getpid()} on {socket.gethostname()}")
         yield
     finally:
         file.unlink(missing_ok=True)  # before letting go: nobody can lock a file that has no name
-        os.close(handle)
+        lock.release()
 
 
-def _locked(file: Path, path: Path) -> int:
-    while True:
-        try:
-            handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
-        except OSError as error:
-            raise OutputError(f"{path}: lock {file} cannot be made ({error.strerror}).") from error
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            holder = os.read(handle, 200).decode(errors="replace")
-            os.close(handle)
-            raise OutputError(
-                f"{path}: {holder or 'another process'} is writing it. Wait until it is done, or "
-                "choose another name."
-            ) from error
-        if _still_there(file, handle):
-            _write_holder(handle)
-            return handle
-        os.close(handle)  # the one before us removed it just as we came
-
-
-def _still_there(file: Path, handle: int) -> bool:
-    try:
-        return os.path.samestat(file.stat(), os.fstat(handle))
-    except FileNotFoundError:
-        return False
-
-
-def _write_holder(handle: int) -> None:
-    """Say who holds the lock; on a full disk it goes without a name."""
-    try:
-        os.truncate(handle, 0)
-        os.write(handle, f"process {os.getpid()} on {socket.gethostname()}".encode())
-    except OSError:
-        pass
+def _holder(lock: Path) -> str:
+    """Return who wrote a lock file."""
+    with suppress(OSError):
+        return lock.read_text(errors="replace") or "another process"
+    return "another process"

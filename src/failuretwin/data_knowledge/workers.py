@@ -77,7 +77,7 @@ def _own_cluster(workers: int) -> Iterator[Client]:
         n_workers=workers,
         threads_per_worker=1,
         processes=True,
-        memory_limit=0,  # no limit: memory is bounded by the size of a piece
+        memory_limit=0,  # no limit: memory is bounded by the size of a chunk
         host="127.0.0.1",
         dashboard_address="127.0.0.1:0",  # it insists on a port: any, seen from here alone
         scheduler_kwargs={"dashboard": False},
@@ -98,7 +98,7 @@ def _connected(address: str) -> Iterator[Client]:
         client = Client(address, timeout=ANSWER_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         raise InputError(
-            f"scheduler {address!r} does not answer ({reason(error)}). Expected the address that "
+            f"scheduler {address!r} does not answer ({_reason(error)}). Expected the address that "
             "`dask scheduler` prints when it starts, such as tcp://host:8786."
         ) from error
     with client:
@@ -111,7 +111,7 @@ def _connected(address: str) -> Iterator[Client]:
         yield client
 
 
-def reason(error: BaseException) -> str:
+def _reason(error: BaseException) -> str:
     """Return what Dask says of an error, on one line."""
     return " ".join(str(error).split()) or type(error).__name__
 
@@ -120,7 +120,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 TASKS_PER_THREAD = 2
-"""Tasks given out at a time: one to do, one that waits, so that no worker is ever idle."""
+"""Tasks submitted at a time: one to do, one that waits, so that no worker is ever idle."""
 LOOK_S = 30.0
 """Time without a result after which it is looked whether there are workers at all [s]."""
 LONGEST_WAIT_S = 1800.0
@@ -150,7 +150,7 @@ class Workforce:
             )
 
     @contextmanager
-    def at_work(
+    def map_unordered(
         self, work: Callable[[Item], Result], items: Iterable[Item]
     ) -> Iterator[Iterator[tuple[Item, Result]]]:
         """Give every item with its result, in the order in which they are done.
@@ -184,23 +184,23 @@ ONE_PROCESS = Workforce()
 def _spread(
     client: Client, work: Callable[[Item], Result], items: Iterable[Item]
 ) -> Generator[tuple[Item, Result]]:
-    """Give items with their results; only as many are given out as workers can do soon."""
+    """Give items with their results; only as many are submitted as workers can do soon."""
     waiting = iter(items)
-    given: dict[Future[Result], Item] = {}
+    submitted: dict[Future[Result], Item] = {}
     done: SimpleQueue[Future[Result]] = SimpleQueue()
 
-    def give_out() -> None:
+    def submit() -> None:
         threads = max(1, sum(client.nthreads().values()))
-        for item in islice(waiting, max(0, TASKS_PER_THREAD * threads - len(given))):
+        for item in islice(waiting, max(0, TASKS_PER_THREAD * threads - len(submitted))):
             future = client.submit(work, item, pure=False)
-            given[future] = item
+            submitted[future] = item
             future.add_done_callback(done.put)
 
-    give_out()
-    while given:
+    submit()
+    while submitted:
         future = _next_done(client, done)
-        yield given.pop(future), _result(future)
-        give_out()
+        yield submitted.pop(future), _result(future)
+        submit()
 
 
 def _next_done(client: Client, done: SimpleQueue[Future[Result]]) -> Future[Result]:
@@ -242,7 +242,7 @@ def _result(future: Future[Result]) -> Result:
         raise _nothing_done() from error  # it was lost with its worker, and is made again
     except KilledWorker as error:
         raise FailureTwinError(
-            "workers died again and again over the same piece. Look for what ends them, such as "
+            "workers died again and again over the same chunk. Look for what ends them, such as "
             "too little memory, and run the same command again."
         ) from error
     except CancelledError as error:
@@ -251,6 +251,6 @@ def _result(future: Future[Result]) -> Result:
         ) from error
     except (ImportError, AttributeError) as error:
         raise InputError(
-            f"the workers cannot run failuretwin ({reason(error)}). Install the same version "
+            f"the workers cannot run failuretwin ({_reason(error)}). Install the same version "
             "there as here."
         ) from error

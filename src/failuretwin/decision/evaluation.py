@@ -1,52 +1,32 @@
-"""All that can be said of stored diagnoses where the truth is known."""
+"""How good diagnoses are where the truth is known, and which of two methods is better.
+
+`evaluate` and `compare` take diagnoses as they come from a diagnoser or a file and return frozen
+values; nothing is printed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import truth_of
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.data_knowledge.read import ReadOptions, read_runs
-from failuretwin.decision.metrics import (
-    Alarms,
-    Coverage,
-    IntervalCase,
-    LogScoreGain,
-    McNemar,
-    Reliability,
-    Scores,
-    adaptive_edges,
-    brier_score,
-    calibrated_error,
-    count_alarms,
-    coverage_by_mode,
-    equal_edges,
-    log_score,
-    log_score_gain,
-    mcnemar,
-    reliability,
-)
-from failuretwin.decision.results import (
-    Record,
-    check_each_once,
-    judged_records,
-    protocol_of,
-    score_records,
-    some_names,
-    truths_as_unknown,
-)
+from failuretwin.decision import metrics
+from failuretwin.decision.results import Record, Results, some_names
 
 if TYPE_CHECKING:
     import xarray as xr
 
-# What was true of the runs of a result file, where a run set or a log knows it.
+Given = Results | Iterable[Diagnosis | Record]
+
+# What was true of the runs, where a run set or a log knows it.
 
 
 @dataclass(frozen=True)
@@ -60,75 +40,159 @@ class RunTruth:
     """
 
     fault: str
-    onset: float
-    magnitude: float
+    onset: float = np.nan
+    magnitude: float = np.nan
 
 
-def read_truths(path: Path, robot: str, published_labels: bool) -> dict[str, RunTruth]:
-    """Return the truth of every run of a run set or of raw sessions, by its name.
+@dataclass(frozen=True)
+class Truths:
+    """The truth of the runs of a run set.
 
-    Args:
-        path: Run set, or whatever else `diagnose` reads.
-        robot: Name or profile of the robot that the logs are of.
-        published_labels: Take the truth of raw sessions from their folder names.
-
-    Raises:
-        InputError: If it cannot be read or knows no truth.
+    Attributes:
+        name: What to call the run set in errors, such as its path.
+        by_run: By the name of the run.
     """
-    options = ReadOptions(published_labels=published_labels)
-    return truths_of(read_runs(path, robot, options), str(path))
+
+    name: str
+    by_run: Mapping[str, RunTruth]
+
+    @classmethod
+    def of(cls, runs: xr.Dataset, name: str = "the run set") -> Truths:
+        """Return the truth of every run of a run set.
+
+        Raises:
+            InputError: If it knows no truth.
+        """
+        faults = truth_of(runs)
+        if faults is None:
+            raise InputError(
+                f"{name}: has no variable `fault`, so it does not know the truth. If the names of "
+                "raw sessions end in _label_K, add --published-labels."
+            )
+        unknown = np.full(len(faults), np.nan)
+        columns = (runs[n].values if n in runs else unknown for n in ("onset", "magnitude"))
+        values = zip(faults, *(map(float, column) for column in columns), strict=True)
+        truths = (RunTruth(*value) for value in values)
+        return cls(name, dict(zip(map(str, runs["run"].values), truths, strict=True)))
+
+    def __getitem__(self, run: str) -> RunTruth:
+        if run not in self.by_run:
+            raise InputError(f"{self.name}: holds no run {run!r} of the results. {self._why(run)}")
+        return self.by_run[run]
+
+    def _why(self, run: str) -> str:
+        name, numbered, _ = run.rpartition("#")
+        if numbered and name in self.by_run:
+            return (
+                f"It holds {name!r}; diagnose numbers runs of the same name, so it was given an "
+                "input twice, or several whose runs are called alike. Diagnose and evaluate each "
+                "input once, by itself."
+            )
+        return "Expected the runs that were diagnosed."
 
 
-def truths_of(runs: xr.Dataset, where: str) -> dict[str, RunTruth]:
-    """Return the truth of every run by its name.
+# Diagnoses beside what was true.
 
-    Args:
-        runs: The run set.
-        where: What to call it in an error.
 
-    Raises:
-        InputError: If it knows no truth.
+@dataclass(frozen=True)
+class Judged:
+    """Diagnoses of the runs whose truth is known, beside it.
+
+    Attributes:
+        diagnoses: One a run.
+        truth: What is right for each: its truth, or `unknown` where that means it.
+        as_unknown: How many runs are judged as `unknown`, by their truth.
+        protocol: How much real data the method has seen; letters joined by a slash where they
+            differ.
     """
-    faults = truth_of(runs)
-    if faults is None:
-        raise InputError(
-            f"{where}: has no variable `fault`, so it does not know the truth. If the names of raw "
-            "sessions end in _label_K, add --published-labels."
+
+    diagnoses: tuple[Diagnosis | Record, ...]
+    truth: tuple[str, ...]
+    as_unknown: Mapping[str, int]
+    protocol: str
+
+    @classmethod
+    def of(cls, results: Given, truths: Truths | None = None) -> Judged:
+        """Judge diagnoses by these truths, or by those that they name themselves.
+
+        Raises:
+            InputError: If the truth of a run is not among `truths`.
+        """
+        given = as_results(results).diagnoses
+        known = [d.truth if truths is None else truths[d.run].fault for d in given]
+        pairs = [(d, true) for d, true in zip(given, known, strict=True) if true]
+        truth = tuple(metrics.judged_truth(true, d.posterior) for d, true in pairs)
+        return cls(
+            diagnoses=tuple(d for d, _ in pairs),
+            truth=truth,
+            as_unknown=Counter(t for (_, t), right in zip(pairs, truth, strict=True) if right != t),
+            protocol="/".join(sorted({d.protocol or "?" for d in given})),
         )
-    unknown = np.full(len(faults), np.nan)
-    onset, magnitude = (runs[n].values if n in runs else unknown for n in ("onset", "magnitude"))
-    names = map(str, runs["run"].values)
-    return {
-        name: RunTruth(fault, float(began), float(size))
-        for name, fault, began, size in zip(names, faults, onset, magnitude, strict=True)
-    }
+
+    @property
+    def verdicts(self) -> list[str | None]:
+        """Verdict on each run; None where there is none."""
+        return [d.diagnosis for d in self.diagnoses]
+
+    @property
+    def right(self) -> BoolArray:
+        """Whether each run is diagnosed right, (run,)."""
+        pairs = zip(self.verdicts, self.truth, strict=True)
+        return np.array([verdict == true for verdict, true in pairs], dtype=np.bool_)
+
+    @property
+    def posteriors(self) -> list[Mapping[str, float]]:
+        """Probabilities of each run."""
+        return [d.posterior for d in self.diagnoses]
+
+    @cached_property
+    def scores(self) -> metrics.Scores:
+        """Right, wrong and the log score; of one run at least."""
+        return metrics.score(self.truth, self.verdicts, self.posteriors)
 
 
-def with_truth(
-    records: Sequence[Record], truths: Mapping[str, RunTruth], where: str
-) -> list[Record]:
-    """Return the records with the truth, matched by run name.
-
-    Raises:
-        InputError: If the truth of a run is not there.
-    """
-    for record in records:
-        if record["run"] not in truths:
-            raise InputError(_no_run(record["run"], truths, where))
-    return [{**record, "truth": truths[record["run"]].fault} for record in records]
+def as_results(given: Given, name: str = "the results") -> Results:
+    """Return diagnoses with a name; those that have one keep it."""
+    return given if isinstance(given, Results) else Results(name, tuple(given))
 
 
-def _no_run(run: str, truths: Mapping[str, RunTruth], where: str) -> str:
-    """Return what is wrong if a run is not there, and why that may be."""
-    problem = f"{where}: holds no run {run!r} of the results. "
-    name, numbered, _ = run.rpartition("#")
-    if numbered and name in truths:
-        return problem + (
-            f"It holds {name!r}; diagnose numbers runs of the same name, so it was given an input "
-            "twice, or several whose runs are called alike. Diagnose and evaluate each input once, "
-            "by itself."
-        )
-    return problem + "Expected the runs that were diagnosed."
+def score_line(judged: Judged) -> str:
+    """Return the accuracy with its protocol, number of runs and interval; empty if unknown."""
+    if not judged.diagnoses:
+        return ""
+    scores = judged.scores
+    low, high = scores.interval
+    return (
+        f"{scores.right} of {scores.runs} runs right: accuracy {100 * scores.accuracy:.1f} % "
+        f"(95 % interval {100 * low:.1f} to {100 * high:.1f} %), protocol {judged.protocol}, "
+        f"log score {_log_score_text(scores.log_scores)}"
+    )
+
+
+def _log_score_text(surprise: metrics.LogScore) -> str:
+    """Return the log score in words; says so where a truth was ruled out altogether."""
+    text = f"{surprise.mean:.3f} nats a run"
+    if not surprise.impossible:
+        return text
+    rest = surprise.nats.size - surprise.impossible
+    if not rest:
+        return f"{text} (the truth was given no probability in any run)"
+    return (
+        f"{text} (of {surprise.impossible} runs the truth was given no probability; the other "
+        f"{rest}: {surprise.mean_of_rest:.3f})"
+    )
+
+
+def as_unknown_line(judged: Judged) -> str:
+    """Return which truths are judged as `unknown`, in words; empty if none is."""
+    found = judged.as_unknown
+    if not found:
+        return ""
+    truths = [f"{truth} ({count} run{'s' * (count > 1)})" for truth, count in found.items()]
+    return f"judged as unknown, since not among the hypotheses: {', '.join(truths)}"
+
+
+# All scores of one method.
 
 
 @dataclass(frozen=True)
@@ -141,115 +205,111 @@ class Calibration:
         by_chance: Errors that a perfectly calibrated method would show in `equal`, (draw,).
     """
 
-    equal: Reliability
-    adaptive: Reliability
+    equal: metrics.Reliability
+    adaptive: metrics.Reliability
     by_chance: FloatArray
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Scores of a result file.
+    """Scores of diagnoses whose truth is known.
 
     Attributes:
-        protocol: How much real data the method has seen.
-        untold: Runs without a verdict.
-        as_unknown: Runs that are judged as `unknown`, since their truth is no hypothesis.
-        scores: Right, wrong and the log score.
+        judged: The diagnoses beside their truth.
         alarms: False alarms and missed detections.
         brier: Mean Brier score, 0 to 2.
         calibration: Over runs with a verdict; None if there are none.
         coverage: Of 90 % intervals, by fault mode; empty where the true values are not known.
     """
 
-    protocol: str
-    untold: int
-    as_unknown: int
-    scores: Scores
-    alarms: Alarms
+    judged: Judged
+    alarms: metrics.Alarms
     brier: float
     calibration: Calibration | None
-    coverage: Sequence[Coverage]
-
-
-def evaluate_records(
-    records: Sequence[Record], truths: Mapping[str, RunTruth], rng: np.random.Generator
-) -> Evaluation | None:
-    """Return all scores of the records whose truth is known; None if there are none.
-
-    Args:
-        records: Diagnoses.
-        truths: True onset and magnitude of runs by name, where known.
-        rng: Source of chance, for the calibration error that chance alone would show.
-    """
-    judged, scores = judged_records(records), score_records(records)
-    if scores is None:
-        return None
-    truth = [record["truth"] for record in judged]
-    return Evaluation(
-        protocol=protocol_of(records),
-        untold=sum(record["diagnosis"] is None for record in judged),
-        as_unknown=truths_as_unknown(records).total(),
-        scores=scores,
-        alarms=count_alarms(truth, [record["diagnosis"] for record in judged]),
-        brier=float(brier_score(truth, [record["posterior"] for record in judged]).mean()),
-        calibration=_calibration(judged, rng),
-        coverage=coverage_by_mode(c for record in judged for c in _intervals(record, truths)),
-    )
-
-
-def _calibration(judged: Sequence[Record], rng: np.random.Generator) -> Calibration | None:
-    told = [record for record in judged if record["diagnosis"] is not None]
-    if not told:
-        return None
-    chance = np.array([record["posterior"][record["diagnosis"]] for record in told])
-    stated = np.minimum(chance, 1.0)  # sums of probabilities may round above
-    right = np.array([record["diagnosis"] == record["truth"] for record in told])
-    equal = equal_edges()
-    return Calibration(
-        equal=reliability(stated, right, equal),
-        adaptive=reliability(stated, right, adaptive_edges(stated)),
-        by_chance=calibrated_error(stated, equal, rng),
-    )
-
-
-def _intervals(record: Record, truths: Mapping[str, RunTruth]) -> Iterator[IntervalCase]:
-    """Yield the intervals of a run whose fault was found, with the values that they should hold."""
-    known = truths.get(record["run"])
-    if known is None or record["diagnosis"] != record["truth"]:
-        return
-    truth = Hypothesis.parse(record["truth"])
-    mode = "+".join(fault.mode for fault in truth.faults) or str(truth)  # `unknown` has no mode
-    for quantity, true in (("onset", known.onset), ("magnitude", known.magnitude)):
-        interval = record.get(f"{quantity}_90")
-        if interval is not None and np.isfinite(true):
-            low, high = interval
-            yield IntervalCase(mode, quantity, low, high, true)
-
-
-# Two result files on the same runs: which method is better?
-
-
-@dataclass(frozen=True)
-class Results:
-    """A result file and what to call it.
-
-    Attributes:
-        name: Such as its path.
-        records: Its diagnoses.
-    """
-
-    name: str
-    records: Sequence[Record]
+    coverage: Sequence[metrics.Coverage]
 
     @property
-    def protocol(self) -> str:
-        """How much real data the method has seen."""
-        return protocol_of(self.records)
+    def scores(self) -> metrics.Scores:
+        """Right, wrong and the log score."""
+        return self.judged.scores
+
+
+def evaluate(
+    results: Given,
+    truth: xr.Dataset | Truths | None = None,
+    rng: np.random.Generator | None = None,
+) -> Evaluation:
+    """Return all scores of the diagnoses whose truth is known.
+
+    Args:
+        results: Diagnoses, as a diagnoser returns them or `read_results` reads them.
+        truth: Run set that knows the truth; None: what the diagnoses themselves say. Without it
+            nothing is known of the coverage of intervals.
+        rng: Source of chance, for the calibration error that chance alone would show; None: seed 0.
+
+    Raises:
+        InputError: If no truth is known, a run is not in `truth`, or is given twice.
+    """
+    given, truths = as_results(results), _truths(truth)
+    judged = Judged.of(given, truths)
+    if not judged.diagnoses:
+        raise _no_truth(given.name)
+    intervals = () if truths is None else _intervals(judged, truths)
+    return Evaluation(
+        judged=judged,
+        alarms=metrics.count_alarms(judged.truth, judged.verdicts),
+        brier=float(metrics.brier_score(judged.truth, judged.posteriors).mean()),
+        calibration=_calibration(judged, rng or np.random.default_rng(0)),
+        coverage=metrics.coverage_by_mode(intervals),
+    )
+
+
+def _no_truth(name: str) -> InputError:
+    return InputError(
+        f"{name}: no run says what was true. Give a run set that does with --truth RUNS."
+    )
+
+
+def _truths(given: xr.Dataset | Truths | None) -> Truths | None:
+    return given if given is None or isinstance(given, Truths) else Truths.of(given)
+
+
+def _calibration(judged: Judged, rng: np.random.Generator) -> Calibration | None:
+    pairs = zip(judged.verdicts, judged.posteriors, strict=True)
+    decided = np.array([verdict is not None for verdict in judged.verdicts])
+    if not decided.any():
+        return None
+    chance = np.array([posterior[verdict] for verdict, posterior in pairs if verdict is not None])
+    stated, right = np.minimum(chance, 1.0), judged.right[decided]  # sums may round above 1
+    equal = metrics.equal_edges()
+    return Calibration(
+        equal=metrics.reliability(stated, right, equal),
+        adaptive=metrics.reliability(stated, right, metrics.adaptive_edges(stated)),
+        by_chance=metrics.calibrated_error(stated, equal, rng),
+    )
+
+
+def _intervals(judged: Judged, truths: Truths) -> Iterator[metrics.IntervalCase]:
+    """Yield the intervals of runs whose fault was found, with the values that they should hold."""
+    for diagnosis, right in zip(judged.diagnoses, judged.truth, strict=True):
+        if diagnosis.diagnosis != right:
+            continue
+        known, hypothesis = truths[diagnosis.run], Hypothesis.parse(right)
+        mode = "+".join(f.mode for f in hypothesis.faults) or str(hypothesis)  # `unknown` has none
+        for quantity, interval, true in (
+            ("onset", diagnosis.onset_90, known.onset),
+            ("magnitude", diagnosis.magnitude_90, known.magnitude),
+        ):
+            if interval is not None and np.isfinite(true):
+                yield metrics.IntervalCase(mode, quantity, *interval, true)
+
+
+# Two methods on the same runs: which is better?
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What two result files say of the same runs.
+    """What two methods say of the same runs.
 
     Attributes:
         first: Name and protocol of the first.
@@ -262,8 +322,8 @@ class Comparison:
 
     first: str
     second: str
-    split: McNemar
-    gain: LogScoreGain
+    split: metrics.McNemar
+    gain: metrics.LogScoreGain
     as_unknown: tuple[int, int]
 
     @property
@@ -273,40 +333,48 @@ class Comparison:
         return split.both + split.first_only + split.second_only + split.neither
 
 
-def compare_results(first: Results, second: Results, rng: np.random.Generator) -> Comparison:
-    """Compare two result files run by run, matched by run name.
+def compare(
+    first: Given,
+    second: Given,
+    truth: xr.Dataset | Truths | None = None,
+    rng: np.random.Generator | None = None,
+) -> Comparison:
+    """Compare two methods run by run, matched by run name, each by its own hypotheses.
 
     Args:
         first: Diagnoses, with the truth of those runs that are to count.
         second: Others of the same runs; where they lack the truth, that of the first counts.
-        rng: Source of chance, for the bootstrap.
+        truth: Run set that knows the truth; None: what the diagnoses say.
+        rng: Source of chance, for the bootstrap; None: seed 0.
 
     Raises:
-        InputError: If the runs or their truths differ.
+        InputError: If the runs or their truths differ, or no truth is known.
     """
-    paired = _paired(first, second)
-    ours, theirs = (judged_records(records) for records in paired)  # each by its own hypotheses
+    one, other = as_results(first, "the first results"), as_results(second, "the second results")
+    matched = _matched(one, other)
+    truths = _truths(truth) or _own_truth(one, other.name, matched)
+    counted = [d for d in one.diagnoses if truth is not None or d.truth]
+    ours, theirs = (Judged.of(ds, truths) for ds in (counted, [matched[d.run] for d in counted]))
     return Comparison(
-        first=f"{first.name} (protocol {first.protocol})",
-        second=f"{second.name} (protocol {second.protocol})",
-        split=mcnemar(_right(ours), _right(theirs)),
-        gain=log_score_gain(_nats(ours), _nats(theirs), rng),
-        as_unknown=(truths_as_unknown(paired[0]).total(), truths_as_unknown(paired[1]).total()),
+        first=_named(one),
+        second=_named(other),
+        split=metrics.mcnemar(ours.right, theirs.right),
+        gain=metrics.log_score_gain(
+            ours.scores.log_scores.nats,
+            theirs.scores.log_scores.nats,
+            rng or np.random.default_rng(0),
+        ),
+        as_unknown=(sum(ours.as_unknown.values()), sum(theirs.as_unknown.values())),
     )
 
 
-def _right(records: Sequence[Record]) -> BoolArray:
-    return np.array([record["diagnosis"] == record["truth"] for record in records], dtype=np.bool_)
+def _named(results: Results) -> str:
+    return f"{results.name} (protocol {Judged.of(results).protocol})"
 
 
-def _nats(records: Sequence[Record]) -> FloatArray:
-    truth = [record["truth"] for record in records]
-    return log_score(truth, [record["posterior"] for record in records]).nats
-
-
-def _paired(first: Results, second: Results) -> tuple[list[Record], list[Record]]:
-    """Return the records of both whose truth is known, run by run, both with that of the first."""
-    ours, theirs = _by_run(first), _by_run(second)
+def _matched(first: Results, second: Results) -> dict[str, Diagnosis | Record]:
+    """Return the second diagnoses by run name, which must be those of the first."""
+    ours, theirs = ({d.run: d for d in results.diagnoses} for results in (first, second))
     for has, lacks, missing in (
         (first, second, [run for run in ours if run not in theirs]),
         (second, first, [run for run in theirs if run not in ours]),
@@ -316,19 +384,19 @@ def _paired(first: Results, second: Results) -> tuple[list[Record], list[Record]
                 f"{lacks.name}: lacks {len(missing)} runs of {has.name} ({some_names(missing)}). "
                 "Two methods are compared on the same runs: diagnose the same inputs with both."
             )
-    known = [record for record in first.records if record["truth"]]
-    matched = [theirs[record["run"]] for record in known]
-    for one, other in zip(known, matched, strict=True):
-        if other["truth"] not in (None, "", one["truth"]):
+    return theirs
+
+
+def _own_truth(first: Results, second: str, matched: Mapping[str, Diagnosis | Record]) -> Truths:
+    """Return what the first diagnoses say was true, which the second must not gainsay."""
+    known = {d.run: RunTruth(d.truth) for d in first.diagnoses if d.truth}
+    if not known:
+        raise _no_truth(first.name)
+    for run, true in known.items():
+        said = matched[run].truth
+        if said and said != true.fault:
             raise InputError(
-                f"{second.name}: run {one['run']!r} is {other['truth']} there, but {one['truth']} "
-                f"in {first.name}. Give the truth of both with --truth RUNS."
+                f"{second}: run {run!r} is {said} there, but {true.fault} in {first.name}. Give "
+                "the truth of both with --truth RUNS."
             )
-    return known, [
-        {**other, "truth": one["truth"]} for one, other in zip(known, matched, strict=True)
-    ]
-
-
-def _by_run(results: Results) -> dict[str, Record]:
-    check_each_once(results.records, results.name)
-    return {record["run"]: record for record in results.records}
+    return Truths(first.name, known)

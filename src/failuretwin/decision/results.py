@@ -1,74 +1,78 @@
-"""Results of a diagnosis as files: JSON lines and CSV."""
+"""Diagnoses as files: JSON lines, an object a run, and CSV, a row a run."""
 
 from __future__ import annotations
 
 import csv
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from failuretwin.core.config import from_table
 from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Diagnosis, Interval
 from failuretwin.data_knowledge.store import replacing
-from failuretwin.decision.metrics import LogScore, Scores, judged_truth, score
 
-Record = dict[str, Any]
-"""One diagnosis as the JSON object of the contract."""
-
-NEEDED = ("run", "diagnosis", "posterior")
-NAMED_RUNS = 3
-"""So many runs are named in an error."""
 SUM_ERROR = 1e-6
 """Probabilities of a run may sum to 1 plus or minus this."""
+NAMED_RUNS = 3
+"""So many runs are named in an error."""
+EXPECTED = "Expected the output of diagnose --json."
 
 
-def write_json_lines(records: Sequence[Record], path: Path) -> None:
-    """Write an object a line; the file appears whole or not at all."""
-    with replacing(path) as partial:
-        text = "".join(json.dumps(record) + "\n" for record in records)
-        partial.write_text(text, encoding="utf-8")
+@dataclass(frozen=True)
+class Record:
+    """A stored diagnosis, of this package or another; the fields are those of `Diagnosis`.
+
+    Attributes:
+        run: Name of the run.
+        posterior: Probability of every hypothesis; sums to 1.
+        diagnosis: The verdict, one of them; None where there is none.
+    """
+
+    run: str
+    posterior: dict[str, float]
+    diagnosis: str | None = None
+    truth: str | None = None
+    onset_s: float | None = None
+    onset_90: Interval | None = None
+    magnitude: float | None = None
+    magnitude_unit: str | None = None
+    magnitude_90: Interval | None = None
+    verdict: str = ""
+    protocol: str | None = None
+    method: str = ""
 
 
-def read_json_lines(path: Path) -> list[Record]:
-    """Read what `write_json_lines` wrote; a line without `truth` is as one whose truth is null.
+NEEDED = ("run", "diagnosis", "posterior")
+KNOWN = frozenset(field.name for field in fields(Record))
+
+
+@dataclass(frozen=True)
+class Results:
+    """Diagnoses by one method, each run once.
+
+    Attributes:
+        name: What to call them in errors and tables, such as the file that they are in.
+        diagnoses: One a run.
 
     Raises:
-        InputError: If the file cannot be read, a line is not a diagnosis, or a run is there twice.
+        InputError: If a run is there twice, which would count it twice.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{path}: cannot be read ({error}). Expected the output of diagnose --json."
-        ) from error
-    records = []
-    for number, line in enumerate(lines, start=1):
-        if line.strip():
-            records.append(_read_record(line, f"{path}: line {number}"))
-    if not records:
-        raise InputError(f"{path}: is empty. Expected the output of diagnose --json.")
-    check_each_once(records, str(path))
-    return records
 
+    name: str
+    diagnoses: Sequence[Diagnosis | Record]
 
-def check_each_once(records: Sequence[Record], where: str) -> None:
-    """Refuse results that hold a run twice, which would count it twice.
-
-    Args:
-        records: Diagnoses.
-        where: What to call them in the error.
-
-    Raises:
-        InputError: If a run is there twice.
-    """
-    count = Counter(record["run"] for record in records)
-    twice = [run for run, times in count.items() if times > 1]
-    if twice:
-        raise InputError(
-            f"{where}: {some_names(twice)} given twice. Expected each run once: remove the lines "
-            "that repeat one, or write the file anew with diagnose --json."
-        )
+    def __post_init__(self) -> None:
+        count = Counter(diagnosis.run for diagnosis in self.diagnoses)
+        twice = [run for run, times in count.items() if times > 1]
+        if twice:
+            raise InputError(
+                f"{self.name}: {some_names(twice)} given twice. Expected each run once: remove the "
+                "lines that repeat one, or write the file anew with diagnose --json."
+            )
 
 
 def some_names(names: Sequence[str]) -> str:
@@ -76,48 +80,57 @@ def some_names(names: Sequence[str]) -> str:
     return ", ".join(names[:NAMED_RUNS]) + (", ..." if len(names) > NAMED_RUNS else "")
 
 
+def write_json_lines(diagnoses: Iterable[Diagnosis], path: Path) -> None:
+    """Write an object a line; the file appears whole or not at all."""
+    with replacing(path) as partial:
+        text = "".join(json.dumps(diagnosis.to_record()) + "\n" for diagnosis in diagnoses)
+        partial.write_text(text, encoding="utf-8")
+
+
+def read_results(path: Path) -> Results:
+    """Read what `write_json_lines` wrote, or another program with the same keys.
+
+    What is null or left out is not known; keys beyond those of `Record` are passed over.
+
+    Raises:
+        InputError: If the file cannot be read, a line is not a diagnosis, or a run is there twice.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error}). {EXPECTED}") from error
+    records = [
+        _read_record(line, f"{path}: line {number}")
+        for number, line in enumerate(lines, start=1)
+        if line.strip()
+    ]
+    if not records:
+        raise InputError(f"{path}: is empty. {EXPECTED}")
+    return Results(str(path), records)
+
+
 def _read_record(line: str, where: str) -> Record:
     try:
-        record = json.loads(line)
+        stored = json.loads(line)
     except json.JSONDecodeError as error:
-        raise InputError(
-            f"{where}: not JSON ({error}). Expected diagnose --json output."
-        ) from error
-    missing = [key for key in NEEDED if not isinstance(record, dict) or key not in record]
+        raise InputError(f"{where}: not JSON ({error}). {EXPECTED}") from error
+    missing = [key for key in NEEDED if not isinstance(stored, dict) or key not in stored]
     if missing:
-        raise InputError(f"{where}: no {', '.join(missing)}. Expected diagnose --json output.")
-    record = {"truth": None} | record
-    _check_kinds(record, where)
-    posterior = record["posterior"]
-    numbers = isinstance(posterior, dict) and all(
-        isinstance(p, int | float) for p in posterior.values()
-    )
-    if not numbers or record["diagnosis"] not in (None, *posterior):
-        raise InputError(
-            f"{where}: `posterior` and `diagnosis` do not fit together. Expected a probability for "
-            "each hypothesis, and one of them (or null) as diagnosis."
-        )
-    _check_probabilities(list(posterior.values()), where)
+        raise InputError(f"{where}: no {', '.join(missing)}. {EXPECTED}")
+    known = {key: value for key, value in stored.items() if key in KNOWN and value is not None}
+    record = from_table(Record, known, where)
+    _check_probabilities(record, where)
     return record
 
 
-def _check_kinds(record: Record, where: str) -> None:
-    for key, allowed in (("run", str), ("truth", str | None)):
-        if not isinstance(record[key], allowed):
-            raise InputError(f"{where}: `{key}` is {record[key]!r}, expected text.")
-    for key in ("onset_90", "magnitude_90"):
-        ends = record.get(key)
-        if ends is not None and not (
-            isinstance(ends, list)
-            and len(ends) == 2
-            and all(isinstance(e, int | float) for e in ends)
-        ):
-            raise InputError(f"{where}: `{key}` is {ends!r}, expected two numbers or null.")
-
-
-def _check_probabilities(posterior: Sequence[float], where: str) -> None:
-    total = sum(posterior)
-    inside = all(0.0 <= p <= 1.0 + SUM_ERROR for p in posterior)
+def _check_probabilities(record: Record, where: str) -> None:
+    if record.diagnosis not in (None, *record.posterior):
+        raise InputError(
+            f"{where}: `posterior` has no `diagnosis` {record.diagnosis!r}. Expected a probability "
+            "for each hypothesis, and one of them (or null) as diagnosis."
+        )
+    total = sum(record.posterior.values())
+    inside = all(0.0 <= p <= 1.0 + SUM_ERROR for p in record.posterior.values())
     if not inside or not abs(total - 1.0) <= SUM_ERROR:
         raise InputError(
             f"{where}: `posterior` sums to {total:g}. Expected probabilities within 0 to 1 that "
@@ -125,98 +138,23 @@ def _check_probabilities(posterior: Sequence[float], where: str) -> None:
         )
 
 
-def judged_records(records: Sequence[Record]) -> list[Record]:
-    """Return the records whose truth is known, with the truth that they are judged by."""
-    return [
-        {**record, "truth": judged_truth(record["truth"], record["posterior"])}
-        for record in records
-        if record["truth"]
-    ]
-
-
-def truths_as_unknown(records: Sequence[Record]) -> Counter[str]:
-    """Return how many runs of each truth are judged as `unknown`, by the truth."""
-    known = [record for record in records if record["truth"]]
-    judged = judged_records(records)
-    return Counter(
-        told["truth"]
-        for told, record in zip(known, judged, strict=True)
-        if told["truth"] != record["truth"]
-    )
-
-
-def as_unknown_line(records: Sequence[Record]) -> str:
-    """Return which truths are judged as `unknown`, in words; empty if none is."""
-    found = truths_as_unknown(records)
-    if not found:
-        return ""
-    truths = [f"{truth} ({count} run{'s' * (count > 1)})" for truth, count in found.items()]
-    return f"judged as unknown, since not among the hypotheses: {', '.join(truths)}"
-
-
-def protocol_of(records: Sequence[Record]) -> str:
-    """Return the protocol letters of the records, joined by a slash where they differ."""
-    return "/".join(sorted({record.get("protocol") or "?" for record in records}))
-
-
-def score_records(records: Sequence[Record]) -> Scores | None:
-    """Return the scores of those records whose truth is known; None if there are none."""
-    judged = judged_records(records)
-    if not judged:
-        return None
-    return score(
-        [record["truth"] for record in judged],
-        [record["diagnosis"] for record in judged],
-        [record["posterior"] for record in judged],
-    )
-
-
-def score_line(records: Sequence[Record]) -> str:
-    """Return the accuracy with its protocol, number of runs and interval; empty if unknown."""
-    scores = score_records(records)
-    if scores is None:
-        return ""
-    low, high = scores.interval
-    return (
-        f"{scores.right} of {scores.runs} runs right: accuracy {100 * scores.accuracy:.1f} % "
-        f"(95 % interval {100 * low:.1f} to {100 * high:.1f} %), protocol {protocol_of(records)}, "
-        f"log score {log_score_text(scores.surprise)}"
-    )
-
-
-def log_score_text(surprise: LogScore) -> str:
-    """Return the log score in words; says so where a truth was ruled out altogether."""
-    text = f"{surprise.mean:.3f} nats a run"
-    if not surprise.impossible:
-        return text
-    rest = surprise.nats.size - surprise.impossible
-    if not rest:
-        return f"{text} (the truth was given no probability in any run)"
-    return (
-        f"{text} (of {surprise.impossible} runs the truth was given no probability; the other "
-        f"{rest}: {surprise.mean_of_rest:.3f})"
-    )
-
-
-def write_csv(records: Sequence[Record], path: Path) -> None:
+def write_csv(diagnoses: Iterable[Diagnosis], path: Path) -> None:
     """Write a row a run: plain columns, then the probability of each hypothesis."""
     with replacing(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
-        rows = [_csv_row(record) for record in records]
+        rows = [_csv_row(diagnosis) for diagnosis in diagnoses]
         columns = dict.fromkeys(column for row in rows for column in row)
         writer = csv.DictWriter(file, fieldnames=list(columns))
         writer.writeheader()
         writer.writerows(rows)
 
 
-def _csv_row(record: Record) -> Record:
-    row: Record = {}
-    for key, value in record.items():
-        if key in ("posterior", "evidence"):
-            continue
+def _csv_row(diagnosis: Diagnosis) -> dict[str, Any]:
+    row: dict[str, Any] = {}
+    for key, value in diagnosis.to_record().items():
         if key.endswith("_90"):
             low, high = value or (None, None)
             row |= {f"{key}_low": low, f"{key}_high": high}
-        else:
+        elif key not in ("posterior", "evidence"):
             row[key] = "; ".join(value) if isinstance(value, list) else value
-    row |= {f"p({name})": p for name, p in record["posterior"].items()}
-    return row | {f"nats({e['movement']})": e["nats"] for e in record["evidence"]}
+    row |= {f"p({name})": p for name, p in diagnosis.posterior.items()}
+    return row | {f"nats({e.movement})": e.nats for e in diagnosis.evidence}

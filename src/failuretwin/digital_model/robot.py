@@ -184,12 +184,16 @@ def bundled_robots() -> list[str]:
     return sorted(path.stem for path in bundled_folder().glob("*.toml"))
 
 
-def load_robot(name_or_path: str | Path) -> Robot:
+def load_robot(name_or_path: str | Path | Robot) -> Robot:
     """Load a bundled robot by name, or any robot by the path of its TOML profile.
+
+    A robot that is loaded already is returned as it is.
 
     Raises:
         InputError: If there is no such robot or its profile or URDF cannot be used.
     """
+    if isinstance(name_or_path, Robot):
+        return name_or_path
     return _load_profile(_find_profile(name_or_path))
 
 

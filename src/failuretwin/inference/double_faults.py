@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from failuretwin.core.numerics import Weighted, log_sum
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.inference.joint_likelihood import JointLikelihood, joint_likelihoods
-from failuretwin.inference.marginal import Estimate, FaultModel, MarginalLikelihood
+from failuretwin.inference.marginal import (
+    Estimate,
+    FaultModel,
+    MarginalLikelihood,
+    change_points,
+    movement_log_likelihoods,
+)
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.unknown import way_of_two
 
 FEWEST_NATS = 14.0
 """Nodes of the first fault this far below its best, given any movement, are left out."""
 MOST_NODES = 400
-"""Nodes of each fault to sum over; of laws with more, such as drift, the others are thinned out.
+"""Nodes of each fault to sum over; of faults with more, such as drift, the others are thinned out.
 What one fault alone makes of a movement says little of its size beside another, so few can be
 spared."""
 
@@ -28,8 +34,8 @@ def double_fault_likelihood(
     """Return what runs say of two faults at once.
 
     Args:
-        likelihoods: One scene of a single run each: the sums over two sizes need memory.
-        fault_models: The laws of the two faults in each, of different motors.
+        likelihoods: Of a single run each: the sums over two sizes need memory.
+        fault_models: Fault models of the two faults in each, of different motors.
     """
     found = [
         _weigh_one(likelihood, *pair)
@@ -45,41 +51,23 @@ def double_fault_likelihood(
 
 def _weigh_one(likelihood: RunLikelihood, one: FaultModel, two: FaultModel) -> MarginalLikelihood:
     one, two = _thinned(likelihood, one), _thinned(likelihood, two)
-    alone = [
-        _cells(_alone(likelihood, fault_model), fault_model) for fault_model in (one, two)
-    ]  # (movement, cell)
-    both = _both(likelihood, one, two)  # (movement, cell of one, cell of two)
-    settled = likelihood.log_healthy[0], alone, both
-    ways = [_way(likelihood, fault_model) for fault_model in (one, two)]
-    alone = [values + way for values, way in zip(alone, ways, strict=True)]
-    # The way with both faults is not computed for each node: it is no less probable than with one
-    # of them, or with both motors where they are seen to settle.
-    with_two = way_of_two(likelihood, (one.motor, two.motor))[0]
-    both = both + np.maximum(
-        np.maximum(ways[0][:, :, None], ways[1][:, None]), with_two[:, None, None]
+    first, second = (movement_log_likelihoods(likelihood, fault) for fault in (one, two))
+    settled = _Densities(
+        likelihood.log_healthy,
+        first.by_cell[..., None],
+        second.by_cell[:, :, None],
+        _both(likelihood, one, two),
     )
-    healthy, count = settled[0] + likelihood.log_transient[0], len(both)
-    prior = [fault_model.log_prior[0] for fault_model in (one, two)]  # (movement, cell)
-
-    before = _sums(healthy)
-    first, second = (_sums(values) for values in alone)
-    together = _sums(both)
-    terms = np.empty((count, count))
-    for i in range(count):
-        for j in range(count):
-            prior_before_run, late = min(i, j), max(i, j)
-            between = (
-                (first[late] - first[prior_before_run])[:, None]
-                if i <= j
-                else (second[late] - second[prior_before_run])[None, :]
-            )
-            joint = between + (together[-1] - together[late])
-            joint = joint + prior[0][i][:, None] + prior[1][j][None, :]
-            terms[i, j] = before[prior_before_run] + log_sum(joint, axis=(0, 1))
-    log_evidence = log_sum(terms, axis=(0, 1))
-    share = np.exp(terms - log_evidence)
-    at = np.unravel_index(np.argmax(share), share.shape)
-    first_two = int(at[0]), int(at[1])
+    whole = settled.on_way(
+        likelihood.log_transient,
+        first.way[..., None],
+        second.way[:, :, None],
+        way_of_two(likelihood, (one.motor, two.motor))[..., None, None],
+    )
+    log_joint = _log_joint(whole, one.log_prior[..., None], two.log_prior[:, :, None])
+    log_evidence = log_sum(log_joint, axis=(0, 1))
+    share = np.exp(log_joint - log_evidence)
+    begun = np.divmod(int(np.argmax(share)), len(share))
     onset = _earliest(one, two, share)
 
     def estimate(run: int) -> Estimate:
@@ -87,34 +75,86 @@ def _weigh_one(likelihood: RunLikelihood, one: FaultModel, two: FaultModel) -> M
 
     return MarginalLikelihood(
         log_evidence=np.atleast_1d(log_evidence),
-        by_movement=lambda run: _by_movement(healthy, alone, both, *first_two),
-        settled=lambda run: _by_movement(*settled, *first_two),
+        by_movement=lambda run: whole.by_movement(*begun),
+        settled=lambda run: settled.by_movement(*begun),
         estimate=estimate,
     )
 
 
-def _way(likelihood: RunLikelihood, fault_model: FaultModel) -> FloatArray:
-    """Return log densities of the way with one of the faults alone, (movement, node or 1)."""
-    if fault_model.log_transient is not None:
-        return fault_model.log_transient[0]
-    return likelihood.log_transient_offset(fault_model.motor, fault_model.gain)[0][:, None]
+@dataclass(frozen=True)
+class _Densities:
+    """Log densities of the movements of a run, with none, one and both of two faults.
+
+    Attributes:
+        healthy: (1, movement).
+        one: With the first fault alone, (1, movement, cell of one, 1).
+        two: With the second alone, (1, movement, 1, cell of two).
+        both: (1, movement, cell of one, cell of two).
+    """
+
+    healthy: FloatArray
+    one: FloatArray
+    two: FloatArray
+    both: FloatArray
+
+    def on_way(
+        self, healthy: FloatArray, one: FloatArray, two: FloatArray, seen: FloatArray
+    ) -> _Densities:
+        """Return the densities with those of the way, axes as of the attributes.
+
+        With both faults the way is not computed for each cell: it is no less probable than with one
+        of them, or with both motors where they are `seen` to settle, (1, movement, 1, 1).
+        """
+        both = np.maximum(np.maximum(one, two), seen)
+        return _Densities(self.healthy + healthy, self.one + one, self.two + two, self.both + both)
+
+    def by_movement(self, one: int, two: int) -> FloatArray:
+        """Return the log density of each movement under the best cells, (movement,).
+
+        Args:
+            one: First movement that the first fault spoils.
+            two: First one that the second spoils.
+        """
+        alone, movement = self.one if one <= two else self.two, np.arange(self.both.shape[1])
+        return np.where(
+            movement < min(one, two),
+            self.healthy[0],
+            np.where(
+                movement < max(one, two), alone[0].max(axis=(1, 2)), self.both[0].max(axis=(1, 2))
+            ),
+        )
 
 
-def _alone(likelihood: RunLikelihood, fault_model: FaultModel) -> FloatArray:
-    """Return log densities with one of the faults alone, (movement, node)."""
-    return likelihood.profile(fault_model.motor).log_density(fault_model.angle, fault_model.held)[0]
+def _log_joint(says: _Densities, log_one: FloatArray, log_two: FloatArray) -> FloatArray:
+    """Return log p(run, i, j): the faults begin with movements i and j, whatever their cells.
+
+    Once the earlier fault is there, the later one is a change point of what is left of the run.
+
+    Args:
+        says: Log densities of the movements.
+        log_one: Log prior of first movement and cell of one fault, (1, movement, cell of one, 1).
+        log_two: The same of the other, (1, movement, 1, cell of two).
+    """
+    count = says.both.shape[1]
+    joint = np.empty((count, count))
+    for i in range(count):
+        before, both = says.healthy[0, :i].sum(), says.both[:, i:]
+        later = change_points(says.one[:, i:], both, log_one[:, i, None] + log_two[:, i:])
+        joint[i, i:] = before + log_sum(later[0], axis=(1, 2))
+        later = change_points(says.two[:, i:], both, log_one[:, i:] + log_two[:, i, None])
+        joint[i + 1 :, i] = before + log_sum(later[0, 1:], axis=(1, 2))
+    return joint
 
 
 def _both(likelihood: RunLikelihood, one: FaultModel, two: FaultModel) -> FloatArray:
-    """Return log densities with both faults, (movement, cell of one, cell of two)."""
+    """Return log densities with both faults, (1, movement, cell of one, cell of two)."""
     profile = _given(likelihood, one, two.motor)
     angle = two.angle[:, :, None]  # (run, movement, 1, node of two, alternative)
     if not two.held:  # an offset from where the motor settles with the other fault there
         angle = angle - likelihood.profile(two.motor).expected[:, :, None, None]
         angle = angle + profile.expected[:, :, :, None]
-    density = profile.log_density(angle, two.held)[0]
-    density = _cells(density, two)
-    return np.swapaxes(_cells(np.swapaxes(density, 1, 2), one), 1, 2)
+    density = two.by_cell(profile.log_density(angle, two.held))
+    return np.swapaxes(one.by_cell(np.swapaxes(density, 2, 3)), 2, 3)
 
 
 def _given(likelihood: RunLikelihood, one: FaultModel, motor: int) -> JointLikelihood:
@@ -133,19 +173,13 @@ def _given(likelihood: RunLikelihood, one: FaultModel, motor: int) -> JointLikel
     return profile
 
 
-def _cells(density: FloatArray, fault_model: FaultModel) -> FloatArray:
-    """Return densities by cell: by node, or by group where every movement draws its own node."""
-    if fault_model.redrawn is None:
-        return density
-    return log_sum(density[..., None, :] + fault_model.redrawn, axis=-1)
-
-
 def _thinned(likelihood: RunLikelihood, fault_model: FaultModel) -> FaultModel:
     """Return the fault model with few nodes: those within reach of what the movements say."""
     nodes = fault_model.angle.shape[2]
     if fault_model.redrawn is not None or nodes <= MOST_NODES:
         return fault_model
-    density = _alone(likelihood, fault_model)
+    profile = likelihood.profile(fault_model.motor)
+    density = profile.log_density(fault_model.angle, fault_model.held)[0]
     near = density - density.max(axis=1, keepdims=True) > -FEWEST_NATS
     score = near.sum(axis=0) + log_sum(fault_model.log_prior[0], axis=0) / 100.0
     kept = np.sort(np.argsort(-score, kind="stable")[:MOST_NODES])
@@ -177,27 +211,6 @@ def _of_nodes(values: FloatArray, nodes: IntArray) -> FloatArray:
 
 def _nearest(values: FloatArray, kept: FloatArray) -> IntArray:
     return np.argmin(np.abs(values[:, None] - kept), axis=1)
-
-
-def _sums(values: FloatArray) -> FloatArray:
-    """Return sums of the first 0, 1, ... entries along the first axis."""
-    return np.concatenate([np.zeros_like(values[:1]), np.cumsum(values, axis=0)])
-
-
-def _by_movement(
-    healthy: FloatArray, alone: list[FloatArray], both: FloatArray, one: int, two: int
-) -> FloatArray:
-    """Return log densities of each movement with the most probable onsets, best cells."""
-    movement = np.arange(len(healthy))
-    return np.where(
-        movement < min(one, two),
-        healthy,
-        np.where(
-            movement < max(one, two),
-            alone[0 if one <= two else 1].max(axis=1),
-            both.max(axis=(1, 2)),
-        ),
-    )
 
 
 def _earliest(one: FaultModel, two: FaultModel, share: FloatArray) -> Weighted:

@@ -1,5 +1,7 @@
 """By how many nats what is true beats every other hypothesis, if nothing is left to chance.
 
+    D(h) = max over m0, z of E log p(e | truth, m0, z) - max over m0, z of E log p(e | h, m0, z)
+
 The truth of each run is made again without scatter, losses and glitches, seen where the run was
 seen, and laid beside the best member of every hypothesis, in units of the declared scatter.
 """
@@ -9,7 +11,6 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,10 +27,10 @@ from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.fault import FaultValue
 from failuretwin.failure_behavior.injection import Injection, replayed
 from failuretwin.failure_behavior.modes import MODES
-from failuretwin.inference.evidence import Evidence
+from failuretwin.inference.evidence import Evidence, SettledEvidence, TransientSamples
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.joint_likelihood import JointLikelihood
-from failuretwin.inference.marginal import FaultModel, movement_log_likelihoods
+from failuretwin.inference.joint_likelihood import JointLikelihood, movement_likelihoods
+from failuretwin.inference.marginal import change_points, movement_log_likelihoods
 from failuretwin.inference.missed_movements import MISSED_MOVEMENT_FAULTS, log_densities
 from failuretwin.inference.posterior import (
     TRANSIENT_FAULTS,
@@ -67,7 +68,7 @@ def first_affected(movements: Movements, onset: FloatArray) -> BoolArray:
 def max_likelihood(
     likelihood: RunLikelihood, hypothesis: Hypothesis, priors: Priors, first: BoolArray
 ) -> FloatArray:
-    """Return the log density of each run under the best member of a hypothesis, (run,).
+    """Return max over m0, z of log p(e | m0, z), of the best member of a hypothesis, (run,).
 
     Args:
         likelihood: The runs.
@@ -78,20 +79,15 @@ def max_likelihood(
     if hypothesis.is_healthy:
         return np.asarray((likelihood.log_healthy + likelihood.log_transient).sum(axis=1))
     fault = hypothesis.faults[0]
+    log_first = log_of(first)[..., None]
     if fault.mode in MISSED_MOVEMENT_FAULTS:
-        whole = log_densities(likelihood, motor_of(likelihood, fault), fault.mode)[:, -1]
-    else:
-        whole = _by_first_and_cell(likelihood, fault_model_of(likelihood, fault, priors))
-    return np.asarray((whole + log_of(first)[..., None]).max(axis=(1, 2)))
-
-
-def _by_first_and_cell(likelihood: RunLikelihood, fault_model: FaultModel) -> FloatArray:
-    """Return the log density of each run, (run, first movement spoilt, cell)."""
+        chain = log_densities(likelihood, motor_of(likelihood, fault), fault.mode)[:, -1]
+        return np.asarray((chain + log_first).max(axis=(1, 2)))
+    fault_model = fault_model_of(likelihood, fault, priors)
     says = movement_log_likelihoods(likelihood, fault_model)
-    healthy, faulty = likelihood.log_healthy + likelihood.log_transient, says.by_cell + says.way
-    before = np.cumsum(healthy, axis=1) - healthy
-    after = np.cumsum(faulty[:, ::-1], axis=1)[:, ::-1]
-    return np.where(np.isfinite(fault_model.log_prior), before[:, :, None] + after, -np.inf)
+    possible = log_first + log_of(np.isfinite(fault_model.log_prior))
+    healthy = likelihood.log_healthy + likelihood.log_transient
+    return change_points(healthy, says.by_cell + says.way, possible).max(axis=(1, 2))
 
 
 # Noise-free runs as they are weighed on average: what a distance is expected to cost.
@@ -113,50 +109,41 @@ def expected_distance_factor(dof: float) -> float:
     return 1.0 if np.isinf(dof) else dof / (dof + 5.0)
 
 
-class ExpectedRunLikelihood(RunLikelihood):
-    """Noise-free runs, with densities that are expected ones, relative to a perfect fit.
+def expected_run_likelihood(
+    evidence: SettledEvidence, model: HealthyModel, moving: TransientSamples | None
+) -> RunLikelihood:
+    """Return noise-free runs with densities that are expected ones, relative to a perfect fit.
 
     Every hypothesis has the scatter of the healthy robot, also at a motor that is held, so that
-    the tool's place counts alone; a command that arrives counts as certain.
+    the tool's place counts alone; a command that arrives counts as certain. The tool of a healthy
+    robot strays along the circle of the motor that strays, not along its tangent: so that of the
+    motor counts that explains the position best.
+
+    Args:
+        evidence: Settled positions of runs without noise.
+        model: The healthy robot and its scatter.
+        moving: Readings on the way; None: they are left aside.
     """
-
-    @cached_property
-    def log_healthy(self) -> FloatArray:
-        """Expected log density of each settled position if no motor is faulty, (run, movement).
-
-        The tool strays along the circle of the motor that strays, not along its tangent: so that
-        of the motor counts that explains the position best.
-        """
-        profiles = [self.profile(motor) for motor in range(len(self.model.scatter))]
-        says = [p.log_density(p.expected[:, :, None], False)[..., 0] for p in profiles]
-        return np.asarray(np.max(says, axis=0))
-
-    def profile(self, motor: int) -> JointLikelihood:
-        """Return what each movement is expected to say of one motor, computed once."""
-        if motor not in self._expected:
-            self._expected[motor] = self._with_expected(super().profile(motor))
-        return self._expected[motor]
-
-    @cached_property
-    def _expected(self) -> dict[int, JointLikelihood]:
-        return {}
-
-    def _with_expected(self, profile: JointLikelihood) -> JointLikelihood:
-        own = 1.0 + profile.scatter**2 * profile.precision
-        factor = expected_distance_factor(profile.dof)
-        return replace(
-            profile,
-            precision=profile.precision / own * factor,
-            min_distance2=profile.min_distance2 * factor,
-            log_weight=_relative(self.outcomes.log_weight),
-            scatter=0.0,
-            outlier=-MOST_NATS,
-        )
+    found = movement_likelihoods(evidence, model)
+    log_weight = found.outcomes.log_weight - found.outcomes.log_weight[..., :1]
+    profiles = tuple(_expected(profile, log_weight) for profile in found.profiles)
+    says = [p.log_density(p.expected[:, :, None], False)[..., 0] for p in profiles]
+    expected = replace(found, profiles=profiles)
+    return RunLikelihood(evidence, model, moving, remembered=expected, healthy=np.max(says, axis=0))
 
 
-def _relative(log_weight: FloatArray) -> FloatArray:
-    """Return log weights of outcomes, relative to that of all commands arriving."""
-    return log_weight - log_weight[..., :1]
+def _expected(profile: JointLikelihood, log_weight: FloatArray) -> JointLikelihood:
+    """Return what each movement is expected to say of a motor, whether it is held or not."""
+    factor = expected_distance_factor(profile.dof)
+    own = 1.0 + profile.scatter**2 * profile.precision
+    return replace(
+        profile,
+        precision=profile.precision / own * factor,
+        min_distance2=profile.min_distance2 * factor,
+        log_weight=log_weight,
+        scatter=0.0,
+        outlier=-MOST_NATS,
+    )
 
 
 CHUNK_RUNS = 64
@@ -232,7 +219,7 @@ class ExpectedLogBayesFactor:
     ) -> FloatArray:
         evidence = Evidence(self.noise_free(runs, faults), self.model.settings)
         moving = evidence.transient if self._needs_way else None
-        likelihood = ExpectedRunLikelihood(evidence.settled, self.model, moving)
+        likelihood = expected_run_likelihood(evidence.settled, self.model, moving)
         first = first_affected(evidence.settled.movements, onset)
         return np.stack(
             [max_likelihood(likelihood, h, self.priors, first) for h in self.hypotheses], axis=1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,6 +22,23 @@ def percent(probability: float) -> str:
     if probability > 0.999:
         return "over 99.9 %"
     return f"{100 * probability:.1f} %" if probability > 0.99 else f"{100 * probability:.0f} %"
+
+
+def worded(
+    diagnosis: Diagnosis, ranked: Sequence[Hypothesis], losses: Sequence[str] = ()
+) -> Diagnosis:
+    """Return a diagnosis with its verdict and explanation in words.
+
+    Args:
+        diagnosis: With evidence and estimates filled in, as far as there are any.
+        ranked: Its hypotheses from the most to the least probable.
+        losses: Commands that seem not to have arrived.
+    """
+    return replace(
+        diagnosis,
+        verdict=verdict(diagnosis, ranked),
+        explanation=explanation(diagnosis, ranked, losses),
+    )
 
 
 def verdict(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> str:

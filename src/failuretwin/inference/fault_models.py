@@ -16,7 +16,7 @@ from failuretwin.data_knowledge.failure_modes import magnitude_range
 from failuretwin.digital_model.settling import sag
 from failuretwin.inference.joint_likelihood import JointLikelihood
 from failuretwin.inference.marginal import FaultModel
-from failuretwin.inference.onset import OnsetIntervals, immediate, next_movement
+from failuretwin.inference.onset import immediate, next_movement
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.settings import Range
 
@@ -199,8 +199,9 @@ def drift_model(likelihood: RunLikelihood, motor: int, prior_before_run: float) 
     settled = likelihood.profile(motor).faulty_baseline
     rate, log_rate = _rates(likelihood, motor, settled, middle)
     stretches = immediate(likelihood.evidence)
-    onset, log_onset = _onsets(stretches, prior_before_run)  # (run, movement, onset)
-    length = np.nan_to_num(stretches.end - stretches.begin)[..., None] * np.ones_like(onset)
+    onset, share = stretches.samples(prior_before_run, ONSETS)  # (run, movement, onset)
+    log_onset = log_of(stretches.weights(prior_before_run)[..., None] * share)
+    length = stretches.length[..., None] * np.ones_like(onset)
     length[..., 0] = 0.0  # before the run is no stretch of it
     runs, movements, onsets = onset.shape
     since = np.maximum(middle[:, :, None] - onset.reshape(runs, 1, -1), 0.0)
@@ -249,23 +250,6 @@ def _rates(
     together = weighted_quantiles(best, weight, (0.5,))
     spread = 1.0 / np.sqrt(np.where(some, total, 1.0))
     return size_nodes(together, spread, some, magnitude_range("drift"), signed=True)
-
-
-def _onsets(stretches: OnsetIntervals, prior_before_run: float) -> tuple[FloatArray, FloatArray]:
-    """Return onsets [s] and their log prior, (run, movement, onset); the first is the start."""
-    begin, end = np.nan_to_num(stretches.begin), np.nan_to_num(stretches.end)
-    inside = begin[..., None] + ONSETS * (end - begin)[..., None]
-    weight = stretches.weights(prior_before_run)
-    late = weight.copy()
-    late[:, 0] = np.maximum(late[:, 0] - prior_before_run, 0.0)
-    before = weight - late
-    onset = np.concatenate([np.zeros_like(inside[..., :1]), inside], axis=-1)
-    shares = np.concatenate(
-        [before[..., None], np.repeat(late[..., None] / len(ONSETS), len(ONSETS), -1)],
-        axis=-1,
-    )
-    log_shares = log_of(shares)
-    return onset, log_shares - log_sum(log_shares, axis=(1, 2))[:, None, None]
 
 
 # Faults that show on the way: a motor that starts late, a motor that is slow.

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from failuretwin.core.movements import Movements
-from failuretwin.core.numerics import Ellipsoid, log_fall, log_of
+from failuretwin.core.numerics import Ellipsoid
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections, Timing
@@ -17,34 +17,12 @@ from failuretwin.digital_model.twin import SAG_ROUNDS, DigitalTwin
 from failuretwin.inference.command_loss import OUTLIER_RATE, CommandOutcomes, LostCommands
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.settings import InferenceSettings
+from failuretwin.inference.start_delay import StartDelay
 
 PATH_NOISE_M = 0.001
 """Noise assumed of a settled tool position where the sensor is not known [m]."""
-LAG_STEPS_S = np.array([-0.04, -0.02, 0.0, 0.02, 0.04])
-"""Punctual starts to sum over, around the lag expected [s]."""
-LAG_SPREAD_S = 0.018
-"""Standard deviation of the lag from movement to movement [s]."""
-LATE_STEP_S = 0.1
-"""Step of the late starts to sum over [s]."""
 LEAST_NOISE_M = 0.0003
 """What a calibration leaves unsaid of the tool's path: bending links, bearings [m]; assumed."""
-
-
-@dataclass(frozen=True)
-class StartDelay:
-    """How long after its command a movement begins, as a sum over times.
-
-    Attributes:
-        shift_s: The times, (shift,) [s].
-        log_prior: Their log probability, (shift,).
-        step_s: How coarse the sum is [s].
-        log_chance: Log probability that a movement is one of these, (run, movement).
-    """
-
-    shift_s: FloatArray
-    log_prior: FloatArray
-    step_s: float
-    log_chance: FloatArray
 
 
 @dataclass(frozen=True)
@@ -139,6 +117,11 @@ class HealthyModel:
         return float(np.mean(loops) + np.mean(timing.delay_s) + np.mean(timing.lag_s))
 
     @cached_property
+    def start_delay(self) -> StartDelay:
+        """How long after its command a movement begins."""
+        return StartDelay.of(self.lag_s, self.imperfections.timing.late_s)
+
+    @cached_property
     def shortening(self) -> float:
         """Mean share by which ramps end early [-]."""
         return float(np.mean(self.imperfections.timing.ramp_shortening))
@@ -200,20 +183,6 @@ class HealthyModel:
         """Return the probability that each movement started late; see `LostCommands.late`."""
         return self.lost_commands.late(movements, first_reading_delay)
 
-    def start_delays(self, evidence: SettledEvidence) -> tuple[StartDelay, StartDelay]:
-        """Return how late movements begin that are punctual, and those that are not."""
-        lag, (low, high) = self.lag_s, self.imperfections.timing.late_s
-        weight = np.exp(-0.5 * (LAG_STEPS_S / LAG_SPREAD_S) ** 2)
-        punctual = np.maximum(lag + LAG_STEPS_S, 0.0)
-        delayed = np.arange(low, high + 0.5 * LATE_STEP_S, LATE_STEP_S) + lag
-        evenly = np.full(len(delayed), -np.log(len(delayed)))
-        late = log_of(self.late(evidence.movements, evidence.first_reading_delay))
-        on_time = log_of(-np.expm1(np.minimum(late, 0.0)))
-        return (
-            StartDelay(punctual, np.log(weight / weight.sum()), 0.0, on_time),
-            StartDelay(delayed, evenly, LATE_STEP_S, late),
-        )
-
     def settle(self, base: FloatArray, direction: FloatArray, held: BoolArray) -> FloatArray:
         """Return the angles at which the motors settle, (..., motor) [rad].
 
@@ -265,8 +234,7 @@ class HealthyModel:
         """
         pose = self.settle(outcomes.base, outcomes.direction, self.none_held)
         error, jacobian, spread = self.residual(evidence.point[:, :, None], pose, self.scatter)
-        dof = self.settling.tail_dof
-        density = spread.log_norm(dof) + log_fall(spread.product(error, error), dof)
+        density = spread.log_student(error, self.settling.tail_dof)
         return density, pose + scattered(spread, jacobian, self.scatter, error)
 
 

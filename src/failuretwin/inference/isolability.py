@@ -348,7 +348,7 @@ MOST_LOST = 0.1
 """A healthy motor loses at most this share of its commands, however often these logs did."""
 
 
-def fault_probability(runs: xr.Dataset, robot: Robot, learned: Imperfections) -> FloatArray:
+def fault_probabilities(runs: xr.Dataset, robot: Robot, learned: Imperfections) -> FloatArray:
     """Return the probability that each run is faulty, (run,); 0 where nothing can be told.
 
     A fit to faulty runs takes their errors for scatter and their stuck motors for lost commands,

@@ -14,7 +14,7 @@ from typing import Annotated
 import numpy as np
 
 from failuretwin.core.arrays import ArrayStruct, Axes
-from failuretwin.core.numerics import log_norm
+from failuretwin.core.numerics import log_fall
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.inference.command_loss import CommandOutcomes
 from failuretwin.inference.evidence import SettledEvidence
@@ -85,7 +85,7 @@ class JointLikelihood(ArrayStruct):
         """
         precision, log_weight = self._with_scatter(held)
         off = self._turned(angle - self.mode)
-        return log_weight + self._fall(self.min_distance2 + precision * off**2)
+        return log_weight + log_fall(self.min_distance2 + precision * off**2, self.dof)
 
     def log_density(self, angle: FloatArray, held: bool) -> FloatArray:
         """Return the log density of each settled position, whatever became of the commands.
@@ -102,7 +102,9 @@ class JointLikelihood(ArrayStruct):
         lead = log_weight.shape[:-1]
         angle = np.broadcast_to(angle, (*lead, *angle.shape[-2:]))
         total = np.ones((*lead, angle.shape[-2]))
-        matters = log_weight + self._fall(self.min_distance2) > self.outlier - NEGLIGIBLE_NATS
+        matters = (
+            log_weight + log_fall(self.min_distance2, self.dof) > self.outlier - NEGLIGIBLE_NATS
+        )
         # Alternative by alternative: large temporary arrays would cost more than the arithmetic.
         for k in range(log_weight.shape[-1]):
             some = matters[..., k]
@@ -113,7 +115,7 @@ class JointLikelihood(ArrayStruct):
             off *= off
             off *= precision[some, k, None]
             off += self.min_distance2[some, k, None]
-            fall = self._fall(off)
+            fall = log_fall(off, self.dof)
             fall += log_weight[some, k, None] - self.outlier
             total[some] += np.exp(fall, out=fall)
         found = self.outlier + np.log(total)
@@ -130,14 +132,6 @@ class JointLikelihood(ArrayStruct):
             return self.precision, self.log_weight
         inflation = 1.0 + self.scatter**2 * self.precision
         return self.precision / inflation, self.log_weight - 0.5 * np.log(inflation)
-
-    def _fall(self, square: FloatArray) -> FloatArray:
-        if np.isinf(self.dof):
-            return -0.5 * square
-        fall = square / self.dof
-        np.log1p(fall, out=fall)
-        fall *= -0.5 * (self.dof + 3.0)
-        return fall
 
 
 def joint_likelihoods(
@@ -197,7 +191,7 @@ def joint_likelihoods(
     settled = np.where(own, angle[..., None], settled)
     beside = _beside(model, expected, direction, base, own, angle)
     dof = model.settling.tail_dof
-    weighed = log_weight + log_norm(dof) - 0.5 * np.log(spread.determinant)
+    weighed = log_weight + spread.log_norm(dof)
 
     def everywhere(values: FloatArray, elsewhere: float = 0.0) -> FloatArray:
         found = np.full((*lead, *values.shape[1:]), elsewhere)

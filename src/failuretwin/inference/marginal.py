@@ -53,41 +53,48 @@ class MarginalLikelihood:
     estimate: Callable[[int], Estimate]
 
 
+# The change point: the first movement m0 that a fault spoils, and the cell z of all else unknown.
+
+
+def change_points(
+    log_healthy: FloatArray, log_faulty: FloatArray, log_prior: FloatArray
+) -> FloatArray:
+    """Return the log density of each run with each first movement spoilt and each cell.
+
+    log p(e, m0, z) = sum_{m < m0} L_m(healthy) + sum_{m >= m0} L_m(z) + log p(m0, z)
+
+    Args:
+        log_healthy: Log density of each movement before the fault, (run, movement), or with axes
+            for cells as below.
+        log_faulty: The same with it, (run, movement, cell, ...).
+        log_prior: log p(m0, z), axes as of `log_faulty`.
+
+    Returns:
+        (run, movement, cell, ...).
+    """
+    cells = (1,) * (log_faulty.ndim - log_healthy.ndim)
+    before = np.cumsum(log_healthy, axis=1) - log_healthy
+    after = np.cumsum(log_faulty[:, ::-1], axis=1)[:, ::-1]
+    return np.asarray(before.reshape(*before.shape, *cells) + after + log_prior)
+
+
 @dataclass(frozen=True)
 class ChangePointPosterior:
     """Log evidence of each run, and of first movement and cell given it.
 
     Attributes:
-        log_evidence: (run,).
-        log_responsibility: Log posterior, (run, movement first spoilt, cell).
+        log_evidence: log p(e) = log sum over m0 and z of p(e, m0, z), (run,).
+        log_responsibility: log p(m0, z | e), (run, movement, cell).
     """
 
     log_evidence: FloatArray
     log_responsibility: FloatArray
 
-
-def change_point_posterior(
-    log_healthy: FloatArray,
-    density: FloatArray,
-    log_prior: FloatArray,
-    log_transient: tuple[FloatArray, FloatArray],
-) -> ChangePointPosterior:
-    """Sum over the first movement that a fault spoils and over its cells.
-
-    Args:
-        log_healthy: Log density of each settled position if all is well, (run, movement).
-        density: The same with the fault, (run, movement, cell).
-        log_prior: Log probability of first movement and cell, (run, movement, cell).
-        log_transient: Log density of the readings on the way if all is well, (run, movement), and
-            with the fault, (run, movement, cell) or the same for all cells, (run, movement, 1).
-    """
-    healthy, faulty = log_healthy + log_transient[0], density + log_transient[1]
-    before = np.cumsum(healthy, axis=1) - healthy
-    after = np.cumsum(faulty[:, ::-1], axis=1)[:, ::-1]
-    joint = before[:, :, None] + after + log_prior
-    log_evidence = log_sum(joint, axis=(1, 2))
-    log_responsibility = joint - log_evidence[:, None, None]
-    return ChangePointPosterior(log_evidence, log_responsibility)
+    @classmethod
+    def of(cls, log_joint: FloatArray) -> ChangePointPosterior:
+        """Return the posterior that belongs to log p(e, m0, z), (run, movement, cell)."""
+        log_evidence = log_sum(log_joint, axis=(1, 2))
+        return cls(log_evidence, log_joint - log_evidence[:, None, None])
 
 
 def leave_one_out(
@@ -140,6 +147,17 @@ class FaultModel:
     log_transient: FloatArray | None = None
     gain: FloatArray | None = None
 
+    def by_cell(self, by_node: FloatArray) -> FloatArray:
+        """Return log densities by cell: by node, or by group where nodes are redrawn, (..., cell).
+
+        Args:
+            by_node: Log densities at each node, (..., node).
+        """
+        if self.redrawn is None:
+            return by_node
+        top = by_node.max(axis=-1, keepdims=True)
+        return np.asarray(top + np.log(np.exp(by_node - top) @ np.exp(self.redrawn).T))
+
 
 @dataclass(frozen=True)
 class MovementLogLikelihoods:
@@ -162,43 +180,24 @@ def movement_log_likelihoods(
     likelihood: RunLikelihood, fault_model: FaultModel
 ) -> MovementLogLikelihoods:
     """Return what each movement says of a fault of one motor."""
-    by_node = by_cell = likelihood.profile(fault_model.motor).log_density(
-        fault_model.angle, fault_model.held
-    )
-    if fault_model.redrawn is not None:
-        by_cell = _in_groups(by_node, fault_model.redrawn)
-    way = fault_model.log_transient
+    profile, way = likelihood.profile(fault_model.motor), fault_model.log_transient
+    by_node = profile.log_density(fault_model.angle, fault_model.held)
     if way is None:
         way = likelihood.log_transient_offset(fault_model.motor, fault_model.gain)[..., None]
-    return MovementLogLikelihoods(by_node, by_cell, way)
-
-
-def _in_groups(by_node: FloatArray, log_weight: FloatArray) -> FloatArray:
-    """Return the log of weighted sums over nodes, (run, movement, group).
-
-    Args:
-        by_node: Logs of what is summed, (run, movement, node).
-        log_weight: (group, node).
-    """
-    top = by_node.max(axis=-1, keepdims=True)
-    return np.asarray(top + np.log(np.exp(by_node - top) @ np.exp(log_weight).T))
+    return MovementLogLikelihoods(by_node, fault_model.by_cell(by_node), way)
 
 
 def marginal_likelihood(likelihood: RunLikelihood, fault_model: FaultModel) -> MarginalLikelihood:
     """Return what the runs say of a fault of one motor."""
-    profile, says = (
-        likelihood.profile(fault_model.motor),
-        movement_log_likelihoods(likelihood, fault_model),
-    )
-    by_node, density, way = says.by_node, says.by_cell, says.way
-    healthy = likelihood.log_healthy
-    found = change_point_posterior(
-        healthy, density, fault_model.log_prior, (likelihood.log_transient, way)
-    )
+    profile = likelihood.profile(fault_model.motor)
+    says = movement_log_likelihoods(likelihood, fault_model)
+    by_node, density = says.by_node, says.by_cell
+    healthy, faulty = likelihood.log_healthy, density + says.way
+    usual = healthy + likelihood.log_transient
+    found = ChangePointPosterior.of(change_points(usual, faulty, fault_model.log_prior))
 
     def by_movement(run: int) -> FloatArray:
-        usual, faulty = healthy[run] + likelihood.log_transient[run], density[run] + way[run]
-        return leave_one_out(usual, faulty, found.log_responsibility[run])
+        return leave_one_out(usual[run], faulty[run], found.log_responsibility[run])
 
     def settled(run: int) -> FloatArray:
         return leave_one_out(healthy[run], density[run], found.log_responsibility[run])

@@ -14,7 +14,7 @@ import numpy as np
 from failuretwin.core.numerics import Weighted, log_of, log_sum
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.failure_modes import magnitude_range
-from failuretwin.inference.marginal import Estimate, MarginalLikelihood
+from failuretwin.inference.marginal import ChangePointPosterior, Estimate, MarginalLikelihood
 from failuretwin.inference.onset import next_movement
 from failuretwin.inference.run_likelihood import RunLikelihood
 
@@ -58,17 +58,16 @@ def missed_movements_likelihood(
         prior_before_run: Probability that the fault was there before the run.
     """
     sizes = _sizes(mode)
-    stretches = next_movement(likelihood.evidence.movements)
-    log_first = log_of(stretches.weights(prior_before_run)) - np.log(SHARES)
+    intervals = next_movement(likelihood.evidence.movements)
+    log_first = log_of(intervals.weights(prior_before_run)) - np.log(SHARES)
     after = log_densities(likelihood, motor, mode)
-    joint = after[:, -1] + log_first[..., None]
-    log_evidence = log_sum(joint, axis=(1, 2))
-    share = np.exp(joint - log_evidence[:, None, None])
+    found = ChangePointPosterior.of(after[:, -1] + log_first[..., None])
+    share = np.exp(found.log_responsibility)
     so_far = log_sum(after + log_first[:, None, :, None], axis=(2, 3))
     by_movement = np.diff(so_far, axis=1, prepend=log_sum(log_first, axis=1)[:, None] + 0.0)
 
     def estimate(run: int) -> Estimate:
-        onset, part = stretches.samples(prior_before_run, run)
+        onset, part = (values[run] for values in intervals.samples(prior_before_run))
         when = (share[run].sum(axis=1)[:, None] * part).ravel()
         return Estimate(
             onset=Weighted(onset.ravel(), when),
@@ -79,7 +78,8 @@ def missed_movements_likelihood(
     settled = by_movement - np.maximum(
         likelihood.log_transient, likelihood.log_transient_offset(motor)
     )
-    return MarginalLikelihood(log_evidence, by_movement.__getitem__, settled.__getitem__, estimate)
+    of_run = by_movement.__getitem__
+    return MarginalLikelihood(found.log_evidence, of_run, settled.__getitem__, estimate)
 
 
 def log_densities(likelihood: RunLikelihood, motor: int, mode: str) -> FloatArray:

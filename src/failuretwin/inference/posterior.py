@@ -21,7 +21,7 @@ from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.data_knowledge.failure_modes import prior_odds
 from failuretwin.inference.double_faults import double_fault_likelihood
 from failuretwin.inference.evidence import SettledEvidence
-from failuretwin.inference.explanation import explanation, verdict
+from failuretwin.inference.explanation import worded
 from failuretwin.inference.fault_models import (
     AMOUNTS,
     LOCAL_STEPS,
@@ -186,7 +186,7 @@ def _fault_models_of_two(
             return fault_model_of(likelihood, fault, priors)
         motor = motor_of(likelihood, fault)
         at = seen.pair.index(motor)
-        width = np.sqrt(seen.covariance[..., at])
+        width = np.sqrt(seen.covariance[..., at, at])
         nodes = seen.angle[..., at, None] + width[..., None] * LOCAL_STEPS
         return stuck_model(likelihood, motor, priors.onset, nodes.reshape(len(nodes), -1))
 
@@ -397,11 +397,7 @@ class Posterior:
             estimate = best.estimate(run)
             losses = self._losses(estimate, ranked[0])
             diagnosis = _with_estimate(diagnosis, ranked[0], estimate, place)
-        return replace(
-            diagnosis,
-            verdict=verdict(diagnosis, ranked),
-            explanation=explanation(diagnosis, ranked, losses),
-        )
+        return worded(diagnosis, ranked, losses)
 
     def _evidence(
         self, run: int, order: IntArray, place: StreamPosition

@@ -36,6 +36,8 @@ class RunLikelihood:
         moving: Readings on the way; None: they are left aside.
         transient_scatter_factor: Factor on the scatter of the way alone; 1 for a robot as it is.
         remembered: What every movement says by itself, where that was computed before.
+        healthy: Log density of each settled position if no motor is faulty, (run, movement), where
+            that is not what the movements say of a healthy robot.
         memo: What was found on the way of each motor, by kind and index of the motor.
     """
 
@@ -44,6 +46,7 @@ class RunLikelihood:
     moving: TransientSamples | None = None
     transient_scatter_factor: float = 1.0
     remembered: MovementLikelihoods | None = None
+    healthy: FloatArray | None = None
     memo: dict[tuple[str, int], FloatArray] = field(
         default_factory=dict, init=False, compare=False, repr=False
     )
@@ -147,6 +150,8 @@ class RunLikelihood:
     @cached_property
     def log_healthy(self) -> FloatArray:
         """Log density of each settled position if no motor is faulty, (run, movement)."""
+        if self.healthy is not None:
+            return self.healthy
         terms = log_sum(self.findings.terms, axis=-1)
         return np.where(self.usable, np.logaddexp(terms, self.model.outlier_log_density), 0.0)
 

@@ -1,6 +1,6 @@
 """A stuck motor: one unknown angle after an unknown onset.
 
-The onset falls in one of two stretches for each movement: on the plateau before it (the motor
+The onset falls in one of two intervals for each movement: on the plateau before it (the motor
 then stands where it had settled) or on its ramp (it stands somewhere on the way). From there on
 the motor keeps its angle and the others behave as healthy ones.
 """
@@ -8,14 +8,12 @@ the motor keeps its angle and the others behave as healthy ones.
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import gammaln
 
-from failuretwin.core.numerics import log_of, log_sum, log_trapezoid_weights
+from failuretwin.core.numerics import log_fall, log_norm, log_of, log_sum, log_trapezoid_weights
 from failuretwin.core.types import FloatArray
 from failuretwin.inference.fault_models import nodes_around
-from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.marginal import FaultModel
-from failuretwin.inference.onset import QUADRATURE, OnsetPrior
+from failuretwin.inference.onset import OnsetIntervals, OnsetPrior, plateau_or_ramp
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 COARSE_NODES = 49
@@ -25,10 +23,8 @@ PRIOR_STEPS = np.array([-5, -2.5, -1, 0, 1, 2.5, 5.0])
 SETTLED_SCALE, ON_THE_WAY_SCALE = 2.0, 8.0
 """How sharply the prior ties the held angle to where the motor had settled, and to where its ramp
 was at a known onset, in scatters of the motor."""
-LAG_STEPS_S = np.array([-0.03, -0.015, 0.0, 0.015, 0.03])
-"""Steps by which the lag may differ from run to run [s]."""
-LATE_QUADRATURE = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
-"""Points at which late starts are sampled, as shares of their range."""
+TIED_DOF = 4.0
+"""Degrees of freedom of that prior: heavy tails."""
 FREE_IF_KNOWN = 0.05
 """Probability that the held angle is unrelated to the commands where the onset is known."""
 
@@ -52,12 +48,14 @@ def stuck_model(
     log_prior = log_sum(parts, axis=2)
 
     def of_run(run: int) -> tuple[FloatArray, FloatArray]:
-        onset, share = _onsets(likelihood[run], motor, angle[run], prior.known_s)
+        by_part = _onsets(likelihood[run], motor, angle[run])
         whole = np.where(np.isfinite(log_prior[run]), log_prior[run], 0.0)
         of_part = np.exp(parts[run] - whole[:, None])
-        plateau = np.repeat(of_part[:, 0, :, None], len(QUADRATURE), axis=-1)
-        ramp = np.repeat(of_part[:, 1, :, None], onset.shape[-1] - len(QUADRATURE), axis=-1)
-        return onset, share * np.concatenate([plateau, ramp], axis=-1)
+        onset = np.concatenate([onset for onset, _ in by_part], axis=-1)
+        if prior.known_s is not None:
+            onset = np.full_like(onset, prior.known_s)
+        shares = [of_part[:, k, :, None] * share for k, (_, share) in enumerate(by_part)]
+        return onset, np.concatenate(shares, axis=-1)
 
     return FaultModel(
         motor=motor,
@@ -99,16 +97,16 @@ def _log_prior(
 ) -> FloatArray:
     """Return log prior masses, (run, movement first affected, plateau | ramp, node).
 
-    Each stretch has its share of the prior; within it the nodes carry the density of the angle
+    Each interval has its share of the prior; within it the nodes carry the density of the angle
     times the weights of the trapezoidal rule, normalised so that no mass is lost between nodes.
     """
     origin, target = _ends(likelihood, motor)
     scale = max(float(likelihood.model.scatter[motor]), 1e-4)
     low, high = likelihood.held_range(motor)
-    plateau = _student(angle[:, None] - origin[..., None], SETTLED_SCALE * scale, 4.0)
+    plateau = _tied(angle[:, None] - origin[..., None], SETTLED_SCALE * scale)
     if prior.known_s is not None:
         way = _position_at(likelihood, motor, prior.known_s)
-        ramp = _student(angle[:, None] - way[..., None], ON_THE_WAY_SCALE * scale, 4.0)
+        ramp = _tied(angle[:, None] - way[..., None], ON_THE_WAY_SCALE * scale)
     else:
         ramp = _between(angle[:, None], origin[..., None], target[..., None], 4.0 * scale)
     tied = np.stack([plateau, ramp], axis=2)
@@ -116,12 +114,15 @@ def _log_prior(
     mixed = np.logaddexp(np.log1p(-share) + tied, np.log(share) - np.log(high - low))
     mass = mixed + log_trapezoid_weights(angle)[:, None, None]
     mass -= log_sum(mass, axis=-1)[..., None]
-    return mass + log_of(_onset_weights(likelihood, motor, prior))[..., None]
+    intervals = _intervals(likelihood, motor)
+    if prior.known_s is not None:
+        return mass + log_of(intervals.holding(prior.known_s))[..., None]
+    return mass + log_of(intervals.weights(prior.before_run("stuck")))[..., None]
 
 
-def _student(error: FloatArray, scale: float, dof: float) -> FloatArray:
-    constant = gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * np.log(dof * np.pi) - np.log(scale)
-    return constant - 0.5 * (dof + 1) * np.log1p((error / scale) ** 2 / dof)
+def _tied(off: FloatArray, scale: float) -> FloatArray:
+    """Return the log density of a held angle that is off by `off` from where it is tied to."""
+    return log_norm(TIED_DOF, dims=1) - np.log(scale) + log_fall((off / scale) ** 2, TIED_DOF, 1)
 
 
 def _between(x: FloatArray, a: FloatArray, b: FloatArray, margin: float) -> FloatArray:
@@ -152,90 +153,49 @@ def _ends(likelihood: RunLikelihood, motor: int) -> tuple[FloatArray, FloatArray
     return np.nan_to_num(movements.origin()[..., motor]) + before, np.nan_to_num(settled)
 
 
-def _stretches(likelihood: RunLikelihood, motor: int) -> tuple[FloatArray, FloatArray]:
-    """Return begin and end of plateau and ramp of each movement, (run, movement, 2) [s].
+def _intervals(likelihood: RunLikelihood, motor: int) -> OnsetIntervals:
+    """Return plateau and ramp of each movement, (run, movement, plateau | ramp) [s].
 
-    The plateau of the first movement is the time before it, from the start of the run. Movements
-    that are likely to have started late count as begun by so much later.
+    Movements that are likely to have started late count as begun by so much later.
     """
     movements, model = likelihood.evidence.movements, likelihood.model
     late_s = float(np.mean(model.imperfections.timing.late_s))
     start = movements.start + model.lag_s + likelihood.late * late_s
-    reached = start + movements.ramp_duration[..., motor] * (1.0 - model.shortening)
-    plateau_begin = np.concatenate([np.zeros_like(start[:, :1]), reached[:, :-1]], axis=1)
-    begin = np.stack([np.minimum(plateau_begin, start), start], axis=-1)
-    return begin, np.stack([start, reached], axis=-1)
-
-
-def _onset_weights(likelihood: RunLikelihood, motor: int, prior: OnsetPrior) -> FloatArray:
-    """Return the prior probability of each stretch, (run, movement, plateau | ramp)."""
-    begin, end = _stretches(likelihood, motor)
-    length = np.nan_to_num(np.maximum(end - begin, 0.0))
-    if prior.known_s is not None:
-        inside = (begin <= prior.known_s) & (prior.known_s < end)
-        none = ~inside.any(axis=(1, 2))
-        inside[none, -1, 1] = True
-        return inside.astype(np.float64)
-    later = length.copy()
-    later[:, 0] = 0.0
-    total = later.sum(axis=(1, 2), keepdims=True)
-    prior_before_run = np.where(total > 0, prior.before_run("stuck"), 1.0)
-    weights = (1.0 - prior_before_run) * later / np.where(total > 0, total, 1.0)
-    weights[:, 0] = 0.5 * prior_before_run[:, 0]
-    return weights
+    ramp = movements.ramp_duration[..., motor] * (1.0 - model.shortening)
+    return plateau_or_ramp(start, start + ramp)
 
 
 def _onsets(
-    likelihood: RunLikelihood, motor: int, angle: FloatArray, known_s: float | None
-) -> tuple[FloatArray, FloatArray]:
-    """Return onsets of one run [s] and their share of their stretch, (movement, node, sample).
+    likelihood: RunLikelihood, motor: int, angle: FloatArray
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return onsets of one run [s] and their share, (movement, node, sample): plateau, then ramp.
 
-    The first samples are for the plateau, where any time is as likely; before the first movement
-    that is before the run, or, with its share of the run's length, until then. The others are for
-    the ramp, where the held angle says when.
+    On the plateau any time is as likely; before the first movement that is before the run, or, with
+    its share of the run's length, until then. On the ramp the held angle says when.
 
     Args:
         likelihood: A single run.
         motor: Index of the motor.
         angle: Held angles, (node,) [rad].
-        known_s: The onset, where it is known [s].
     """
     movements, model = likelihood.evidence.movements, likelihood.model
-    begin, end = (np.nan_to_num(x[0]) for x in _stretches(likelihood, motor))
+    intervals = _intervals(likelihood, motor)
+    plateau = OnsetIntervals(intervals.begin[..., 0], intervals.end[..., 0])
+    end = np.nan_to_num(intervals.end)
+    waits = end[:, 0, 0] / np.maximum(end.max(axis=(1, 2)), 1e-9)
+    waiting = [values[0, :, None] for values in plateau.spread(1.0 - waits)]
     origin, target = (x[0] for x in _ends(likelihood, motor))
     travel = target - origin
     span = np.where(np.abs(travel) > 1e-6, travel, np.inf)
     done = np.clip((angle - origin[:, None]) / span[:, None], 0.0, 1.0)
-    shift, shift_share = _starts(model, likelihood.late[0])
     ramp = np.nan_to_num(movements.ramp_duration[0, :, motor]) * (1.0 - model.shortening)
-    on_ramp = np.nan_to_num(movements.start[0])[:, None] + done * ramp[:, None]
-    on_ramp = np.maximum(on_ramp[..., None] + shift, 0.0)
-    on_plateau = begin[:, 0, None] + QUADRATURE * (end - begin)[:, 0, None]
-    on_plateau[0, 0] = 0.0
-    plateau_share = np.full((len(begin), len(QUADRATURE)), 1 / len(QUADRATURE))
-    waits = end[0, 0] / max(float(end.max()), 1e-9)
-    plateau_share[0] = np.append(
-        1.0 - waits, np.full(len(QUADRATURE) - 1, waits / (len(QUADRATURE) - 1))
-    )
-    on_plateau = np.repeat(on_plateau[:, None], len(angle), axis=1)
-    onset = np.concatenate([on_plateau, on_ramp], axis=-1)
-    if known_s is not None:
-        onset = np.full_like(onset, known_s)
-    share = np.concatenate([plateau_share, shift_share], axis=-1)
-    return onset, np.broadcast_to(share[:, None], onset.shape)
+    reached = np.nan_to_num(movements.start[0])[:, None] + done * ramp[:, None]
+    delay, chance = model.start_delay.nodes(likelihood.late[0])
+    moving = [reached[..., None] + delay, chance[:, None]]
+    return [_for_nodes(part, len(angle)) for part in (waiting, moving)]
 
 
-def _starts(model: HealthyModel, late: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return by how much motions start after their command, (start,) [s], and how probable it is.
-
-    (movement, start).
-
-    Args:
-        model: The healthy robot.
-        late: Probability that each movement starts late, (movement,).
-    """
-    low, high = model.imperfections.timing.late_s
-    shift = model.lag_s + np.concatenate([LAG_STEPS_S, low + LATE_QUADRATURE * (high - low)])
-    punctual = np.repeat((1.0 - late)[:, None] / len(LAG_STEPS_S), len(LAG_STEPS_S), axis=1)
-    held_up = np.repeat(late[:, None] / len(LATE_QUADRATURE), len(LATE_QUADRATURE), axis=1)
-    return shift, np.concatenate([punctual, held_up], axis=1)
+def _for_nodes(part: list[FloatArray], nodes: int) -> tuple[FloatArray, FloatArray]:
+    """Return onsets and shares, (movement, node or 1, sample), for all of the nodes."""
+    onset, share = (np.repeat(x, nodes // x.shape[1], axis=1) for x in part)
+    return onset, share

@@ -14,15 +14,16 @@ from functools import cached_property
 
 import numpy as np
 
-from failuretwin.core.numerics import along_polyline, log_norm, log_of, log_sum
+from failuretwin.core.numerics import along_polyline, log_fall, log_norm, log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.evidence import SettledEvidence, TransientSamples
-from failuretwin.inference.healthy_model import HealthyModel, StartDelay
+from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.joint_likelihood import (
     LARGEST_OFFSET_RAD,
     JointLikelihood,
     MovementLikelihoods,
 )
+from failuretwin.inference.start_delay import StartNodes
 
 KNOTS = 11
 """Instants of a ramp at which the path is computed; between them it is a straight line."""
@@ -257,9 +258,7 @@ class TransientLikelihood:
     def _fill_in(
         self, ends: FloatArray, chosen: IntArray, lost: BoolArray
     ) -> tuple[IntArray, FloatArray]:
-        """Find out what became of movements whose end was not seen; arguments as for `_course`.
-
-        Each outcome is judged by the way there and by the way of the movement that follows.
+        """Find out what became of movements whose end was not seen, by the way there and on.
 
         Returns:
             What became of each movement, the most probable where its end was not seen, and the
@@ -365,8 +364,8 @@ class TransientLikelihood:
         path, longest = self._path(origin, destination, np.nan_to_num(duration), late)
         variance = self._variance(item, destination[:, 0]) + spread_m**2
         found = np.full(origin.shape[:2], -np.inf)
-        for start in self._starts:
-            chance = start.log_chance[item]
+        for start, log_chance in self._starts:
+            chance = log_chance[item]
             some = np.flatnonzero(chance > -np.inf)
             if len(some) > 0:
                 at, ways = tuple(index[some] for index in item), (path[some], longest[some])
@@ -375,9 +374,11 @@ class TransientLikelihood:
         return found
 
     @cached_property
-    def _starts(self) -> tuple[StartDelay, ...]:
-        """How late movements may start."""
-        return self.model.start_delays(self.settled)
+    def _starts(self) -> tuple[tuple[StartNodes, FloatArray], ...]:
+        """Punctual and late starts, and the log probability of each, (run, movement)."""
+        late = log_of(self.model.late(self.settled.movements, self.settled.first_reading_delay))
+        delay, on_time = self.model.start_delay, log_of(-np.expm1(np.minimum(late, 0.0)))
+        return (delay.punctual, on_time), (delay.late, late)
 
     def _of_starts(
         self,
@@ -385,7 +386,7 @@ class TransientLikelihood:
         path: FloatArray,
         longest: FloatArray,
         variance: FloatArray,
-        start: StartDelay,
+        start: StartNodes,
     ) -> FloatArray:
         """Return log densities of movements that begin so late, (item, case).
 
@@ -400,9 +401,7 @@ class TransientLikelihood:
             start: How late.
         """
         variance = variance[:, None, None, None]
-        since = (
-            self.moving.since[item][:, None, :, None] - start.shift_s
-        )  # (item, 1, reading, shift)
+        since = self.moving.since[item][:, None, :, None] - start.delay  # (.., reading, start)
         predicted, velocity = along_polyline(path, longest, since)
         point = self.moving.point[item][:, None, :, None]
         error = [point[..., axis] - predicted[axis] for axis in range(3)]
@@ -412,11 +411,11 @@ class TransientLikelihood:
         error2 = sum(e * e for e in error)
         stretched = variance + speed2 * (JITTER_S**2 + start.step_s**2 / 12.0)
         square = np.maximum(error2 - along2, 0.0) / variance + along2 / stretched
-        log_at = -0.5 * (DOF + 3.0) * np.log1p(square / DOF) - 0.5 * np.log(stretched)
+        log_at = log_fall(square, DOF) - 0.5 * np.log(stretched)
         log_at += log_norm(DOF) - np.log(variance) + np.log1p(-GLITCH_RATE)
         log_at = np.logaddexp(log_at, np.log(GLITCH_RATE) + self.model.anywhere_log_density)
         log_at *= self.moving.seen[item][:, None, :, None]
-        return log_sum(log_at.sum(axis=2) + start.log_prior, axis=-1)
+        return log_sum(log_at.sum(axis=2) + start.log_weight, axis=-1)
 
     def _variance(self, item: tuple[IntArray, ...], destination: FloatArray) -> FloatArray:
         """Return the variance of a reading on each axis, (item,) [m2]; ends (item, motor) [rad]."""

@@ -1,7 +1,8 @@
 """Where two motors must stand to bring the tool where it settled, the others being well.
 
 Two motors reach nearly any place of the plane or the sphere that they span in up to two ways (elbow
-up, elbow down). Near each, the density of the place is Gaussian in the two angles.
+up, elbow down). Near each, the density of the place is Gaussian in the two angles, so that of a run
+with motors that are off by linear functions of unknown amounts is found by a Kalman filter.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.core.numerics import log_fall, log_norm, log_normal_2d
+from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.inference.command_loss import CommandOutcomes
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
@@ -42,11 +44,10 @@ class TwoJointLikelihood:
     Attributes:
         pair: Indices of the motors.
         angle: (run, movement, way, motor of the pair) [rad].
-        covariance: (run, movement, way, 3): of both with themselves, and of one with the other
-            [rad2].
+        covariance: (run, movement, way, motor of the pair, motor of the pair) [rad2].
         log_weight: (run, movement, way) [log rad2/m3].
         expected: Where they settle if they are well, (run, movement, motor of the pair) [rad].
-        outcome_probability: Alternative that each way belongs to, (way,).
+        outcome: Outcome of the commands that each way belongs to, (way,).
     """
 
     pair: tuple[int, int]
@@ -54,7 +55,7 @@ class TwoJointLikelihood:
     covariance: FloatArray
     log_weight: FloatArray
     expected: FloatArray
-    outcome_probability: IntArray
+    outcome: IntArray
 
 
 def two_joint_likelihood(
@@ -85,13 +86,13 @@ def two_joint_likelihood(
         near = _laplace(evidence.point, model, chosen, pair, angle)
         angle = angle + near.step
     dof = model.settling.tail_dof
-    log_weight = chosen.log_weight[..., None] + near.log_norm + _over_plane(near.square, dof)
+    log_weight = chosen.log_weight[..., None] + near.log_norm + log_fall(near.square, dof, dims=1)
     log_weight = np.where(_found(model, pair, angle, near.covariance), log_weight, -np.inf)
     shape = (*evidence.usable.shape, len(kept) * SOLUTIONS)
     return TwoJointLikelihood(
         pair,
         angle.reshape(*shape, 2),
-        near.covariance.reshape(*shape, 3),
+        near.covariance.reshape(*shape, 2, 2),
         log_weight.reshape(shape),
         expected[:, :, 0][..., list(pair)],
         np.repeat(kept, SOLUTIONS),
@@ -105,8 +106,8 @@ class _Laplace:
     Attributes:
         step: From there to its lowest point, bounded, (..., motor) [rad].
         square: Squared distance after that step, in scales of the others' scatter.
-        covariance: Inverse of its curvature, (..., 3) [rad2].
-        log_norm: Log density at its lowest point, times the area of `covariance`.
+        covariance: Inverse of its curvature, (..., motor, motor) [rad2].
+        log_norm: Log density at its lowest point, integrated over both angles.
     """
 
     step: FloatArray
@@ -137,21 +138,20 @@ def _laplace(
     pose[..., list(pair)] = angle
     settled = model.settle(pose, outcomes.direction[..., None, :], fixed)
     error, jacobian, spread = model.residual(point[:, :, None, None], settled, scale)
-    levers = [jacobian[..., motor] for motor in pair]
-    pulls = [spread.solve(lever) for lever in levers]
-    aa, bb, ab = (np.sum(pulls[i] * levers[j], axis=-1) for i, j in ((0, 0), (1, 1), (0, 1)))
-    aa, bb = aa + LEAST_PRECISION, bb + LEAST_PRECISION
-    slope_a, slope_b = (np.sum(pull * error, axis=-1) for pull in pulls)
-    area = 1.0 / (aa * bb - ab * ab)
-    step = np.stack([bb * slope_a - ab * slope_b, aa * slope_b - ab * slope_a], axis=-1)
-    step = np.clip(step * area[..., None], -LONGEST_STEP_RAD, LONGEST_STEP_RAD)
-    a, b = step[..., 0], step[..., 1]
-    gained = 2.0 * (a * slope_a + b * slope_b) - aa * a * a - bb * b * b - 2.0 * ab * a * b
+    lever = jacobian[..., list(pair)]  # (..., axis, motor)
+    pull = np.stack([spread.solve(lever[..., k]) for k in range(2)], axis=-1)
+    precision = np.swapaxes(lever, -1, -2) @ pull + LEAST_PRECISION * np.eye(2)
+    covariance = as_floats(np.linalg.inv(precision))
+    slope = np.einsum("...ak,...a->...k", pull, error)
+    step = np.einsum("...ij,...j->...i", covariance, slope)
+    step = np.clip(step, -LONGEST_STEP_RAD, LONGEST_STEP_RAD)
+    left = 2.0 * slope - np.einsum("...ij,...j->...i", precision, step)
+    area = np.linalg.det(covariance) / spread.determinant
     return _Laplace(
         step,
-        np.maximum(spread.product(error, error) - gained, 0.0),
-        np.stack([bb, aa, -ab], axis=-1) * area[..., None],
-        spread.log_norm(model.settling.tail_dof) + 0.5 * np.log(area),
+        np.maximum(spread.product(error, error) - np.sum(step * left, axis=-1), 0.0),
+        covariance,
+        log_norm(model.settling.tail_dof, dims=1) + 0.5 * np.log(area),
     )
 
 
@@ -194,16 +194,200 @@ def _found(
         low, high = model.twin.robot.motors[motor].movement_range
         margin = 0.2 * (high - low)
         there &= (angle[..., k] > low - margin) & (angle[..., k] < high + margin)
-    a, b = np.moveaxis(angle[..., 1:, :] - angle[..., :1, :], -1, 0)
-    aa, bb, ab = np.moveaxis(covariance[..., 1:, :], -1, 0)
-    apart = bb * a * a + aa * b * b - 2.0 * ab * a * b > SAME**2 * (aa * bb - ab * ab)
+    off = angle[..., 1:, :] - angle[..., :1, :]
+    square = np.sum(
+        off * np.linalg.solve(covariance[..., 1:, :, :], off[..., None])[..., 0], axis=-1
+    )
+    apart = square > SAME**2
     there[..., 1:] &= apart | ~there[..., :1]
     return there
 
 
-def _over_plane(square: FloatArray, dof: float) -> FloatArray:
-    """Return the log of a 3-variate Student t over its centre, integrated over two directions."""
-    if np.isinf(dof):
-        return np.log(2.0 * np.pi) - 0.5 * square
-    whole = np.log(2.0 * np.pi * dof / (dof + 1.0))
-    return whole - 0.5 * (dof + 1.0) * np.log1p(square / dof)
+# A run followed by a Kalman filter of the amounts by which two motors are off, x = centre + slope *
+# amount + noise. Which of its ways each movement took is chosen greedily.
+
+
+@dataclass(frozen=True)
+class LinearOffsets:
+    """Where two motors stand after each movement: x = centre + slope * amount, give or take noise.
+
+    Attributes:
+        centre: (run, movement, kind, motor) [rad].
+        slope: (run, movement, kind, motor), in rad for each unit of the amount.
+        noise: Variance, (kind, motor) [rad2].
+        mean: Mean of each amount beforehand, (kind, motor).
+        variance: Its variance, (kind, motor).
+        well: Where they stand if they are well, (run, movement, motor) [rad].
+        well_noise: Variance then, (motor,) [rad2].
+    """
+
+    centre: FloatArray
+    slope: FloatArray
+    noise: FloatArray
+    mean: FloatArray
+    variance: FloatArray
+    well: FloatArray
+    well_noise: FloatArray
+
+
+@dataclass(frozen=True)
+class GaussianBelief:
+    """Normal belief about the amounts by which two motors are off.
+
+    Attributes:
+        mean: (run, kind, motor).
+        covariance: (run, kind, motor, motor).
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+
+    def predict(self, slope: FloatArray) -> FloatArray:
+        """Return H P H^T, the covariance of slope * amount, (run, kind, state, motor, motor).
+
+        Args:
+            slope: The diagonal of H, (run, kind, state, motor).
+        """
+        return slope[..., None] * self.covariance[:, :, None] * slope[..., None, :]
+
+    def update(
+        self, slope: FloatArray, error: FloatArray, covariance: FloatArray
+    ) -> GaussianBelief:
+        """Return the belief once angles were off by `error` from what was predicted.
+
+        With the gain K = P H^T S^-1, the mean grows by K error and P shrinks by K H P.
+
+        Args:
+            slope: The diagonal of H, (run, kind, motor).
+            error: (run, kind, motor).
+            covariance: S, of the error, (run, kind, motor, motor).
+        """
+        cross = self.covariance * slope[..., None, :]  # P H^T
+        gain = cross @ np.linalg.inv(covariance)
+        mean = self.mean + np.einsum("...ij,...j->...i", gain, error)
+        return GaussianBelief(mean, self.covariance - gain @ np.swapaxes(cross, -1, -2))
+
+    def where(self, some: BoolArray, other: GaussianBelief) -> GaussianBelief:
+        """Return this belief for some of the (run, kind), the other for the rest."""
+        return GaussianBelief(
+            np.where(some[..., None], self.mean, other.mean),
+            np.where(some[..., None, None], self.covariance, other.covariance),
+        )
+
+
+SHOWS = np.array([[True, True], [True, False], [False, True]])
+"""Which of two faults a movement shows, (state, motor): either may begin late, or come and go."""
+LOG_SHOWS = np.log([0.8, 0.1, 0.1])
+"""How probable that is; assumed."""
+SEEDS = 6
+"""Movements, spread over the run, from which a path through the run is followed."""
+SAME_NATS = 1e-6
+"""Paths closer than this are one, met in another order: the first counts."""
+
+
+@dataclass(frozen=True)
+class GreedyPath:
+    """What became of the movements of each run, and what that says.
+
+    Attributes:
+        log_density: Of each movement given those met before it, (run, kind, movement).
+        way: Which way of `TwoJointLikelihood` each one took, (run, kind, movement); -1: none.
+        angle: Where the two motors stand by the amounts learnt, (run, kind, movement, motor)
+            [rad].
+    """
+
+    log_density: FloatArray
+    way: IntArray
+    angle: FloatArray
+
+
+@dataclass(frozen=True)
+class PathFilter:
+    """Runs of two motors that are off, followed movement by movement.
+
+    Attributes:
+        seen: What each movement says of the two angles.
+        offsets: Where the motors may stand.
+        usable: Movements with evidence, (run, movement).
+        outlier: Log density of the tool being anywhere, times its rate.
+    """
+
+    seen: TwoJointLikelihood
+    offsets: LinearOffsets
+    usable: BoolArray
+    outlier: float
+
+    def map_path(self) -> GreedyPath:
+        """Return the most probable path of each run and kind, begun at one movement or another."""
+        count = self.usable.shape[1]
+        starts = np.unique(np.linspace(0, count - 1, min(SEEDS, count)).astype(np.int64)).tolist()
+        paths = [self._path(start, way) for start in starts for way in range(SOLUTIONS)]
+        total = np.array([path.log_density.sum(axis=-1) for path in paths])
+        best = np.argmax(total > total.max(axis=0) - SAME_NATS, axis=0)
+        chosen = (best, *np.indices(best.shape))
+        return GreedyPath(
+            np.stack([path.log_density for path in paths])[chosen],
+            np.stack([path.way for path in paths])[chosen],
+            np.stack([path.angle for path in paths])[chosen],
+        )
+
+    def _path(self, start: int, way: int) -> GreedyPath:
+        """Return the path that begins with one way of one movement and goes on as is best.
+
+        Args:
+            start: The movement that is met first; then come the others in their order.
+            way: Way that it took, with both faults showing.
+        """
+        offsets = self.offsets
+        runs, movements, kinds, _ = offsets.slope.shape
+        mean, variance = (
+            np.broadcast_to(values, (runs, kinds, 2)) for values in (offsets.mean, offsets.variance)
+        )
+        belief = GaussianBelief(mean, variance[..., None] * np.eye(2))
+        log_density = np.zeros((runs, kinds, movements))
+        taken = np.full((runs, kinds, movements), -1)
+        for m in (start, *(m for m in range(movements) if m != start)):
+            log_at, *options = self._options(belief, m)
+            best = np.full((runs, kinds), way) if m == start else np.argmax(log_at, axis=-1)
+            at, usable = _select(log_at, best), self.usable[:, m, None]
+            here = usable & (at > self.outlier)
+            belief = belief.update(*(_select(values, best) for values in options)).where(
+                here, belief
+            )
+            log_density[:, :, m] = np.where(usable, np.maximum(at, self.outlier), 0.0)
+            taken[:, :, m] = np.where(here, best % self.seen.log_weight.shape[-1], -1)
+        centre, slope = (np.moveaxis(values, 1, 2) for values in (offsets.centre, offsets.slope))
+        return GreedyPath(log_density, taken, centre + slope * belief.mean[:, :, None])
+
+    def _options(
+        self, belief: GaussianBelief, m: int
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return what may have become of a movement, by state of the faults and way of the tool.
+
+        Returns:
+            Log density, (run, kind, option), and for each option the slope of both motors (..., 2),
+            their error (..., 2) and its covariance (..., 2, 2).
+        """
+        seen, offsets = self.seen, self.offsets
+        slope = np.where(SHOWS, offsets.slope[:, m, :, None], 0.0)  # (run, kind, state, motor)
+        centre = np.where(SHOWS, offsets.centre[:, m, :, None], offsets.well[:, m, None, None])
+        noise = np.where(SHOWS, offsets.noise[:, None], offsets.well_noise)
+        predicted = belief.predict(slope) + noise[..., None] * np.eye(2)
+        expected = centre + slope * belief.mean[:, :, None]
+        error = seen.angle[:, m, None, None] - expected[..., None, :]
+        covariance = predicted[:, :, :, None] + seen.covariance[:, m, None, None]
+        log_at = log_normal_2d(error, covariance)
+        log_at = log_at + LOG_SHOWS[:, None] + seen.log_weight[:, m, None, None]
+        slope = np.broadcast_to(slope[..., None, :], error.shape)
+        options = (*log_at.shape[:2], -1)
+        return (
+            log_at.reshape(options),
+            slope.reshape(*options, 2),
+            error.reshape(*options, 2),
+            covariance.reshape(*options, 2, 2),
+        )
+
+
+def _select(values: FloatArray, option: IntArray) -> FloatArray:
+    """Return the values (run, kind, option, ...) of one option each."""
+    return np.asarray(values[(*np.indices(option.shape), option)])

@@ -15,13 +15,17 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
-from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.marginal import Estimate, MarginalLikelihood
 from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.two_joint_likelihood import TwoJointLikelihood, two_joint_likelihood
-from failuretwin.inference.unmodelled_offsets import GreedyPath, LinearOffsets, greedy_map_path
+from failuretwin.inference.two_joint_likelihood import (
+    LinearOffsets,
+    PathFilter,
+    TwoJointLikelihood,
+    two_joint_likelihood,
+)
 
-# One motor or two that are off, each in its own way, whatever may have done that.
+# How a motor may be off, whatever may have done that: x = centre + slope * amount + noise.
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,9 @@ LOG_CHANCE = -np.log([2 * len(ONE_OFF)] * len(ONE_OFF) + [2 * len(TWO_OFF)] * le
 """Log probability of each of `KINDS`: one motor as often as two."""
 
 
+# What the runs say of one motor or two being off anyhow.
+
+
 def unmodelled_offsets_likelihood(
     likelihood: RunLikelihood, known: Sequence[Hypothesis] = ()
 ) -> MarginalLikelihood | None:
@@ -76,14 +83,14 @@ def unmodelled_offsets_likelihood(
     pairs = list(combinations(range(len(likelihood.model.scatter)), 2))
     if not pairs:
         return None
-    settled, ways = zip(*(_weigh(likelihood, pair, known) for pair in pairs), strict=True)
-    says = [one + way for one, way in zip(settled, ways, strict=True)]
-    whole = np.stack([one.sum(axis=1) for one in says], axis=1)
-    best = np.argmax(whole, axis=1)
+    settled, ways = zip(*(_of_pair(likelihood, pair, known) for pair in pairs), strict=True)
+    whole = [one + way for one, way in zip(settled, ways, strict=True)]
+    log_evidence = np.stack([one.sum(axis=1) for one in whole], axis=1)
+    best = np.argmax(log_evidence, axis=1)
     none = np.zeros(likelihood.outcomes.log_weight.shape[1:])
     return MarginalLikelihood(
-        log_evidence=log_sum(whole, axis=1) - np.log(len(pairs)),
-        by_movement=lambda run: says[best[run]][run],
+        log_evidence=log_sum(log_evidence, axis=1) - np.log(len(pairs)),
+        by_movement=lambda run: whole[best[run]][run],
         settled=lambda run: settled[best[run]][run],
         estimate=lambda run: Estimate(None, None, none),
     )
@@ -93,58 +100,30 @@ def way_of_two(likelihood: RunLikelihood, pair: tuple[int, int]) -> FloatArray:
     """Return log densities of the way with two motors off, (run, movement)."""
     if likelihood.transients is None:
         return likelihood.log_transient
-    return _weigh(likelihood, (min(pair), max(pair)))[1]
+    return _of_pair(likelihood, (min(pair), max(pair)))[1]
 
 
-def _weigh(
+def _of_pair(
     likelihood: RunLikelihood, pair: tuple[int, int], known: Sequence[Hypothesis] = ()
 ) -> tuple[FloatArray, FloatArray]:
     """Return log densities of settled positions and of the way, (run, movement) each."""
     seen = two_joint_likelihood(likelihood.evidence, likelihood.model, likelihood.outcomes, pair)
-    outlier = likelihood.model.outlier_log_density
-    course = greedy_map_path(seen, _lines(likelihood, seen), likelihood.usable, outlier)
-    chance = np.where(_among(known, likelihood, pair), -np.inf, LOG_CHANCE)
-    total = course.says.sum(axis=-1) + chance  # (run, kind)
-    best, run = np.argmax(total, axis=1), np.arange(len(total))
-    says = course.says[run, best]
+    offsets, outlier = _offsets(likelihood, seen), likelihood.model.outlier_log_density
+    path = PathFilter(seen, offsets, likelihood.usable, outlier).map_path()
+    log_chance = np.where(_among(known, likelihood, pair), -np.inf, LOG_CHANCE)
+    total = path.log_density.sum(axis=-1) + log_chance  # (run, kind)
+    best = np.arange(len(total)), np.argmax(total, axis=1)
+    settled = path.log_density[best]
     # What chance and the other kinds add belongs to no movement more than to another.
-    more = log_sum(total, axis=1) - says.sum(axis=1)
-    share = (
-        np.where(likelihood.usable, 1.0, 0.0)
-        / np.maximum(likelihood.usable.sum(axis=1), 1)[:, None]
-    )
-    says = says + share * more[:, None]
+    more = log_sum(total, axis=1) - settled.sum(axis=1)
+    count = np.maximum(likelihood.usable.sum(axis=1), 1)
+    settled = settled + np.where(likelihood.usable, (more / count)[:, None], 0.0)
     if likelihood.transients is None:
-        return says, np.zeros_like(says)
-    return says, _on_way(
-        likelihood, seen, GreedyPath(says, course.way[run, best], course.angle[run, best])
-    )
+        return settled, np.zeros_like(settled)
+    return settled, _on_way(likelihood, seen, path.way[best], path.angle[best])
 
 
-def _among(
-    known: Sequence[Hypothesis], likelihood: RunLikelihood, pair: tuple[int, int]
-) -> BoolArray:
-    """Return which of `KINDS` of two motors are known hypotheses, (kind,)."""
-    names = [likelihood.model.twin.robot.motor_names[motor] for motor in pair]
-    said = [{fault.motor: OFFSET_KINDS.get(fault.mode) for fault in h.faults} for h in known]
-    kinds = [tuple(one[name] for name in names) for one in said if set(one) == set(names)]
-    return np.array([kind in kinds for kind in KINDS])
-
-
-def _on_way(likelihood: RunLikelihood, seen: TwoJointLikelihood, course: GreedyPath) -> FloatArray:
-    """Return log densities of the way if the two motors went where they were seen to settle."""
-    transients, pair = likelihood.transients, list(seen.pair)
-    assert transients is not None
-    followed = course.way >= 0
-    way = np.maximum(course.way, 0)[..., None]
-    at = np.take_along_axis(seen.angle, way[..., None], axis=2)[:, :, 0]
-    ends = transients.findings.expected
-    ends[..., pair] = np.where(followed[..., None], at, course.angle)[:, :, None]
-    outcome_probability = np.where(followed, seen.outcome_probability[way[..., 0]], 0)
-    return transients.toward(ends, outcome_probability, seen.pair[0])
-
-
-def _lines(likelihood: RunLikelihood, seen: TwoJointLikelihood) -> LinearOffsets:
+def _offsets(likelihood: RunLikelihood, seen: TwoJointLikelihood) -> LinearOffsets:
     """Return where two motors may stand, for each of `KINDS`."""
     pair = list(seen.pair)
     motors = [likelihood.model.twin.robot.motors[motor] for motor in pair]
@@ -163,11 +142,45 @@ def _lines(likelihood: RunLikelihood, seen: TwoJointLikelihood) -> LinearOffsets
         centre=np.where(held, 0.0, seen.expected[:, :, None]),
         slope=np.where(amount, slope, 0.0),
         noise=np.where(held, 0.0, scatter) + np.where(redrawn, spread**2, 0.0),
-        amount=(np.where(held, middle, 0.0), deviation**2),
+        mean=np.where(held, middle, 0.0),
+        variance=deviation**2,
         well=seen.expected,
         well_noise=scatter,
     )
 
+
+def _among(
+    known: Sequence[Hypothesis], likelihood: RunLikelihood, pair: tuple[int, int]
+) -> BoolArray:
+    """Return which of `KINDS` of two motors are known hypotheses, (kind,)."""
+    names = [likelihood.model.twin.robot.motor_names[motor] for motor in pair]
+    said = [{fault.motor: OFFSET_KINDS.get(fault.mode) for fault in h.faults} for h in known]
+    kinds = [tuple(one[name] for name in names) for one in said if set(one) == set(names)]
+    return np.array([kind in kinds for kind in KINDS])
+
+
+def _on_way(
+    likelihood: RunLikelihood, seen: TwoJointLikelihood, way: IntArray, angle: FloatArray
+) -> FloatArray:
+    """Return log densities of the way if the two motors went where they were seen to settle.
+
+    Args:
+        likelihood: The runs.
+        seen: What each movement says of the two angles.
+        way: Which of its ways each movement took, (run, movement); -1: none.
+        angle: Where the motors stand then, (run, movement, motor) [rad].
+    """
+    transients = likelihood.transients
+    assert transients is not None
+    taken = np.maximum(way, 0)
+    at = np.take_along_axis(seen.angle, taken[..., None, None], axis=2)[:, :, 0]
+    ends = transients.findings.expected
+    ends[..., list(seen.pair)] = np.where((way >= 0)[..., None], at, angle)[:, :, None]
+    outcome = np.where(way >= 0, seen.outcome[taken], 0)
+    return transients.toward(ends, outcome, seen.pair[0])
+
+
+# The unknown: the best of all that is not known.
 
 SCATTER_FACTORS = (3.0, 8.0, 25.0)
 """Factors on the scatter: just more than tails allow, to anywhere near."""

@@ -9,7 +9,7 @@ from failuretwin import BayesDiagnoser, Plan
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
 from failuretwin.data_knowledge.generate import simulate
-from failuretwin.decision.streaming.fleet import SILENCE_S, StreamingFleet
+from failuretwin.decision.streaming.fleet import StreamingFleet
 from failuretwin.digital_model.calibrated_robot import load_calibration
 
 
@@ -107,7 +107,7 @@ def test_whole_samples_may_be_missing(live_runs, live_diagnoser, rng):
 def test_silence_is_told(live_runs, live_diagnoser):
     fleet = play(live_runs.isel(run=[0, 1]), live_diagnoser)
     assert not fleet.stale.any()
-    fleet.update(fleet.time + SILENCE_S + 0.1, None, [[0.1, 0.1, 0.1], [np.nan] * 3])
+    fleet.update(fleet.time + 5.1, None, [[0.1, 0.1, 0.1], [np.nan] * 3])
     assert fleet.stale.tolist() == [False, True]
 
 

@@ -135,11 +135,9 @@ def simulate(
     names = known.robot.motor_names
     plan = Plan(
         robot=known.robot,
-        hypotheses=(
-            parse_hypotheses(hypotheses.split(","), names)
-            if hypotheses is not None
-            else paper_hypotheses(names)
-        ),
+        hypotheses=paper_hypotheses(names)
+        if hypotheses is None
+        else parse_hypotheses(hypotheses.split(","), names),
         runs_per_class=runs_per_class,
         seed=seed,
         imperfections=known.imperfections,

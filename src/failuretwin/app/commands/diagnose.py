@@ -1,4 +1,4 @@
-"""`failuretwin diagnose`: which motor failed, how, since when and how surely."""
+"""`failuretwin diagnose` and `failuretwin evaluate`: what is wrong, and how often that is right."""
 
 from __future__ import annotations
 
@@ -6,23 +6,25 @@ from pathlib import Path
 
 import click
 
-from failuretwin.app.commands.options import PATH, LogOptions, common_options, reading_options
+from failuretwin.app.commands.options import (
+    PATH,
+    LogOptions,
+    calibration_option,
+    common_options,
+    reading_options,
+)
 
 
 @click.command()
 @click.argument("inputs", nargs=-1, required=True, type=PATH, metavar="INPUT...")
-@click.option(
-    "--calibration",
-    type=PATH,
-    metavar="FILE",
-    help="What `calibrate` learned of this robot. Default: the calibration its profile names.",
-)
+@calibration_option
 @click.option(
     "--method",
     default="bayes",
     show_default=True,
-    metavar="bayes|MODEL|bayes+MODEL",
-    help="How to diagnose: by Bayes' rule, by a network that `train` wrote, or by both.",
+    metavar="bayes|MODEL|bayes+MODEL|module:Class",
+    help="How to diagnose: by Bayes' rule, by a network that `train` wrote, by both, or by a class "
+    "of your own.",
 )
 @click.option(
     "--track",
@@ -78,23 +80,24 @@ def diagnose(
     from failuretwin.app.inputs import (
         chosen_diagnoser,
         expected_name,
+        parse_cli_hypotheses,
         read_inputs,
-        tell_mismatch,
-        told_hypotheses,
+        warn_mismatch,
     )
-    from failuretwin.app.tables import (
-        ambiguity_lines,
+    from failuretwin.app.reports import (
+        isolability_summary,
         print_diagnoses,
-        print_lines,
         print_scores,
-        progress_bar,
+        tracking_line,
     )
-    from failuretwin.connection.tracking import (
+    from failuretwin.app.tables import progress_bar, show
+    from failuretwin.connection.tracked_diagnosis import (
         diagnose_tracked,
         keep_history,
         open_history,
-        tracking_line,
     )
+    from failuretwin.core.errors import InputError
+    from failuretwin.decision.evaluation import Judged
     from failuretwin.decision.results import write_csv, write_json_lines
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
@@ -106,7 +109,7 @@ def diagnose(
     bayes = BayesDiagnoser(
         known.twin,
         imperfections=known.imperfections,
-        hypotheses=told_hypotheses(hypotheses, model),
+        hypotheses=parse_cli_hypotheses(hypotheses, model),
         priors=priors_of(model, sse_range, onset),
     )
     settings = {
@@ -117,19 +120,25 @@ def diagnose(
         "--onset": onset,
     }
     diagnoser = chosen_diagnoser(method, bayes, settings)
-    history = open_history(bayes, calibration) if track else None
+    history = None
+    if track:
+        if calibration is None:
+            raise InputError(
+                "--track keeps its history beside the calibration: name one (--calibration FILE; "
+                "`failuretwin calibrate` makes it)."
+            )
+        history = open_history(bayes, calibration)
     runs = read_inputs(inputs, model, reading)
-    tell_mismatch(runs, expected_name(diagnoser, bayes))
+    warn_mismatch(runs, expected_name(diagnoser, bayes))
     tracked = None
     if history is not None:
         with progress_bar("diagnosing", runs.sizes["run"]) as advance:
             tracked = diagnose_tracked(runs, bayes, history, advance)
     diagnoses = diagnoser.diagnose(runs) if tracked is None else tracked.diagnoses
-    records = [diagnosis.to_record() for diagnosis in diagnoses]
     if json_file is not None:
-        write_json_lines(records, json_file)
+        write_json_lines(diagnoses, json_file)
     if csv_file is not None:
-        write_csv(records, csv_file)
+        write_csv(diagnoses, csv_file)
     if plot is not None:
         from failuretwin.app.plots import plot_runs, write_page
         from failuretwin.data_knowledge.store import filling
@@ -141,7 +150,71 @@ def diagnose(
         keep_history(tracked)
     print_diagnoses(diagnoses)
     if method == "bayes":
-        print_lines(ambiguity_lines(runs, bayes))
-    print_scores(records)
+        show(*isolability_summary(runs, bayes))
+    print_scores(Judged.of(diagnoses))
     if tracked is not None:
         click.echo(f"\n{tracking_line(tracked)}")
+
+
+@click.command()
+@click.argument("results", type=PATH, metavar="RESULTS.jsonl")
+@click.option(
+    "--truth",
+    type=PATH,
+    metavar="RUNS",
+    help="Run set or raw sessions that know the truth; default: the results. Needed for the "
+    "coverage of intervals.",
+)
+@click.option(
+    "--published-labels",
+    is_flag=True,
+    help="Take the truth of raw sessions from folder names that end in _label_K, as diagnose does.",
+)
+@click.option(
+    "--against",
+    type=PATH,
+    metavar="OTHER.jsonl",
+    help="Compare with other results of the same runs.",
+)
+@click.option("--latex", type=PATH, metavar="FILE", help="Write the scores as LaTeX tables.")
+@click.option("--plot", type=PATH, metavar="DIR", help="Write a picture of the reliability.")
+@common_options
+def evaluate(
+    results: Path,
+    truth: Path | None,
+    published_labels: bool,
+    against: Path | None,
+    latex: Path | None,
+    plot: Path | None,
+    robot: str,
+    seed: int,
+) -> None:
+    """Score the results of `diagnose --json` against the truth."""
+    import numpy as np
+
+    from failuretwin.app.plots import write_reliability
+    from failuretwin.app.reports import print_comparison, print_evaluation, write_latex
+    from failuretwin.core.errors import InputError
+    from failuretwin.data_knowledge.read import ReadOptions, read_runs
+    from failuretwin.decision import evaluation
+    from failuretwin.decision.results import read_results
+
+    truths = None
+    if truth is not None:
+        runs = read_runs(truth, robot, ReadOptions(published_labels=published_labels))
+        truths = evaluation.Truths.of(runs, str(truth))
+    elif published_labels:
+        raise InputError("--published-labels says how to read the truth. Add --truth RUNS.")
+    first = read_results(results)
+    scores = evaluation.evaluate(first, truths, np.random.default_rng(seed))
+    comparison = None
+    if against is not None:
+        second = read_results(against)
+        comparison = evaluation.compare(first, second, truths, np.random.default_rng(seed))
+    if latex is not None:
+        write_latex(scores, comparison, latex)
+    if plot is not None:
+        write_reliability(scores, plot)
+    print_evaluation(scores, truth is not None)
+    if comparison is not None:
+        print_comparison(comparison)

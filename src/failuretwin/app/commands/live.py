@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from failuretwin.app.commands.options import PATH, LiveOptions, common_options, live_options
+from failuretwin.app.commands.options import (
+    PATH,
+    LiveOptions,
+    calibration_option,
+    common_options,
+    live_options,
+)
 
 if TYPE_CHECKING:
     from failuretwin.failure_behavior.injection import ScheduledFault
@@ -18,12 +24,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("source", metavar="SOURCE")
-@click.option(
-    "--calibration",
-    type=PATH,
-    metavar="FILE",
-    help="What `calibrate` learned of this robot. Default: the calibration its profile names.",
-)
+@calibration_option
 @click.option(
     "--record",
     type=PATH,
@@ -43,39 +44,37 @@ def watch(
     """Watch a robot as a digital shadow: it listens, says what is wrong, and moves nothing.
 
     SOURCE is `ros1`, `rosbridge://HOST[:PORT]`, `emulated` (a robot that exists only as physics),
-    or a log to replay: a raw session, a bag, a recording. On a ROS network the diagnosis is
+    a log to replay (a raw session, a bag, a recording), or a source of your own, MODULE:CLASS, made
+    as failuretwin.connection.links.base.Source says. On a ROS network the diagnosis is
     published on /diagnostics. Stop with Ctrl-C.
     """
     from contextlib import ExitStack
 
-    from failuretwin.app.live import EmulationOptions, connect, topics_of, watch_until_end
+    from failuretwin.app.live import connect, topics_of, watch_until_end
     from failuretwin.app.shadow import Shadow
     from failuretwin.app.tables import console
-    from failuretwin.connection.links.base import Pace
-    from failuretwin.connection.links.diagnostics import statuses
     from failuretwin.connection.links.recording import Recorder
+    from failuretwin.connection.links.ros_messages import statuses
     from failuretwin.decision.streaming.diagnoser import monitor
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
 
-    model, names = load_robot(robot), topics_of(live.topics)
-    known = load_calibration(calibration, model)
-    diagnoser = monitor(known.twin, known.imperfections)
-    length = math.inf if live.duration is None else live.duration
-    options = EmulationOptions(live.faults, live.imperfections, length, seed)
+    model = load_robot(robot)
+    known, motors = load_calibration(calibration, model), model.motor_names
+    diagnoser, wait_s = monitor(known.twin, known.imperfections), topics_of(live.topics).wait_s
+    # An emulated robot ends by itself, a log when it is over.
+    length = live.duration if live.duration and source != "emulated" else math.inf
     with ExitStack() as stack:
-        connections = connect(source, model, names, options, Pace(live.speed), stack)
-        sinks = list(connections.sinks)
+        link, sinks = connect(source, model, live, seed, stack)
         if record is not None:
             sinks.append(stack.enter_context(Recorder(record, model)))
-        shadow = Shadow(connections.source, diagnoser, known.twin, sinks, names.wait_s)
+        shadow = Shadow(link, diagnoser, known.twin, sinks, wait_s)
         try:
-            # An emulated robot ends by itself, a log when it is over.
-            until = time.monotonic() + (length if source != "emulated" else math.inf)
-            watch_until_end(shadow, connections.source, sinks, model.motor_names, console(), until)
+            until = time.monotonic() + length
+            watch_until_end(shadow, link, sinks, motors, console(), until)
         except KeyboardInterrupt:
             click.echo("stopped")
-    arm = statuses(shadow.moment.answer, model.motor_names)[0]
+    arm = statuses(shadow.snapshot.answer, motors)[0]
     click.echo(f"last answer: {arm.message}")
 
 
@@ -108,23 +107,21 @@ def emulate(
 
     Needs no robot. Watch it with `failuretwin watch ros1`.
     """
-    from failuretwin.app.live import EmulationOptions, emulated_robot, topics_of
+    from failuretwin.app.live import emulated_robot, schedule_of, topics_of
     from failuretwin.connection.links.base import AS_FAST_AS_POSSIBLE, Pace, Sink
     from failuretwin.connection.links.recording import Recorder
     from failuretwin.core.errors import InputError
     from failuretwin.digital_model.robot import load_robot
-    from failuretwin.failure_behavior.injection import ScheduledFault, state_at
+    from failuretwin.failure_behavior.injection import state_at
 
     model = load_robot(robot)
-    schedule = [ScheduledFault.parse(text, model.motor_names) for text in live.faults]
+    schedule = schedule_of(live, model)
     zero, on_ros = time.time(), target == "ros1"
     if not on_ros and Path(target).suffix != ".mcap":
         raise InputError(f"--to is {target!r}, expected ros1 or a file that ends in .mcap.")
     length = live.duration or (math.inf if on_ros else _file_length(schedule))
-    options = EmulationOptions(live.faults, live.imperfections, length, seed)
-    source = emulated_robot(
-        model, options, Pace(live.speed if on_ros else AS_FAST_AS_POSSIBLE), zero
-    )
+    pace = Pace(live.speed if on_ros else AS_FAST_AS_POSSIBLE)
+    source = emulated_robot(model, live, seed, pace, length, zero)
     sink: Sink
     if on_ros:
         from failuretwin.connection.links.ros1 import Ros1Robot
@@ -132,7 +129,7 @@ def emulate(
         sink = Ros1Robot(model, topics_of(live.topics))
     else:
         sink = Recorder(Path(target), model)
-    told, trouble = "", ""
+    state, trouble = "", ""
     with source, sink:
         try:
             while not source.ended:
@@ -143,10 +140,10 @@ def emulate(
                 if sink.trouble != trouble:
                     trouble = sink.trouble
                     click.echo(trouble or "going on")
-                state = state_at(schedule, event.time - zero, model.motor_names)
-                if state != told:
-                    click.echo(f"{event.time - zero:8.1f} s  {state}")
-                    told = state
+                now = state_at(schedule, event.time - zero, model.motor_names)
+                if now != state:
+                    click.echo(f"{event.time - zero:8.1f} s  {now}")
+                    state = now
         except KeyboardInterrupt:
             click.echo("stopped")
     if sink.trouble:

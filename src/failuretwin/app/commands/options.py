@@ -80,6 +80,14 @@ def common_options(command: F) -> F:
     )(command)
 
 
+calibration_option = click.option(
+    "--calibration",
+    type=PATH,
+    metavar="FILE",
+    help="What `calibrate` learned of this robot. Default: the calibration its profile names.",
+)
+
+
 def reading_options(command: F) -> F:
     """Add what says how raw logs become runs; the command gets it as `reading`."""
     command = _gathered(command, LogOptions, "reading")

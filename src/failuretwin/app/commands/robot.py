@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
 
 import click
 
-from failuretwin.app.commands.options import PATH
-
-F = TypeVar("F", bound=Callable[..., Any])
+from failuretwin.app.commands.options import PATH, F
 
 
 def link_options(command: F) -> F:
@@ -36,7 +32,7 @@ def robot() -> None:
 @link_options
 def check(urdf: Path, base: str | None, tool: str | None) -> None:
     """Say whether a URDF can be used, which motors move the tool, and what is missing."""
-    from failuretwin.app.tables import print_report
+    from failuretwin.app.reports import print_report
     from failuretwin.digital_model.urdf_check import check_urdf
 
     report = check_urdf(urdf, base, tool)

@@ -1,17 +1,23 @@
-"""From healthy runs to a calibration."""
+"""From healthy logs to a calibration: fit, suspect runs, fit again to what is trusted, check."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from failuretwin.connection.calibration.cross_validation import cross_validate, judge
 from failuretwin.connection.calibration.observations import observe, session_names
 from failuretwin.connection.calibration.parameters import (
+    LossRates,
+    Rate,
+    glitch_rates,
     lateness_parameters,
     loss_parameters,
+    loss_rates,
     rate_parameter,
     readings_of,
     schedule_of,
@@ -20,26 +26,26 @@ from failuretwin.connection.calibration.parameters import (
     timing_of,
     timing_parameters,
 )
-from failuretwin.connection.calibration.rates import LossRates, Rate, loss_rates
 from failuretwin.connection.calibration.result import Calibration, HeldOut, LeftOut, Parameter
-from failuretwin.connection.calibration.settling import SettledPart, fit_settled_part
-from failuretwin.connection.calibration.timing import (
+from failuretwin.connection.calibration.settling_fit import (
+    SettlingFit,
+    best_payload,
+    sense_remarks,
+    sort_and_fit,
+)
+from failuretwin.connection.calibration.timing_fit import (
     fit_timing,
     gap_starts,
-    glitch_rates,
     lateness,
     movements_of,
     transients,
 )
-from failuretwin.connection.calibration.validation import (
-    best_payload,
-    held_out_sessions,
-    judge,
-    sense_remarks,
-)
+from failuretwin.core.errors import InputError
+from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
-from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.robot import Robot, shown_unit
+from failuretwin.inference.isolability import fault_probabilities
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -53,7 +59,7 @@ MOST_SUSPECT = 0.25
 whole, and logs are refused. Of ten healthy runs three look faulty in one session of a thousand."""
 
 
-def untrusted(
+def exclude_suspect_runs(
     names: Sequence[str], sessions: Sequence[str], fault_probability: FloatArray
 ) -> list[LeftOut]:
     """Return the runs that look faulty, and those of sessions that do.
@@ -61,7 +67,7 @@ def untrusted(
     Args:
         names: Names of the runs.
         sessions: The session of each run.
-        fault_probability: Probability that each run is faulty, (run,).
+        fault_probability: That of each run, (run,).
     """
     suspect, of = fault_probability >= SUSPECT, np.asarray(sessions)
     found = []
@@ -79,7 +85,7 @@ def untrusted(
 BOOTSTRAP_SEED = 0
 
 
-def calibrate(
+def fit_calibration(
     runs: xr.Dataset,
     robot: Robot,
     name: str,
@@ -97,8 +103,8 @@ def calibrate(
         robot: The robot.
         name: What to call the imperfections in results.
         source: Which logs they come from.
-        fault_probability: Probability that each run is faulty, (run,); runs and sessions that look
-            so are left out. None: all count.
+        fault_probability: That of each run, (run,); runs and sessions that look faulty are left
+            out. None: all count.
         use_readings: Whether to look at the motors' own readings, where the runs have them.
         judged: Healthy runs of sessions that only say how good the fit is; None: each session is
             left out once and judged by a fit to the others.
@@ -110,16 +116,16 @@ def calibrate(
     """
     names = [str(run) for run in runs["run"].values]
     doubt = np.zeros(len(names)) if fault_probability is None else fault_probability
-    left_out = untrusted(names, session_names(runs), doubt)
+    left_out = exclude_suspect_runs(names, session_names(runs), doubt)
     out = {entry.run for entry in left_out}
     kept = runs.isel(run=[i for i, run in enumerate(names) if run not in out])
-    part = fit_settled_part(observe(kept, use_readings=use_readings), robot)
+    part = sort_and_fit(observe(kept, use_readings=use_readings), robot)
     payload, remarks = 0.0, list[str]()
     if thorough:
         payload, told = best_payload(part, robot)
         remarks = [*sense_remarks(part, robot), told]
         if payload > 0.0:
-            part = fit_settled_part(part.observations, robot, payload)
+            part = sort_and_fit(part.observations, robot, payload)
     movements = movements_of(kept)
     late = lateness(movements)
     losses = loss_rates(
@@ -160,10 +166,10 @@ def calibrate(
     )
 
 
-def _held_out(part: SettledPart, robot: Robot, judged: xr.Dataset | None) -> tuple[HeldOut, ...]:
+def _held_out(part: SettlingFit, robot: Robot, judged: xr.Dataset | None) -> tuple[HeldOut, ...]:
     seen = part.observations
     if judged is None:
-        return held_out_sessions(seen, robot, part.payload)
+        return cross_validate(seen, robot, part.payload)
     unseen = observe(judged, use_readings=seen.position is not None)
     entries = [
         judge(unseen[unseen.session == index], part, robot, name)
@@ -172,7 +178,7 @@ def _held_out(part: SettledPart, robot: Robot, judged: xr.Dataset | None) -> tup
     return tuple(entry for entry in entries if entry is not None)
 
 
-def _variation(part: SettledPart, losses: Sequence[LossRates]) -> Variation:
+def _variation(part: SettlingFit, losses: Sequence[LossRates]) -> Variation:
     """Return the doubt about the figures: what a robot of these logs may be like."""
     deviation = part.fit.deviation[:-1].reshape(4, -1)
     bias, compliance, friction, log_scatter = deviation
@@ -193,3 +199,104 @@ def _glitch_parameters(glitches: Sequence[Rate] | None, robot: Robot) -> list[Pa
         return []
     pairs = zip(robot.motor_names, glitches, strict=True)
     return [rate_parameter("spoilt readings", motor, rate) for motor, rate in pairs]
+
+
+# The whole procedure: fit, suspect, fit again what is trusted, and check.
+
+MOST_LEFT_OUT = 0.3
+"""Share of movements that may be left out before the logs are refused."""
+
+MOST_SCATTER_RAD = 0.03
+"""Settled scatter beyond which a motor is no healthy one [rad], three times what is assumed of a
+robot of which nothing is known: errors redrawn for every movement pass for scatter."""
+
+
+def calibrate(
+    runs: xr.Dataset, robot: Robot, name: str, source: str, hold_out: str | None = None
+) -> Calibration:
+    """Calibrate a robot from logs that should be healthy.
+
+    Args:
+        runs: The logs.
+        robot: The robot.
+        name: What to call the calibration in results.
+        source: Which logs these are.
+        hold_out: Text in the names of sessions that are not learned from, only judged; None: all
+            sessions are learned from, and each is judged by a fit to the others.
+
+    Raises:
+        InputError: If the logs are labelled faulty or look so, or too few movements are left.
+    """
+    check_motors(runs, robot.name, robot.motor_names)
+    runs, labelled = _without_faulty_labels(runs)
+    inside = _held_out_runs(runs, hold_out)
+    learning = runs.isel(run=np.flatnonzero(~inside))
+    first = fit_calibration(learning, robot, name, source, thorough=False)
+    _refuse_scatter(first, robot)
+    doubt = fault_probabilities(learning, robot, first.imperfections)
+    _refuse_suspects(learning, doubt)
+    judged = runs.isel(run=np.flatnonzero(inside)) if inside.any() else None
+    found = fit_calibration(learning, robot, name, source, fault_probability=doubt, judged=judged)
+    _refuse_left_out(found)
+    return replace(found, left_out=(*labelled, *found.left_out))
+
+
+def _without_faulty_labels(runs: xr.Dataset) -> tuple[xr.Dataset, tuple[LeftOut, ...]]:
+    truth = truth_of(runs)
+    if truth is None:
+        return runs, ()
+    healthy = np.array([fault == "healthy" for fault in truth])
+    if not healthy.any():
+        raise InputError(
+            "every run is labelled faulty. Expected healthy logs: a twin that learns from a fault "
+            "takes it for normal."
+        )
+    names = runs["run"].values
+    labelled = tuple(
+        LeftOut(str(names[i]), 0, "", f"labelled {truth[i]}") for i in np.flatnonzero(~healthy)
+    )
+    return runs.isel(run=np.flatnonzero(healthy)), labelled
+
+
+def _held_out_runs(runs: xr.Dataset, hold_out: str | None) -> np.ndarray:
+    sessions = session_names(runs)
+    inside = np.array([hold_out is not None and hold_out in session for session in sessions])
+    known = ", ".join(dict.fromkeys(sessions))
+    if hold_out is not None and not inside.any():
+        raise InputError(f"--hold-out {hold_out!r} is in no session's name. There are: {known}.")
+    if inside.all():
+        raise InputError(f"--hold-out {hold_out!r} leaves nothing to learn from: {known}.")
+    return inside
+
+
+def _refuse_scatter(first: Calibration, robot: Robot) -> None:
+    for parameter in first.parameters:
+        if parameter.name == "scatter" and parameter.low > MOST_SCATTER_RAD:
+            scale, unit = shown_unit("rad", robot)
+            raise InputError(
+                f"{parameter.motor} settles anew with every movement, with a scatter of "
+                f"{scale * parameter.value:.1f} {unit}; expected {scale * MOST_SCATTER_RAD:.1f} at "
+                "most. Nothing is learned from these logs; give logs of a healthy robot."
+            )
+
+
+def _refuse_suspects(runs: xr.Dataset, doubt: FloatArray) -> None:
+    suspects = np.flatnonzero(doubt >= SUSPECT)
+    if len(suspects) > MOST_SUSPECT * len(doubt):
+        names = [str(runs["run"].values[i]) for i in suspects[:5]]
+        raise InputError(
+            f"{len(suspects)} of {len(doubt)} runs look faulty ({', '.join(names)}"
+            f"{', ...' if len(suspects) > 5 else ''}), so nothing is learned from these logs. Give "
+            "logs of a healthy robot; `failuretwin diagnose` shows what is wrong with each run."
+        )
+
+
+def _refuse_left_out(found: Calibration) -> None:
+    movements = [entry for entry in found.left_out if entry.movement > 0]
+    if len(movements) > MOST_LEFT_OUT * max(found.movements, 1):
+        reasons = Counter(f"{e.motor} {e.reason}".strip() for e in movements).most_common(3)
+        told = "; ".join(f"{reason} ({count} times)" for reason, count in reasons)
+        raise InputError(
+            f"{len(movements)} movements do not look healthy beside {found.movements} that do: "
+            f"{told}. Nothing is learned from these logs; give logs of a healthy robot."
+        )

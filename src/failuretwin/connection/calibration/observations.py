@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import gammaln, stdtr
@@ -11,7 +11,7 @@ from scipy.special import gammaln, stdtr
 from failuretwin.core.numerics import log_student
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.digital_model.robot import Robot
-from failuretwin.digital_model.settling import largest_load
+from failuretwin.digital_model.settling import Settling, largest_load
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.evidence import SettledEvidence, settled_evidence
 
@@ -56,17 +56,9 @@ class Observations:
 
     def __getitem__(self, kept: BoolArray | IntArray) -> Observations:
         """Return some of the movements."""
-        return Observations(
-            self.run[kept],
-            self.session[kept],
-            self.number[kept],
-            self.origin[kept],
-            self.target[kept],
-            self.point[kept],
-            None if self.position is None else self.position[kept],
-            self.sessions,
-            self.runs,
-        )
+        named = {f.name: getattr(self, f.name) for f in fields(self)}
+        each: dict[str, Any] = {n: v[kept] for n, v in named.items() if isinstance(v, np.ndarray)}
+        return replace(self, **each)
 
     def __len__(self) -> int:
         """Return the number of movements."""
@@ -131,7 +123,7 @@ def _settled_position(
     return settled
 
 
-def follows_seen(observations: Observations) -> BoolArray:
+def has_known_origin(observations: Observations) -> BoolArray:
     """Return which movements follow one that was seen, or begin a run, (movement,).
 
     After an unseen movement it is not known where a motor came from.
@@ -142,7 +134,7 @@ def follows_seen(observations: Observations) -> BoolArray:
     return np.asarray(seen)
 
 
-def obeyed(observations: Observations, lost: BoolArray) -> Observations:
+def without_lost(observations: Observations, lost: BoolArray) -> Observations:
     """Return the observations with the origins of motors that had missed the command before.
 
     Args:
@@ -157,7 +149,7 @@ def obeyed(observations: Observations, lost: BoolArray) -> Observations:
     return replace(observations, origin=origin)
 
 
-def stayed(observations: Observations, robot: Robot, expected: FloatArray) -> BoolArray:
+def lost_command(observations: Observations, robot: Robot, expected: FloatArray) -> BoolArray:
     """Return which motors stayed where they were although told to move, (movement, motor).
 
     With readings each motor is looked at by itself; with the tool path alone, a set of motors
@@ -194,14 +186,19 @@ def stayed(observations: Observations, robot: Robot, expected: FloatArray) -> Bo
 
 ROUNDING = float(1.0 / np.sqrt(12.0))
 """Standard deviation of what whole numbers round off."""
+LEAST_SCATTER_RAD = 1e-5
+"""Scatter assumed of motors that are said to have none [rad]; no reading is as fine."""
 LEAST_DOF = 1.0
 """Degrees of freedom below which tails grow no heavier: where every error is far smaller than what
 counts round off, ever heavier tails would fit ever better."""
 
 
 @dataclass(frozen=True)
-class SettledErrors:
-    """Settled errors as a linear model of bias, compliance and friction, with scatter.
+class SettlingRegression:
+    """Settled errors, linear in bias, compliance and friction, with the scatter of a Student t.
+
+    error = bias + compliance * torque - friction * direction + scatter of each motor; where the
+    tool alone was seen, the Jacobian times that.
 
     Attributes:
         error: Settled minus commanded: angles (movement, motor) [rad] or tool (movement, axis) [m].
@@ -218,8 +215,63 @@ class SettledErrors:
     count: float
     arrived: FloatArray
 
+    @classmethod
+    def of(
+        cls, observations: Observations, robot: Robot, arrived: FloatArray, settling: Settling
+    ) -> SettlingRegression:
+        """Return the regression of settled movements.
+
+        Args:
+            observations: Settled movements.
+            robot: The robot.
+            arrived: How probable it is that each motor got its command, (movement, motor).
+            settling: Where motors settle as far as is known: where the tool alone was seen, the
+                model is made linear there. Its payload is in the torques.
+        """
+        twin, direction = DigitalTwin(robot), observations.direction
+        base = np.where(arrived > 0, observations.target, observations.origin)
+        jacobian = None
+        if observations.position is not None:
+            pose, error = observations.position, observations.position - observations.target
+        else:
+            pose = base + settling.offset(robot, base, direction)
+            point, jacobian = twin.path_and_jacobian(pose)
+            error = observations.point - point + np.einsum("iak,ik->ia", jacobian, pose - base)
+        torque = robot.sense * robot.loads.torque(pose * robot.sense, settling.payload)
+        design = np.stack([np.ones_like(torque), torque, -direction])
+        return cls(error, design, jacobian, count_of(robot), arrived)
+
+    def whitened(self, settling: Settling, noise: float) -> tuple[FloatArray, FloatArray]:
+        """Return errors and their slopes by bias and compliance in units of the scatter.
+
+        Friction is taken off. What scatters together as one Student t is a group: the three axes
+        of a tool position, or the reading of one motor.
+
+        Args:
+            settling: Friction and scatter.
+            noise: Of the tool sensor [m].
+
+        Returns:
+            Errors, (movement, group, axis), and slopes, (movement, group, axis, 2 motor).
+        """
+        bias, torque, against = self.design
+        friction = against * np.asarray(settling.friction)
+        if self.jacobian is None:
+            scale = np.hypot(settling.scatter, self.count * ROUNDING)
+            scale = np.maximum(scale, LEAST_SCATTER_RAD)
+            unit = np.eye(len(scale)) / scale[:, None]
+            slope = np.concatenate([unit * bias[:, None], unit * torque[:, None]], axis=2)
+            return ((self.error - friction) / scale)[..., None], slope[:, :, None]
+        error = self.error - np.einsum("iak,ik->ia", self.jacobian, friction)
+        slope = np.concatenate([self.jacobian, self.jacobian * torque[:, None]], axis=2)
+        scaled = self.jacobian * np.asarray(settling.scatter)
+        spread = np.einsum("iak,ibk->iab", scaled, scaled) + noise**2 * np.eye(3)
+        both = np.concatenate([error[..., None], slope], axis=2)
+        white = np.linalg.solve(np.linalg.cholesky(spread), both)
+        return white[:, None, :, 0], white[:, None, :, 1:]
+
     def log_likelihood(self, parameters: FloatArray) -> float:
-        """Return the log likelihood of parameters as in `SettledFit.mode`.
+        """Return the log likelihood of parameters as in `SettlingPosterior.mode`.
 
         With the tool path alone, the logarithm of the tool sensor's noise [m] comes after them.
         """

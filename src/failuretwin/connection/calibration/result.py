@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -126,22 +126,8 @@ class Calibration:
 
 # Calibrations as TOML files: the imperfections, which the twin reads, and how they were found.
 
-
-@dataclass(frozen=True)
-class _Record:
-    """The table beside the imperfections: how they were found."""
-
-    robot: str
-    failuretwin_version: str
-    sessions: tuple[str, ...]
-    runs: int
-    movements: int
-    used_readings: bool
-    parameters: tuple[Parameter, ...]
-    left_out: tuple[LeftOut, ...] = ()
-    held_out: tuple[HeldOut, ...] = ()
-    remarks: tuple[str, ...] = ()
-    loops: tuple[CalibratedLoop, ...] = ()
+ORIGIN = ("robot", "failuretwin_version")
+"""Keys of the file's table beside the fields of `Calibration`: what it is of and who wrote it."""
 
 
 def save_calibration(calibration: Calibration, robot: Robot, path: Path) -> None:
@@ -152,24 +138,13 @@ def save_calibration(calibration: Calibration, robot: Robot, path: Path) -> None
     """
     import tomli_w
 
-    record = _Record(
-        robot=robot.name,
-        failuretwin_version=__version__,
-        sessions=calibration.sessions,
-        runs=calibration.runs,
-        movements=calibration.movements,
-        used_readings=calibration.used_readings,
-        parameters=calibration.parameters,
-        left_out=calibration.left_out,
-        held_out=calibration.held_out,
-        remarks=calibration.remarks,
-        loops=calibration.loops,
-    )
-    table = {**_plain(calibration.imperfections), CALIBRATION_TABLE: _plain(record)}
+    record = _plain(calibration)
+    table = record.pop("imperfections")
+    origin = dict(zip(ORIGIN, (robot.name, __version__), strict=True))
     text = (
         "# What a healthy robot does that the published twin does not, learned from its logs by\n"
         "# `failuretwin calibrate`. Angles in rad in the sense of the logs, times in s.\n"
-        f"{tomli_w.dumps(table)}"
+        f"{tomli_w.dumps({**table, CALIBRATION_TABLE: {**origin, **record}})}"
     )
     with replacing(path) as partial:
         partial.write_text(text, encoding="utf-8")
@@ -189,25 +164,17 @@ def read_calibration(path: Path, robot: Robot) -> Calibration:
         InputError: If the file is no calibration, or one of another robot.
     """
     imperfections = load_calibration(path, robot).imperfections
-    table = read_toml(path).get(CALIBRATION_TABLE)
-    if not isinstance(table, dict):
+    table = read_toml(path)
+    record = table.pop(CALIBRATION_TABLE, None)
+    if record is None:
         raise InputError(
             f"{path}: holds imperfections without a calibration. Expected a file written by "
             "`failuretwin calibrate`."
         )
-    record = from_table(_Record, table, f"{path}: {CALIBRATION_TABLE}")
-    return Calibration(
-        imperfections=imperfections,
-        parameters=record.parameters,
-        sessions=record.sessions,
-        runs=record.runs,
-        movements=record.movements,
-        used_readings=record.used_readings,
-        left_out=record.left_out,
-        held_out=record.held_out,
-        remarks=record.remarks,
-        loops=record.loops,
-    )
+    told = {name: value for name, value in record.items() if name not in ORIGIN}
+    where = f"{path}: {CALIBRATION_TABLE}"
+    found = from_table(Calibration, {**told, "imperfections": table}, where)
+    return replace(found, imperfections=imperfections)
 
 
 def _plain(value: Any) -> Any:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import time
-import time as wall_clock
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from threading import Condition
-from typing import Protocol, Self
+from time import time as wall_clock
+from typing import Protocol, Self, cast
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import FloatArray
+from failuretwin.digital_model.robot import Robot
 
 OK, STALE = "OK", "STALE"
 """States of an answer: data keep coming, or they have stopped."""
@@ -90,7 +92,31 @@ class LinkCounts:
 
 
 class Source(Protocol):
-    """Where readings and commands come from. Used in a ``with`` statement, fetched one by one."""
+    """Where readings and commands come from; implement this to watch a robot of your own.
+
+    It is opened by its constructor and used in one ``with`` statement, by one thread, which calls
+    `poll` again and again and looks at `ended` and `counts` in between. A source that listens in a
+    thread of its own puts what it hears into an `EventQueue`. Times are by the robot's clock, and
+    need not be in order. `failuretwin watch MODULE:CLASS` watches such a class; it is called with
+    the robot, and with the text after a second colon if there is one, such as an address::
+
+        class Replayed:
+            name, ended, counts = "ten readings at rest", False, LinkCounts()
+
+            def __init__(self, robot: Robot) -> None:
+                self._left = iter([Reading(0.1 * i, np.zeros(3)) for i in range(10)])
+
+            def poll(self, timeout_s: float) -> Event | None:
+                event = next(self._left, None)
+                self.ended = event is None
+                return event
+
+            def __enter__(self) -> Self:
+                return self
+
+            def __exit__(self, *_: object) -> None:
+                pass
+    """
 
     @property
     def name(self) -> str:
@@ -124,7 +150,25 @@ class Source(Protocol):
 
 
 class Sink(Protocol):
-    """Where items go: a recording, a network. Used in a ``with`` statement."""
+    """Where items go: a recording, a network, a log of your own.
+
+    Used in one ``with`` statement. `put` is called by one thread with every reading, command and
+    answer in the order of the stream, and must not wait: an answer comes with every reading. After
+    it `trouble` is looked at, and told to the user whenever it changes::
+
+        class Printed:
+            name, trouble = "printed", ""
+
+            def put(self, item: Item) -> None:
+                if isinstance(item, Answer) and item.diagnosis is not None:
+                    print(item.time, item.diagnosis.verdict)
+
+            def __enter__(self) -> Self:
+                return self
+
+            def __exit__(self, *_: object) -> None:
+                pass
+    """
 
     @property
     def name(self) -> str:
@@ -214,7 +258,7 @@ class StreamClock:
         self._newest = 0.0
         self._seen_s = 0.0
 
-    def place(self, stamp: float, now_s: float) -> float:
+    def to_stream_time(self, stamp: float, now_s: float) -> float:
         """Return the stream time of an event [s].
 
         Args:
@@ -244,7 +288,7 @@ class StreamClock:
         Until it has said anything, it is taken to agree with ours.
         """
         if self._offset is None:
-            return wall_clock.time()
+            return wall_clock()
         return time - self._offset
 
 
@@ -341,3 +385,38 @@ class PacedSource:
 
     def __exit__(self, *_: object) -> None:
         """Nothing to be closed."""
+
+
+# Sources of other people, by their names.
+
+SOURCE_PARTS = ("name", "ended", "counts", "poll", "__enter__", "__exit__")
+"""What `Source` asks for."""
+
+
+def source_from_text(text: str, robot: Robot) -> Source:
+    """Return the source of a class that the user names.
+
+    Args:
+        text: ``module:Class``, or ``module:Class:ADDRESS`` for a class that takes an address; the
+            module is imported from where Python finds modules.
+        robot: The robot, given to the class before the address.
+
+    Raises:
+        InputError: If there is no such class, or what it makes is no source.
+    """
+    module, _, rest = text.partition(":")
+    name, *address = rest.split(":", 1)
+    try:
+        made = getattr(import_module(module), name)(robot, *address)
+    except (ImportError, AttributeError) as error:
+        raise InputError(
+            f"source {text!r}: {error}. Expected MODULE:CLASS, a class such as the docstring of "
+            "failuretwin.connection.links.base.Source shows, in a module that Python finds."
+        ) from error
+    lacking = [part for part in SOURCE_PARTS if not hasattr(made, part)]
+    if lacking:
+        raise InputError(
+            f"source {text!r}: lacks {', '.join(lacking)}. Expected a class such as the docstring "
+            "of failuretwin.connection.links.base.Source shows."
+        )
+    return cast(Source, made)

@@ -23,8 +23,13 @@ from failuretwin.connection.links.base import (
     PacedSource,
     Reading,
 )
-from failuretwin.connection.links.live_commands import SampledCommands
-from failuretwin.connection.links.ros_messages import Bulletin, Outgoing, RosTopics, RosWriter
+from failuretwin.connection.links.live_events import SampledCommands, motor_reading
+from failuretwin.connection.links.ros_messages import (
+    DiagnosticsPublisher,
+    Outgoing,
+    RosTopics,
+    RosWriter,
+)
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.bags.messages import NS_PER_S
@@ -217,7 +222,7 @@ class Recorder:
         self.name = str(path)
         self._path = path
         self._writer = RosWriter(robot, RECORDED)
-        self._bulletin = Bulletin(robot, RECORDED)
+        self._bulletin = DiagnosticsPublisher(robot, RECORDED)
         self._unsaved: deque[tuple[Outgoing, int]] = deque(maxlen=KEPT)
         self._trouble = ""
         self._retry_s = 0.0
@@ -376,18 +381,6 @@ def log_events(log: TimedLog, robot: Robot) -> Iterator[Event]:
 
 def _motor_readings(time: FloatArray, angle: FloatArray, twin: DigitalTwin) -> list[Reading]:
     return [motor_reading(float(t), angle[i], twin) for i, t in enumerate(time)]
-
-
-def motor_reading(time: float, angle: FloatArray, twin: DigitalTwin) -> Reading:
-    """Return motor readings as the reading of a virtual tool sensor, as published.
-
-    Args:
-        time: By the robot's clock [s].
-        angle: (motor,) [rad], NaN where one is missing; then there is no tool position.
-        twin: Kinematics of the robot.
-    """
-    sound = bool(np.isfinite(angle).all())
-    return Reading(time, twin.path(angle) if sound else np.full(3, np.nan), angle)
 
 
 def _commands(command: Samples | Targets) -> list[CommandSent]:

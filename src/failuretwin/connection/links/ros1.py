@@ -19,21 +19,19 @@ from xmlrpc.client import Error, ServerProxy, Transport
 from failuretwin.connection.links.base import (
     Answer,
     CommandSent,
-    Event,
     EventQueue,
     Item,
-    LinkCounts,
     Reading,
 )
+from failuretwin.connection.links.live_events import NetworkSource
 from failuretwin.connection.links.ros1_import import Decoder, load_rospy, message_class
 from failuretwin.connection.links.ros_messages import (
     DIAGNOSTICS_TYPE,
-    Bulletin,
+    DiagnosticsPublisher,
     Outgoing,
     RosTopics,
     RosWriter,
 )
-from failuretwin.connection.links.ros_reading import Inbox
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.bags.messages import Role
 from failuretwin.digital_model.robot import Robot
@@ -164,7 +162,7 @@ def _are_known(role: NodeRole, topics: Sequence[str]) -> bool:
 # A robot on ROS 1, listened to.
 
 
-class Ros1Source:
+class Ros1Source(NetworkSource):
     """Listens to the topics of a robot; a master that goes away and comes back is no trouble.
 
     Messages are known by their fields, whatever package they come from. What makes no sense is
@@ -173,16 +171,14 @@ class Ros1Source:
     Args:
         robot: The robot.
         topics: Its topics.
-        queue: Where events wait to be fetched.
+        queue: Where events wait to be fetched; None: a queue of its own.
 
     Raises:
         InputError: If rospy is missing, no master answers, or the robot does not fit the topics.
     """
 
-    ended = False
-
     def __init__(self, robot: Robot, topics: RosTopics, queue: EventQueue | None = None) -> None:
-        self._inbox = Inbox(robot, topics, queue)
+        super().__init__(robot, topics, queue)
         self._rospy = join()
         self._topics = topics
         self._decoder = Decoder()
@@ -193,18 +189,12 @@ class Ros1Source:
         self._registration = Registration("subscriber", names, self._subscribe)
 
     @property
-    def counts(self) -> LinkCounts:
-        """What it has seen so far."""
-        return self._inbox.counts(self._registration.renewals)
+    def reconnects(self) -> int:
+        """How often the master went away and came back."""
+        return self._registration.renewals
 
-    def poll(self, timeout_s: float) -> Event | None:
-        """Return the next event; None if none came within `timeout_s` [s]."""
-        return self._inbox.poll(timeout_s)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """Stop listening."""
         self._registration.stop()
         self._unsubscribe()
 
@@ -221,7 +211,7 @@ class Ros1Source:
         self._subscribers = []
 
     def _take(self, message: Any, role: Role) -> None:
-        self._inbox.take(role, partial(self._decoder.decode, message))
+        self.take(role, partial(self._decoder.decode, message))
 
 
 # What is said on ROS 1: an emulated robot's readings and commands, and the diagnosis.
@@ -329,7 +319,7 @@ class Ros1Diagnostics:
     name = "ROS 1 diagnostics"
 
     def __init__(self, robot: Robot, topics: RosTopics) -> None:
-        self._bulletin = Bulletin(robot, topics)
+        self._bulletin = DiagnosticsPublisher(robot, topics)
         self._publishers = _Publishers([(topics.diagnostics, DIAGNOSTICS_TYPE)])
 
     @property

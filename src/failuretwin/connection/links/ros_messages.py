@@ -4,28 +4,32 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from failuretwin.connection.links.base import Answer, CommandSent, Reading
-from failuretwin.connection.links.diagnostics import Beat, Status, statuses
+from failuretwin.connection.links.base import STALE, Answer, CommandSent, Reading
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.types import MS_PER_S, FloatArray
-from failuretwin.data_knowledge.bags.messages import KINDS, NS_PER_S, Kind, Role
+from failuretwin.data_knowledge.bags.messages import (
+    MONITORING,
+    NS_PER_S,
+    Kind,
+    Role,
+    check_role,
+    kind_of_type,
+)
 from failuretwin.digital_model.robot import Robot
 
 # Names and types of the topics that a robot is connected by; TOML, Python and defaults agree.
 
 AUTHORS_TYPE = "cm/msg_cm"
 """Type of the message of the data set's authors; any other package may define the same fields."""
-MONITORING = Kind.MONITORING
-STANDARD_TYPES = {kind.value.replace("/msg/", "/"): kind for kind in Kind if kind is not MONITORING}
-"""Kinds of the standard types by their ROS 1 names."""
 STANDARD_PACKAGES = ("std_msgs", "sensor_msgs", "geometry_msgs", "trajectory_msgs", "nav_msgs")
 """Packages of ROS itself: their other types have none of the fields that are looked for."""
 TOPIC_NAME = re.compile(r"[~/]?[A-Za-z]\w*(/[A-Za-z]\w*)*")
@@ -81,11 +85,7 @@ class RosTopics:
                 )
             kind = kind_of_type(type_)
             foreign = kind is MONITORING and type_.split("/")[0] in STANDARD_PACKAGES
-            if foreign or kind not in KINDS[role]:
-                raise InputError(
-                    f"{role}_type is {type_!r}, which cannot be the {role}. Expected "
-                    f"{', '.join(k.value for k in KINDS[role])}."
-                )
+            check_role(role, None if foreign else kind, f"{role}_type is {type_!r}, which")
 
     @property
     def wait_s(self) -> float:
@@ -97,7 +97,9 @@ class RosTopics:
 
     def check_fits(self, robot: Robot) -> None:
         """Raise InputError if a message would hold servo counts and the robot has none."""
-        in_counts = [type_ for _, _, type_ in self.subscribed if kind_of_type(type_) is MONITORING]
+        in_counts = [
+            type_ for _, _, type_ in self.subscribed if kind_of_type(type_) is Kind.MONITORING
+        ]
         has_counts = robot.profile.servo_units and all(motor.log_column for motor in robot.motors)
         if in_counts and not has_counts:
             raise InputError(
@@ -115,11 +117,6 @@ class RosTopics:
             ("position", self.position, self.position_type),
         ]
         return [entry for entry in found if entry[1]]
-
-
-def kind_of_type(type_: str) -> Kind:
-    """Return the kind of a message type; one that is not standard has the authors' fields."""
-    return STANDARD_TYPES.get(type_.replace("/msg/", "/"), MONITORING)
 
 
 def load_topics(path: Path) -> RosTopics:
@@ -281,7 +278,7 @@ def _header(time: float) -> dict[str, Any]:
 # Answers as diagnostics messages, when it is time for one.
 
 
-class Bulletin:
+class DiagnosticsPublisher:
     """Writes a message every second, and at once when a status gets worse.
 
     Args:
@@ -292,7 +289,7 @@ class Bulletin:
     def __init__(self, robot: Robot, topics: RosTopics) -> None:
         self._robot = robot
         self._topics = topics
-        self._beat = Beat()
+        self._beat = RateLimiter()
 
     def message(self, answer: Answer) -> Outgoing | None:
         """Return the message for an answer, None if it is not time for one."""
@@ -300,3 +297,134 @@ class Bulletin:
         if not self._beat.due(found, time.monotonic()):
             return None
         return diagnostics_message(found, answer.time, self._topics, self._robot)
+
+
+LEVEL_OK, LEVEL_WARN, LEVEL_ERROR, LEVEL_STALE = range(4)
+"""Levels of ``diagnostic_msgs/DiagnosticStatus``."""
+LEVEL_NAMES = ("OK", "WARN", "ERROR", "STALE")
+LIKELY = 0.5
+"""Probability of a fault from which there is a warning."""
+SURE = 0.9
+"""Probability of a fault from which there is an error."""
+PERIOD_S = 1.0
+"""Time between two reports when nothing gets worse [s]."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """State of a motor or of the whole arm.
+
+    Attributes:
+        name: ``arm``, or the name of the motor.
+        level: One of the four levels.
+        message: What is the matter, in words.
+        values: Key-values: probability, mode, magnitude, onset, runner-up.
+    """
+
+    name: str
+    level: int
+    message: str
+    values: Mapping[str, str]
+
+
+def statuses(answer: Answer, motors: Sequence[str]) -> list[Status]:
+    """Return the statuses of an answer: the arm first, then its motors.
+
+    Without data everything is stale; what was known before is told with it.
+
+    Args:
+        answer: The answer.
+        motors: Names of the robot's motors in chain order.
+    """
+    names = ["arm", *motors]
+    diagnosis = answer.diagnosis
+    if diagnosis is None:
+        text = "no data have come yet" if answer.state == STALE else "nothing can be said yet"
+        return [Status(name, LEVEL_STALE, text, {}) for name in names]
+    if diagnosis.undecided:
+        found = [Status(name, LEVEL_WARN, diagnosis.verdict, {}) for name in names]
+    else:
+        found = [_arm(diagnosis), *(_motor(diagnosis, motor) for motor in motors)]
+    if answer.state != STALE:
+        return found
+    told = "no data for a while; before that: "
+    return [Status(s.name, LEVEL_STALE, told + s.message, s.values) for s in found]
+
+
+def _arm(diagnosis: Diagnosis) -> Status:
+    best = diagnosis.ranked[0]
+    values = {"diagnosis": best, "probability": _number(diagnosis.posterior[best])}
+    if best != "healthy":
+        values |= _size(diagnosis)
+    if diagnosis.runner_up is not None:
+        runner_up = diagnosis.runner_up
+        values |= {
+            "runner_up": runner_up,
+            "runner_up_probability": _number(diagnosis.posterior[runner_up]),
+        }
+    healthy = diagnosis.posterior.get("healthy", 0.0)
+    return Status("arm", _level(1.0 - healthy), diagnosis.verdict, values)
+
+
+def _motor(diagnosis: Diagnosis, motor: str) -> Status:
+    modes = {
+        fault.mode: probability
+        for name, probability in diagnosis.posterior.items()
+        for fault in Hypothesis.parse(name).faults
+        if fault.motor == motor
+    }
+    total = min(1.0, sum(modes.values()))
+    ranked = sorted(modes, key=lambda mode: -modes[mode])
+    values = {"probability": _number(total)}
+    if ranked:
+        values["mode"] = ranked[0]
+        best = diagnosis.ranked[0]
+        if f"{motor}:{ranked[0]}" in best.split("+"):
+            values |= _size(diagnosis)
+    if len(ranked) > 1:
+        values["runner_up"] = ranked[1]
+    if total < LIKELY or not ranked:
+        return Status(motor, LEVEL_OK, f"no fault seen ({100 * total:.1f} % faulty)", values)
+    return Status(motor, _level(total), f"{ranked[0]}, {100 * total:.1f} %", values)
+
+
+def _size(diagnosis: Diagnosis) -> dict[str, str]:
+    values = {}
+    if diagnosis.magnitude is not None and np.isfinite(diagnosis.magnitude):
+        values["magnitude"] = _number(diagnosis.magnitude)
+        values["magnitude_unit"] = diagnosis.magnitude_unit or ""
+    if diagnosis.onset_s is not None:
+        values["onset_s"] = f"{diagnosis.onset_s:.2f}"
+    return values
+
+
+def _number(value: float) -> str:
+    return f"{value:.6g}"
+
+
+def _level(probability: float) -> int:
+    if probability >= SURE:
+        return LEVEL_ERROR
+    return LEVEL_WARN if probability >= LIKELY else LEVEL_OK
+
+
+class RateLimiter:
+    """Says when to report: every second, and at once when any status gets worse."""
+
+    def __init__(self) -> None:
+        self._levels: list[int] = []
+        self._due_s = -np.inf
+
+    def due(self, found: Sequence[Status], now_s: float) -> bool:
+        """Return whether these statuses are to be reported now.
+
+        Args:
+            found: The statuses.
+            now_s: Our own monotonic clock [s].
+        """
+        levels = [status.level for status in found]
+        worse = any(new > old for new, old in zip(levels, self._levels, strict=False))
+        if not worse and now_s < self._due_s:
+            return False
+        self._levels, self._due_s = levels, now_s + PERIOD_S
+        return True

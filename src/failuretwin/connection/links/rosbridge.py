@@ -7,16 +7,15 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any, Self
 
-from failuretwin.connection.links.base import Answer, Event, EventQueue, Item, LinkCounts
+from failuretwin.connection.links.base import Answer, EventQueue, Item
+from failuretwin.connection.links.live_events import NetworkSource
 from failuretwin.connection.links.ros_messages import (
     DIAGNOSTICS_TYPE,
-    Bulletin,
+    DiagnosticsPublisher,
     RosTopics,
-    kind_of_type,
 )
-from failuretwin.connection.links.ros_reading import Inbox
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.bags.messages import Kind, Role
+from failuretwin.data_knowledge.bags.messages import Kind, Role, kind_of_type
 from failuretwin.digital_model.robot import Robot
 
 CONNECT_S = 5.0
@@ -64,7 +63,7 @@ def disconnect(ros: Any) -> None:
     ros.terminate()
 
 
-class RosbridgeSource:
+class RosbridgeSource(NetworkSource):
     """Listens to the topics of a robot; a server that goes away and comes back is no trouble.
 
     Args:
@@ -74,8 +73,6 @@ class RosbridgeSource:
         queue: Where events wait to be fetched.
     """
 
-    ended = False
-
     def __init__(
         self, robot: Robot, topics: RosTopics, ros: Any, queue: EventQueue | None = None
     ) -> None:
@@ -84,7 +81,7 @@ class RosbridgeSource:
         names = [name for _, name, _ in topics.subscribed]
         self.name = f"rosbridge {ros.factory.url}: {', '.join(names)}"
         self._ros = ros
-        self._inbox = Inbox(robot, topics, queue)
+        super().__init__(robot, topics, queue)
         self._reconnects = -1
         self._topics = []
         self._count_connections(None)
@@ -94,18 +91,12 @@ class RosbridgeSource:
             self._topics.append(topic)
 
     @property
-    def counts(self) -> LinkCounts:
-        """What it has seen so far."""
-        return self._inbox.counts(self._reconnects)
+    def reconnects(self) -> int:
+        """How often the server went away and came back."""
+        return self._reconnects
 
-    def poll(self, timeout_s: float) -> Event | None:
-        """Return the next event; None if none came within `timeout_s` [s]."""
-        return self._inbox.poll(timeout_s)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """Stop listening."""
         if self._ros.is_connected:
             for topic in self._topics:
                 topic.unsubscribe()
@@ -118,7 +109,7 @@ class RosbridgeSource:
         self._ros.factory.once("ready", self._count_connections)
 
     def _take(self, role: Role, kind: Kind, message: Any) -> None:
-        self._inbox.take(role, lambda: (_as_object(message), kind))
+        self.take(role, lambda: (_as_object(message), kind))
 
 
 class RosbridgeDiagnostics:
@@ -135,7 +126,7 @@ class RosbridgeDiagnostics:
 
         self.name = f"rosbridge {ros.factory.url} diagnostics"
         self._ros = ros
-        self._bulletin = Bulletin(robot, topics)
+        self._bulletin = DiagnosticsPublisher(robot, topics)
         self._topic = roslibpy.Topic(ros, topics.diagnostics, DIAGNOSTICS_TYPE)
         self._topic.advertise()
 

@@ -8,7 +8,6 @@ later. Where the stamp is zero, the time at which the message was received stand
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -20,7 +19,6 @@ import numpy as np
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.types import MS_PER_S, FloatArray, IntArray, as_floats
 from failuretwin.data_knowledge.bags.file import BagMessage, BagTopic
-from failuretwin.digital_model.robot import Robot
 
 NS_PER_S = 1_000_000_000
 HEADER = {"header": "std_msgs/msg/Header"}
@@ -39,6 +37,15 @@ class Kind(Enum):
     POSE = "geometry_msgs/msg/PoseStamped"
 
 
+Role = Literal["command", "tool", "position"]
+ROLES: tuple[Role, ...] = get_args(Role)
+
+KINDS: dict[Role, tuple[Kind, ...]] = {
+    "command": (Kind.TRAJECTORY, Kind.MONITORING, Kind.JOINT_STATE),
+    "tool": (Kind.POINT, Kind.POSE),
+    "position": (Kind.MONITORING, Kind.JOINT_STATE),
+}
+"""Kinds of messages that can play each role."""
 FIELDS: dict[Kind, dict[str, str]] = {
     Kind.MONITORING: {
         "name": "string[]",
@@ -60,6 +67,9 @@ FIELDS: dict[Kind, dict[str, str]] = {
     Kind.POSE: {"pose": "geometry_msgs/msg/Pose"},
 }
 """Fields beside the header that each kind is known by; all kinds but the first have no others."""
+MONITORING = Kind.MONITORING
+STANDARD_TYPES = {kind.value.replace("/msg/", "/"): kind for kind in Kind if kind is not MONITORING}
+"""Kinds of the standard types by their ROS 1 names."""
 
 
 def kind_of(fields: Mapping[str, str]) -> Kind | None:
@@ -71,12 +81,30 @@ def kind_of(fields: Mapping[str, str]) -> Kind | None:
     return None
 
 
+def kind_of_type(type_: str) -> Kind:
+    """Return the kind of a message type; one that is not standard has the authors' fields."""
+    return STANDARD_TYPES.get(type_.replace("/msg/", "/"), MONITORING)
+
+
 def require_kind(fields: Mapping[str, str]) -> Kind:
     """Return the kind of a message that is known to be understood."""
     kind = kind_of(fields)
     if kind is None:
         raise AssertionError(f"no message that is understood: {dict(fields)}")
     return kind
+
+
+def check_role(role: Role, kind: Kind | None, what: str) -> None:
+    """Raise InputError unless messages of a kind can play a role.
+
+    Args:
+        role: The role.
+        kind: The kind; None: one that is not understood.
+        what: The topic or type, with its verb, for the error text.
+    """
+    if kind not in KINDS[role]:
+        expected = ", ".join(kind.value for kind in KINDS[role])
+        raise InputError(f"{what} cannot be the {role}. Expected {expected}.")
 
 
 @dataclass(frozen=True)
@@ -272,70 +300,8 @@ def _joined(rows: Sequence[_Row], *, in_counts: bool) -> JointRows:
     return JointRows(stamps, tuple(names), value, duration if timed else None, in_counts)
 
 
-# Which column of recorded joint values belongs to which motor of the robot.
-
-
-def names_a_motor(names: Sequence[str], robot: Robot) -> bool:
-    """Return whether any of the names can stand for a motor of the robot."""
-    return any(set(scheme) & set(names) for scheme in _schemes(robot, in_counts=False).values())
-
-
-def motor_columns(names: Sequence[str], robot: Robot, where: str, *, in_counts: bool) -> list[int]:
-    """Return the column of each motor among `names`, in chain order.
-
-    All motors are named in one way: by joint, by motor, by log column, or by the number that the
-    log column ends in. The same name may mean two motors in two ways (the log column ``motor_1``
-    of the ArmPi is not its motor 1), so the ways are never mixed and their order matters: values
-    in counts come from the servo bus, angles from a driver that knows joints.
-
-    Args:
-        names: Names of the columns.
-        robot: The robot.
-        where: Name of the file and topic for error texts.
-        in_counts: Whether the values are servo counts.
-
-    Raises:
-        InputError: If a motor is missing.
-    """
-    schemes = _schemes(robot, in_counts=in_counts)
-    column = {name: index for index, name in enumerate(names)}
-    for wanted in schemes.values():
-        if all(name in column for name in wanted):
-            return [column[name] for name in wanted]
-    best = max(schemes.values(), key=lambda wanted: sum(name in column for name in wanted))
-    missing = [name for name in best if name not in column]
-    ways = "; ".join(f"{kind} {', '.join(wanted)}" for kind, wanted in schemes.items())
-    raise InputError(
-        f"{where}: values for {', '.join(missing)} are missing; it names "
-        f"{', '.join(names) or 'no joint at all'}. Expected all motors of {robot.name!r} by one of "
-        f"these: {ways}."
-    )
-
-
-def _schemes(robot: Robot, *, in_counts: bool) -> dict[str, list[str]]:
-    """Return the names of the motors in each way of naming them all, the likeliest first."""
-    bus: dict[str, list[str]] = {}
-    if all(motor.log_column for motor in robot.motors):
-        bus["log columns"] = [motor.log_column for motor in robot.motors]
-        numbers = [re.search(r"\d+$", motor.log_column) for motor in robot.motors]
-        bus["servo numbers"] = [match.group() for match in numbers if match]
-        if len(bus["servo numbers"]) < len(robot.motors):
-            del bus["servo numbers"]
-    arm = {"joints": [motor.joint for motor in robot.motors], "motors": robot.motor_names}
-    return bus | arm if in_counts else arm | bus
-
-
 # Which topic of a recording is what: commands, the tool's position, motor readings.
 
-Role = Literal["command", "tool", "position"]
-ROLES: tuple[Role, ...] = get_args(Role)
-
-KINDS: dict[Role, tuple[Kind, ...]] = {
-    "command": (Kind.TRAJECTORY, Kind.MONITORING, Kind.JOINT_STATE),
-    "tool": (Kind.POINT, Kind.POSE),
-    "position": (Kind.MONITORING, Kind.JOINT_STATE),
-}
-"""Kinds of messages that can play each role."""
 EXPECTED: dict[Role, str] = {
     "command": "no commands. Expected a JointTrajectory, or joint values on a topic that has "
     "`command` or `position_monitoring` in its name",
@@ -381,9 +347,7 @@ def fitting_topics(
     if not same:
         raise InputError(f"{path}: {unknown_name('topic', name, [t.name for t in found])}")
     (topic,) = same
-    if kind_of(topic.fields) not in KINDS[role]:
-        kinds = ", ".join(kind.value for kind in KINDS[role])
-        raise InputError(f"{path}: topic {topic} cannot be the {role}. Expected {kinds}.")
+    check_role(role, kind_of(topic.fields), f"{path}: topic {topic}")
     if topic.count == 0:
         raise InputError(f"{path}: topic {topic} is empty. Name another one as the {role}.")
     return same

@@ -5,6 +5,7 @@ Angles are taken in the sense of the robot's commands, tool positions in its bas
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,8 +31,6 @@ from failuretwin.data_knowledge.bags.messages import (
     check_understood,
     fitting_topics,
     joint_rows,
-    motor_columns,
-    names_a_motor,
     nothing_for,
     only_topic,
     require_kind,
@@ -123,7 +122,7 @@ class _Recording:
     def motors(self, role: Role, fitting: Sequence[BagTopic], *, needed: bool) -> Track | None:
         """Return what the topic for a role says; topics of other joints only do not count."""
         read = {topic.name: self._joints(role, topic) for topic in fitting}
-        ours = [topic for topic in fitting if names_a_motor(read[topic.name].names, self.robot)]
+        ours = [topic for topic in fitting if _names_a_motor(read[topic.name].names, self.robot)]
         # If none is ours but one is needed, the first is refused for the joints that it names.
         topic = only_topic(role, ours or (fitting[:1] if needed else []), self.path)
         if topic is None:
@@ -140,7 +139,7 @@ class _Recording:
 
 def motor_track(rows: JointRows, robot: Robot, where: str) -> Track:
     """Return the angles of the robot's motors, leaving out rows that say nothing of them."""
-    columns = motor_columns(rows.names, robot, where, in_counts=rows.in_counts)
+    columns = _motor_columns(rows.names, robot, where, in_counts=rows.in_counts)
     angle = rows.value[:, columns]
     if rows.in_counts:
         units = robot.servo_units
@@ -150,6 +149,56 @@ def motor_track(rows: JointRows, robot: Robot, where: str) -> Track:
     said = np.asarray(np.isfinite(angle).any(axis=1))
     duration = None if rows.duration is None else rows.duration[said][:, columns]
     return Track(where, rows.stamp_ns[said], angle[said], duration)
+
+
+def _names_a_motor(names: Sequence[str], robot: Robot) -> bool:
+    """Return whether any of the names can stand for a motor of the robot."""
+    return any(set(scheme) & set(names) for scheme in _schemes(robot, in_counts=False).values())
+
+
+def _motor_columns(names: Sequence[str], robot: Robot, where: str, *, in_counts: bool) -> list[int]:
+    """Return the column of each motor among `names`, in chain order.
+
+    All motors are named in one way: by joint, by motor, by log column, or by the number that the
+    log column ends in. The same name may mean two motors in two ways (the log column ``motor_1``
+    of the ArmPi is not its motor 1), so the ways are never mixed and their order matters: values
+    in counts come from the servo bus, angles from a driver that knows joints.
+
+    Args:
+        names: Names of the columns.
+        robot: The robot.
+        where: Name of the file and topic for error texts.
+        in_counts: Whether the values are servo counts.
+
+    Raises:
+        InputError: If a motor is missing.
+    """
+    schemes = _schemes(robot, in_counts=in_counts)
+    column = {name: index for index, name in enumerate(names)}
+    for wanted in schemes.values():
+        if all(name in column for name in wanted):
+            return [column[name] for name in wanted]
+    best = max(schemes.values(), key=lambda wanted: sum(name in column for name in wanted))
+    missing = [name for name in best if name not in column]
+    ways = "; ".join(f"{kind} {', '.join(wanted)}" for kind, wanted in schemes.items())
+    raise InputError(
+        f"{where}: values for {', '.join(missing)} are missing; it names "
+        f"{', '.join(names) or 'no joint at all'}. Expected all motors of {robot.name!r} by one of "
+        f"these: {ways}."
+    )
+
+
+def _schemes(robot: Robot, *, in_counts: bool) -> dict[str, list[str]]:
+    """Return the names of the motors in each way of naming them all, the likeliest first."""
+    bus: dict[str, list[str]] = {}
+    if all(motor.log_column for motor in robot.motors):
+        bus["log columns"] = [motor.log_column for motor in robot.motors]
+        numbers = [re.search(r"\d+$", motor.log_column) for motor in robot.motors]
+        bus["servo numbers"] = [match.group() for match in numbers if match]
+        if len(bus["servo numbers"]) < len(robot.motors):
+            del bus["servo numbers"]
+    arm = {"joints": [motor.joint for motor in robot.motors], "motors": robot.motor_names}
+    return bus | arm if in_counts else arm | bus
 
 
 def _check_commanded(command: Track, robot: Robot) -> None:

@@ -11,8 +11,14 @@ import numpy as np
 
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import BoolArray, FloatArray, frozen_array
-from failuretwin.data_knowledge.recovery.fit import Free, PathPart, Ramps, fit_ramps, largest_error
 from failuretwin.data_knowledge.recovery.inverse_kinematics import EXACT_M, MOTORS, PlaneArm
+from failuretwin.data_knowledge.recovery.ramps import (
+    Free,
+    PathPart,
+    Ramps,
+    fit_ramps,
+    largest_error,
+)
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.random_movements import RandomMovements
 

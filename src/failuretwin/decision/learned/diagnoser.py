@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import log_softmax, softmax
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils import check_random_state
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis
+from failuretwin.core.movements import find_movements
 from failuretwin.core.runs import check_motors, check_runs, truth_of
-from failuretwin.core.types import FloatArray
-from failuretwin.decision.learned.data import movement_counts, movement_range, with_doubt
-from failuretwin.decision.learned.features import POINTS, SHARED, Encoder, Floats, signals_of
+from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.decision.learned.feature_encoder import (
+    POINTS,
+    SHARED,
+    FeatureEncoder,
+    Floats,
+    signals_of,
+)
+from failuretwin.decision.learned.log_pool import PoolWeights
 from failuretwin.decision.learned.networks import (
     Batch,
     Pace,
@@ -30,15 +37,8 @@ from failuretwin.decision.learned.networks import (
     shuffled_batches,
     training,
 )
-from failuretwin.decision.learned.posteriors import (
-    Weights,
-    best_temperature,
-    blended,
-    gated,
-    probabilities,
-    tell,
-    told,
-)
+from failuretwin.inference.explanation import worded
+from failuretwin.inference.log_quality import LogQuality, drop_invalid, log_quality
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -67,13 +67,13 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         standard_: Mean and spread of each channel.
         temperature_: What scores are divided by before they become probabilities.
         movements_: Fewest and most movements of a run that it learned from; None: not known.
-        weights_: How it is blended with the Bayesian diagnosis; None: was never fitted.
+        weights_: Its part in a pool with the Bayesian diagnosis; None: was never fitted.
     """
 
     def __init__(
         self,
         network: str = "cnn",
-        encoder: Encoder | None = None,
+        encoder: FeatureEncoder | None = None,
         iterations: int = 500,
         learning_rate: float = 1e-3,
         decay: bool = True,
@@ -105,7 +105,10 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         """
         if _is_run_set(X) and y is None:
             y = truth_of(X)
-        self.movements_ = movement_range(X) if _is_run_set(X) else None
+        self.movements_ = None
+        if _is_run_set(X):
+            counts = movement_counts(X)
+            self.movements_ = (int(counts.min()), int(counts.max()))
         features, classes = validate_data(
             self, self._features(X), y, allow_nd=True, dtype=np.float32
         )
@@ -169,10 +172,10 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
                 on_iteration(done)
         self.network_ = network.cpu()
         self.classes_, self.standard_, self.temperature_ = classes, standard, 1.0
-        self.weights_: Weights | None = None
+        self.weights_: PoolWeights | None = None
 
     def calibrate(self, X: Runs, y: ArrayLike | None = None) -> LearnedDiagnoser:
-        """Set the temperature at which these runs surprise least; never use a test set.
+        """Set the temperature of the best mean log score on these runs; never use a test set.
 
         Args:
             X: Runs that the network has not learned from.
@@ -239,13 +242,45 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             InputError: If the run set is of another robot, or the network has no encoder.
         """
         check_is_fitted(self, "network_")
-        encoder = self._encoder()
+        robot = self._encoder().robot
         check_runs(runs, "the run set")
-        check_motors(runs, encoder.robot.name, encoder.robot.motor_names)
-        diagnoses = tell(
-            runs, self.predict_proba, [str(name) for name in self.classes_], self.about
+        check_motors(runs, robot.name, robot.motor_names)
+        quality = log_quality(runs)
+        chances = self.predict_proba(drop_invalid(runs, quality)).tolist()
+        names, faults = runs["run"].values.tolist(), truth_of(runs)
+        truth: Sequence[str | None] = [None] * len(names) if faults is None else faults
+        counts = movement_counts(runs).tolist()
+        rows = zip(names, truth, chances, quality, counts, strict=True)
+        return [self._diagnosis(*row) for row in rows]
+
+    def _diagnosis(
+        self, name: str, truth: str | None, chances: list[float], log: LogQuality, movements: int
+    ) -> Diagnosis:
+        """Return the diagnosis of a run; a log too poor for a verdict gets none."""
+        if log.fatal:  # nothing is learnt, so no class is more probable than another
+            chances = [1.0 / len(chances)] * len(chances)
+        protocol, method = self.about
+        diagnosis = Diagnosis(
+            run=str(name),
+            posterior=dict(zip(map(str, self.classes_), chances, strict=True)),
+            truth=truth,
+            quality=(*log.remarks, *self._unfamiliar(movements)),
+            undecided=log.fatal,
+            protocol=protocol,
+            method=method,
         )
-        return with_doubt(diagnoses, movement_counts(runs), self.movements_)
+        return worded(diagnosis, [Hypothesis.parse(name) for name in diagnosis.ranked])
+
+    def _unfamiliar(self, movements: int) -> tuple[str, ...]:
+        """Return a remark on a run of more or fewer movements than the network learned from."""
+        if self.movements_ is None or self.movements_[0] <= movements <= self.movements_[1]:
+            return ()
+        low, high = self.movements_
+        known = f"{low}" if low == high else f"{low} to {high}"
+        return (
+            f"{movements} movements, and the network learned from runs of {known}: its "
+            "probabilities mean little here",
+        )
 
     @property
     def about(self) -> tuple[str, str]:
@@ -256,7 +291,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             method += f"; healthy behaviour: {encoder.expected.name}"
         return encoder.protocol, method
 
-    def _encoder(self) -> Encoder:
+    def _encoder(self) -> FeatureEncoder:
         if self.encoder is None:
             raise InputError("this network has no encoder, so it takes arrays, not run sets.")
         return self.encoder
@@ -265,7 +300,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return self._encoder().encode(signals_of(X)) if _is_run_set(X) else X
 
 
-def network_shape(encoder: Encoder | None, channels: int, classes: int) -> Shape:
+def network_shape(encoder: FeatureEncoder | None, channels: int, classes: int) -> Shape:
     """Return the shape of a network for some features.
 
     Args:
@@ -287,74 +322,34 @@ def _points(features: Floats) -> Floats:
     return features if features.ndim == 3 else features[:, None, :]
 
 
-# Model and network together: the paper's closing idea, in two forms.
-
-HEALTHY = "healthy"
-
-
-class Diagnoser(Protocol):
-    """Whatever diagnoses runs: the Bayesian diagnoser, a network."""
-
-    def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
-        """Return the diagnosis of each run."""
-        ...
+def movement_counts(runs: xr.Dataset) -> IntArray:
+    """Return the number of movements of each run, (run,)."""
+    signals = signals_of(runs)
+    return find_movements(signals.command, signals.time).exists.sum(axis=1)
 
 
-@dataclass(frozen=True)
-class HybridDiagnoser:
-    """Two diagnosers as one.
+def probabilities(scores: FloatArray, temperature: float) -> FloatArray:
+    """Return p_k ~ exp(score_k / temperature), (run, class)."""
+    return softmax(scores / temperature, axis=1)
 
-    Attributes:
-        bayes: The model-based one; where it gives no verdict, there is none.
-        network: The learned one, of the same classes.
-        weights: Of a blend; None: gated.
+
+TEMPERATURES = (0.05, 20.0)
+"""Temperatures worth trying."""
+
+
+def best_temperature(scores: FloatArray, truth: IntArray) -> float:
+    """Return the temperature of the best mean log score (Guo et al., ICML 2017).
+
+    Args:
+        scores: (run, class).
+        truth: Number of the true class, (run,).
     """
+    from scipy.optimize import minimize_scalar
 
-    bayes: Diagnoser
-    network: Diagnoser
-    weights: Weights | None = None
+    runs = np.arange(len(truth))
 
-    def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
-        """Return the diagnosis of each run of a run set.
+    def log_score(log_temperature: float) -> float:
+        return float(-log_softmax(scores / np.exp(log_temperature), axis=1)[runs, truth].mean())
 
-        Onset and size are those of the Bayesian part, where both agree on the fault.
-
-        Raises:
-            InputError: If the parts know different classes.
-        """
-        pairs = zip(self.bayes.diagnose(runs), self.network.diagnose(runs), strict=True)
-        return [self._joined(first, second) for first, second in pairs]
-
-    def _joined(self, bayes: Diagnosis, network: Diagnosis) -> Diagnosis:
-        if bayes.undecided:
-            return bayes
-        if set(bayes.posterior) != set(network.posterior):
-            raise InputError(
-                f"the parts know different classes: {', '.join(bayes.posterior)} and "
-                f"{', '.join(network.posterior)}."
-            )
-        classes = list(bayes.posterior)
-        first = np.array([[bayes.posterior[name] for name in classes]])
-        second = np.array([[network.posterior[name] for name in classes]])
-        if self.weights is None:
-            chances = gated(first, second, classes.index(HEALTHY))[0]
-        else:
-            chances = blended(first, second, self.weights)[0]
-        joined = replace(
-            bayes,
-            posterior=dict(zip(classes, map(float, chances), strict=True)),
-            evidence=(),
-            protocol=max(bayes.protocol, network.protocol),
-            method=f"{'gated' if self.weights is None else 'blended'}: {bayes.method} with "
-            f"{network.method}",
-        )
-        if joined.diagnosis != bayes.diagnosis:
-            joined = replace(
-                joined,
-                onset_s=None,
-                onset_90=None,
-                magnitude=None,
-                magnitude_unit=None,
-                magnitude_90=None,
-            )
-        return told(joined)
+    low, high = np.log(TEMPERATURES)
+    return float(np.exp(minimize_scalar(log_score, bounds=(low, high), method="bounded").x))

@@ -7,13 +7,7 @@ Each takes standardised features (run, point, channel) and gives a score for eac
 from __future__ import annotations
 
 import math
-import multiprocessing
-import os
-from collections import deque
 from collections.abc import Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,10 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from failuretwin.core.errors import FailureTwinError, unknown_name
+from failuretwin.core.errors import unknown_name
 from failuretwin.core.types import FloatArray, IntArray
-from failuretwin.decision.learned.data import Recipe
-from failuretwin.decision.learned.features import Encoder, Floats
+from failuretwin.decision.learned.feature_encoder import Floats
 
 HIDDEN = 100
 """Units of both LSTM layers, as published (Table I of the paper)."""
@@ -71,9 +64,9 @@ class PaperLstm(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return scores (run, class)."""
-        steps, _ = self.first(x)
-        steps, _ = self.second(self.dropout(steps))
-        return self.dense(steps[:, -1])
+        steps = self.first(x)[0]
+        steps = self.second(self.dropout(steps))[0]
+        return self.dense(steps.select(dim=1, index=-1))
 
 
 def _begin_as_published(layer: nn.LSTM) -> None:
@@ -91,23 +84,27 @@ def _begin_as_published(layer: nn.LSTM) -> None:
     nn.init.ones_(weights["bias_ih_l0"][HIDDEN : 2 * HIDDEN])
 
 
+def _convolutions(channels: int, wide: int, *, bias: bool = True) -> nn.ModuleList:
+    return nn.ModuleList(
+        nn.Conv1d(taken, wide, KERNEL, stride=stride, padding=KERNEL // 2, bias=bias)
+        for taken, stride in zip((channels, wide, wide, wide), STRIDES, strict=True)
+    )
+
+
 class Cnn(nn.Module):
     """Four convolutions over time, mean and largest value of each channel, one hidden layer."""
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
         wide = CNN_WIDTH
-        self.convolutions = nn.ModuleList(
-            nn.Conv1d(taken, wide, KERNEL, stride=stride, padding=KERNEL // 2)
-            for taken, stride in zip((shape.channels, wide, wide, wide), STRIDES, strict=True)
-        )
+        self.convolutions = _convolutions(shape.channels, wide)
         self.dropout = nn.Dropout(DROPOUT)
         self.hidden = nn.Linear(2 * wide, wide)
         self.dense = nn.Linear(wide, shape.classes)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return scores (run, class)."""
-        x = x.transpose(1, 2)
+        x = x.permute(0, 2, 1)
         for convolution in self.convolutions:
             x = torch.relu(convolution(x))
         seen = torch.cat([x.mean(dim=2), x.amax(dim=2)], dim=1)
@@ -126,25 +123,17 @@ class MotorWise(nn.Module):
         self.motors, self.shared = shape.motors, shape.shared
         self.each = (shape.channels - shape.shared) // shape.motors
         wide = MOTORWISE_WIDTH
-        sizes = list(zip((self.each + shape.shared, wide, wide, wide), STRIDES, strict=True))
-        self.own = nn.ModuleList(
-            nn.Conv1d(taken, wide, KERNEL, stride=stride, padding=KERNEL // 2)
-            for taken, stride in sizes
-        )
-        self.all = nn.ModuleList(
-            nn.Conv1d(taken, wide, KERNEL, stride=stride, padding=KERNEL // 2, bias=False)
-            for taken, stride in sizes
-        )
+        self.own = _convolutions(self.each + shape.shared, wide)
+        self.all = _convolutions(self.each + shape.shared, wide, bias=False)
         self.dropout = nn.Dropout(DROPOUT)
         self.hidden = nn.Linear(2 * wide * shape.motors, 2 * wide)
         self.dense = nn.Linear(2 * wide, shape.classes)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return scores (run, class)."""
-        runs, points, _ = x.shape
-        own = self.motors * self.each
-        motor = x[:, :, :own].reshape(runs, points, self.motors, self.each)
-        common = x[:, :, None, own:].expand(runs, points, self.motors, self.shared)
+        motor, common = torch.split(x, [self.motors * self.each, self.shared], dim=2)
+        motor = torch.unflatten(motor, 2, (self.motors, self.each))
+        common = common.unsqueeze(2).repeat(1, 1, self.motors, 1)
         x = torch.cat([motor, common], dim=3).permute(0, 2, 3, 1)  # run, motor, channel, point
         for own_part, all_part in zip(self.own, self.all, strict=True):
             each = own_part(x.flatten(0, 1)).unflatten(0, (-1, self.motors))
@@ -248,9 +237,15 @@ def scores_of(network: nn.Module, features: Floats) -> FloatArray:
 def shuffled_batches(
     features: Floats, classes: IntArray, size: int, rng: np.random.Generator
 ) -> Iterator[Batch]:
-    """Give batches of arrays without end, in a new order each time through.
+    """Give batches of arrays without end, in a new order each time through; see `epoch`."""
+    while True:
+        yield from epoch(features, classes, min(size, len(features)), rng)
 
-    What is left at the end of an epoch is left out, unless it is all there is.
+
+def epoch(
+    features: Floats, classes: IntArray, size: int, rng: np.random.Generator
+) -> Iterator[Batch]:
+    """Give batches of arrays once through in random order; what is left at the end is left out.
 
     Args:
         features: (run, point, channel).
@@ -258,12 +253,10 @@ def shuffled_batches(
         size: Runs in a batch.
         rng: Source of chance.
     """
-    size = min(size, len(features))
-    while True:
-        order = rng.permutation(len(features))
-        for first in range(0, len(order) - size + 1, size):
-            chosen = order[first : first + size]
-            yield features[chosen], classes[chosen]
+    order = rng.permutation(len(features))
+    for first in range(0, len(order) - size + 1, size):
+        chosen = order[first : first + size]
+        yield features[chosen], classes[chosen]
 
 
 @dataclass(frozen=True)
@@ -289,81 +282,3 @@ class Standard:
     def __call__(self, features: Floats) -> Floats:
         """Return standardised features."""
         return (features - self.mean) / self.spread
-
-
-# Training batches that never end, made by other processes while a network learns.
-
-CHUNK_RUNS = 576
-"""Runs made at a time."""
-AHEAD = 2
-"""Chunks made ahead for each process, so that none waits."""
-
-Chunk = tuple[Floats, IntArray]
-
-
-def cores() -> int:
-    """Return how many processes this machine can run at a time."""
-    return os.cpu_count() or 1
-
-
-@dataclass(frozen=True)
-class Stream:
-    """Batches of runs straight from the generator.
-
-    They depend on the recipe alone, not on how many processes make the runs.
-
-    Attributes:
-        recipe: What runs are made.
-        encoder: What networks see of them.
-        batch_runs: Runs in a batch.
-        uses: Batches that a run is part of before it is thrown away; 1: none is seen twice.
-    """
-
-    recipe: Recipe
-    encoder: Encoder
-    batch_runs: int = 64
-    uses: int = 6
-
-    @contextmanager
-    def chunks(self) -> Iterator[Iterator[Chunk]]:
-        """Give chunks of fresh runs without end; leaving the block ends the processes.
-
-        Scripts must be guarded by ``if __name__ == "__main__":``.
-        """
-        workers = max(1, cores() - 1)
-        pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
-        try:
-            yield self._in_order(pool, AHEAD * workers)
-        except BrokenProcessPool as error:
-            raise FailureTwinError(
-                "a process that makes runs has died. Look for what ended it, such as too little "
-                "memory, and start again."
-            ) from error
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-
-    def _in_order(self, pool: ProcessPoolExecutor, ahead: int) -> Iterator[Chunk]:
-        given: deque[Future[Chunk]] = deque()
-        number = 0
-        while True:
-            while len(given) <= ahead:
-                given.append(pool.submit(self.recipe.chunk, number, CHUNK_RUNS, self.encoder))
-                number += 1
-            yield given.popleft().result()
-
-    def batches(self, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
-        """Give batches from chunks: each fresh chunk is shuffled with those still in use.
-
-        Args:
-            chunks: Fresh runs, as `chunks` gives them.
-        """
-        rng = np.random.default_rng([self.recipe.seed, CHUNK_RUNS])
-        in_use: deque[Chunk] = deque(maxlen=self.uses)
-        for chunk in chunks:
-            in_use.append(chunk)
-            features = np.concatenate([features for features, _ in in_use])
-            classes = np.concatenate([classes for _, classes in in_use])
-            order = rng.permutation(len(classes))
-            for first in range(0, len(order) - self.batch_runs + 1, self.batch_runs):
-                chosen = order[first : first + self.batch_runs]
-                yield features[chosen], classes[chosen]

@@ -1,42 +1,44 @@
 """How good diagnoses are, where the truth is known.
 
-One module for each question: right or wrong (`classes`), false alarms (`alarms`), how soon
-(`delay`), how much probability (`proper`), whether probabilities mean what they say
-(`reliability`, `ranks`, `coverage`), and which of two methods is better (`paired`).
+`proportions` counts: right or wrong, false alarms, coverage of intervals, delays. `scoring_rules`
+is about probabilities: what they are worth, whether they mean what they say (reliability,
+simulation-based calibration), and which of two methods is better.
 """
 
-from failuretwin.decision.metrics.classification import (
+from failuretwin.decision.metrics.proportions import (
     NO_VERDICT,
     Alarms,
     ClassScore,
+    Coverage,
+    Delays,
+    IntervalCase,
+    Scores,
+    Share,
+    alarm_threshold,
+    count_alarms,
+    coverage_by_mode,
+    delays_after_onset,
+    judged_truth,
+    score,
+    wilson_interval,
+)
+from failuretwin.decision.metrics.scoring_rules import (
+    EcdfBand,
+    LogScore,
     LogScoreGain,
     McNemar,
-    Scores,
-    count_alarms,
-    judged_truth,
-    log_score_gain,
-    mcnemar,
-    score,
-)
-from failuretwin.decision.metrics.delay import Delays, alarm_threshold, delays_after_onset
-from failuretwin.decision.metrics.probability import (
-    Coverage,
-    EcdfBand,
-    IntervalCase,
-    LogScore,
     RankCheck,
     Reliability,
-    Share,
     adaptive_edges,
     brier_score,
     calibrated_error,
     check_ranks,
-    coverage_by_mode,
     equal_edges,
     log_score,
+    log_score_gain,
+    mcnemar,
     rank_of_truth,
     reliability,
-    wilson_interval,
 )
 
 __all__ = [

@@ -1,0 +1,184 @@
+"""`failuretwin calibrate`, `train` and `study`: what is learned, from logs or from the twin."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from failuretwin.app.commands.options import (
+    PATH,
+    LogOptions,
+    calibration_option,
+    common_options,
+    reading_options,
+)
+
+
+@click.command()
+@click.argument("logs", nargs=-1, required=True, type=PATH, metavar="LOG...")
+@click.option("--out", required=True, type=PATH, help="Calibration to write (.toml).")
+@click.option(
+    "--hold-out",
+    metavar="SESSION",
+    help="Learn nothing from sessions with this in their name; only see how well they are "
+    "predicted. Default: each session is left out once, and the result learns from all.",
+)
+@click.option("--name", help="What results call the calibration. Default: the file's name.")
+@click.option("--report", type=PATH, metavar="DIR", help="Write a page with tables and pictures.")
+@reading_options
+@common_options
+def calibrate(
+    logs: tuple[Path, ...],
+    out: Path,
+    hold_out: str | None,
+    name: str | None,
+    report: Path | None,
+    reading: LogOptions,
+    robot: str,
+    seed: int,
+) -> None:
+    """Learn from healthy logs where the motors settle, how they lag and what goes wrong by chance.
+
+    LOG is whatever `diagnose` reads. Motor readings are used where the logs have them, else the
+    tool path alone. Runs that are labelled or look faulty are left out. Step tests (CSV files, or
+    folders that hold some) add servo loops and speed limits.
+    """
+    del seed  # nothing here depends on chance
+    from failuretwin.app.calibration_tables import beats_uncalibrated, print_calibration
+    from failuretwin.app.inputs import learn_loops, read_inputs, split_step_tests, with_step_tests
+    from failuretwin.connection.calibration.calibrate import calibrate as learn
+    from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
+    from failuretwin.digital_model.robot import load_robot
+
+    check_calibration_file(out)
+    tests, others = split_step_tests(logs, reading.columns)
+    steps = learn_loops(tests, load_robot(robot))
+    model = steps.robot
+    runs = read_inputs(others, model, reading)
+    source = ", ".join(str(log) for log in logs)
+    found = learn(runs, model, name or out.stem, source, hold_out)
+    found = with_step_tests(found, steps)
+    if report is not None:
+        from failuretwin.app.calibration_report import write_calibration_page
+        from failuretwin.data_knowledge.store import filling
+
+        with filling(report) as folder:
+            write_calibration_page(found, runs, model, folder)
+    save_calibration(found, model, out)
+    print_calibration(found, model)
+    click.echo(f"written to {out}")
+    if beats_uncalibrated(found) is not False:
+        click.echo(f"use it with `failuretwin diagnose --calibration {out}`")
+
+
+@click.command()
+@click.option("--out", required=True, type=PATH, metavar="MODEL", help="Network to write (.npz).")
+@calibration_option
+@click.option(
+    "--network",
+    type=click.Choice(["cnn", "motorwise", "lstm"]),
+    default="cnn",
+    show_default=True,
+    help="A convolutional network, one that looks at every motor alike, or the paper's LSTM.",
+)
+@click.option(
+    "--iterations",
+    type=click.IntRange(min=1),
+    default=6000,
+    show_default=True,
+    help="Batches of 64 runs to learn from.",
+)
+@common_options
+def train(
+    out: Path, calibration: Path | None, network: str, iterations: int, robot: str, seed: int
+) -> None:
+    """Train a network on the imperfect twin, for `diagnose --method MODEL`.
+
+    Runs come fresh from the generator, as various as real ones: no recorded failure is needed. Its
+    probabilities are calibrated on simulated runs of the physics engine.
+    """
+    from failuretwin.app.inputs import check_learning
+    from failuretwin.app.tables import progress_bar
+    from failuretwin.data_knowledge.store import check_writable
+    from failuretwin.digital_model.calibrated_robot import load_calibration
+    from failuretwin.digital_model.robot import load_robot
+
+    check_learning()
+    from failuretwin.decision.learned.storage import check_network_file, save_network
+    from failuretwin.decision.training import TrainingPlan, train_network
+
+    check_network_file(out)
+    check_writable(out)
+    model = load_robot(robot)
+    known = load_calibration(calibration, model)
+    plan = TrainingPlan(network, iterations, seed)
+    with progress_bar("training", iterations) as advance:
+        diagnoser, alone, both = train_network(
+            plan, known.robot, known.imperfections, lambda done: advance(1)
+        )
+    save_network(diagnoser, out)
+    click.echo(
+        f"of {alone.runs} simulated runs of the physics engine {100.0 * alone.right:.1f} % right, "
+        f"log score {alone.log_score:.3f} nats a run, temperature {diagnoser.temperature_:.2f}; "
+        f"blended with Bayes {100.0 * both.right:.1f} %, {both.log_score:.3f} nats"
+    )
+    click.echo(f"written to {out}; use it with `failuretwin diagnose --method {out}`")
+    click.echo(f"or together with Bayes: --method bayes+{out}")
+
+
+@click.command()
+@click.option("--out", required=True, type=PATH, metavar="DIR", help="Folder for everything.")
+@click.option(
+    "--test",
+    "test_path",
+    type=PATH,
+    metavar="PATH",
+    help="Real runs to test on. Default: runs of the physics engine, as a stand-in.",
+)
+@click.option(
+    "--published-labels",
+    is_flag=True,
+    help="Take the truth of raw test sessions from folder names that end in _label_K and freeze "
+    "the motor of labels 1-4 from sample 49 on, as the authors of the data did.",
+)
+@click.option("--quick", is_flag=True, help="A small version of about two minutes.")
+@click.option("--resume", is_flag=True, help="Go on with a study that was cut short.")
+@common_options
+def study(
+    out: Path,
+    test_path: Path | None,
+    published_labels: bool,
+    quick: bool,
+    resume: bool,
+    robot: str,
+    seed: int,
+) -> None:
+    """Repeat the paper's study: train its network on the published twin, test it, write a page.
+
+    Both feature sets, both readings of the learning rate, five repetitions, the figures of
+    tables II and III beside the published ones. Each training that is done is kept.
+    """
+    from failuretwin.app import study as paper
+    from failuretwin.app.inputs import check_learning
+    from failuretwin.app.plots import figure_class
+    from failuretwin.app.tables import progress_bar
+    from failuretwin.core.errors import InputError
+    from failuretwin.digital_model.robot import load_robot
+
+    if published_labels and test_path is None:
+        raise InputError("--published-labels says how to read a test set. Add --test PATH.")
+    model = load_robot(robot)
+    plan = paper.quick_plan(seed) if quick else paper.StudyPlan(seed)
+    paper.check_folder(out, resume)
+    figure_class()  # better told before the work than after it
+    test = (
+        paper.stand_in_test_set(plan, model)
+        if test_path is None
+        else paper.real_test_set(test_path, model, published_labels)
+    )
+    check_learning()
+    total = len(list(plan.jobs())) * plan.iterations
+    with progress_bar("training", total) as advance:
+        page = paper.run_study(plan, model, test, out, advance)
+    click.echo(f"written to {page}")

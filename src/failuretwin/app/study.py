@@ -1,0 +1,407 @@
+"""The paper's study from end to end: its plan, its trainings, each kept, and the page.
+
+The networks learn from runs of the published twin alone and are tested on real runs. A study that
+was cut short goes on with the trainings that have no result yet.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from failuretwin import __version__
+from failuretwin.core.config import fingerprint, from_table
+from failuretwin.core.errors import FailureTwinError, InputError, OutputError
+from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.core.runs import check_motors, truth_of
+from failuretwin.core.types import IntArray
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.data_knowledge.read import ReadOptions, read_runs
+from failuretwin.data_knowledge.store import reason, replacing
+from failuretwin.decision.evaluation import Truths
+from failuretwin.decision.learned.feature_encoder import FeatureEncoder, signals_of
+from failuretwin.digital_model.robot import Robot
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+PLAN_FILE, WORK, PAGE = "study.json", "trainings", "index.html"
+
+# What the study does, to the letter of the paper; and a small version of it.
+
+FEATURES = ("original", "augmented")
+"""The paper's two feature sets."""
+PRINTED_RATE, REPRODUCING_RATE = 1e-4, 1e-3
+"""Learning rate as printed in the paper, and the reading that reproduces its Table II."""
+BATCH_RUNS = 32
+VALIDATION_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training.
+
+    Attributes:
+        features: Feature set.
+        learning_rate: Of Adam.
+        repeat: Number of the repetition, from 0: of the split and the random weights.
+    """
+
+    features: str
+    learning_rate: float
+    repeat: int
+
+    @property
+    def name(self) -> str:
+        """Name of its result file, without suffix."""
+        return f"{self.features}-{self.learning_rate:g}-{self.repeat}"
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """Sizes of the study; the defaults are the paper's.
+
+    Attributes:
+        seed: Seed of all chance.
+        runs_per_class: Simulated runs of each of the nine classes.
+        checkpoints: Iterations after which accuracies are taken, all of one training. The paper
+            calls them epochs; its figures fit iterations, of which an epoch has 101.
+        repeats: Repetitions of each training.
+        stand_in_runs: Runs of each class by the physics engine where no real test set is given.
+    """
+
+    seed: int = 0
+    runs_per_class: int = 400
+    checkpoints: tuple[int, ...] = (1010, 2020, 3030, 4040, 5050)
+    repeats: int = 5
+    stand_in_runs: int = 100
+
+    def jobs(self) -> Iterator[Job]:
+        """Give every training, those that tell most first."""
+        for repeat in range(self.repeats):
+            for rate in (REPRODUCING_RATE, PRINTED_RATE):
+                for features in reversed(FEATURES):
+                    yield Job(features, rate, repeat)
+
+    @property
+    def iterations(self) -> int:
+        """Iterations of one training."""
+        return self.checkpoints[-1]
+
+
+def quick_plan(seed: int) -> StudyPlan:
+    """Return a study of about two minutes: all of its parts, figures that mean little."""
+    return StudyPlan(seed, 60, (50, 100, 150, 200, 250), 2, 20)
+
+
+# The runs as features: simulated by the published twin, and a test set beside them.
+
+
+@dataclass(frozen=True)
+class Exam:
+    """Runs that networks are tested on.
+
+    Attributes:
+        runs: The run set.
+        real: Whether they come from a log, not from the physics engine.
+        source: What they are, in words.
+    """
+
+    runs: xr.Dataset
+    real: bool
+    source: str
+
+
+def class_names(robot: Robot) -> list[str]:
+    """Return the paper's classes in the order of its labels."""
+    return [str(hypothesis) for hypothesis in paper_hypotheses(robot.motor_names)]
+
+
+def real_test_set(path: Path, robot: Robot, published_labels: bool) -> Exam:
+    """Read a test set as the authors processed theirs: readings drawn out by straight lines.
+
+    Raises:
+        InputError: If it cannot be read or its truth is not known or not one of the classes.
+    """
+    runs = read_runs(path, robot, ReadOptions("published", published_labels))
+    check_motors(runs, robot.name, robot.motor_names)
+    truth = {known.fault for known in Truths.of(runs, str(path)).by_run.values()}
+    strange = sorted(truth - set(class_names(robot)))
+    if strange:
+        raise InputError(
+            f"{path}: runs of {', '.join(strange)} are no class of the study. Expected "
+            f"{', '.join(class_names(robot))}."
+        )
+    return Exam(runs, real=True, source=f"{runs.sizes['run']} runs of {path}")
+
+
+def stand_in_test_set(plan: StudyPlan, robot: Robot) -> Exam:
+    """Simulate a test set with the physics engine, for want of a real one."""
+    hypotheses = paper_hypotheses(robot.motor_names)
+    runs = simulate(Plan(robot, hypotheses, plan.stand_in_runs, plan.seed + 1, engine="physics"))
+    engine = "runs of the physics engine, which stands in for a robot"
+    return Exam(runs, real=False, source=f"{runs.sizes['run']} {engine}")
+
+
+def make_arrays(plan: StudyPlan, robot: Robot, test: Exam, folder: Path) -> None:
+    """Simulate the training data and write a file of arrays for each feature set into `folder`."""
+    names = class_names(robot)
+    simulated = simulate(
+        Plan(robot, paper_hypotheses(robot.motor_names), plan.runs_per_class, plan.seed)
+    )
+    for features in FEATURES:
+        encoder = FeatureEncoder(features, robot)
+        with replacing(_data_file(folder, features)) as new, new.open("wb") as file:
+            np.savez(
+                file,
+                simulated=encoder.encode(signals_of(simulated)),
+                simulated_class=_classes(simulated, names),
+                test=encoder.encode(signals_of(test.runs)),
+                test_class=_classes(test.runs, names),
+            )
+
+
+def _data_file(folder: Path, features: str) -> Path:
+    return folder / f"{features}.npz"
+
+
+def _classes(runs: xr.Dataset, names: list[str]) -> IntArray:
+    return np.array([names.index(fault) for fault in truth_of(runs) or []], dtype=np.int64)
+
+
+# The trainings, each a process of its own.
+
+LOOK_S = 0.5
+"""Time between two looks at how far the trainings are [s]."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """The result of one job.
+
+    Attributes:
+        job: What was trained.
+        accuracies: Shares of runs that are right at each checkpoint of the plan, on those learned
+            from (`training`), simulated ones held out (`validation`) and the `test` set.
+        confusion: Counts on the test set at the last checkpoint, rows of (truth, diagnosis).
+        seconds: Time it took [s].
+    """
+
+    job: Job
+    accuracies: dict[str, tuple[float, ...]]
+    confusion: tuple[tuple[int, ...], ...]
+    seconds: float
+
+
+def run_all(
+    plan: StudyPlan, folder: Path, classes: int, on_progress: Callable[[int], None]
+) -> list[Training]:
+    """Do all trainings that have no result in `folder` yet; return the results of all.
+
+    Progress counts iterations, those of earlier attempts included.
+    """
+    jobs = list(plan.jobs())
+    missing = [job for job in jobs if not _file(folder, job).is_file()]
+    on_progress((len(jobs) - len(missing)) * plan.iterations)
+    if missing:
+        _spread(partial(train, plan, folder, classes), missing, on_progress)
+    files = [_file(folder, job) for job in jobs]
+    return [from_table(Training, json.loads(f.read_text(encoding="utf-8")), str(f)) for f in files]
+
+
+def _spread(
+    work: Callable[[Job], None], jobs: Sequence[Job], on_progress: Callable[[int], None]
+) -> None:
+    import torch
+
+    from failuretwin.decision.learned.training_data import cores
+
+    at_a_time = 1 if torch.cuda.is_available() else min(len(jobs), cores())
+    context = multiprocessing.get_context("spawn")
+    done, reported = context.Value("q", 0), 0
+    with ProcessPoolExecutor(at_a_time, context, initializer=_begin, initargs=(done,)) as pool:
+        running = {pool.submit(work, job) for job in jobs}
+        try:
+            while running:
+                finished, running = wait(running, LOOK_S, FIRST_COMPLETED)
+                on_progress(done.value - reported)
+                reported = done.value
+                for future in finished:
+                    future.result()
+        except BrokenProcessPool as error:
+            raise FailureTwinError(
+                "a training has died. Look for what ended it, such as too little memory, and go "
+                "on with --resume."
+            ) from error
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():  # they would go on with their jobs
+                process.terminate()
+            raise
+
+
+_done: Any = None
+"""Iterations that all processes have done; set in each of them."""
+
+
+def _begin(done: Any) -> None:
+    global _done
+    _done = done
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for whoever gives out the jobs
+    import torch
+
+    torch.set_num_threads(1)
+
+
+def _count() -> None:
+    if _done is not None:
+        with _done.get_lock():
+            _done.value += 1
+
+
+def train(plan: StudyPlan, folder: Path, classes: int, job: Job) -> None:
+    """Do one training and write its result into `folder`."""
+    import torch
+
+    from failuretwin.decision.learned.networks import (
+        Pace,
+        Shape,
+        Standard,
+        build_network,
+        scores_of,
+        shuffled_batches,
+        training,
+    )
+
+    begun = time.perf_counter()
+    with np.load(_data_file(folder, job.features), allow_pickle=False) as stored:
+        arrays = dict(stored)
+    simulated, truth = arrays["simulated"], arrays["simulated_class"]
+    rng = np.random.default_rng([plan.seed, job.repeat])
+    order = rng.permutation(len(simulated))
+    held_out = round(VALIDATION_SHARE * len(order))
+    validation, learning = order[:held_out], order[held_out:]
+    standard = Standard.of(simulated[learning])
+    sets = {
+        "training": (standard(simulated[learning]), truth[learning]),
+        "validation": (standard(simulated[validation]), truth[validation]),
+        "test": (standard(arrays["test"]), arrays["test_class"]),
+    }
+    torch.manual_seed(int(rng.integers(2**31)))
+    network = build_network("lstm", Shape(simulated.shape[2], classes))
+    batches = shuffled_batches(*sets["training"], BATCH_RUNS, rng)
+    right: dict[str, list[float]] = {name: [] for name in sets}
+    verdicts: dict[str, IntArray] = {}
+    for iteration in training(network, batches, Pace(plan.iterations, job.learning_rate)):
+        _count()
+        if iteration in plan.checkpoints:
+            verdicts = {name: scores_of(network, x).argmax(axis=1) for name, (x, _) in sets.items()}
+            for name, shares in right.items():
+                shares.append(float(np.mean(verdicts[name] == sets[name][1])))
+    confusion = np.zeros((classes, classes), dtype=np.int64)
+    np.add.at(confusion, (arrays["test_class"], verdicts["test"]), 1)
+    counts = tuple(tuple(row) for row in confusion.tolist())
+    accuracies = {name: tuple(shares) for name, shares in right.items()}
+    result = Training(job, accuracies, counts, time.perf_counter() - begun)
+    with replacing(_file(folder, job)) as file:
+        file.write_text(json.dumps(asdict(result), indent=1), encoding="utf-8")
+
+
+def _file(folder: Path, job: Job) -> Path:
+    return folder / f"{job.name}.json"
+
+
+# The study in one call: take up what is there, do what is missing, write the page.
+
+
+def check_folder(folder: Path, resume: bool) -> None:
+    """Refuse a folder that this study must not write to.
+
+    Raises:
+        InputError: If it holds anything and is not to be resumed, or is to be and is no study.
+    """
+    taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    if taken and not resume:
+        raise InputError(
+            f"{folder}: is there already. Go on with a study begun there (--resume), or choose "
+            "another folder."
+        )
+    names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
+    begun = names == [WORK]  # interrupted before it had a plan
+    if taken and not begun and not (folder / PLAN_FILE).is_file():
+        raise InputError(f"{folder}: holds no study to resume ({PLAN_FILE} is missing).")
+
+
+def run_study(
+    plan: StudyPlan, robot: Robot, test: Exam, folder: Path, on_progress: Callable[[int], None]
+) -> Path:
+    """Do the study in a folder that `check_folder` allowed; return its page.
+
+    Raises:
+        InputError: If the folder holds a study with another plan, or an extra is missing.
+    """
+    manifest = _manifest(plan, robot, test)
+    stored = folder / PLAN_FILE
+    if stored.is_file():
+        _check_same(json.loads(stored.read_text(encoding="utf-8")), manifest, folder)
+    else:
+        _make(folder / WORK)
+        make_arrays(plan, robot, test, folder / WORK)
+        with replacing(stored) as new:
+            new.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+    trainings = run_all(plan, folder / WORK, len(class_names(robot)), on_progress)
+    from failuretwin.app.study_page import write_study_page
+
+    page = folder / PAGE
+    write_study_page(trainings, plan, robot, test, page)
+    return page
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be made ({reason(error)}).") from error
+
+
+def _manifest(plan: StudyPlan, robot: Robot, test: Exam) -> dict[str, Any]:
+    """Return what decides the study's figures."""
+    return {
+        "seed": plan.seed,
+        "runs_per_class": plan.runs_per_class,
+        "checkpoints": list(plan.checkpoints),
+        "repeats": plan.repeats,
+        "robot": fingerprint(robot),
+        "test": test.source,
+        "test_sha256": _digest(test),
+        "failuretwin_version": __version__,
+    }
+
+
+def _digest(test: Exam) -> str:
+    """Return a hash of all that networks see of the test set, and of its truth."""
+    digest = hashlib.sha256(json.dumps([str(f) for f in test.runs["fault"].values]).encode())
+    for name in ("command", "measured"):
+        digest.update(test.runs[name].values.tobytes())
+    return digest.hexdigest()
+
+
+def _check_same(stored: dict[str, Any], wanted: dict[str, Any], folder: Path) -> None:
+    for key, value in wanted.items():
+        if stored.get(key) != value:
+            raise InputError(
+                f"{folder}: the study begun there has {key} {stored.get(key)!r}, this one "
+                f"{value!r}. Give the same arguments again, or choose another folder."
+            )

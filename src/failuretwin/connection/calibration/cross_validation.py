@@ -1,0 +1,362 @@
+"""Does the calibration predict logs that it has not seen? Each session left out in turn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from failuretwin.connection.calibration.observations import Observations, observe, rounding
+from failuretwin.connection.calibration.result import Calibration, HeldOut
+from failuretwin.connection.calibration.settling_fit import (
+    SettlingFit,
+    sort_and_fit,
+    sort_movements,
+)
+from failuretwin.connection.calibration.timing_fit import (
+    AFTER_RAMP_S,
+    Transients,
+    lateness,
+    motion,
+    movements_of,
+    transients,
+)
+from failuretwin.core.errors import InputError
+from failuretwin.core.numerics import log_student
+from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.digital_model.nonidealities import Timing, generic_imperfections
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.settling import Settling
+from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.healthy_model import PATH_NOISE_M
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+TO_DEVIATION = 1.4826
+"""Median absolute deviation to standard deviation of a normal distribution."""
+
+
+def cross_validate(
+    observations: Observations, robot: Robot, payload: float = 0.0
+) -> tuple[HeldOut, ...]:
+    """Return how well the other sessions predict each session; empty with one session alone."""
+    found = []
+    for index in range(len(observations.sessions)):
+        inside = observations.session == index
+        if not inside.any() or inside.all():
+            continue
+        try:
+            others = sort_and_fit(observations[~inside], robot, payload)
+        except InputError:
+            continue  # what is left is too little to learn from
+        found.append(judge(observations[inside], others, robot, observations.sessions[index]))
+    return tuple(entry for entry in found if entry is not None)
+
+
+def judge(
+    observations: Observations, others: SettlingFit, robot: Robot, session: str
+) -> HeldOut | None:
+    """Return how well a fit predicts settled movements that it has not seen.
+
+    Movements whose commands did not arrive are left out: there is nothing to predict of them. None
+    if fewer than two are left, for one movement says nothing of scatter.
+
+    Args:
+        observations: Settled movements of one session.
+        others: The fit to other sessions.
+        robot: The robot.
+        session: Name of the session.
+    """
+    settling = others.settling
+    generic = generic_imperfections(robot).settling
+    assert generic is not None
+    plain = settled_errors(observations, robot, None)
+    told = settled_errors(observations, robot, settling)
+    kept = _healthy(plain, observations)
+    gain = _log_density(observations, robot, settling) - _log_density(observations, robot, generic)
+    gain = gain[kept]
+    if len(gain) < 2:
+        return None
+    return HeldOut(
+        session=session,
+        movements=int(kept.sum()),
+        before=tuple(robust_scale(plain[kept]).tolist()),
+        after=tuple(robust_scale(told[kept]).tolist()),
+        gain=float(gain.mean()),
+        gain_error=float(gain.std(ddof=1) / np.sqrt(len(gain))),
+    )
+
+
+def _healthy(plain: FloatArray, observations: Observations) -> BoolArray:
+    """Return the movements in which everything went near where it was told."""
+    limit = 0.084 if observations.position is not None else 0.03
+    return np.asarray((np.abs(plain) < limit).all(axis=1))
+
+
+def robust_scale(errors: FloatArray) -> FloatArray:
+    """Return 1.48 times the median size of the errors in each column.
+
+    It is taken about zero: a shift of the whole session is an error too.
+    """
+    return TO_DEVIATION * np.median(np.abs(errors), axis=0)
+
+
+def settled_errors(
+    observations: Observations, robot: Robot, settling: Settling | None
+) -> FloatArray:
+    """Return settled minus expected: of motors [rad] or of the tool [m], a row a movement.
+
+    Args:
+        observations: Settled movements.
+        robot: The robot.
+        settling: Where its motors settle; None: exactly at their targets.
+    """
+    pose = expected_pose(observations, robot, settling)
+    if observations.position is not None:
+        return observations.position - pose
+    return observations.point - DigitalTwin(robot).path(pose)
+
+
+def expected_pose(
+    observations: Observations, robot: Robot, settling: Settling | None
+) -> FloatArray:
+    """Return the angles at which motors are expected to settle, (movement, motor) [rad]."""
+    if settling is None:
+        return observations.target
+    target, direction = observations.target, observations.direction
+    near = target + settling.offset(robot, target, direction)
+    return target + settling.offset(robot, near, direction)
+
+
+def _log_density(observations: Observations, robot: Robot, settling: Settling) -> FloatArray:
+    """Return the log density of the settled tool position of each movement, (movement,)."""
+    pose = expected_pose(observations, robot, settling)
+    point, jacobian = DigitalTwin(robot).path_and_jacobian(pose)
+    spread = jacobian * np.asarray(settling.scatter)
+    return log_student(observations.point - point, spread, PATH_NOISE_M**2, settling.tail_dof)
+
+
+# Settled errors beside what a calibration expects of them, for a person to look at.
+
+MOST_FOLDS = 10
+"""Sessions are left out in at most this many groups: a fit to each rest takes about a second."""
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Settled errors and what is expected of them, a row a movement.
+
+    A channel is a motor [rad] or, where the log has the tool path alone, an axis of the tool [m].
+
+    Attributes:
+        error: Settled minus commanded, (movement, channel).
+        expected: What the fit expects it to be, (movement, channel).
+        scale: Scale of the Student t distribution of the difference, (movement, channel).
+        counts: Entries whose command arrived and that look healthy, (movement, channel).
+        target: Commanded angles, (movement, motor) [rad].
+        direction: Sign of the commanded travel, (movement, motor).
+        torque: Load torque that each motor meets, in the log's sense, (movement, motor) [N m].
+        of_motors: Whether channels are motors.
+        unseen: Whether each movement is expected by a fit that has not seen its session.
+    """
+
+    error: FloatArray
+    expected: FloatArray
+    scale: FloatArray
+    counts: BoolArray
+    target: FloatArray
+    direction: FloatArray
+    torque: FloatArray
+    of_motors: bool
+    unseen: bool
+
+
+def trusted_runs(found: Calibration, runs: xr.Dataset) -> xr.Dataset:
+    """Return the runs that were not left out as a whole."""
+    out = {entry.run for entry in found.left_out if entry.movement == 0}
+    kept = [i for i, run in enumerate(runs["run"].values) if str(run) not in out]
+    return runs.isel(run=kept)
+
+
+def settling_of(found: Calibration, robot: Robot) -> Settling:
+    """Return where the motors settle by a calibration."""
+    return found.imperfections.settling or Settling.ideal(len(robot.motors))
+
+
+def predict(found: Calibration, runs: xr.Dataset, robot: Robot) -> Predictions:
+    """Return what the calibration expects of the sessions held out.
+
+    Where none were, each session is expected by a fit to the others; with one session alone, by
+    the calibration itself.
+
+    Args:
+        found: The calibration.
+        runs: The runs it was learned from or judged on.
+        robot: The robot.
+    """
+    seen = observe(trusted_runs(found, runs), use_readings=found.used_readings)
+    settling = settling_of(found, robot)
+    learned = np.array([name in found.sessions for name in seen.sessions])[seen.session]
+    if not learned.all():
+        seen = seen[~learned]
+        return _predictions(seen, robot, settling, expected_pose(seen, robot, settling), True)
+    pose = _expected_by_others(seen, robot, settling.payload)
+    unseen = pose is not None
+    if pose is None:
+        pose = expected_pose(seen, robot, settling)
+    return _predictions(seen, robot, settling, pose, unseen)
+
+
+def _expected_by_others(seen: Observations, robot: Robot, payload: float) -> FloatArray | None:
+    """Return the angles expected by fits to other sessions; None where too little is left."""
+    groups = min(len(seen.sessions), MOST_FOLDS)
+    pose = np.empty_like(seen.target)
+    for group in range(groups):
+        inside = seen.session % groups == group
+        try:
+            others = sort_and_fit(seen[~inside], robot, payload)
+        except InputError:
+            return None
+        pose[inside] = expected_pose(seen[inside], robot, others.settling)
+    return pose
+
+
+def _predictions(
+    seen: Observations, robot: Robot, settling: Settling, pose: FloatArray, unseen: bool
+) -> Predictions:
+    lost, odd = sort_movements(seen, robot, settling)
+    twin, scatter = DigitalTwin(robot), np.asarray(settling.scatter)
+    error = settled_errors(seen, robot, None)
+    if seen.position is not None:
+        expected, counts = pose - seen.target, ~lost & ~odd[:, None]
+        scale = np.broadcast_to(np.hypot(scatter, rounding(robot)), error.shape)
+    else:
+        point, jacobian = twin.path_and_jacobian(pose)
+        expected = point - twin.path(seen.target)
+        counts = np.repeat(~lost.any(axis=1, keepdims=True) & ~odd[:, None], 3, axis=1)
+        scale = np.sqrt(jacobian**2 @ scatter**2 + PATH_NOISE_M**2)
+    settled = pose if seen.position is None else seen.position
+    return Predictions(
+        error=error,
+        expected=expected,
+        scale=scale,
+        counts=counts,
+        target=seen.target,
+        direction=seen.direction,
+        torque=robot.sense * robot.loads.torque(settled * robot.sense, settling.payload),
+        of_motors=seen.position is not None,
+        unseen=unseen,
+    )
+
+
+# One movement of the logs as an example: command, twin before and after calibration, readings.
+
+BEFORE_S, AFTER_S = 0.2, 0.5
+"""What is shown before a movement and after its ramp [s]."""
+
+
+@dataclass(frozen=True)
+class ExampleTransient:
+    """One movement; a channel is a motor [rad] or an axis of the tool [m].
+
+    Attributes:
+        run: Name of the run.
+        movement: Its number in the run, from 1.
+        time: Time since the command, (time,) [s].
+        command: What is asked for, (time, channel).
+        plain: What the uncalibrated twin does, (time, channel).
+        calibrated: What the calibrated twin does, (time, channel).
+        reading: What was read, (time, channel); NaN where nothing was.
+        of_motors: Whether channels are motors.
+    """
+
+    run: str
+    movement: int
+    time: FloatArray
+    command: FloatArray
+    plain: FloatArray
+    calibrated: FloatArray
+    reading: FloatArray
+    of_motors: bool
+
+
+def example_transient(
+    found: Calibration, runs: xr.Dataset, robot: Robot
+) -> ExampleTransient | None:
+    """Return the movement that the calibrated twin fits neither well nor badly, but typically.
+
+    It is taken from the longer half of the movements that began on time at a known place; None if
+    there are none.
+
+    Args:
+        found: The calibration.
+        runs: The runs it was learned from or judged on.
+        robot: The robot.
+    """
+    runs = trusted_runs(found, runs)
+    settling = settling_of(found, robot)
+    seen = observe(runs, use_readings=found.used_readings)
+    part = sort_and_fit(seen, robot, settling.payload)
+    movements = movements_of(runs)
+    # What is shown is the calibration, which may have seen fewer sessions than this fit.
+    ramps = transients(runs, movements, lateness(movements), part, settling, robot)
+    twin = DigitalTwin(robot)
+    told = _motion(ramps, twin, found.imperfections.timing)
+    if not ramps.of_motors:
+        told = twin.path(told)
+    chosen = _typical(ramps, told)
+    if chosen is None:
+        return None
+    run, movement = chosen
+    begin = float(ramps.movements.start[run, movement])
+    end = begin + float(np.nanmax(ramps.movements.ramp_duration[run, movement]))
+    shown = (ramps.time >= begin - BEFORE_S) & (ramps.time <= end + AFTER_S)
+    command = as_floats(runs["command"].values[run])
+    plain = twin.respond(command, ramps.time)
+    if not ramps.of_motors:
+        command, plain = twin.path(command), twin.path(plain)
+    return ExampleTransient(
+        run=str(runs["run"].values[run]),
+        movement=movement + 1,
+        time=ramps.time[shown] - begin,
+        command=command[shown],
+        plain=plain[shown],
+        calibrated=told[run][shown],
+        reading=ramps.reading[run][shown],
+        of_motors=ramps.of_motors,
+    )
+
+
+def _motion(ramps: Transients, twin: DigitalTwin, timing: Timing) -> FloatArray:
+    """Return how the typical calibrated robot makes the movements, (run, time, motor) [rad]."""
+    ones = np.ones(len(ramps.movements.start))
+    free = motion(
+        ramps.movements,
+        ramps.time,
+        twin,
+        float(np.mean(timing.delay_s)) * ones,
+        float(np.mean(timing.ramp_shortening)) * ones,
+        float(np.mean(timing.lag_s)),
+    )
+    return free + ramps.yielding
+
+
+def _typical(ramps: Transients, told: FloatArray) -> tuple[int, int] | None:
+    movements = ramps.movements
+    travel = np.abs(movements.target - movements.origin()).min(axis=-1)
+    found = []
+    for run, movement in np.argwhere(movements.exists):
+        begin = movements.start[run, movement]
+        end = begin + np.nanmax(movements.ramp_duration[run, movement]) + AFTER_RAMP_S
+        inside = ramps.used[run] & (ramps.time >= begin) & (ramps.time < end)
+        if inside.any():
+            off = (told[run] - ramps.reading[run])[inside]
+            misfit = float(np.sqrt(np.mean(off**2)))
+            found.append((float(travel[run, movement]), misfit, int(run), int(movement)))
+    if not found:
+        return None
+    longer = sorted(found)[len(found) // 2 :]
+    _, _, run, movement = sorted(longer, key=lambda entry: entry[1])[len(longer) // 2]
+    return run, movement

@@ -1,0 +1,378 @@
+"""Delay, lag and early ramp ends from the motion between the plateaus, for all runs at once.
+
+Each run has a delay and a ramp shortening of its own; the lag is that of the robot. For each lag
+tried, Gauss-Newton with robust weights finds the other two for every run; the lag with the least
+cost wins, and runs drawn again and again (bootstrap) say how sure all three are together: a lag
+that is too short makes every delay too long.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from failuretwin.connection.calibration.settling_fit import SettlingFit
+from failuretwin.core.movements import Movements, find_movements
+from failuretwin.core.runs import measured_rate
+from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.digital_model.disturbances import lagged
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.settling import Settling, sag
+from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.readings import measured_samples
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+LAGS_S = np.linspace(0.0, 0.08, 11)
+"""Lags tried [s]; a spline through their costs refines the choice. Steps of 10 ms and more are too
+coarse: they pull the lag of clean motion by 0.3 ms."""
+DELAY_STEP_S, SHARE_STEP = 0.005, 0.01
+"""Steps of the numerical derivatives by delay [s] and by shortening [-]."""
+ROUNDS = 6
+SCALE_RAD, SCALE_M = 0.008, 0.0015
+"""Residuals beyond this count less: two counts of a motor, 1.5 mm of the tool."""
+DRAWS = 400
+BOUNDS = ((-0.15, 0.4), (-0.3, 0.5))
+"""Delay [s] and shortening [-] stay within these."""
+
+
+@dataclass(frozen=True)
+class Transients:
+    """Readings on the ramps of many runs.
+
+    Attributes:
+        movements: The movements as the motors make them but for delay, lag, shortening and
+            gravity: their targets are where they would settle without load.
+        yielding: How far gravity moves the motors, (run, time, motor) [rad]. It goes by the pose,
+            so it is not spread evenly over a ramp.
+        reading: Motor angles (run, time, motor) [rad] or tool positions (run, time, axis) [m].
+        of_motors: Whether `reading` holds angles.
+        used: Which of them count, (run, time).
+        time: Grid, (time,) [s].
+    """
+
+    movements: Movements
+    yielding: FloatArray
+    reading: FloatArray
+    of_motors: bool
+    used: BoolArray
+    time: FloatArray
+
+
+@dataclass(frozen=True)
+class TimingFit:
+    """Timing of a robot.
+
+    Attributes:
+        delay: Of each run that tells, (run,) [s].
+        shortening: Of each run that tells, (run,).
+        lag: Lag of the robot [s].
+        doubt: Half 95 % intervals of mean delay [s], mean shortening and lag [s].
+        residual: Typical residual left (1.48 MAD) [rad or m].
+    """
+
+    delay: FloatArray
+    shortening: FloatArray
+    lag: float
+    doubt: tuple[float, float, float]
+    residual: float
+
+
+def fit_timing(transients: Transients, robot: Robot, rng: np.random.Generator) -> TimingFit | None:
+    """Fit the timing of a healthy robot; None if fewer than three runs show ramps.
+
+    Args:
+        transients: Readings on the ramps.
+        robot: The robot.
+        rng: For the bootstrap.
+    """
+    telling = np.flatnonzero(transients.used.sum(axis=1) >= 12)
+    if len(telling) < 3:
+        return None
+    transients = _some(transients, telling)
+    runs = len(telling)
+    costs = np.empty((len(LAGS_S), runs))
+    values = np.empty((len(LAGS_S), runs, 2))
+    start = np.zeros((runs, 2))
+    for i, lag in enumerate(LAGS_S):
+        values[i], costs[i] = _fit_runs(transients, robot, float(lag), start)
+        start = values[i]
+    lag = _least(costs.sum(axis=1))
+    found, _ = _fit_runs(transients, robot, lag, values[int(np.argmin(np.abs(LAGS_S - lag)))])
+    left = _residual(transients, robot, found, lag)
+    left = np.abs(left[transients.used]).ravel()
+    return TimingFit(
+        delay=found[:, 0],
+        shortening=found[:, 1],
+        lag=lag,
+        doubt=joint_doubt(values, costs, rng),
+        residual=float(1.4826 * np.nanmedian(left)),
+    )
+
+
+def joint_doubt(
+    values: FloatArray, costs: FloatArray, rng: np.random.Generator
+) -> tuple[float, float, float]:
+    """Return half 95 % intervals of mean delay, mean shortening and lag, from runs drawn again.
+
+    The spread of such draws is too small by the share (n - 1)/n of a variance of n runs, and is
+    itself not known well from few: hence the quantile of Student's t.
+
+    Args:
+        values: Delay and shortening at `LAGS_S`, (lag, run, 2).
+        costs: Their costs, (lag, run).
+        rng: For the draws.
+    """
+    from scipy.interpolate import CubicSpline
+    from scipy.stats import t
+
+    runs = costs.shape[1]
+    chosen = rng.integers(runs, size=(DRAWS, runs))
+    lags = np.array([_least(costs[:, some].sum(axis=1)) for some in chosen])
+    at_lag = CubicSpline(LAGS_S, values)(lags)
+    means = [found[some].mean(axis=0) for found, some in zip(at_lag, chosen, strict=True)]
+    spread = np.std(np.column_stack([means, lags]), axis=0) * np.sqrt(runs / (runs - 1.0))
+    delay, shortening, lag = (t.ppf(0.975, runs - 1) * spread).tolist()
+    return delay, shortening, lag
+
+
+def _some(transients: Transients, runs: np.ndarray) -> Transients:
+    m = transients.movements
+    return replace(
+        transients,
+        movements=Movements(m.initial[runs], m.target[runs], m.ramp_duration[runs], m.start[runs]),
+        yielding=transients.yielding[runs],
+        reading=transients.reading[runs],
+        used=transients.used[runs],
+    )
+
+
+def _least(costs: FloatArray) -> float:
+    """Return the lag [s] at the least of a cubic spline through costs at `LAGS_S`.
+
+    The costs bend too unevenly for a parabola: through three of them it is off by up to 3 ms.
+    """
+    from scipy.interpolate import CubicSpline
+
+    spline = CubicSpline(LAGS_S, costs)
+    lags = np.append(spline.derivative().roots(extrapolate=False), LAGS_S[[0, -1]])
+    return float(lags[np.argmin(spline(lags))])
+
+
+def _fit_runs(
+    transients: Transients, robot: Robot, lag: float, start: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return delay and shortening of each run, (run, 2), and its robust cost, (run,)."""
+    values = start.copy()
+    steps = (DELAY_STEP_S, SHARE_STEP)
+    low, high = np.array(BOUNDS).T
+    scale = SCALE_RAD if transients.of_motors else SCALE_M
+    for _ in range(ROUNDS):
+        residual = _residual(transients, robot, values, lag)
+        slopes = []
+        for k, step in enumerate(steps):
+            moved = values.copy()
+            moved[:, k] += step
+            slopes.append((_residual(transients, robot, moved, lag) - residual) / step)
+        weight = 1.0 / (1.0 + (residual / scale) ** 2)
+        slope = np.stack(slopes)
+        normal = np.einsum("prtm,qrtm,rtm->rpq", slope, slope, weight)
+        normal += 1e-9 * np.eye(2)
+        pull = np.einsum("prtm,rtm,rtm->rp", slope, residual, weight)
+        values = np.clip(values - np.linalg.solve(normal, pull[..., None])[..., 0], low, high)
+    residual = _residual(transients, robot, values, lag)
+    return values, np.sum(np.log1p((residual / scale) ** 2), axis=(1, 2))
+
+
+def _residual(transients: Transients, robot: Robot, values: FloatArray, lag: float) -> FloatArray:
+    """Return predicted minus read, (run, time, motor or axis); 0 where a reading does not count."""
+    twin = DigitalTwin(robot)
+    delay, shortening = values.T
+    position = motion(transients.movements, transients.time, twin, delay, shortening, lag)
+    position += transients.yielding
+    predicted = position if transients.of_motors else twin.path(position)
+    residual = np.where(transients.used[..., None], predicted - transients.reading, 0.0)
+    return np.nan_to_num(residual)
+
+
+def motion(
+    movements: Movements,
+    time: FloatArray,
+    twin: DigitalTwin,
+    delay: FloatArray,
+    shortening: FloatArray,
+    lag: float,
+) -> FloatArray:
+    """Return how motors without load make movements late and short, (run, time, motor) [rad].
+
+    Args:
+        movements: Movements between the angles at which the motors would settle without load.
+        time: Uniform grid, (time,) [s].
+        twin: The servo loops.
+        delay: Dead time of each run, (run,) [s].
+        shortening: Share by which the ramps of each run end early, (run,).
+        lag: Time constant of the lag on top of the servo loops [s].
+    """
+    moved = replace(
+        movements,
+        start=movements.start + delay[:, None],
+        ramp_duration=movements.ramp_duration * (1.0 - shortening)[:, None, None],
+    )
+    reference = lagged(moved.reference(time), time, np.full(len(delay), lag))
+    return twin.respond(reference, time)
+
+
+# What the logs say between the plateaus: late starts, gaps, glitches, and ramps for the timing.
+
+LATE_S = 0.15
+"""A movement that outlasts the usual time to the next command by this much started late [s]."""
+STEADY_S = 0.05
+"""Commands whose spacing scatters less than this come at a steady pace [s]."""
+AFTER_RAMP_S = 0.25
+"""Readings up to this long after a ramp still tell of its timing [s]."""
+USUAL_LAG_S = 0.03
+"""Lag with which the tool path's poses are guessed, for the sag on the way [s]."""
+GAP_PERIODS = 4.0
+"""A silence of this many periods of the readings is a gap."""
+
+
+@dataclass(frozen=True)
+class Lateness:
+    """Late starts of a stalled bus, read off the times between commands.
+
+    Attributes:
+        known: Whether commands come at a steady pace, so that lateness can be told.
+        late: How late each movement started, (run, movement) [s]; 0 punctual, NaN not known.
+        period: Usual time from command to command [s].
+    """
+
+    known: bool
+    late: FloatArray
+    period: float
+
+    @property
+    def delayed(self) -> BoolArray:
+        """Which movements surely started late, (run, movement)."""
+        return np.asarray(self.late > 0.0)
+
+    @property
+    def punctual(self) -> BoolArray:
+        """Which movements surely started on time, (run, movement).
+
+        The last one of a run holds up no other: it is taken for punctual only if all others were.
+        """
+        return np.asarray(self.late == 0.0) if self.delayed.any() else ~self.delayed
+
+
+def lateness(movements: Movements) -> Lateness:
+    """Return how late movements started: a late start holds up the next command."""
+    spacing = np.diff(movements.start, axis=1)
+    late = np.full(movements.start.shape, np.nan)
+    seen = spacing[np.isfinite(spacing)]
+    if len(seen) < 3:
+        return Lateness(False, late, float("nan"))
+    period = float(np.median(seen))
+    spread = 1.4826 * float(np.median(np.abs(seen - period)))
+    if spread > STEADY_S:
+        return Lateness(False, late, period)
+    excess = spacing - period
+    late[:, :-1] = np.where(np.isfinite(excess), np.where(excess > LATE_S, excess, 0.0), np.nan)
+    return Lateness(True, late, period)
+
+
+def gap_starts(runs: xr.Dataset, movements: Movements, late: FloatArray) -> FloatArray:
+    """Return when readings stop before late starts, after the movement before, (gap,) [s]."""
+    time, rate = as_floats(runs["time"].values), measured_rate(runs)
+    seen = measured_samples(runs).seen
+    found = []
+    for run, movement in np.argwhere(np.nan_to_num(late) > 0.0):
+        if movement == 0:
+            continue
+        begin, end = movements.start[run, movement - 1], movements.start[run, movement]
+        inside = time[seen[run] & (time > begin) & (time < end + late[run, movement])]
+        holes = np.flatnonzero(
+            np.diff(np.append(inside, end + late[run, movement])) > GAP_PERIODS / rate
+        )
+        if len(holes):
+            found.append(inside[holes[0]] + 0.5 / rate - begin)
+    return np.array(found)
+
+
+def transients(
+    runs: xr.Dataset,
+    movements: Movements,
+    late: Lateness,
+    part: SettlingFit,
+    settling: Settling,
+    robot: Robot,
+) -> Transients:
+    """Return the readings on ramps that began on time and at a known place.
+
+    Args:
+        runs: The runs of the observations.
+        movements: Their movements.
+        late: How late they started.
+        part: Sorted settled movements.
+        settling: Where motors settle.
+        robot: The robot.
+    """
+    time = as_floats(runs["time"].values)
+    used = _on_time(movements, late, part, time)
+    of_motors = part.observations.position is not None
+    reading = as_floats(runs["position"].values) if of_motors else measured_samples(runs).point
+    free = unloaded_movements(movements, settling)
+    if of_motors:
+        pose = np.nan_to_num(reading)
+    else:
+        none = np.zeros(len(movements.start))
+        pose = motion(free, time, DigitalTwin(robot), none, none, USUAL_LAG_S)
+    return Transients(
+        movements=free,
+        yielding=sag(robot, pose, np.asarray(settling.compliance), settling.payload),
+        reading=reading,
+        of_motors=of_motors,
+        used=used & np.isfinite(reading).all(axis=2),
+        time=time,
+    )
+
+
+def _on_time(
+    movements: Movements, late: Lateness, part: SettlingFit, time: FloatArray
+) -> BoolArray:
+    """Return which times belong to a ramp that began on time at a known place, (run, time)."""
+    on_time = _sound(movements, part) & late.punctual
+    used = np.zeros((len(movements.start), len(time)), dtype=bool)
+    for run, movement in np.argwhere(on_time):
+        begin = movements.start[run, movement]
+        end = begin + np.nanmax(movements.ramp_duration[run, movement]) + AFTER_RAMP_S
+        used[run] |= (time >= begin) & (time < end)
+    return used
+
+
+def _sound(movements: Movements, part: SettlingFit) -> BoolArray:
+    """Return which movements began and ended where the fit says, (run, movement)."""
+    good, seen = np.zeros(movements.start.shape, dtype=bool), part.observations
+    fine = ~part.odd & (part.arrived > 0.5).all(axis=1)
+    good[seen.run[fine], seen.number[fine]] = True
+    before = np.ones_like(good)
+    before[:, 1:] = good[:, :-1]
+    return good & before
+
+
+def unloaded_movements(movements: Movements, settling: Settling) -> Movements:
+    """Return the movements with the targets at which motors would settle without load."""
+    bias, friction = np.asarray(settling.bias), np.asarray(settling.friction)
+    travel = np.nan_to_num(movements.target) - np.nan_to_num(movements.origin())
+    return replace(
+        movements,
+        initial=movements.initial + bias,
+        target=movements.target + bias - friction * np.sign(travel),
+    )
+
+
+def movements_of(runs: xr.Dataset) -> Movements:
+    """Return the movements of a run set."""
+    return find_movements(as_floats(runs["command"].values), as_floats(runs["time"].values))

@@ -1,0 +1,335 @@
+"""Features that carry over to a real robot: what each motor alone would have to be off by.
+
+Every reading is compared with where a healthy arm would be: commands with the mean lag, sag and
+friction of the calibration. For each motor, the turn that brings the tool nearest to the reading
+(exact: a joint moves the tool on a circle) and what no turn of this motor explains tell which motor
+it is; both are compressed, so that a glitch is only a little larger than a fault. Points without a
+reading are zero and marked by a mask.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.runs import RunTable
+from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfections
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.settling import Settling
+from failuretwin.digital_model.twin import DigitalTwin
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# What a network may look at: commands and tool paths as plain arrays, and nothing else.
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Commands and tool paths of many runs.
+
+    Attributes:
+        time: Uniform grid from 0, (time,) [s].
+        command: (run, time, motor) [rad].
+        measured: (run, time, axis) [m]; NaN = no sample.
+        duration: True length of each run, (run,) [s].
+    """
+
+    time: FloatArray
+    command: FloatArray
+    measured: FloatArray
+    duration: FloatArray
+
+    @property
+    def seen(self) -> BoolArray:
+        """Where there is a reading, (run, time)."""
+        within = self.time <= self.duration[:, None] + 1e-9
+        return np.asarray(np.isfinite(self.measured).all(axis=-1) & within)
+
+    @property
+    def step(self) -> float:
+        """Step of the grid [s]."""
+        return float((self.time[-1] - self.time[0]) / (len(self.time) - 1))
+
+
+def signals_of(runs: xr.Dataset | RunTable) -> Signals:
+    """Return the signals of runs; reads `time`, `command`, `measured` and `duration` alone."""
+    time, command = as_floats(runs.time), as_floats(runs.command)
+    duration = getattr(runs, "duration", None)
+    if duration is None:
+        duration = np.full(len(command), time[-1])
+    return Signals(time, command, as_floats(runs.measured), as_floats(duration))
+
+
+# The paper's two feature sets: every tenth of 1000 samples, over the first ten seconds.
+
+POINTS = 100
+"""Points of a run that a network sees."""
+PERIOD_S = 0.1
+"""Time from one point to the next [s]: every tenth sample of the published 100 Hz."""
+
+
+def original_features(twin: DigitalTwin, signals: Signals) -> FloatArray:
+    """Return commands [rad] and measured tool position [m], (run, point, motor + axis)."""
+    del twin  # these features know nothing of the robot
+    command, measured = _at_points(signals)
+    return np.concatenate([command, measured], axis=-1)
+
+
+def augmented_features(twin: DigitalTwin, signals: Signals) -> FloatArray:
+    """Return desired tool position and what is measured beyond it, (run, point, 6) [m].
+
+    The desired position is the forward kinematics of the command, without any servo.
+    """
+    command, measured = _at_points(signals)
+    desired = twin.path(command)
+    return np.concatenate([desired, measured - desired], axis=-1)
+
+
+def _at_points(signals: Signals) -> tuple[FloatArray, FloatArray]:
+    """Return commands (run, point, motor) and filled readings (run, point, axis).
+
+    Where a run ends early, its last values are held.
+    """
+    stride = max(1, round(PERIOD_S / signals.step))
+    index = np.minimum(stride * np.arange(POINTS), len(signals.time) - 1)
+    seen, at = signals.seen, signals.time[index]
+    measured = np.zeros((len(signals.command), POINTS, 3))
+    for run, known in enumerate(seen):
+        if known.all():
+            measured[run] = signals.measured[run, index]
+        elif known.any():
+            for axis in range(3):
+                measured[run, :, axis] = np.interp(
+                    at, signals.time[known], signals.measured[run, known, axis]
+                )
+    return signals.command[:, index], measured
+
+
+PER_MOTOR = ("turn", "misfit", "angle", "command")
+"""Channels of each motor; those of the first motor come first."""
+SHARED = ("x", "y", "z", "seen")
+"""Channels that belong to no motor, after those of the motors."""
+
+TURN_RAD = 0.01
+"""Turns below this are shown in proportion, larger ones by their logarithm [rad]: 2.4 counts."""
+DISTANCE_M = 0.002
+"""The same for distances [m]: what half a degree does at the length of the arm."""
+DAMPING_M = 0.003
+"""A tool this near to a joint's axis says half of nothing about the joint's turn [m]."""
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """Where a healthy arm is expected to be: all of a calibration that features make use of.
+
+    Attributes:
+        name: Name of the calibration.
+        protocol: How much real data it has seen.
+        lag_s: Mean time by which each motor runs behind its command, (motor,) [s].
+        settling: Where motors settle.
+    """
+
+    name: str
+    protocol: str
+    lag_s: tuple[float, ...]
+    settling: Settling
+
+
+def expectation_of(robot: Robot, imperfections: Imperfections) -> Expectation:
+    """Return what is expected of a healthy robot with some imperfections."""
+    timing = imperfections.timing
+    common = float(np.mean(timing.delay_s) + np.mean(timing.lag_s))
+    # 1 / I: delay of the loop (P s + I) / (s (tau s + 1)^2 + P s + I) at low frequency.
+    lag = tuple(common + 1.0 / motor.loop.I for motor in robot.motors)
+    settling = imperfections.settling or Settling.ideal(len(lag))
+    return Expectation(imperfections.name, imperfections.protocol, lag, settling)
+
+
+@dataclass(frozen=True)
+class RobustFeatures:
+    """Turns a run into 100 points of residuals in motor space.
+
+    Attributes:
+        robot: Kinematics and masses.
+        expected: Where a healthy arm is expected to be.
+    """
+
+    robot: Robot
+    expected: Expectation
+
+    def __post_init__(self) -> None:
+        sliding = [joint.name for joint in self.robot.chain.joints if joint.prismatic]
+        if sliding:
+            raise InputError(
+                f"robust features know joints that turn, and {', '.join(sliding)} of "
+                f"{self.robot.name!r} slides. Use another method."
+            )
+
+    def __call__(self, signals: Signals) -> FloatArray:
+        """Return the features, (run, point, channel), each of about unit size."""
+        index, seen = _points(signals)
+        run = np.arange(len(index))[:, None]
+        pose = self._healthy_pose(signals, index)
+        origin, axis, tool = joint_frames(self.robot, pose * self.robot.sensor_sense)
+        measured = np.where(seen[..., None], signals.measured[run, index], tool)
+        turn, misfit = _explained(origin, axis, tool, measured)
+        turn = turn * self.robot.sensor_sense
+        off = _compressed(measured - tool, DISTANCE_M) * seen[..., None]
+        known = seen[..., None]
+        per_motor = np.stack(
+            [
+                _compressed(turn, TURN_RAD) * known,
+                _compressed(misfit, DISTANCE_M) * known,
+                (pose + turn) * known,
+                pose,
+            ],
+            axis=-1,
+        )
+        flat = per_motor.reshape(*pose.shape[:2], -1)
+        return np.concatenate([flat, off, seen[..., None]], axis=-1)
+
+    def _healthy_pose(self, signals: Signals, index: IntArray) -> FloatArray:
+        """Return where a healthy arm would be at some samples, (run, point, motor) [rad]."""
+        command, lag = signals.command, np.asarray(self.expected.lag_s)
+        place = np.maximum(index[..., None] - lag / signals.step, 0.0)
+        low = place.astype(np.int64)
+        high = np.minimum(low + 1, command.shape[1] - 1)
+        run, motor = np.arange(len(index))[:, None, None], np.arange(command.shape[2])
+        before, after = command[run, low, motor], command[run, high, motor]
+        pose = before + (place - low) * (after - before)
+        direction = _direction(command)[run, low, motor]
+        return pose + self.expected.settling.offset(self.robot, pose, direction)
+
+
+def _points(signals: Signals) -> tuple[IntArray, FloatArray]:
+    """Return the sample of each point (run, point), and 1 where it is a reading, else 0.
+
+    Points divide the length of a run evenly; of several readings in one the last counts.
+    """
+    runs = len(signals.command)
+    last = np.floor(signals.duration[:, None] / signals.step + 1e-6)  # sample of each run
+    share = np.arange(len(signals.time)) / np.maximum(last, 1.0)
+    index = ((np.arange(POINTS) + 0.5) / POINTS * last).astype(np.int64)
+    seen = np.zeros((runs, POINTS))
+    run, sample = np.nonzero(signals.seen)
+    point = np.minimum((share[run, sample] * POINTS).astype(np.int64), POINTS - 1)
+    index[run, point] = sample  # the last of several stays
+    seen[run, point] = 1.0
+    return index, seen
+
+
+def _direction(command: FloatArray) -> FloatArray:
+    """Return the sign of each motor's last travel, (run, time, motor); 0 before the first."""
+    sign = np.zeros_like(command)
+    sign[:, 1:] = np.sign(np.diff(command, axis=1))
+    when = np.where(sign != 0.0, np.arange(command.shape[1])[:, None], 0)
+    last = np.maximum.accumulate(when, axis=1)
+    return np.take_along_axis(sign, last, axis=1)
+
+
+def joint_frames(robot: Robot, pose: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return where the joints are and point to, and where the tool is, in the base frame.
+
+    Args:
+        robot: Its chain; joints that slide are not supported.
+        pose: Angles that the tool sensor's path belongs to, (..., motor) [rad].
+
+    Returns:
+        Origins (..., motor, 3) [m], unit axes (..., motor, 3) and tool points (..., 3) [m].
+    """
+    lead = pose.shape[:-1]
+    rotation = np.broadcast_to(np.eye(3), (*lead, 3, 3))
+    point = np.zeros((*lead, 3))
+    origins, axes = [], []
+    for joint, angle in zip(robot.chain.joints, np.moveaxis(pose, -1, 0), strict=True):
+        point = point + rotation @ joint.T_pj[:3, 3]
+        rotation = rotation @ joint.T_pj[:3, :3]
+        origins.append(point)
+        axes.append(rotation[..., :, 2])
+        c, s = np.cos(angle)[..., None], np.sin(angle)[..., None]
+        x, y = rotation[..., :, 0], rotation[..., :, 1]
+        rotation = np.stack([c * x + s * y, c * y - s * x, rotation[..., :, 2]], axis=-1)
+    tool = point + rotation @ robot.chain.T_jt[:3, 3]
+    return np.stack(origins, axis=-2), np.stack(axes, axis=-2), tool
+
+
+def _explained(
+    origin: FloatArray, axis: FloatArray, tool: FloatArray, measured: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the turn of each joint that brings the tool nearest, and the distance left.
+
+    Returns:
+        (..., joint) [rad] and (..., joint) [m].
+    """
+    here, there = tool[..., None, :] - origin, measured[..., None, :] - origin
+    along = np.sum(axis * (there - here), axis=-1)
+    here = here - np.sum(axis * here, axis=-1, keepdims=True) * axis
+    there = there - np.sum(axis * there, axis=-1, keepdims=True) * axis
+    sine = np.sum(axis * np.cross(here, there), axis=-1)
+    cosine = np.sum(here * there, axis=-1)
+    across = np.linalg.norm(here, axis=-1) - np.linalg.norm(there, axis=-1)
+    turn = np.arctan2(sine, cosine)
+    lever = np.sum(here * here, axis=-1)
+    return turn * lever / (lever + DAMPING_M**2), np.hypot(along, across)
+
+
+def _compressed(values: FloatArray, scale: float) -> FloatArray:
+    return np.arcsinh(values / scale) / 3.0
+
+
+# From runs to what a network sees, by one of the named feature sets.
+
+FEATURE_SETS = ("original", "augmented", "robust")
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class FeatureEncoder:
+    """Turns runs into arrays for a network.
+
+    Attributes:
+        features: One of `FEATURE_SETS`: the paper's two, and the one for real robots.
+        robot: The robot.
+        expected: Healthy behaviour that the robust features compare with; None: that of the
+            published twin. The paper's features know of none.
+    """
+
+    features: str
+    robot: Robot
+    expected: Expectation | None = None
+
+    def __post_init__(self) -> None:
+        if self.features not in FEATURE_SETS:
+            raise unknown_name("feature set", self.features, FEATURE_SETS)
+
+    @property
+    def channels(self) -> int:
+        """Channels of each point."""
+        motors = len(self.robot.motors)
+        robust = len(PER_MOTOR) * motors + len(SHARED)
+        return {"original": motors + 3, "augmented": 6, "robust": robust}[self.features]
+
+    @property
+    def protocol(self) -> str:
+        """How much real data the features have seen."""
+        return "P0" if self.expected is None else self.expected.protocol
+
+    def encode(self, signals: Signals) -> Floats:
+        """Return what a network sees, (run, point, channel)."""
+        if self.features == "robust":
+            return self._robust(signals).astype(np.float32)
+        twin = DigitalTwin(self.robot)
+        make = original_features if self.features == "original" else augmented_features
+        return make(twin, signals).astype(np.float32)
+
+    @cached_property
+    def _robust(self) -> RobustFeatures:
+        expected = self.expected or expectation_of(self.robot, NO_IMPERFECTIONS)
+        return RobustFeatures(self.robot, expected)

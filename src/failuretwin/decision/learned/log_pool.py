@@ -1,0 +1,135 @@
+"""Model and network together, the paper's closing idea: a logarithmic opinion pool, or a gate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis
+from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.inference.explanation import worded
+from failuretwin.inference.protocol import Diagnoser
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+HEALTHY = "healthy"
+LEAST = 1e-300
+"""Probabilities that have underflowed count as this, so that a logarithm of them exists."""
+
+
+@dataclass(frozen=True)
+class PoolWeights:
+    """How much the log probability of each part counts; 1 and 0: the first part alone."""
+
+    bayes: float
+    network: float
+
+
+def log_pool(bayes: FloatArray, network: FloatArray, weights: PoolWeights) -> FloatArray:
+    """Return p ~ p_bayes^w_bayes p_network^w_network, (run, class), normalised."""
+    from scipy.special import softmax
+
+    return softmax(weights.bayes * _log(bayes) + weights.network * _log(network), axis=1)
+
+
+def gated(bayes: FloatArray, network: FloatArray, healthy: int) -> FloatArray:
+    """Return probabilities (run, class): of healthy by the first, of faults by the second.
+
+    Args:
+        bayes: (run, class).
+        network: (run, class).
+        healthy: Number of the healthy class.
+    """
+    faults = np.maximum(network, LEAST)
+    faults[:, healthy] = 0.0
+    rest = 1.0 - bayes[:, [healthy]]
+    chances = rest * faults / faults.sum(axis=1, keepdims=True)
+    chances[:, healthy] = bayes[:, healthy]
+    return chances
+
+
+def fit_pool_weights(bayes: FloatArray, network: FloatArray, truth: IntArray) -> PoolWeights:
+    """Return the weights of the best mean log score.
+
+    Args:
+        bayes: Probabilities of simulated runs by the model, (run, class).
+        network: The same by the network.
+        truth: Number of the true class, (run,).
+    """
+    from scipy.optimize import minimize
+
+    runs = np.arange(len(truth))
+
+    def log_score(values: FloatArray) -> float:
+        pooled = log_pool(bayes, network, PoolWeights(*values))
+        return float(-_log(pooled)[runs, truth].mean())
+
+    best = minimize(log_score, np.array([0.5, 0.5]), bounds=[(0.0, 3.0)] * 2)
+    return PoolWeights(*(float(value) for value in best.x))
+
+
+def _log(chances: FloatArray) -> FloatArray:
+    return np.log(np.maximum(chances, LEAST))
+
+
+@dataclass(frozen=True)
+class HybridDiagnoser:
+    """Two diagnosers as one.
+
+    Attributes:
+        bayes: The model-based one; where it gives no verdict, there is none.
+        network: The learned one, of the same classes.
+        weights: Of the pool; None: gated.
+    """
+
+    bayes: Diagnoser
+    network: Diagnoser
+    weights: PoolWeights | None = None
+
+    def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
+        """Return the diagnosis of each run of a run set.
+
+        Onset and size are those of the Bayesian part, where both agree on the fault.
+
+        Raises:
+            InputError: If the parts know different classes.
+        """
+        pairs = zip(self.bayes.diagnose(runs), self.network.diagnose(runs), strict=True)
+        return [self._joined(first, second) for first, second in pairs]
+
+    def _joined(self, bayes: Diagnosis, network: Diagnosis) -> Diagnosis:
+        if bayes.undecided:
+            return bayes
+        if set(bayes.posterior) != set(network.posterior):
+            raise InputError(
+                f"the parts know different classes: {', '.join(bayes.posterior)} and "
+                f"{', '.join(network.posterior)}."
+            )
+        classes = list(bayes.posterior)
+        first, second = (np.array([[d.posterior[c] for c in classes]]) for d in (bayes, network))
+        if self.weights is None:
+            chances = gated(first, second, classes.index(HEALTHY))[0]
+        else:
+            chances = log_pool(first, second, self.weights)[0]
+        joined = replace(
+            bayes,
+            posterior=dict(zip(classes, chances.tolist(), strict=True)),
+            evidence=(),
+            protocol=max(bayes.protocol, network.protocol),
+            method=f"{'gated' if self.weights is None else 'blended'}: {bayes.method} with "
+            f"{network.method}",
+        )
+        if joined.diagnosis != bayes.diagnosis:
+            joined = replace(
+                joined,
+                onset_s=None,
+                onset_90=None,
+                magnitude=None,
+                magnitude_unit=None,
+                magnitude_90=None,
+            )
+        return worded(joined, [Hypothesis.parse(name) for name in joined.ranked])

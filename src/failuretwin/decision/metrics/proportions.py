@@ -1,0 +1,433 @@
+"""How many of how many: right or wrong, false alarms, coverage of intervals, and how soon.
+
+Shares of runs come with the interval that so few runs allow.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.decision.metrics.scoring_rules import LogScore, log_score
+
+Z_95 = 1.959963984540054
+"""Two-sided 95 % point of the normal distribution."""
+
+
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Return the Wilson 95 % interval of a share (Wilson, JASA 1927)."""
+    if trials == 0:
+        return 0.0, 1.0
+    share, z2 = successes / trials, Z_95**2
+    centre = (share + z2 / (2 * trials)) / (1 + z2 / trials)
+    spread = math.sqrt(share * (1 - share) / trials + z2 / (4 * trials**2))
+    half = Z_95 * spread / (1 + z2 / trials)
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+@dataclass(frozen=True)
+class Share:
+    """So many of so many.
+
+    Attributes:
+        count: How many.
+        total: Of how many.
+    """
+
+    count: int
+    total: int
+
+    @property
+    def value(self) -> float:
+        """The share; NaN of nothing."""
+        return self.count / self.total if self.total else math.nan
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson 95 % interval; everything where there is nothing."""
+        return wilson_interval(self.count, self.total)
+
+
+# Right or wrong: accuracy, confusion, precision, recall and F1 of each class.
+
+NO_VERDICT = "cannot tell"
+"""Class of the runs that got no verdict."""
+UNKNOWN, HEALTHY = "unknown", "healthy"
+
+
+def judged_truth(truth: str, hypotheses: Container[str]) -> str:
+    """Return the hypothesis that is right for a run: its truth, or `unknown` where that means it.
+
+    `unknown` stands for every fault that is not named, so where it is among the hypotheses and
+    the true fault is not, it is the right answer. A healthy robot has no fault and stays healthy.
+
+    Args:
+        truth: True hypothesis of the run.
+        hypotheses: Those that were given a probability.
+    """
+    if truth == HEALTHY or truth in hypotheses or UNKNOWN not in hypotheses:
+        return truth
+    return UNKNOWN
+
+
+@dataclass(frozen=True)
+class ClassScore:
+    """Scores of one class; NaN where the ratio has no meaning (0 / 0).
+
+    Attributes:
+        name: The hypothesis.
+        runs: Runs of which it is the truth.
+        precision: Share of its diagnoses that are right; NaN if it was never diagnosed.
+        recall: Share of its runs that are found; NaN if it is never the truth.
+        f1: 2 hits / (runs + diagnoses), the harmonic mean of both where both have a meaning. A
+            class that is true but never diagnosed has 0; NaN if it is neither.
+    """
+
+    name: str
+    runs: int
+    precision: float
+    recall: float
+    f1: float
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of a set of diagnoses.
+
+    Attributes:
+        classes: Hypotheses in the order of the confusion matrix.
+        confusion: Counts, (truth, diagnosis).
+        log_scores: Log score of the same runs.
+    """
+
+    classes: tuple[str, ...]
+    confusion: IntArray
+    log_scores: LogScore
+
+    @property
+    def log_score(self) -> float:
+        """Mean of minus the log probability of the truth [nats a run]; may be infinite."""
+        return self.log_scores.mean
+
+    @property
+    def runs(self) -> int:
+        """Number of runs."""
+        return int(self.confusion.sum())
+
+    @property
+    def right(self) -> int:
+        """Number of runs diagnosed right."""
+        return int(np.trace(self.confusion))
+
+    @property
+    def accuracy(self) -> float:
+        """Share of runs diagnosed right."""
+        return self.right / self.runs
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson 95 % interval of the accuracy."""
+        return wilson_interval(self.right, self.runs)
+
+    @property
+    def macro_f1(self) -> float:
+        """Mean F1 of the classes that are the truth of any run, each with the same weight.
+
+        Other classes (never true; "cannot tell") have no say of their own: their diagnoses already
+        lower the recall of the classes that were true.
+        """
+        return float(np.mean([row.f1 for row in self.by_class() if row.runs]))
+
+    def by_class(self) -> list[ClassScore]:
+        """Return precision, recall and F1 of each class."""
+        truth, said = self.confusion.sum(axis=1), self.confusion.sum(axis=0)
+        return [
+            ClassScore(
+                name=name,
+                runs=int(truth[i]),
+                precision=_ratio(self.confusion[i, i], said[i]),
+                recall=_ratio(self.confusion[i, i], truth[i]),
+                f1=_ratio(2 * self.confusion[i, i], truth[i] + said[i]),
+            )
+            for i, name in enumerate(self.classes)
+        ]
+
+
+def _ratio(part: int, whole: int) -> float:
+    return float(part / whole) if whole else math.nan
+
+
+def score(
+    truth: Sequence[str],
+    diagnosis: Sequence[str | None],
+    posterior: Sequence[Mapping[str, float]],
+) -> Scores:
+    """Score diagnoses against the truth.
+
+    Args:
+        truth: True hypothesis of each run.
+        diagnosis: Most probable hypothesis of each run; None: no verdict, a class of its own.
+        posterior: Probabilities of each run.
+    """
+    said_of = [NO_VERDICT if said is None else said for said in diagnosis]
+    names = [name for p in posterior for name in p]
+    classes = tuple(dict.fromkeys([*names, *truth, *said_of]))
+    index = {name: i for i, name in enumerate(classes)}
+    confusion = np.zeros((len(classes), len(classes)), dtype=np.int64)
+    for true, said in zip(truth, said_of, strict=True):
+        confusion[index[true], index[said]] += 1
+    return Scores(classes, confusion, log_score(truth, posterior))
+
+
+# False alarms and missed detections: faulty or not, whatever the fault.
+
+
+@dataclass(frozen=True)
+class Alarms:
+    """Alarms on healthy runs and silence on faulty ones.
+
+    An alarm is a verdict other than healthy. A run without a verdict raises none, so it is missed
+    if it is faulty.
+
+    Attributes:
+        false_alarms: Healthy runs that raised an alarm, of all healthy runs.
+        missed: Faulty runs that raised none, of all faulty runs.
+        healthy_abstained: Healthy runs without a verdict.
+        faulty_abstained: Faulty runs without a verdict, part of `missed`.
+    """
+
+    false_alarms: Share
+    missed: Share
+    healthy_abstained: int
+    faulty_abstained: int
+
+
+def count_alarms(truth: Sequence[str], diagnosis: Sequence[str | None]) -> Alarms:
+    """Count false alarms and missed detections.
+
+    Args:
+        truth: True hypothesis of each run.
+        diagnosis: Diagnosis of each run; None: no verdict.
+    """
+    pairs = list(zip(truth, diagnosis, strict=True))
+    healthy = [said for true, said in pairs if true == HEALTHY]
+    faulty = [said for true, said in pairs if true != HEALTHY]
+    false_alarms = sum(said not in (HEALTHY, None) for said in healthy)
+    missed = sum(said in (HEALTHY, None) for said in faulty)
+    return Alarms(
+        false_alarms=Share(false_alarms, len(healthy)),
+        missed=Share(missed, len(faulty)),
+        healthy_abstained=healthy.count(None),
+        faulty_abstained=faulty.count(None),
+    )
+
+
+# Do 90 % intervals hold the truth in 90 % of the runs?
+
+
+@dataclass(frozen=True)
+class IntervalCase:
+    """An interval and the truth that it should hold.
+
+    Attributes:
+        mode: Fault mode that it is about.
+        quantity: What is estimated, such as ``"onset"``.
+        low: Lower end, in the unit of the quantity.
+        high: Upper end, in the same unit.
+        truth: True value, in the same unit.
+    """
+
+    mode: str
+    quantity: str
+    low: float
+    high: float
+    truth: float
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How often the intervals of one quantity hold the truth; ends count as inside.
+
+    Attributes:
+        mode: Fault mode.
+        quantity: What is estimated.
+        inside: Intervals that hold the truth, of all.
+        below: Truths below their interval.
+        above: Truths above their interval.
+        points: Intervals without width: told or assumed rather than estimated.
+    """
+
+    mode: str
+    quantity: str
+    inside: Share
+    below: int
+    above: int
+    points: int
+
+
+def coverage_by_mode(cases: Iterable[IntervalCase]) -> list[Coverage]:
+    """Return the coverage of each quantity of each fault mode, in order of appearance.
+
+    Give the runs whose fault was diagnosed right: an interval says where the value lies *if* the
+    diagnosis holds, and choosing runs by what the data say does not change its coverage.
+    """
+    groups: dict[tuple[str, str], list[IntervalCase]] = {}
+    for case in cases:
+        groups.setdefault((case.mode, case.quantity), []).append(case)
+    return [_coverage(*key, group) for key, group in groups.items()]
+
+
+def _coverage(mode: str, quantity: str, cases: list[IntervalCase]) -> Coverage:
+    below = sum(case.truth < case.low for case in cases)
+    above = sum(case.truth > case.high for case in cases)
+    inside = Share(len(cases) - below - above, len(cases))
+    points = sum(case.low == case.high for case in cases)
+    return Coverage(mode, quantity, inside, below, above, points)
+
+
+# How soon after its onset a fault is noticed and named, at a stated rate of false alarms.
+
+ISOLATED = 0.5
+"""A fault is isolated once it holds more than this share of the probability of any fault."""
+
+
+@dataclass(frozen=True)
+class Delays:
+    """Delays of the faulty runs, in their order.
+
+    Attributes:
+        threshold: An alarm is a probability of any fault above this.
+        false_alarms: Healthy runs that alarm with it, of all healthy runs.
+        detection: From onset to alarm, (faulty run,) [s]; infinite: none before the run ended; NaN:
+            the alarm came before the onset, which is a false alarm and no delay.
+        isolation: From onset to the first alarm with the right fault in front, (faulty run,) [s];
+            infinite and NaN as above.
+        followed: From onset to the end of the run, (faulty run,) [s]: a delay that is infinite is
+            only known to be longer than this.
+    """
+
+    threshold: float
+    false_alarms: Share
+    detection: FloatArray
+    isolation: FloatArray
+    followed: FloatArray
+
+    @property
+    def early(self) -> Share:
+        """Faulty runs with an alarm before the onset, of all faulty runs."""
+        return Share(int(np.isnan(self.detection).sum()), len(self.detection))
+
+    @property
+    def undetected(self) -> Share:
+        """Runs that ended without an alarm, of those without an early one."""
+        return _never(self.detection)
+
+    @property
+    def unisolated(self) -> Share:
+        """Runs that ended without the right fault in front, of those without an early alarm."""
+        return _never(self.isolation)
+
+    @property
+    def median_detection(self) -> float:
+        """Median delay of detection [s], runs that ended too soon counted as censored."""
+        return _median(self.detection, self.followed)
+
+    @property
+    def median_isolation(self) -> float:
+        """Median delay of isolation [s], runs that ended too soon counted as censored."""
+        return _median(self.isolation, self.followed)
+
+
+def alarm_threshold(healthy: FloatArray, share: float) -> float:
+    """Return the lowest threshold that at most `share` of the healthy runs ever exceed.
+
+    Args:
+        healthy: Probability of any fault, (healthy run, time); NaN: no answer yet.
+        share: Stated rate of false alarms [runs with one a run], 0 <= share < 1.
+
+    Raises:
+        InputError: If there are no healthy runs or the share is not one.
+    """
+    if not 0.0 <= share < 1.0:
+        raise InputError(f"the rate of false alarms is {share:g}, expected 0 <= rate < 1.")
+    if healthy.size == 0:
+        raise InputError("there are no healthy runs to set the threshold by.")
+    peaks = np.sort(np.max(np.where(np.isnan(healthy), 0.0, healthy), axis=1))[::-1]
+    allowed = int(share * len(peaks) + 1e-9)  # 0.29 of 100 is 28.999...
+    return float(peaks[allowed])
+
+
+def delays_after_onset(
+    time: FloatArray, fault: FloatArray, true_fault: FloatArray, onset: FloatArray, share: float
+) -> Delays:
+    """Return the delays at the threshold that keeps false alarms at `share` of the healthy runs.
+
+    Args:
+        time: Instants of the answers, (time,) [s].
+        fault: Probability of any fault given all data so far, (run, time); NaN: no answer, as
+            after the end of the run.
+        true_fault: Probability of the true hypothesis, (run, time); not read in healthy runs.
+        onset: When the fault began, (run,) [s]; NaN: healthy; 0: before the run.
+        share: Stated rate of false alarms [runs with one a run], 0 <= share < 1.
+
+    Raises:
+        InputError: If shapes do not fit, or no healthy or no faulty run is there.
+    """
+    if not fault.shape == true_fault.shape == (len(onset), len(time)):
+        raise InputError(
+            f"`fault` has shape {fault.shape}, `true_fault` {true_fault.shape}; expected both "
+            f"(run, time) = {(len(onset), len(time))}."
+        )
+    healthy = np.isnan(onset)
+    if healthy.all():
+        raise InputError("there are no faulty runs to measure delays on.")
+    threshold = alarm_threshold(fault[healthy], share)
+    alarm = fault > threshold  # False where NaN
+    named = alarm & (true_fault > ISOLATED * fault)
+    faulty, began = ~healthy, onset[~healthy]
+    early = np.any(alarm[faulty] & (time < began[:, None]), axis=1)
+    answered = np.where(np.isnan(fault[faulty]), -np.inf, time).max(axis=1)
+    return Delays(
+        threshold=threshold,
+        false_alarms=Share(int(alarm[healthy].any(axis=1).sum()), int(healthy.sum())),
+        detection=_first_after(time, alarm[faulty], began, early),
+        isolation=_first_after(time, named[faulty], began, early),
+        followed=np.maximum(answered - began, 0.0),
+    )
+
+
+def _first_after(
+    time: FloatArray, event: BoolArray, onset: FloatArray, early: BoolArray
+) -> FloatArray:
+    """Return the time from each onset to the first event at or after it [s]."""
+    at = np.where(event & (time >= onset[:, None]), time, np.inf).min(axis=1)
+    return np.where(early, np.nan, at - onset)
+
+
+def _never(delay: FloatArray) -> Share:
+    valid = delay[~np.isnan(delay)]
+    return Share(int(np.isinf(valid).sum()), len(valid))
+
+
+def _median(delay: FloatArray, followed: FloatArray) -> float:
+    """Return where the product-limit curve falls to one half (Kaplan & Meier, JASA 1958) [s].
+
+    Infinite where it never does; NaN where there is no run.
+    """
+    from scipy.stats import CensoredData, ecdf
+
+    valid = ~np.isnan(delay)
+    ended = valid & np.isinf(delay)
+    if not valid.any():
+        return float("nan")
+    if ended.sum() == valid.sum():
+        return float("inf")
+    data = CensoredData(uncensored=delay[valid & ~ended], right=followed[ended])
+    curve = ecdf(data).sf
+    low = curve.probabilities <= 0.5 + 1e-12
+    return float(curve.quantiles[low.argmax()]) if low.any() else float("inf")

@@ -1,0 +1,364 @@
+"""Run sets made piece by piece: the same bytes whoever makes them, whatever happens meanwhile."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from failuretwin import read_runs
+from failuretwin.core.errors import InputError, OutputError
+from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.data_knowledge import resumable
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.data_knowledge.resumable import make_chunk, produce
+from failuretwin.data_knowledge.store import load_run_set, save_run_set, sole_writer
+from failuretwin.data_knowledge.workers import ONE_PROCESS
+from failuretwin.digital_model.calibrated_robot import load_calibration
+
+RUNS_PER_CLASS = 2
+PIECE = 4
+PIECES = 5
+"""18 runs in pieces of four."""
+
+
+@pytest.fixture(scope="module", params=["none", "armpi_fpv"])
+def plan(request, armpi):
+    known = load_calibration(request.param, armpi).imperfections
+    return Plan(armpi, paper_hypotheses(armpi.motor_names), RUNS_PER_CLASS, 5, known)
+
+
+@pytest.fixture(scope="module")
+def imperfect(armpi):
+    known = load_calibration("armpi_fpv", armpi).imperfections
+    return Plan(armpi, paper_hypotheses(armpi.motor_names), RUNS_PER_CLASS, 5, known)
+
+
+def contents(folder):
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
+
+
+def listing(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def cut_short(plan, path, pieces, monkeypatch, error=KeyboardInterrupt):
+    """Make the first `pieces` only; return what the user is told."""
+    told, made = [], []
+
+    def failing(job, piece):
+        if len(made) == pieces:
+            raise error
+        made.append(piece)
+        return make_chunk(job, piece)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(resumable, "make_chunk", failing)
+        with pytest.raises(OutputError if error is OSError else error):
+            produce(plan, path, tell=told.append, chunk_runs=PIECE)
+    return told
+
+
+def counting(monkeypatch):
+    """Count the pieces that are made from now on."""
+    made = []
+
+    def counted(job, piece):
+        made.append(piece)
+        return make_chunk(job, piece)
+
+    monkeypatch.setattr(resumable, "make_chunk", counted)
+    return made
+
+
+@pytest.mark.parametrize("chunk_runs", [1, PIECE, 100])
+def test_what_is_made_piece_by_piece_is_what_is_made_in_memory(tmp_path, plan, chunk_runs):
+    produce(plan, tmp_path / "runs.zarr", chunk_runs=chunk_runs)
+    whole = simulate(plan)
+    xr.testing.assert_identical(load_run_set(tmp_path / "runs.zarr"), whole)
+    save_run_set(whole, tmp_path / "whole.zarr")
+    with (
+        xr.open_zarr(tmp_path / "runs.zarr", chunks=None) as made,
+        xr.open_zarr(tmp_path / "whole.zarr", chunks=None) as stored,
+    ):
+        assert {n: v.dtype for n, v in made.variables.items()} == {
+            n: v.dtype for n, v in stored.variables.items()
+        }
+        assert list(made.variables) == list(stored.variables)
+    assert listing(tmp_path) == ["runs.zarr", "whole.zarr"]
+
+
+def test_netcdf_holds_the_same(tmp_path, imperfect):
+    done = []
+    produce(imperfect, tmp_path / "runs.nc", on_progress=done.append)
+    xr.testing.assert_identical(load_run_set(tmp_path / "runs.nc"), simulate(imperfect))
+    assert done == [18]
+
+
+def test_netcdf_beyond_memory_is_refused_at_once(tmp_path, imperfect):
+    plan = replace(imperfect, runs_per_class=1_000_000)
+    with pytest.raises(InputError, match=r"NetCDF is made in memory.* Write to runs\.zarr"):
+        produce(plan, tmp_path / "runs.nc")
+    assert listing(tmp_path) == []
+
+
+def test_manifest_says_what_was_made(tmp_path, imperfect):
+    produce(imperfect, tmp_path / "runs.zarr", chunk_runs=PIECE)
+    manifest = json.loads((tmp_path / "runs.zarr" / "manifest.json").read_text())
+    assert (manifest["runs"], manifest["runs_per_chunk"]) == (18, PIECE)
+    assert manifest["versions"]["numpy"] == np.__version__
+    assert manifest["plan"]["seed"] == 5
+    assert manifest["plan"]["imperfections"]["name"] == "armpi_fpv"
+    assert manifest["plan"]["hypotheses"][1]["faults"][0]["motor"] == "motor_1"
+
+
+def test_manifest_holds_the_hash_of_the_data(tmp_path, imperfect):
+    """The hash as its documentation defines it, from nothing but the files."""
+    produce(imperfect, tmp_path / "runs.zarr", chunk_runs=PIECE)
+    pieces = []
+    for piece in range(PIECES):
+        total = hashlib.sha256()
+        for file in sorted((tmp_path / "runs.zarr").glob("*/c.*"), key=str):
+            name = f"{file.parent.name}/{file.name}"
+            if file.name.split(".")[1] == str(piece):
+                data = file.read_bytes()
+                total.update(name.encode() + b"\0" + str(len(data)).encode() + b"\0" + data)
+        pieces.append(total.hexdigest())
+    manifest = json.loads((tmp_path / "runs.zarr" / "manifest.json").read_text())
+    assert manifest["content"] == hashlib.sha256("".join(pieces).encode()).hexdigest()
+
+
+def test_work_that_was_interrupted_goes_on(monkeypatch, tmp_path, plan):
+    produce(plan, tmp_path / "whole.zarr", chunk_runs=PIECE)
+    (told,) = cut_short(plan, tmp_path / "runs.zarr", 3, monkeypatch)
+    assert told.startswith("12 of 18 runs are kept in ")
+    made, done, told = counting(monkeypatch), [], []
+    produce(plan, tmp_path / "runs.zarr", ONE_PROCESS, done.append, told.append, PIECE)
+    assert made == [3, 4]
+    assert told == ["continuing: 12 of 18 runs were there"]
+    assert done == [12, 4, 2]
+    assert contents(tmp_path / "runs.zarr") == contents(tmp_path / "whole.zarr")
+    assert listing(tmp_path) == ["runs.zarr", "whole.zarr"]
+
+
+def test_unfinished_work_cannot_be_read(monkeypatch, tmp_path, imperfect):
+    cut_short(imperfect, tmp_path / "runs.zarr", PIECES - 1, monkeypatch)
+    (partial,) = tmp_path.iterdir()
+    for path in (tmp_path, partial, partial / "store"):
+        with pytest.raises(InputError):
+            read_runs(path)
+    with pytest.raises(FileNotFoundError):
+        xr.open_zarr(partial / "store")
+
+
+def test_pieces_that_are_not_what_was_written_are_made_again(monkeypatch, tmp_path, imperfect):
+    produce(imperfect, tmp_path / "whole.zarr", chunk_runs=PIECE)
+    cut_short(imperfect, tmp_path / "runs.zarr", 4, monkeypatch)
+    (partial,) = tmp_path.glob(".*.partial")
+    (partial / "store" / "fault" / "c.0").unlink()
+    torn = partial / "store" / "command" / "c.2.0.0"
+    torn.write_bytes(torn.read_bytes()[:100])
+    made = counting(monkeypatch)
+    produce(imperfect, tmp_path / "runs.zarr", chunk_runs=PIECE)
+    assert made == [0, 2, 4]
+    assert contents(tmp_path / "runs.zarr") == contents(tmp_path / "whole.zarr")
+
+
+@pytest.mark.parametrize("change", [{"seed": 6}, {"runs_per_class": 3}])
+def test_another_plan_starts_over(monkeypatch, tmp_path, imperfect, change):
+    cut_short(imperfect, tmp_path / "runs.zarr", 2, monkeypatch)
+    made, told = counting(monkeypatch), []
+    other = replace(imperfect, **change)
+    produce(other, tmp_path / "runs.zarr", tell=told.append, chunk_runs=PIECE)
+    assert (told, made[0]) == ([], 0)
+    xr.testing.assert_identical(load_run_set(tmp_path / "runs.zarr"), simulate(other))
+    assert listing(tmp_path) == ["runs.zarr"]
+
+
+def test_other_versions_start_over(monkeypatch, tmp_path, imperfect):
+    cut_short(imperfect, tmp_path / "runs.zarr", 2, monkeypatch)
+    made = counting(monkeypatch)
+    monkeypatch.setattr(resumable, "__version__", "0.0.0")
+    produce(imperfect, tmp_path / "runs.zarr", chunk_runs=PIECE)
+    assert made == [0, 1, 2, 3, 4]
+
+
+@pytest.fixture
+def old(tmp_path, imperfect):
+    """A run set that stands where the new one is to go."""
+    path = tmp_path / "runs.zarr"
+    produce(replace(imperfect, runs_per_class=1, seed=99), path, chunk_runs=PIECE)
+    return path
+
+
+def test_the_old_run_set_stands_until_the_new_one_does(monkeypatch, imperfect, old):
+    before, seen = contents(old), []
+
+    def watching(job, piece):
+        seen.append(contents(old) == before)
+        return make_chunk(job, piece)
+
+    monkeypatch.setattr(resumable, "make_chunk", watching)
+    produce(imperfect, old, chunk_runs=PIECE)
+    assert seen == [True] * PIECES
+    xr.testing.assert_identical(load_run_set(old), simulate(imperfect))
+    assert listing(old.parent) == [old.name]
+
+
+def test_a_kill_between_the_two_renames_is_mended_by_the_same_command(monkeypatch, imperfect, old):
+    """The old run set stands aside, the new one is whole but not yet in its place."""
+    cut_short(imperfect, old, PIECES - 1, monkeypatch)
+    old.rename(old.with_name(".runs.zarr.old"))
+    produce(imperfect, old, chunk_runs=PIECE)
+    xr.testing.assert_identical(load_run_set(old), simulate(imperfect))
+    assert listing(old.parent) == [old.name]
+
+
+def test_what_a_kill_left_half_written_is_no_part_of_the_run_set(monkeypatch, tmp_path, imperfect):
+    produce(imperfect, tmp_path / "whole.zarr", chunk_runs=PIECE)
+    cut_short(imperfect, tmp_path / "runs.zarr", 2, monkeypatch)
+    (partial,) = tmp_path.glob(".*.partial")
+    (partial / "store" / "command" / "c.2.0.0123.partial").write_bytes(b"half")
+    (partial / "done" / "2").write_bytes(b"")
+    made = counting(monkeypatch)
+    produce(imperfect, tmp_path / "runs.zarr", chunk_runs=PIECE)
+    assert made == [2, 3, 4]
+    assert contents(tmp_path / "runs.zarr") == contents(tmp_path / "whole.zarr")
+
+
+def test_a_link_stays_a_link(tmp_path, imperfect):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "runs.zarr").symlink_to(tmp_path / "disk" / "runs.zarr")
+    produce(imperfect, tmp_path / "runs.zarr", chunk_runs=100)
+    assert (tmp_path / "runs.zarr").is_symlink()
+    assert load_run_set(tmp_path / "runs.zarr").sizes["run"] == 18
+
+
+def test_full_disk_keeps_what_is_done(monkeypatch, imperfect, old):
+    before = contents(old)
+    (told,) = cut_short(imperfect, old, 3, monkeypatch, OSError)
+    assert told.startswith("12 of 18 runs are kept in ")
+    assert contents(old) == before
+
+
+def test_nothing_done_leaves_nothing(monkeypatch, tmp_path, imperfect):
+    assert cut_short(imperfect, tmp_path / "runs.zarr", 0, monkeypatch, OSError) == []
+    assert listing(tmp_path) == []
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from failuretwin.data_knowledge.store import sole_writer
+with sole_writer(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_two_processes_cannot_write_the_same_run_set(tmp_path, imperfect):
+    path = tmp_path / "runs.zarr"
+    with subprocess.Popen([sys.executable, "-c", HOLD, path], stdout=subprocess.PIPE) as holder:
+        assert holder.stdout.readline() == b"held\n"
+        with pytest.raises(OutputError, match=rf"process {holder.pid} on .* is writing it"):
+            produce(imperfect, path)
+        assert listing(tmp_path) == [".runs.zarr.lock"]
+        holder.kill()
+    produce(imperfect, path)
+    assert listing(tmp_path) == ["runs.zarr"]
+
+
+def test_a_lock_is_for_one_run_set_and_ends_with_its_block(tmp_path):
+    with (
+        sole_writer(tmp_path / "a.zarr"),
+        sole_writer(tmp_path / "b.zarr"),
+        pytest.raises(OutputError),
+        sole_writer(tmp_path / "a.zarr"),
+    ):
+        pass
+    with sole_writer(tmp_path / "a.zarr"):
+        assert listing(tmp_path) == [".a.zarr.lock"]
+
+
+def test_worker_with_other_versions_is_refused(tmp_path, imperfect):
+    job, _ = resumable._open(imperfect, tmp_path / "runs.zarr", PIECE)
+    other = replace(job, versions={**job.versions, "numpy": "1.0"})
+    with pytest.raises(InputError, match=r"expected .*numpy 1\.0.* Install the same versions"):
+        make_chunk(other, 0)
+
+
+def test_worker_that_does_not_share_the_folder_is_refused(tmp_path, imperfect):
+    job, _ = resumable._open(imperfect, tmp_path / "runs.zarr", PIECE)
+    job.remove()
+    with pytest.raises(InputError, match=r"sees no .* that all workers share"):
+        make_chunk(job, 0)
+    assert listing(tmp_path) == []
+
+
+RSS = """
+import resource, sys
+from pathlib import Path
+from failuretwin import load_robot
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.data_knowledge.generate import Plan
+from failuretwin.data_knowledge.resumable import make_chunk, produce
+produce(Plan(load_robot("armpi_fpv"), [Hypothesis()], int(sys.argv[2])), Path(sys.argv[1]))
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+def test_memory_does_not_grow_with_the_runs(tmp_path):
+    """1500 runs are 145 MB; all that may grow is a few bytes of bookkeeping."""
+    peaks_kb = [
+        int(
+            subprocess.run(
+                [sys.executable, "-c", RSS, tmp_path / f"{runs}.zarr", str(runs)],
+                check=True,
+                capture_output=True,
+            ).stdout
+        )
+        for runs in (300, 1800)
+    ]
+    assert peaks_kb[1] - peaks_kb[0] < 30_000
+
+
+KILL = """
+import sys
+from pathlib import Path
+from failuretwin import load_robot
+from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.data_knowledge.generate import Plan
+from failuretwin.data_knowledge.resumable import make_chunk, produce
+from failuretwin.digital_model.calibrated_robot import load_calibration
+robot = load_robot("armpi_fpv")
+known = load_calibration("armpi_fpv", robot).imperfections
+plan = Plan(robot, paper_hypotheses(robot.motor_names), 20, 5, known)
+produce(plan, Path(sys.argv[1]), chunk_runs=4)
+"""
+
+
+def test_killed_process_loses_at_most_the_piece_in_hand(monkeypatch, tmp_path, imperfect):
+    plan = replace(imperfect, runs_per_class=20)
+    path = tmp_path / "runs.zarr"
+    with subprocess.Popen([sys.executable, "-c", KILL, path]) as process:
+        while len(list(tmp_path.glob(".runs.zarr.*.partial/done/*"))) < 5:
+            assert process.poll() is None
+            time.sleep(0.005)
+        process.send_signal(signal.SIGKILL)
+    assert not path.exists()
+    there = len(list(tmp_path.glob(".runs.zarr.*.partial/done/*")))
+    made = counting(monkeypatch)
+    produce(plan, path, chunk_runs=PIECE)
+    assert len(made) == 45 - there
+    produce(plan, tmp_path / "whole.zarr", chunk_runs=PIECE)
+    assert contents(path) == contents(tmp_path / "whole.zarr")
+    assert listing(tmp_path) == ["runs.zarr", "whole.zarr"]
