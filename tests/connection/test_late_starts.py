@@ -56,7 +56,7 @@ def one_movement():
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "resumed", "late"),
+    ("rate_hz", "first_reading_delay", "late"),
     [
         (10.0, 0.1, 0.0),
         (10.0, 1.0, 1.0),

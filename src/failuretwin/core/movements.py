@@ -322,3 +322,46 @@ def _level(value: FloatArray, tolerance: float) -> FloatArray:
         if abs(value[i] - value[i - 1]) <= tolerance:
             value[i] = value[i - 1]
     return value
+
+
+# References as they come: at uneven times, and with noise on them.
+
+TURN_RAD = 1e-5
+"""A reference that is further than this from where it stood moves [rad]; less is noise."""
+NOISE_RAD = 1e-9
+"""References that typically bend by more than this from sample to sample are noisy [rad]."""
+GRID_S = 0.01
+"""Step of the grid onto which references are drawn out whose times are not even [s]."""
+
+
+def movements_of_samples(command: FloatArray, time: FloatArray) -> Movements:
+    """Find the movements in the references of one run that were taken at any times.
+
+    Args:
+        command: Reference angles, (sample, motor) [rad].
+        time: Increasing times of two samples at least, (sample,) [s].
+
+    Raises:
+        InputError: If a command is not finite.
+    """
+    grid, values = _evenly(time, command)
+    bends = np.abs(np.diff(values, 2, axis=0))
+    if len(bends) and np.median(bends, axis=0).max() > NOISE_RAD:
+        lines = [np.interp(grid, *simplify(grid, value, TURN_RAD)) for value in values.T]
+        values = np.stack(lines, axis=-1)
+    return find_movements(values[None], grid)
+
+
+def _evenly(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return values (time, motor) on an even grid; what is even already stays as it is."""
+    steps = np.diff(time)
+    step = float(steps.min())
+    multiples = steps / step
+    if np.abs(multiples - np.rint(multiples)).max() < 1e-3 and step >= 0.5 * GRID_S:
+        if multiples.max() < 1.5:
+            return time, values
+        grid = time[0] + step * np.arange(round((time[-1] - time[0]) / step) + 1)
+    else:
+        grid = np.append(np.arange(time[0], time[-1], GRID_S), time[-1])
+        grid = np.linspace(time[0], time[-1], len(grid))
+    return grid, np.stack([np.interp(grid, time, v) for v in values.T], axis=-1)

@@ -180,14 +180,7 @@ class HealthyModel:
     def late(
         self, movements: Movements, first_reading_delay: FloatArray | None = None
     ) -> FloatArray:
-        """Return the probability that each movement started late, (run, movement).
-
-        Args:
-            movements: The movements.
-            first_reading_delay: Time from each command to the first reading after it, (run,
-                movement) [s];
-                None: not known.
-        """
+        """Return the probability that each movement started late; see `LostCommands.late`."""
         return self.lost_commands.late(movements, first_reading_delay)
 
     def settle(self, base: FloatArray, direction: FloatArray, held: BoolArray) -> FloatArray:

@@ -152,7 +152,8 @@ class RunLikelihood:
         """Log density of each settled position if no motor is faulty, (run, movement)."""
         if self.healthy is not None:
             return self.healthy
-        return with_outliers(self.findings.terms, self.model.outlier_log_density, self.usable)
+        terms = log_sum(self.findings.terms, axis=-1)
+        return np.where(self.usable, np.logaddexp(terms, self.model.outlier_log_density), 0.0)
 
     @cached_property
     def outcome_probability(self) -> FloatArray:
@@ -169,21 +170,13 @@ class RunLikelihood:
         return self.findings.profiles[motor]
 
 
-def with_outliers(terms: FloatArray, outlier: float, usable: BoolArray) -> FloatArray:
-    """Return the log density whatever became of the commands; 0 where there is no evidence.
-
-    Args:
-        terms: Log weight times density of each outcome, (run, movement, outcome).
-        outlier: The same of the tool being anywhere.
-        usable: Movements with evidence, (run, movement).
-    """
-    return np.where(usable, np.logaddexp(log_sum(terms, axis=-1), outlier), 0.0)
-
-
 def share_of(terms: FloatArray, outlier: float, usable: BoolArray) -> FloatArray:
     """Return the probability of each outcome; 0 where there is no evidence.
 
-    Arguments as for `with_outliers`.
+    Args:
+        terms: Log weight times density of each outcome, (..., outcome).
+        outlier: The same of the tool being anywhere.
+        usable: Movements with evidence, (...).
     """
     total = np.logaddexp(log_sum(terms, axis=-1), outlier)
     return np.where(usable[..., None], np.exp(terms - total[..., None]), 0.0)

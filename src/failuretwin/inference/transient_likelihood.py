@@ -258,9 +258,7 @@ class TransientLikelihood:
     def _fill_in(
         self, ends: FloatArray, chosen: IntArray, lost: BoolArray
     ) -> tuple[IntArray, FloatArray]:
-        """Find out what became of movements whose end was not seen; arguments as for `_course`.
-
-        Each outcome is judged by the way there and by the way of the movement that follows.
+        """Find out what became of movements whose end was not seen, by the way there and on.
 
         Returns:
             What became of each movement, the most probable where its end was not seen, and the
@@ -332,10 +330,7 @@ class TransientLikelihood:
         delay: FloatArray | None = None,
         spread_m: float = 0.0,
     ) -> FloatArray:
-        """Return log densities of all movements of runs, (run, movement, case); 0 without readings.
-
-        Arguments as for `log_density`, with axes of runs and movements.
-        """
+        """Return `log_density` of all movements, (run, movement, case); 0 without readings."""
         item = np.nonzero(self.moving.seen.any(axis=-1))
         found = np.zeros(origin.shape[:-1])
         lasts = None if duration is None else duration[item]
@@ -406,8 +401,7 @@ class TransientLikelihood:
             start: How late.
         """
         variance = variance[:, None, None, None]
-        # (item, 1, reading, start)
-        since = self.moving.since[item][:, None, :, None] - start.delay
+        since = self.moving.since[item][:, None, :, None] - start.delay  # (.., reading, start)
         predicted, velocity = along_polyline(path, longest, since)
         point = self.moving.point[item][:, None, :, None]
         error = [point[..., axis] - predicted[axis] for axis in range(3)]

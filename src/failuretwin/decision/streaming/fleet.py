@@ -61,21 +61,6 @@ class FleetPosterior(ArrayStruct):
     dead: Annotated[BoolArray, Axes("run", empty=False)]
 
 
-@dataclass(frozen=True)
-class _Latest:
-    """What was judged last, and where it lay in the stream.
-
-    Attributes:
-        robots: The robots, (run,).
-        judgement: What was judged; None: nothing yet.
-        places: Where the run of each lay in its stream.
-    """
-
-    robots: IntArray
-    posterior_of_runs: Posterior | None
-    places: list[StreamPosition]
-
-
 class StreamingFleet:
     """Streaming diagnosis of many robots of one kind.
 
@@ -121,7 +106,7 @@ class StreamingFleet:
         self._beliefs = FleetPosterior.empty(**sizes)
         self._beliefs.posterior[:] = self._prior
         self._everything_counts = any(shows_in_transients(h) for h in diagnoser.hypothesis_set)
-        self._latest = _Latest(np.array([], dtype=np.int64), None, [])
+        self._latest: dict[int, tuple[Posterior, int, StreamPosition]] = {}
 
     @property
     def time(self) -> float:
@@ -141,7 +126,7 @@ class StreamingFleet:
     @property
     def stale(self) -> BoolArray:
         """Robots that have not been seen for a while: nothing is known of their present."""
-        read_s = self._tracker.read_s
+        read_s = self._tracker.window.read_s
         return np.asarray(np.isinf(read_s) | (read_s < self._now - SILENCE_S))
 
     def update(
@@ -189,23 +174,22 @@ class StreamingFleet:
         known = beliefs.judged[robot] or beliefs.dead[robot]
         if not known or window.count[robot] == 0:
             return None
-        if robot not in self._latest.robots or self._latest.posterior_of_runs is None:
+        if robot not in self._latest:
             self._remember(np.array([robot]), self._judgement(np.array([robot])))
-        latest = self._latest
-        at = int(np.flatnonzero(latest.robots == robot)[0])
-        quality = DEAD if beliefs.dead[robot] else LogQuality()
-        assert latest.posterior_of_runs is not None
-        place = replace(latest.places[at], before=before)
-        return latest.posterior_of_runs.to_diagnosis(at, f"robot {robot}", quality, place=place)
+        posterior_of_runs, at, position = self._latest[robot]
+        return posterior_of_runs.to_diagnosis(
+            at,
+            f"robot {robot}",
+            DEAD if beliefs.dead[robot] else LogQuality(),
+            place=replace(position, before=before),
+        )
 
     def _remember(self, robots: IntArray, posterior_of_runs: Posterior) -> None:
-        """Keep a judgement for whoever asks for it in words."""
-        window, zero = self._tracker.window, self._zero or 0.0
-        places = [
-            StreamPosition(float(window.zero_s[robot]) + zero, int(window.forgotten[robot]))
-            for robot in robots
-        ]
-        self._latest = _Latest(robots, posterior_of_runs, places)
+        """Keep the last judgement, and where each robot then was, for whoever asks for words."""
+        window, zero, self._latest = self._tracker.window, self._zero or 0.0, {}
+        for at, robot in enumerate(robots.tolist()):
+            begin_s, older = float(window.zero_s[robot]) + zero, int(window.forgotten[robot])
+            self._latest[robot] = posterior_of_runs, at, StreamPosition(begin_s, older)
 
     def _by_own_clock(self, time: float) -> float:
         """Return the time since the first sample [s]; small numbers are exact."""
@@ -223,10 +207,10 @@ class StreamingFleet:
     def state(self) -> dict[str, np.ndarray]:
         """Return all that the stream knows, by name."""
         zero = np.nan if self._zero is None else self._zero
-        found = {"clock": np.array([zero, self._now]), "read_s": self._tracker.read_s}
+        found = {"clock": np.array([zero, self._now])} | self._tracker.samples.state()
         for name, part in self._parts.items():
             found |= part.to_arrays(name)
-        return found | self._tracker.samples.state()
+        return found
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Take over what `state` returned.
@@ -237,7 +221,6 @@ class StreamingFleet:
         """
         zero, self._now = state["clock"].tolist()
         self._zero = None if np.isnan(zero) else zero
-        self._tracker.read_s[:] = state["read_s"]
         for name, part in self._parts.items():
             part.from_arrays(name, state)
         self._tracker.samples.restore(state)

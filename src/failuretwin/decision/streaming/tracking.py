@@ -8,14 +8,19 @@ from typing import Annotated
 import numpy as np
 
 from failuretwin.core.arrays import ArrayStruct, Axes
-from failuretwin.core.movements import Movements, find_movements, simplify
+from failuretwin.core.movements import (
+    GRID_S,
+    TURN_RAD,
+    Movements,
+    find_movements,
+    movements_of_samples,
+)
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.decision.streaming.samples import SampleBuffer
 from failuretwin.decision.streaming.window import MovementWindow
 from failuretwin.inference.evidence import (
     JUST_AFTER_S,
     SETTLING_S,
-    Rest,
     estimate_rest,
     rest_begin,
 )
@@ -26,18 +31,10 @@ Items = tuple[IntArray, IntArray]
 
 # Movements in the references of many robots, found as soon as a reference comes to rest.
 
-TURN_RAD = 1e-5
-"""A reference that is further than this from where it stood moves [rad]; less is noise."""
-NOISE_RAD = 1e-9
-"""References that typically bend by more than this from sample to sample are noisy [rad]."""
 STILL_STEPS = 2
 """Steps without a change after which a reference is at rest: a line needs two."""
 PLATEAU_S = 1.0
 """How much of the rest before a movement is looked at [s]."""
-GRID_S = 0.01
-"""Step of the grid onto which references are drawn out whose times are not even [s]."""
-
-TWO_SAMPLES = GRID_S * np.arange(2.0)
 
 
 @dataclass(frozen=True)
@@ -98,45 +95,14 @@ class References(ArrayStruct):
         time, command = samples.time[some], samples.command[some, robot]
         known = np.isfinite(command).all(axis=1)
         if known.sum() < 2:  # all others are too old to be remembered
-            return find_movements(np.repeat(self.last[None, [robot]], 2, axis=1), TWO_SAMPLES)
-        grid, values = _evenly(time[known], command[known])
-        if _noisy(values):
-            values = np.stack([_smooth(grid, value) for value in values.T], axis=-1)
-        return find_movements(values[None], grid)
-
-
-def _noisy(values: FloatArray) -> bool:
-    """Return whether references (time, motor) typically bend from sample to sample."""
-    bends = np.abs(np.diff(values, 2, axis=0))
-    return bool(len(bends) and np.median(bends, axis=0).max() > NOISE_RAD)
-
-
-def _smooth(time: FloatArray, value: FloatArray) -> FloatArray:
-    """Return a noisy reference (time,) as the straight lines that it is meant to be."""
-    at, corner = simplify(time, value, TURN_RAD)
-    return np.asarray(np.interp(time, at, corner))
-
-
-def _evenly(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return values (time, motor) on an even grid; what is even already stays as it is."""
-    steps = np.diff(time)
-    step = float(steps.min())
-    multiples = steps / step
-    if np.abs(multiples - np.rint(multiples)).max() < 1e-3 and step >= 0.5 * GRID_S:
-        if multiples.max() < 1.5:
-            return time, values
-        grid = time[0] + step * np.arange(round((time[-1] - time[0]) / step) + 1)
-    else:
-        grid = np.append(np.arange(time[0], time[-1], GRID_S), time[-1])
-        grid = np.linspace(time[0], time[-1], len(grid))
-    return grid, np.stack([np.interp(grid, time, v) for v in values.T], axis=-1)
+            return find_movements(self.last[None, [robot, robot]], GRID_S * np.arange(2.0))
+        return movements_of_samples(command[known], time[known])
 
 
 # Where the tools of many robots come to rest after their movements, seen reading by reading.
 
 REST_S = 0.15
 """Time in the same place that shows a tool at rest while it may still be moving [s]."""
-NO_REST = Rest(np.zeros((1, 3)), np.zeros(1, dtype=bool), np.zeros(1, dtype=bool))
 
 
 class MovementTracker:
@@ -156,7 +122,6 @@ class MovementTracker:
         self.samples = SampleBuffer(robots, motors)
         self.references = References.empty(run=robots, motor=motors)
         self.window = MovementWindow.of(model, robots, movements)
-        self.read_s = np.full(robots, -np.inf)
         self._twin, self._settings = model.twin, model.settings
         self._least_step = 0.0 if rate_hz is None else 0.9 / rate_hz
         self._latest_start_s = model.imperfections.timing.late_s[1] + model.lag_s + SETTLING_S
@@ -179,7 +144,7 @@ class MovementTracker:
         for robot in begun:
             self.find_movements(int(robot))
         read = np.flatnonzero(np.isfinite(points).all(axis=1))
-        self.read_s[read] = np.maximum(self.read_s[read], time)
+        self.window.read_s[read] = np.maximum(self.window.read_s[read], time)
         return begun, self.look(read)
 
     def find_movements(self, robot: int) -> None:
@@ -220,8 +185,8 @@ class MovementTracker:
 
     def _present(self, robots: IntArray) -> tuple[Items, FloatArray]:
         """Return the robots that have a movement and readings, which, and when these end [s]."""
-        some = robots[(self.window.count[robots] > 0) & np.isfinite(self.read_s[robots])]
-        return (some, self.window.count[some] - 1), self.read_s[some] + JUST_AFTER_S
+        some = robots[(self.window.count[robots] > 0) & np.isfinite(self.window.read_s[robots])]
+        return (some, self.window.count[some] - 1), self.window.read_s[some] + JUST_AFTER_S
 
     def see_on_way(self, robot: int, place: int) -> None:
         """Note what was read on the way of a movement, until the tool rested."""
@@ -240,7 +205,7 @@ class MovementTracker:
         for place in range(int(self.window.count[robot])):
             if settled.end[robot, place] > since_s:
                 at = np.array([robot]), np.array([place])
-                settled.settle(at, NO_REST)
+                settled.point[at], settled.usable[at], settled.moving[at] = 0.0, False, False
                 self._settle(at, settled.end[at])
                 self.see_on_way(robot, place)
 
@@ -281,7 +246,7 @@ class MovementTracker:
             self._resume(int(at[0][k]), int(at[1][k]))
         delay, now = settled.first_reading_delay[at], settled.movements[at]
         lasts = delay + now.ramp_duration.max(axis=-1) + SETTLING_S
-        over = self.read_s[at[0]] - now.start > lasts
+        over = self.window.read_s[at[0]] - now.start > lasts
         return np.asarray((delay > self._late_after_s) & ~over)
 
     def _resume(self, robot: int, place: int) -> None:
@@ -305,7 +270,7 @@ class MovementTracker:
         seen = (later & settled.usable[before])[:, None]
         rested = np.where(seen, settled.point[before], self._twin.path(told))
         unmoved = np.linalg.norm(point - rested, axis=1) < self._settings.unmoved_m
-        since = self.read_s[robots] - known.start[at]
+        since = self.window.read_s[robots] - known.start[at]
         return np.asarray(unmoved & (since < self._latest_start_s))
 
 

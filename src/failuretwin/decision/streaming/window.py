@@ -29,6 +29,7 @@ class MovementWindow(ArrayStruct):
         count: Movements that there are, (robot,).
         forgotten: Movements that there were before them, (robot,).
         zero_s: When the window begins: with the stream or its oldest movement, (robot,) [s].
+        read_s: When the tool was last read, (robot,) [s].
         settled: Where the tools settled.
         transient: What was read on the way.
         judged: Movements of which `likelihoods` are up to date, (robot, movement).
@@ -38,6 +39,7 @@ class MovementWindow(ArrayStruct):
     count: Annotated[IntArray, Axes("run", empty=0)]
     forgotten: Annotated[IntArray, Axes("run", empty=0)]
     zero_s: Annotated[FloatArray, Axes("run", empty=np.nan)]
+    read_s: Annotated[FloatArray, Axes("run", empty=-np.inf)]
     settled: SettledEvidence
     transient: TransientSamples
     judged: Annotated[BoolArray, Axes("run", "movement", empty=False)]
@@ -52,6 +54,7 @@ class MovementWindow(ArrayStruct):
             count=np.zeros(0, dtype=np.int64),
             forgotten=np.zeros(0, dtype=np.int64),
             zero_s=np.zeros(0),
+            read_s=np.zeros(0),
             settled=settled,
             transient=TransientSamples.empty(run=0, movement=movements, **sizes),
             judged=np.zeros((0, movements), dtype=bool),
