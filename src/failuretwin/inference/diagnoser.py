@@ -1,4 +1,9 @@
-"""Bayesian diagnosis: which hypothesis explains where the tool went, and how surely."""
+"""Bayesian diagnosis: which hypothesis explains where the tool went, and how surely.
+
+    runs -> Evidence -> RunLikelihood -> compute_posterior -> Diagnosis of each run
+
+Section: docs/diagnosis.md#posterior-estimates-and-abstention
+"""
 
 from __future__ import annotations
 
@@ -40,8 +45,8 @@ class BayesDiagnoser:
         twin: Digital twin of the robot.
         imperfections: How the healthy robot differs from it; None: as its profile says.
         hypotheses: What may be the case, as `Hypothesis` or in its text form, such as
-            ``["healthy", "motor_1:stuck", "unknown"]``, with the prior odds of the table of
-            failure modes; None: the paper's classes. A single one is always certain.
+            ``["healthy", "motor_1:stuck", "unknown"]``, with the prior odds of their
+            modes; None: the paper's classes. A single one is always certain.
         priors: Beliefs about onset and size.
         whole_run: Whether readings on the way count beside settled poses, where it is known how
             late this robot starts to move.
