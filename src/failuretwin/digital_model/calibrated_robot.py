@@ -106,14 +106,22 @@ def load_calibration(name_or_path: str | Path | None, robot: Robot) -> Calibrate
     path = _file_of(str(name_or_path or robot.name), robot)
     table = read_toml(path)
     record = _record(table.pop(CALIBRATION_TABLE, {}), path)
-    _check_robot(record.robot, robot, path)
+    if record.robot not in ("", robot.name):
+        raise InputError(
+            f"{path}: is a calibration of robot {record.robot!r}, not of {robot.name!r}. Name the "
+            "right robot (--robot) or calibrate this one."
+        )
     imperfections = _completed(from_table(Imperfections, table, str(path)), len(robot.motors))
     _check_fit(imperfections, robot, path)
     return CalibratedRobot(with_loops(robot, record.loops), imperfections)
 
 
 def _file_of(name_or_path: str, robot: Robot) -> Path:
-    path, known = Path(name_or_path), _known_files(robot)
+    """Return the file of a name: that of the profile or one beside it; or of a path."""
+    path, own = Path(name_or_path), robot.imperfections_file
+    known = {}
+    if own is not None:
+        known = {robot.name: own} | {p.stem: p for p in sorted(own.parent.glob("*.toml"))}
     if name_or_path in known:
         return known[name_or_path]
     if path.suffix != ".toml" and not path.exists():
@@ -123,14 +131,6 @@ def _file_of(name_or_path: str, robot: Robot) -> Path:
             "TOML file, such as `failuretwin calibrate` writes."
         )
     return path
-
-
-def _known_files(robot: Robot) -> dict[str, Path]:
-    """Return the files that go by a name: that of the profile, and those that lie beside it."""
-    own = robot.imperfections_file
-    if own is None:
-        return {}
-    return {robot.name: own} | {path.stem: path for path in sorted(own.parent.glob("*.toml"))}
 
 
 def _completed(imperfections: Imperfections, motors: int) -> Imperfections:
@@ -157,14 +157,6 @@ def _record(table: object, path: Path) -> _Record:
         raise InputError(f"{path}: {CALIBRATION_TABLE} is {table!r}, expected a table.")
     known = {name: table[name] for name in ("robot", "loops") if name in table}
     return from_table(_Record, known, f"{path}: {CALIBRATION_TABLE}")
-
-
-def _check_robot(owner: str, robot: Robot, path: Path) -> None:
-    if owner not in ("", robot.name):
-        raise InputError(
-            f"{path}: is a calibration of robot {owner!r}, not of {robot.name!r}. Name the right "
-            "robot (--robot) or calibrate this one."
-        )
 
 
 def _check_fit(imperfections: Imperfections, robot: Robot, path: Path) -> None:
