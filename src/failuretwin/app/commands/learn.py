@@ -46,9 +46,14 @@ def calibrate(
     """
     del seed  # nothing here depends on chance
     from failuretwin.app.calibration_tables import beats_uncalibrated, print_calibration
-    from failuretwin.app.inputs import learn_loops, read_inputs, split_step_tests, with_step_tests
+    from failuretwin.app.inputs import read_inputs
     from failuretwin.connection.calibration.calibrate import calibrate as learn
     from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
+    from failuretwin.connection.calibration.step_parameters import (
+        learn_loops,
+        split_step_tests,
+        with_step_tests,
+    )
     from failuretwin.digital_model.robot import load_robot
 
     check_calibration_file(out)
