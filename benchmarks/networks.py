@@ -19,7 +19,7 @@ from failuretwin.data_knowledge.generate import simulate
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.decision.learned.networks import NETWORKS
 from failuretwin.decision.learned.storage import load_network, save_network
-from failuretwin.decision.metrics import (
+from failuretwin.decision.scoring_rules import (
     equal_edges,
     log_score,
     log_score_gain,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from failuretwin.app.commands.train import train as command
+from failuretwin.app.commands.learn import train as command
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate

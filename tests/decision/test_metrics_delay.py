@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats import expon
 
 from failuretwin.core.errors import InputError
-from failuretwin.decision.metrics import Share, alarm_threshold, delays_after_onset
+from failuretwin.decision.proportions import Share, alarm_threshold, delays_after_onset
 
 TIME = np.arange(11.0)
 HEALTHY = [0.1, 0.2, 0.1, 0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1]

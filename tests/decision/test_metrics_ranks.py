@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from failuretwin.core.errors import InputError
-from failuretwin.decision.metrics import check_ranks, rank_of_truth
+from failuretwin.decision.scoring_rules import check_ranks, rank_of_truth
 
 DRAWS = 99
 

@@ -20,7 +20,8 @@ from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.failure_modes import plain_name
 from failuretwin.data_knowledge.store import filling
 from failuretwin.decision.evaluation import Evaluation, Judged, as_unknown_line, score_line
-from failuretwin.decision.metrics import Reliability, Share, judged_truth
+from failuretwin.decision.proportions import Share, judged_truth
+from failuretwin.decision.scoring_rules import Reliability
 from failuretwin.digital_model.twin import DigitalTwin
 
 if TYPE_CHECKING:
@@ -32,6 +33,8 @@ MM_PER_M = 1000.0
 TITLE_COLUMNS = 100
 """Letters of the title that fit on one line of the picture."""
 BLUE, RED, GREY = "#1f5f99", "#c8402f", "#9aa3ab"
+SMALL: dict[str, Any] = {"fontsize": 8, "frameon": False}
+"""How legends look."""
 
 
 def figure_class() -> Any:
@@ -47,6 +50,12 @@ def figure_class() -> Any:
             f"pictures need matplotlib ({error}). Install it: pip install 'failuretwin[plots]'."
         ) from error
     return Figure
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of this size [in] that arranges its panels by itself."""
+    made: Figure = figure_class()(figsize=(width, height), layout="constrained")
+    return made
 
 
 def png(figure: Figure) -> str:
@@ -83,25 +92,28 @@ def run_figure(
         measured: Tool path, (time, axis) [m], NaN where there is no sample.
         diagnosis: What was found.
     """
-    figure = figure_class()(figsize=(11.0, 6.2), layout="constrained")
+    figure = new_figure(11.0, 6.2)
     seen = np.asarray(np.isfinite(measured).all(axis=1))
     shown = slice(0, len(time) - int(np.argmax(seen[::-1])) if seen.any() else len(time))
     time, desired, measured = time[shown], MM_PER_M * desired[shown], MM_PER_M * measured[shown]
     dense = seen[shown].mean() > 0.95
-    style = {"ls": "-", "lw": 1.2} if dense else {"ls": "none", "marker": ".", "ms": 4}
+    style: dict[str, Any] = {"lw": 1.2} if dense else {"ls": "none", "marker": ".", "ms": 4}
     grid = figure.add_gridspec(4, 2, width_ratios=[2.1, 1.0])
-    panels = [figure.add_subplot(grid[row, 0]) for row in range(4)]
-    for row, (panel, axis) in enumerate(zip(panels, AXES, strict=False)):
+    *tool, off = (figure.add_subplot(grid[row, 0]) for row in range(4))
+    for row, (panel, axis) in enumerate(zip(tool, AXES, strict=True)):
         panel.plot(time, desired[:, row], color=GREY, lw=2.0, label="commanded")
         panel.plot(time, measured[:, row], color=BLUE, label="measured", **style)
         panel.set_ylabel(f"tool {axis} [mm]")
         panel.tick_params(labelbottom=False)
-    panels[0].legend(
-        loc="lower right", bbox_to_anchor=(1.0, 0.98), fontsize=8, ncols=2, frameon=False
-    )
-    panels[3].plot(time, np.linalg.norm(measured - desired, axis=1), color=RED, **style)
-    _mark_onset(panels[3], diagnosis.onset_s)
-    for panel in panels:
+    tool[0].legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=2, **SMALL)
+    off.plot(time, np.linalg.norm(measured - desired, axis=1), color=RED, **style)
+    off.set(xlabel="time [s]", ylabel="off by [mm]")
+    off.set_ylim(bottom=0.0)
+    if diagnosis.onset_s:
+        off.axvline(diagnosis.onset_s, color="black", lw=1.0, ls="--")
+        place = (diagnosis.onset_s, 0.85)
+        off.annotate(" fault begins", place, xycoords=("data", "axes fraction"), fontsize=8)
+    for panel in (*tool, off):
         panel.set_xlim(-0.02 * time[-1], 1.02 * time[-1])
         clean(panel)
     _plot_posterior(figure.add_subplot(grid[:, 1]), diagnosis)
@@ -111,25 +123,13 @@ def run_figure(
     return figure
 
 
-def _mark_onset(panel: Axes, onset_s: float | None) -> None:
-    panel.set_ylabel("off by [mm]")
-    panel.set_xlabel("time [s]")
-    panel.set_ylim(bottom=0.0)
-    if onset_s:
-        panel.axvline(onset_s, color="black", lw=1.0, ls="--")
-        at = ("data", "axes fraction")
-        panel.annotate(" fault begins", (onset_s, 0.85), xycoords=at, fontsize=8)
-
-
 def _plot_posterior(panel: Axes, diagnosis: Diagnosis) -> None:
     names = list(diagnosis.posterior)[::-1]
     values = [100.0 * diagnosis.posterior[name] for name in names]
     colours = [BLUE if name == diagnosis.diagnosis else GREY for name in names]
     panel.barh(range(len(names)), values, color=colours)
     panel.set_yticks(range(len(names)), [plain(name) for name in names], fontsize=9)
-    panel.set_xlim(0.0, 115.0)
-    panel.set_xticks([0, 50, 100])
-    panel.set_xlabel("probability [%]")
+    panel.set(xlim=(0.0, 115.0), xticks=[0, 50, 100], xlabel="probability [%]")
     for y, value in enumerate(values):
         panel.annotate(f"{value:.1f}", (value + 1.5, y), va="center", fontsize=8)
     panel.set_title("what is wrong?", fontsize=10)
@@ -220,14 +220,11 @@ def write_reliability(evaluation: Evaluation, folder: Path) -> None:
 
 def reliability_figure(bins: Reliability, title: str) -> Figure:
     """Return how often verdicts are right by how sure they are, and how many there are."""
-    figure = figure_class()(figsize=(5.6, 6.4), layout="constrained")
-    grid = figure.add_gridspec(2, 1, height_ratios=[4.0, 1.0])
-    upper = figure.add_subplot(grid[0])
+    figure = new_figure(5.6, 6.4)
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[4.0, 1.0])
     _plot_shares(upper, bins)
-    lower = figure.add_subplot(grid[1], sharex=upper)
     lower.bar(bins.edges[:-1], bins.count, np.diff(bins.edges), align="edge", color=GREY, ec="w")
-    lower.set_xlabel("stated probability of the verdict")
-    lower.set_ylabel("runs")
+    lower.set(xlabel="stated probability of the verdict", ylabel="runs")
     clean(upper)
     clean(lower)
     figure.suptitle(title, fontsize=11)
@@ -251,8 +248,5 @@ def _plot_shares(panel: Axes, bins: Reliability) -> None:
         capsize=3,
         label="share right, 95 % interval",
     )
-    panel.set_xlim(0.0, 1.02)
-    panel.set_ylim(-0.02, 1.02)
-    panel.set_ylabel("share of verdicts that are right")
-    panel.tick_params(labelbottom=False)
-    panel.legend(loc="upper left", fontsize=8, frameon=False)
+    panel.set(xlim=(0.0, 1.02), ylim=(-0.02, 1.02), ylabel="share of verdicts that are right")
+    panel.legend(loc="upper left", **SMALL)

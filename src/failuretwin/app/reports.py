@@ -17,7 +17,7 @@ from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.failure_modes import plain_name
 from failuretwin.data_knowledge.store import replacing
-from failuretwin.decision import metrics
+from failuretwin.decision import proportions, scoring_rules
 from failuretwin.decision.evaluation import (
     Calibration,
     Comparison,
@@ -61,7 +61,7 @@ def _mark(diagnosis: Diagnosis) -> str:
     """Return whether a verdict is right; empty where there is none or the truth is not known."""
     if diagnosis.truth is None or diagnosis.diagnosis is None:
         return ""
-    truth = metrics.judged_truth(diagnosis.truth, diagnosis.posterior)
+    truth = proportions.judged_truth(diagnosis.truth, diagnosis.posterior)
     return "right" if truth == diagnosis.diagnosis else "WRONG"
 
 
@@ -75,7 +75,7 @@ def print_scores(judged: Judged) -> None:
     show("", class_table(judged.scores), "", _confusion_table(judged.scores))
 
 
-def class_table(scores: metrics.Scores) -> Table:
+def class_table(scores: proportions.Scores) -> Table:
     """Return precision, recall and F1 of each class."""
     return figures_table(
         ("class", "runs", "precision", "recall", "F1"),
@@ -86,7 +86,7 @@ def class_table(scores: metrics.Scores) -> Table:
     )
 
 
-def _confusion_table(scores: metrics.Scores) -> Table:
+def _confusion_table(scores: proportions.Scores) -> Table:
     return figures_table(
         ("truth", *(f"({i})" for i in range(len(scores.classes)))),
         [
@@ -123,7 +123,7 @@ def summary_table(evaluation: Evaluation) -> Table:
     scores, alarms = evaluation.scores, evaluation.alarms
     false_alarms = _percent(alarms.false_alarms) + _abstained(alarms.healthy_abstained)
     rows = [
-        ("accuracy", _percent(metrics.Share(scores.right, scores.runs))),
+        ("accuracy", _percent(proportions.Share(scores.right, scores.runs))),
         ("macro-F1", f"{scores.macro_f1:.3f}, mean over the classes that were true of any run"),
         ("false-alarm rate", false_alarms),
         ("missed-detection rate", _percent(alarms.missed) + _abstained(alarms.faulty_abstained)),
@@ -135,7 +135,7 @@ def summary_table(evaluation: Evaluation) -> Table:
     return Table(("Score", _runs_and_protocol(evaluation)), rows, header=False)
 
 
-def _percent(share: metrics.Share) -> str:
+def _percent(share: proportions.Share) -> str:
     """Return a share and its Wilson interval in per cent; a dash for a share of nothing."""
     if not share.total:
         return "-"
@@ -160,10 +160,10 @@ def _calibration_rows(calibration: Calibration) -> list[tuple[str, str]]:
     ]
 
 
-def _reliability_table(bins: metrics.Reliability) -> Table:
+def _reliability_table(bins: scoring_rules.Reliability) -> Table:
     rows = []
     for i in np.flatnonzero(bins.count):
-        right = metrics.Share(int(bins.right[i]), int(bins.count[i]))
+        right = proportions.Share(int(bins.right[i]), int(bins.count[i]))
         low, high = right.interval
         edges = f"{bins.edges[i]:.1f} to {bins.edges[i + 1]:.1f}"
         ratios = f"{bins.confidence[i]:.3f}", f"{right.value:.3f}", f"{low:.3f} to {high:.3f}"
@@ -175,7 +175,7 @@ def _reliability_table(bins: metrics.Reliability) -> Table:
     )
 
 
-def coverage_table(coverage: Sequence[metrics.Coverage]) -> Table:
+def coverage_table(coverage: Sequence[proportions.Coverage]) -> Table:
     """Return a row for each quantity of each fault mode."""
     rows = []
     for row in coverage:
@@ -210,7 +210,7 @@ def comparison_rows(comparison: Comparison) -> list[tuple[str, str]]:
     return rows + _gain_rows(comparison.gain)
 
 
-def _gain_rows(gain: metrics.LogScoreGain) -> list[tuple[str, str]]:
+def _gain_rows(gain: scoring_rules.LogScoreGain) -> list[tuple[str, str]]:
     rows = []
     if gain.first_impossible or gain.second_impossible or gain.both_impossible:
         impossible = (

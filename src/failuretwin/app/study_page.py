@@ -12,7 +12,7 @@ import numpy as np
 
 from failuretwin import __version__
 from failuretwin.app import plots
-from failuretwin.app.plots import BLUE, GREY, MM_PER_M, RED
+from failuretwin.app.plots import BLUE, GREY, MM_PER_M, RED, SMALL
 from failuretwin.app.study import (
     FEATURES,
     PRINTED_RATE,
@@ -133,7 +133,7 @@ def training_figure(
 
     The published accuracies are lines in the panel of augmented features.
     """
-    figure = plots.figure_class()(figsize=(11.0, 4.2), layout="constrained")
+    figure = plots.new_figure(11.0, 4.2)
     panels = figure.subplots(1, len(FEATURES), sharey=True)
     for panel, features in zip(panels, FEATURES, strict=True):
         repeats = of_kind(trainings, features, learning_rate)
@@ -152,11 +152,10 @@ def training_figure(
             if features == "augmented":
                 panel.axhline(100.0 * TABLE_2[name].mean, color=COLOURS[name], lw=0.8, ls=":")
         panel.set_title(f"{features} features", fontsize=10)
-        panel.set_xlabel("iterations")
-        panel.set_ylim(0.0, 102.0)
+        panel.set(xlabel="iterations", ylim=(0.0, 102.0))
         plots.clean(panel)
     panels[0].set_ylabel("right [%]")
-    panels[0].legend(loc="lower right", fontsize=8, frameon=False)
+    panels[0].legend(loc="lower right", **SMALL)
     return figure
 
 
@@ -166,7 +165,7 @@ def path_figure(runs: xr.Dataset, run: int, twin: DigitalTwin) -> Figure:
     measured = as_floats(runs["measured"].values[run])
     simulated = twin.path(twin.respond(as_floats(runs["command"].values[run]), time))
     seen = np.isfinite(measured).all(axis=1)
-    figure = plots.figure_class()(figsize=(11.0, 5.4), layout="constrained")
+    figure = plots.new_figure(11.0, 5.4)
     panels = figure.subplots(2, len(AXES), sharex=True)
     for column, axis in enumerate(AXES):
         upper, lower = panels[:, column]
@@ -178,7 +177,7 @@ def path_figure(runs: xr.Dataset, run: int, twin: DigitalTwin) -> Figure:
         lower.set_xlabel("time [s]")
         plots.clean(upper)
         plots.clean(lower)
-    panels[0, 0].legend(fontsize=8, frameon=False)
+    panels[0, 0].legend(**SMALL)
     panels[1, 0].set_ylabel("residual [mm]")
     return figure
 
@@ -190,7 +189,7 @@ def confusion_figure(shares: Mapping[str, FloatArray], classes: Sequence[str]) -
         shares: Share of each truth that got each diagnosis, by title, (truth, diagnosis).
         classes: Names of the classes.
     """
-    figure = plots.figure_class()(figsize=(6.0 * len(shares), 5.6), layout="constrained")
+    figure = plots.new_figure(6.0 * len(shares), 5.6)
     panels = figure.subplots(1, len(shares), sharey=True, squeeze=False)[0]
     for panel, (title, share) in zip(panels, shares.items(), strict=True):
         panel.imshow(np.nan_to_num(share), vmin=0.0, vmax=1.0, cmap="Blues")

@@ -13,7 +13,7 @@ from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expecta
 from failuretwin.decision.learned.log_pool import HybridDiagnoser, fit_pool_weights
 from failuretwin.decision.learned.networks import Standard
 from failuretwin.decision.learned.training_data import Stream, TrainingData, widened
-from failuretwin.decision.metrics import log_score
+from failuretwin.decision.scoring_rules import log_score
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot

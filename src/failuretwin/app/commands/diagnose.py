@@ -21,7 +21,6 @@ from failuretwin.app.commands.options import (
 @click.option(
     "--method",
     default="bayes",
-    show_default=True,
     metavar="bayes|MODEL|bayes+MODEL|module:Class",
     help="How to diagnose: by Bayes' rule, by a network that `train` wrote, by both, or by a class "
     "of your own.",

@@ -45,7 +45,7 @@ def calibrate(
     folders that hold some) add servo loops and speed limits.
     """
     del seed  # nothing here depends on chance
-    from failuretwin.app.calibration_tables import beats_uncalibrated, print_calibration
+    from failuretwin.app.calibration_report import print_calibration
     from failuretwin.app.inputs import read_inputs
     from failuretwin.connection.calibration.calibrate import calibrate as learn
     from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
@@ -73,7 +73,7 @@ def calibrate(
     save_calibration(found, model, out)
     print_calibration(found, model)
     click.echo(f"written to {out}")
-    if beats_uncalibrated(found) is not False:
+    if found.beats_uncalibrated is not False:
         click.echo(f"use it with `failuretwin diagnose --calibration {out}`")
 
 
@@ -84,14 +84,12 @@ def calibrate(
     "--network",
     type=click.Choice(["cnn", "motorwise", "lstm"]),
     default="cnn",
-    show_default=True,
     help="A convolutional network, one that looks at every motor alike, or the paper's LSTM.",
 )
 @click.option(
     "--iterations",
     type=click.IntRange(min=1),
     default=6000,
-    show_default=True,
     help="Batches of 64 runs to learn from.",
 )
 @common_options

@@ -13,7 +13,7 @@ import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.decision.metrics.scoring_rules import LogScore, log_score
+from failuretwin.decision.scoring_rules import LogScore, log_score
 
 Z_95 = 1.959963984540054
 """Two-sided 95 % point of the normal distribution."""
