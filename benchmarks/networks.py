@@ -46,7 +46,8 @@ def train_missing(folder: Path, robot: Robot, seeds: int, iterations: int) -> No
                     TrainingPlan(name, iterations, seed), robot, imperfections
                 )
                 save_network(diagnoser, path)
-                print(f"{name} seed {seed}: {found}", flush=True)
+                said = f"{found.accuracy:.4f} right, {found.log_score:.4f} nats a run"
+                print(f"{name} seed {seed}: {said}", flush=True)
 
 
 def judged(diagnoses: Sequence[Diagnosis]) -> tuple[float, float, float]:

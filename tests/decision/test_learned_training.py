@@ -20,8 +20,7 @@ from failuretwin.decision.learned.networks import (
     shuffled_batches,
     training,
 )
-from failuretwin.decision.learned.training_data import VARIANTS, TrainingData, widened
-from failuretwin.decision.training import TrainingPlan, train
+from failuretwin.decision.training import VARIANTS, TrainingData, TrainingPlan, train, widened
 
 SHAPE = Shape(channels=10, classes=3, motors=2, shared=2)
 ALL = pytest.mark.parametrize("name", list(NETWORKS))

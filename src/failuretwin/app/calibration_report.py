@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -385,8 +385,6 @@ def write_calibration_page(
     """Write `index.html` into an existing folder; the runs are those learned from or judged on."""
     units, better = robot.profile.servo_units, found.beats_uncalibrated
     left_out = [(e.run, str(e.movement or "all"), f"{e.motor} {e.reason}") for e in found.left_out]
-    seen, settling = predict(found, runs, robot), settling_of(found, robot)
-    ramp = example_transient(found, runs, robot)
     text = render_page(
         "calibration.html.j2",
         {
@@ -394,24 +392,21 @@ def write_calibration_page(
             "robot": robot.name,
             "verdict": verdict_line(found).rstrip("."),
             "grade": "unknown" if better is None else "good" if better else "bad",
-            "facts": _facts(found, settling),
+            "facts": _facts(found, settling_of(found, robot).payload),
             "sessions": held_out_table(found, robot),
             "groups": parameter_groups(found, robot),
             "count_deg": None if units is None else units.deg_per_count,
             "left_out": Table(("run", "movement", "why"), left_out),
             "left_out_line": left_out_line(found),
-            "pictures": _pictures(found, seen, settling, ramp, robot),
-            "unseen": seen.unseen,
-            "dof": settling.tail_dof,
-            "ramp": ramp,
+            **_pictures(found, runs, robot),
         },
     )
     (folder / "index.html").write_text(text, encoding="utf-8")
 
 
-def _facts(found: Calibration, settling: Settling) -> Table:
+def _facts(found: Calibration, payload: float) -> Table:
     way = "the motors' own readings" if found.used_readings else "the tool path alone"
-    payload, protocol = settling.payload, found.imperfections.protocol
+    protocol = found.imperfections.protocol
     rows = [
         ("learned from", found.imperfections.source),
         ("sessions", f"{len(found.sessions)}: {', '.join(found.sessions)}"),
@@ -423,14 +418,10 @@ def _facts(found: Calibration, settling: Settling) -> Table:
     return Table(("", ""), rows, header=False)
 
 
-def _pictures(
-    found: Calibration,
-    seen: Predictions,
-    settling: Settling,
-    ramp: ExampleTransient | None,
-    robot: Robot,
-) -> dict[str, str]:
-    """Return those pictures that there is something to show in, by name."""
+def _pictures(found: Calibration, runs: xr.Dataset, robot: Robot) -> dict[str, Any]:
+    """Return those pictures that there is something to show in, by name, and what they are of."""
+    seen, settling = predict(found, runs, robot), settling_of(found, robot)
+    ramp = example_transient(found, runs, robot)
     figures = {}
     if found.held_out:
         figures["sessions"] = session_figure(found.held_out, robot, found.used_readings)
@@ -441,4 +432,5 @@ def _pictures(
             figures["load"] = load_figure(seen, settling, robot)
     if ramp is not None:
         figures["ramp"] = ramp_figure(ramp, robot)
-    return {name: png(figure) for name, figure in figures.items()}
+    pictures = {name: png(figure) for name, figure in figures.items()}
+    return {"pictures": pictures, "unseen": seen.unseen, "dof": settling.tail_dof, "ramp": ramp}

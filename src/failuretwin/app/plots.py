@@ -86,11 +86,8 @@ def run_figure(
 ) -> Figure:
     """Return the picture of one run: each axis, the distance, and the posterior.
 
-    Args:
-        time: (time,) [s].
-        desired: Path that the commands ask for, (time, axis) [m].
-        measured: Tool path, (time, axis) [m], NaN where there is no sample.
-        diagnosis: What was found.
+    The path that the commands ask for and the one measured are (time, axis) [m], the latter NaN
+    where there is no sample.
     """
     figure = new_figure(11.0, 6.2)
     seen = np.asarray(np.isfinite(measured).all(axis=1))
@@ -173,7 +170,8 @@ def write_page(
     judged = Judged.of(diagnoses)
     values = {
         "runs": [
-            (d, *_truth_cell(d), _embedded(p)) for d, p in zip(diagnoses, pictures, strict=True)
+            (d, *_truth_cell(d), base64.b64encode(p.read_bytes()).decode("ascii"))
+            for d, p in zip(diagnoses, pictures, strict=True)
         ],
         "robot": robot,
         "method": diagnoses[0].method,
@@ -192,10 +190,6 @@ def _truth_cell(diagnosis: Diagnosis) -> tuple[str, bool]:
         return "", False
     truth = judged_truth(diagnosis.truth, diagnosis.posterior)
     return plain(diagnosis.truth), truth != diagnosis.diagnosis
-
-
-def _embedded(picture: Path) -> str:
-    return base64.b64encode(picture.read_bytes()).decode("ascii")
 
 
 # Picture of the reliability diagram.

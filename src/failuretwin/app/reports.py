@@ -207,11 +207,7 @@ def comparison_rows(comparison: Comparison) -> list[tuple[str, str]]:
     if a or b:
         unknown = f"by A {a} runs, by B {b}: their truth is not among its hypotheses"
         rows.append(("judged as unknown", unknown))
-    return rows + _gain_rows(comparison.gain)
-
-
-def _gain_rows(gain: scoring_rules.LogScoreGain) -> list[tuple[str, str]]:
-    rows = []
+    gain = comparison.gain
     if gain.first_impossible or gain.second_impossible or gain.both_impossible:
         impossible = (
             f"only by A in {gain.first_impossible} runs, only by B in {gain.second_impossible}, by "
@@ -290,19 +286,15 @@ def _left_out_lines(others: Sequence[Hypothesis]) -> list[str]:
     pairs = sum(len(h.faults) > 1 for h in others)
     names = [f"{pairs} pair{'s' * (pairs > 1)} of faults"] * (pairs > 0)
     names += [str(h) for h in others if not h.known]
-    if not names:
-        return []
-    return [f"what motions tell apart is said of single faults only, not of {' and '.join(names)}"]
+    said = "what motions tell apart is said of single faults only, not of "
+    return [said + " and ".join(names)] * bool(names)
 
 
 def group_lines(found: IsolabilityReport) -> list[str]:
     """Return the groups, with the sizes at which their faults look alike."""
-    groups = [
-        " or ".join(_name(name, found.typical.get(name)) for name in group)
-        for group in found.groups
-    ]
-    if not groups:
+    if not found.groups:
         return []
+    groups = (" or ".join(_name(n, found.typical.get(n)) for n in group) for group in found.groups)
     sized = any(name in found.typical for group in found.groups for name in group)
     when = " when faults are as large as this" if sized else ""
     return [f"cannot be told apart by such motions{when}: {'; '.join(groups)}"]

@@ -46,12 +46,7 @@ class RunTruth:
 
 @dataclass(frozen=True)
 class Truths:
-    """The truth of the runs of a run set.
-
-    Attributes:
-        name: What to call the run set in errors, such as its path.
-        by_run: By the name of the run.
-    """
+    """The truth of the runs of a run set, by their names; `name` is what errors call the set."""
 
     name: str
     by_run: Mapping[str, RunTruth]
@@ -197,12 +192,9 @@ def as_unknown_line(judged: Judged) -> str:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibration of the probability of the most probable hypothesis.
+    """Calibration of the verdict's probability, in bins of equal width and of about equal counts.
 
-    Attributes:
-        equal: Bins of equal width.
-        adaptive: Bins of about as many runs each.
-        by_chance: Errors that a perfectly calibrated method would show in `equal`, (draw,).
+    By chance alone, a perfectly calibrated method would show these errors in `equal`, (draw,).
     """
 
     equal: scoring_rules.Reliability
@@ -309,11 +301,9 @@ def _intervals(judged: Judged, truths: Truths) -> Iterator[proportions.IntervalC
 
 @dataclass(frozen=True)
 class Comparison:
-    """What two methods say of the same runs.
+    """What two methods, by name and protocol, say of the same runs.
 
     Attributes:
-        first: Name and protocol of the first.
-        second: Name and protocol of the second.
         split: Which runs they got right.
         gain: Nats a run that the second saves.
         as_unknown: Runs that the first and the second judge as `unknown`, since the truth is not

@@ -47,23 +47,19 @@ def calibrate(
     del seed  # nothing here depends on chance
     from failuretwin.app.calibration_report import print_calibration
     from failuretwin.app.inputs import read_inputs
+    from failuretwin.connection.calibration import step_parameters
     from failuretwin.connection.calibration.calibrate import calibrate as learn
     from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
-    from failuretwin.connection.calibration.step_parameters import (
-        learn_loops,
-        split_step_tests,
-        with_step_tests,
-    )
     from failuretwin.digital_model.robot import load_robot
 
     check_calibration_file(out)
-    tests, others = split_step_tests(logs, reading.columns)
-    steps = learn_loops(tests, load_robot(robot))
+    tests, others = step_parameters.split_step_tests(logs, reading.columns)
+    steps = step_parameters.learn_loops(tests, load_robot(robot))
     model = steps.robot
     runs = read_inputs(others, model, reading)
     source = ", ".join(str(log) for log in logs)
     found = learn(runs, model, name or out.stem, source, hold_out)
-    found = with_step_tests(found, steps)
+    found = step_parameters.with_step_tests(found, steps)
     if report is not None:
         from failuretwin.app.calibration_report import write_calibration_page
         from failuretwin.data_knowledge.store import filling
@@ -122,9 +118,10 @@ def train(
         )
     save_network(diagnoser, out)
     click.echo(
-        f"of {alone.runs} simulated runs of the physics engine {100.0 * alone.right:.1f} % right, "
-        f"log score {alone.log_score:.3f} nats a run, temperature {diagnoser.temperature_:.2f}; "
-        f"blended with Bayes {100.0 * both.right:.1f} %, {both.log_score:.3f} nats"
+        f"of {alone.runs} simulated runs of the physics engine {100.0 * alone.accuracy:.1f} % "
+        f"right, log score {alone.log_score:.3f} nats a run, "
+        f"temperature {diagnoser.temperature_:.2f}; "
+        f"blended with Bayes {100.0 * both.accuracy:.1f} %, {both.log_score:.3f} nats"
     )
     click.echo(f"written to {out}; use it with `failuretwin diagnose --method {out}`")
     click.echo(f"or together with Bayes: --method bayes+{out}")

@@ -37,13 +37,7 @@ def log_pool(bayes: FloatArray, network: FloatArray, weights: PoolWeights) -> Fl
 
 
 def gated(bayes: FloatArray, network: FloatArray, healthy: int) -> FloatArray:
-    """Return probabilities (run, class): of healthy by the first, of faults by the second.
-
-    Args:
-        bayes: (run, class).
-        network: (run, class).
-        healthy: Number of the healthy class.
-    """
+    """Return probabilities (run, class): of class `healthy` by Bayes, of others by the network."""
     faults = np.maximum(network, LEAST)
     faults[:, healthy] = 0.0
     rest = 1.0 - bayes[:, [healthy]]
@@ -53,12 +47,9 @@ def gated(bayes: FloatArray, network: FloatArray, healthy: int) -> FloatArray:
 
 
 def fit_pool_weights(bayes: FloatArray, network: FloatArray, truth: IntArray) -> PoolWeights:
-    """Return the weights of the best mean log score.
+    """Return the weights of the best mean log score of some runs.
 
-    Args:
-        bayes: Probabilities of simulated runs by the model, (run, class).
-        network: The same by the network.
-        truth: Number of the true class, (run,).
+    Takes the probabilities by either part, (run, class), and the number of the true class, (run,).
     """
     from scipy.optimize import minimize
 
