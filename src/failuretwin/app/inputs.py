@@ -12,7 +12,7 @@ import click
 
 from failuretwin.app.commands.options import LogOptions
 from failuretwin.core.config import from_table, read_toml
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.core.hypothesis import Hypothesis, parse_hypotheses
 from failuretwin.data_knowledge.bags.read import BagTopics
 from failuretwin.data_knowledge.column_guess import column_map_text, guess_columns
@@ -99,14 +99,9 @@ def _with_map(
 
 def check_learning() -> None:
     """Raise InputError, saying how to install them, if the learning libraries are missing."""
-    try:
+    with needs_extra("networks need PyTorch and scikit-learn", "learn"):
         import sklearn
         import torch
-    except ImportError as error:
-        raise InputError(
-            f"networks need PyTorch and scikit-learn ({error}). Install them: "
-            "pip install 'failuretwin[learn]'."
-        ) from error
     del sklearn, torch
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from failuretwin import __version__
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import AXES, unique_names
 from failuretwin.core.types import FloatArray, as_floats
@@ -43,12 +43,8 @@ def figure_class() -> Any:
     Raises:
         InputError: If matplotlib is missing.
     """
-    try:
+    with needs_extra("pictures need matplotlib", "plots"):
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise InputError(
-            f"pictures need matplotlib ({error}). Install it: pip install 'failuretwin[plots]'."
-        ) from error
     return Figure
 
 
@@ -152,12 +148,8 @@ def render_page(template: str, values: Mapping[str, Any]) -> str:
     Raises:
         InputError: If jinja2 is missing.
     """
-    try:
+    with needs_extra("pictures need jinja2", "plots"):
         from jinja2 import Environment, PackageLoader, StrictUndefined
-    except ImportError as error:
-        raise InputError(
-            f"pictures need jinja2 ({error}). Install it: pip install 'failuretwin[plots]'."
-        ) from error
     loader = PackageLoader("failuretwin.app", "")
     pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
     return pages.get_template(template).render(values)
@@ -206,8 +198,7 @@ def write_reliability(evaluation: Evaluation, folder: Path) -> None:
     """
     if evaluation.calibration is None:
         raise InputError("no run got a verdict, so there is no reliability to draw.")
-    title = f"{evaluation.scores.runs} runs, protocol {evaluation.judged.protocol}"
-    figure = reliability_figure(evaluation.calibration.equal, title)
+    figure = reliability_figure(evaluation.calibration.equal, evaluation.runs_and_protocol)
     with filling(folder) as partial:
         figure.savefig(partial / NAME, dpi=130)
 

@@ -103,7 +103,7 @@ def _confusion_table(scores: proportions.Scores) -> Table:
 def print_evaluation(evaluation: Evaluation, truth_given: bool) -> None:
     """Print every score; without a run set given, no true onset or magnitude can be known."""
     print_scores(evaluation.judged)
-    show(f"\n{_runs_and_protocol(evaluation, 'all ')}", summary_table(evaluation))
+    show(f"\nall {evaluation.runs_and_protocol}", summary_table(evaluation))
     if evaluation.calibration is not None:
         show("", _reliability_table(evaluation.calibration.equal))
     if evaluation.coverage:
@@ -112,10 +112,6 @@ def print_evaluation(evaluation: Evaluation, truth_given: bool) -> None:
         show("\ncoverage of intervals: the truth names no onset or magnitude of a fault found")
     else:
         show("\ncoverage of intervals: needs true onsets and magnitudes, give --truth RUNS")
-
-
-def _runs_and_protocol(evaluation: Evaluation, first: str = "") -> str:
-    return f"{first}{evaluation.scores.runs} runs, protocol {evaluation.judged.protocol}"
 
 
 def summary_table(evaluation: Evaluation) -> Table:
@@ -132,7 +128,7 @@ def summary_table(evaluation: Evaluation) -> Table:
     ]
     if evaluation.calibration is not None:
         rows += _calibration_rows(evaluation.calibration)
-    return Table(("Score", _runs_and_protocol(evaluation)), rows, header=False)
+    return Table(("Score", evaluation.runs_and_protocol), rows, header=False)
 
 
 def _percent(share: proportions.Share) -> str:

@@ -225,6 +225,11 @@ class Evaluation:
         """Right, wrong and the log score."""
         return self.judged.scores
 
+    @property
+    def runs_and_protocol(self) -> str:
+        """What was judged, in words."""
+        return f"{self.scores.runs} runs, protocol {self.judged.protocol}"
+
 
 def evaluate(
     results: Given,

@@ -28,7 +28,7 @@ from torch.fx.passes.shape_prop import ShapeProp
 
 from failuretwin import __version__
 from failuretwin.core.config import fingerprint, from_table
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.data_knowledge.store import reason, replacing
 from failuretwin.decision.learned.diagnoser import LearnedDiagnoser, network_shape
 from failuretwin.decision.learned.feature_encoder import (
@@ -325,13 +325,9 @@ def export_onnx(diagnoser: LearnedDiagnoser, path: Path) -> None:
         InputError: If onnx is missing.
         OutputError: If it cannot be written.
     """
-    try:
+    with needs_extra("ONNX files need onnx", "learn"):
         import onnx
         from onnx import TensorProto, helper, numpy_helper
-    except ImportError as error:
-        raise InputError(
-            f"ONNX files need onnx ({error}). Install it: pip install 'failuretwin[learn]'."
-        ) from error
     made = _record(diagnoser)
     channels, classes = len(diagnoser.standard_.mean), len(diagnoser.classes_)
     model = helper.make_model(
