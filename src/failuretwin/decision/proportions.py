@@ -264,50 +264,56 @@ ISOLATED = 0.5
 
 
 @dataclass(frozen=True)
-class Delays:
-    """Delays of the faulty runs, in their order.
+class CensoredDelays:
+    """From onset to an event in the faulty runs, in their order.
 
     Attributes:
-        threshold: An alarm is a probability of any fault above this.
-        false_alarms: Healthy runs that alarm with it, of all healthy runs.
-        detection: From onset to alarm, (faulty run,) [s]; infinite: none before the run ended; NaN:
-            the alarm came before the onset, which is a false alarm and no delay.
-        isolation: From onset to the first alarm with the right fault in front, (faulty run,) [s];
-            infinite and NaN as above.
+        delay: (faulty run,) [s]; infinite: no event before the run ended; NaN: an alarm came before
+            the onset, which is a false alarm and no delay.
         followed: From onset to the end of the run, (faulty run,) [s]: a delay that is infinite is
             only known to be longer than this.
     """
 
-    threshold: float
-    false_alarms: Share
-    detection: FloatArray
-    isolation: FloatArray
+    delay: FloatArray
     followed: FloatArray
 
     @property
-    def early(self) -> Share:
-        """Faulty runs with an alarm before the onset, of all faulty runs."""
-        return Share(int(np.isnan(self.detection).sum()), len(self.detection))
+    def never(self) -> Share:
+        """Runs that ended without the event, of those without an early alarm."""
+        return Share(int(np.isinf(self.delay).sum()), int((~np.isnan(self.delay)).sum()))
 
     @property
-    def undetected(self) -> Share:
-        """Runs that ended without an alarm, of those without an early one."""
-        return _never(self.detection)
+    def median(self) -> float:
+        """Where the product-limit curve falls to one half (Kaplan & Meier, JASA 1958) [s].
 
-    @property
-    def unisolated(self) -> Share:
-        """Runs that ended without the right fault in front, of those without an early alarm."""
-        return _never(self.isolation)
+        Infinite where it never does; NaN where there is no run.
+        """
+        from scipy.stats import CensoredData, ecdf
 
-    @property
-    def median_detection(self) -> float:
-        """Median delay of detection [s], runs that ended too soon counted as censored."""
-        return _median(self.detection, self.followed)
+        ended = np.isinf(self.delay)
+        if self.never.count == self.never.total:
+            return float("inf") if self.never.total else float("nan")
+        data = CensoredData(self.delay[np.isfinite(self.delay)], right=self.followed[ended])
+        curve = ecdf(data).sf
+        low = curve.probabilities <= 0.5 + 1e-12
+        return float(curve.quantiles[low.argmax()]) if low.any() else float("inf")
 
-    @property
-    def median_isolation(self) -> float:
-        """Median delay of isolation [s], runs that ended too soon counted as censored."""
-        return _median(self.isolation, self.followed)
+
+@dataclass(frozen=True)
+class Delays:
+    """How soon faults are noticed (`detection`) and the right one is in front (`isolation`).
+
+    Attributes:
+        threshold: An alarm is a probability of any fault above this.
+        false_alarms: Healthy runs that alarm with it, of all healthy runs.
+        early: Faulty runs with an alarm before the onset, of all faulty runs.
+    """
+
+    threshold: float
+    false_alarms: Share
+    early: Share
+    detection: CensoredDelays
+    isolation: CensoredDelays
 
 
 def alarm_threshold(healthy: FloatArray, share: float) -> float:
@@ -358,12 +364,13 @@ def delays_after_onset(
     faulty, began = ~healthy, onset[~healthy]
     early = np.any(alarm[faulty] & (time < began[:, None]), axis=1)
     answered = np.where(np.isnan(fault[faulty]), -np.inf, time).max(axis=1)
+    followed = np.maximum(answered - began, 0.0)
+    first = (_first_after(time, event[faulty], began, early) for event in (alarm, named))
     return Delays(
-        threshold=threshold,
-        false_alarms=Share(int(alarm[healthy].any(axis=1).sum()), int(healthy.sum())),
-        detection=_first_after(time, alarm[faulty], began, early),
-        isolation=_first_after(time, named[faulty], began, early),
-        followed=np.maximum(answered - began, 0.0),
+        threshold,
+        Share(int(alarm[healthy].any(axis=1).sum()), int(healthy.sum())),
+        Share(int(early.sum()), len(early)),
+        *(CensoredDelays(delay, followed) for delay in first),
     )
 
 
@@ -373,27 +380,3 @@ def _first_after(
     """Return the time from each onset to the first event at or after it [s]."""
     at = np.where(event & (time >= onset[:, None]), time, np.inf).min(axis=1)
     return np.where(early, np.nan, at - onset)
-
-
-def _never(delay: FloatArray) -> Share:
-    valid = delay[~np.isnan(delay)]
-    return Share(int(np.isinf(valid).sum()), len(valid))
-
-
-def _median(delay: FloatArray, followed: FloatArray) -> float:
-    """Return where the product-limit curve falls to one half (Kaplan & Meier, JASA 1958) [s].
-
-    Infinite where it never does; NaN where there is no run.
-    """
-    from scipy.stats import CensoredData, ecdf
-
-    valid = ~np.isnan(delay)
-    ended = valid & np.isinf(delay)
-    if not valid.any():
-        return float("nan")
-    if ended.sum() == valid.sum():
-        return float("inf")
-    data = CensoredData(uncensored=delay[valid & ~ended], right=followed[ended])
-    curve = ecdf(data).sf
-    low = curve.probabilities <= 0.5 + 1e-12
-    return float(curve.quantiles[low.argmax()]) if low.any() else float("inf")

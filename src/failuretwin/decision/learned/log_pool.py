@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     import xarray as xr
 
 HEALTHY = "healthy"
+UNSIZED: dict[str, Any] = dict.fromkeys(
+    ("onset_s", "onset_90", "magnitude", "magnitude_unit", "magnitude_90")
+)
+"""What is not known of a fault that only the network names."""
 LEAST = 1e-300
 """Probabilities that have underflowed count as this, so that a logarithm of them exists."""
 
@@ -115,12 +119,5 @@ class HybridDiagnoser:
             f"{network.method}",
         )
         if joined.diagnosis != bayes.diagnosis:
-            joined = replace(
-                joined,
-                onset_s=None,
-                onset_90=None,
-                magnitude=None,
-                magnitude_unit=None,
-                magnitude_90=None,
-            )
+            joined = replace(joined, **UNSIZED)
         return worded(joined, [Hypothesis.parse(name) for name in joined.ranked])
