@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,13 +19,14 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import truth_of
 from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.data_knowledge.read import RunsLike, as_runs
 from failuretwin.decision import proportions, scoring_rules
-from failuretwin.decision.results import Record, Results, some_names
+from failuretwin.decision.results import Record, Results, read_results, some_names
 
 if TYPE_CHECKING:
     import xarray as xr
 
-Given = Results | Iterable[Diagnosis | Record]
+Given = Results | Iterable[Diagnosis | Record] | str | Path
 
 # What was true of the runs, where a run set or a log knows it.
 
@@ -147,7 +149,9 @@ class Judged:
 
 
 def as_results(given: Given, name: str = "the results") -> Results:
-    """Return diagnoses with a name; those that have one keep it."""
+    """Return diagnoses with a name; those that have one keep it, a path is read."""
+    if isinstance(given, str | Path):
+        return read_results(Path(given))
     return given if isinstance(given, Results) else Results(name, tuple(given))
 
 
@@ -233,14 +237,15 @@ class Evaluation:
 
 def evaluate(
     results: Given,
-    truth: xr.Dataset | Truths | None = None,
+    truth: RunsLike | Truths | None = None,
     rng: np.random.Generator | None = None,
 ) -> Evaluation:
     """Return all scores of the diagnoses whose truth is known.
 
     Args:
-        results: Diagnoses, as a diagnoser returns them or `read_results` reads them.
-        truth: Run set that knows the truth; None: what the diagnoses themselves say. Without it
+        results: Diagnoses, as a diagnoser returns them or `read_results` reads them, or the path
+            of such a file.
+        truth: Run set that knows the truth, or where it is; None: what the diagnoses say. Without it
             nothing is known of the coverage of intervals.
         rng: Source of chance, for the calibration error that chance alone would show; None: seed 0.
 
@@ -267,8 +272,10 @@ def _no_truth(name: str) -> InputError:
     )
 
 
-def _truths(given: xr.Dataset | Truths | None) -> Truths | None:
-    return given if given is None or isinstance(given, Truths) else Truths.of(given)
+def _truths(given: RunsLike | Truths | None) -> Truths | None:
+    if given is None or isinstance(given, Truths):
+        return given
+    return Truths.of(as_runs(given))
 
 
 def _calibration(judged: Judged, rng: np.random.Generator) -> Calibration | None:
@@ -331,7 +338,7 @@ class Comparison:
 def compare(
     first: Given,
     second: Given,
-    truth: xr.Dataset | Truths | None = None,
+    truth: RunsLike | Truths | None = None,
     rng: np.random.Generator | None = None,
 ) -> Comparison:
     """Compare two methods run by run, matched by run name, each by its own hypotheses.

@@ -34,7 +34,7 @@ from failuretwin.decision.learned.feature_encoder import (
 from failuretwin.decision.learned.log_pool import HybridDiagnoser, fit_pool_weights
 from failuretwin.decision.learned.networks import Batch, Standard, epoch
 from failuretwin.decision.proportions import Scores
-from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
 from failuretwin.digital_model.nonidealities import SETTLING_LISTS, Imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
@@ -287,8 +287,8 @@ class TrainingPlan:
 
 
 def train(
-    robot: Robot,
-    imperfections: Imperfections | None = None,
+    robot: RobotLike = "armpi_fpv",
+    imperfections: HealthyLike = None,
     plan: TrainingPlan = TrainingPlan(),
     *,
     with_bayes: bool = False,
@@ -301,13 +301,11 @@ def train(
     Its healthy behaviour is that of some imperfections, such as a calibration; None: as its profile
     says. The pool with the Bayesian diagnosis has fitted weights.
     """
-    if imperfections is None:
-        known = load_calibration(None, robot)
-        robot, imperfections = known.robot, known.imperfections
-    network, _, _ = train_network(plan, robot, imperfections)
+    known = calibrated(robot, imperfections)
+    network, _, _ = train_network(plan, known.robot, known.imperfections)
     if not with_bayes:
         return network
-    bayes = BayesDiagnoser(DigitalTwin(robot), imperfections)
+    bayes = BayesDiagnoser(known)
     return HybridDiagnoser(bayes, network, network.weights_)
 
 

@@ -19,7 +19,7 @@ from failuretwin.digital_model.nonidealities import (
     Imperfections,
     generic_imperfections,
 )
-from failuretwin.digital_model.robot import Motor, Robot
+from failuretwin.digital_model.robot import Motor, Robot, load_robot
 from failuretwin.digital_model.servo import ServoLoop
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -68,6 +68,30 @@ class CalibratedRobot:
     def twin(self) -> DigitalTwin:
         """Digital twin with the calibrated servo loops."""
         return DigitalTwin(self.robot)
+
+
+RobotLike = DigitalTwin | CalibratedRobot | Robot | str | Path
+"""A robot in any form: a twin, what a calibration made of it, or a bundled name or profile."""
+HealthyLike = Imperfections | str | Path | None
+"""What a healthy robot does: figures, the name or path of a calibration, None: by its profile."""
+
+
+def calibrated(robot: RobotLike, healthy: HealthyLike = None) -> CalibratedRobot:
+    """Return a robot with what is known of it, whatever form both are given in.
+
+    Args:
+        robot: The robot; a `CalibratedRobot` is returned as it is where `healthy` is None.
+        healthy: What it does that its twin does not.
+
+    Raises:
+        InputError: If there is no such robot or calibration, or it is of another robot.
+    """
+    if isinstance(robot, CalibratedRobot) and healthy is None:
+        return robot
+    model = robot.robot if isinstance(robot, DigitalTwin | CalibratedRobot) else load_robot(robot)
+    if isinstance(healthy, Imperfections):
+        return CalibratedRobot(model, healthy)
+    return load_calibration(healthy, model)
 
 
 def with_loops(robot: Robot, loops: Sequence[CalibratedLoop]) -> Robot:
