@@ -245,8 +245,8 @@ def evaluate(
     Args:
         results: Diagnoses, as a diagnoser returns them or `read_results` reads them, or the path
             of such a file.
-        truth: Run set that knows the truth, or where it is; None: what the diagnoses say. Without it
-            nothing is known of the coverage of intervals.
+        truth: Run set that knows the truth, or where it is; None: what the diagnoses say. Without
+            it nothing is known of the coverage of intervals.
         rng: Source of chance, for the calibration error that chance alone would show; None: seed 0.
 
     Raises:
