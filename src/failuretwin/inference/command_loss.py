@@ -1,4 +1,11 @@
-"""What chance may do to the movements of a healthy robot: late starts, commands that get lost."""
+"""What chance may do to the movements of a healthy robot: late starts, commands that get lost.
+
+    w_a(m) = p(l(a)) sum over a' that lead to a of w_a'(m-1) exp L_m-1(a') / sum over all a'
+
+with outcomes a of a movement, and the losses l(a) that lead there.
+
+Section: docs/diagnosis.md#lost-commands-a-hidden-markov-chain
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Bayesian diagnosis: which hypothesis explains where the tool went, and how surely."""
+"""Bayesian diagnosis: which hypothesis explains where the tool went, and how surely.
+
+    runs -> Evidence -> RunLikelihood -> compute_posterior -> Diagnosis of each run
+
+Section: docs/diagnosis.md#posterior-estimates-and-abstention
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Two faults at once: each with its own onset and size, on different motors."""
+"""Two faults at once: each with its own onset and size, on different motors.
+
+    p(run | h) = sum over both change points and both sizes of p(m1, z1) p(m2, z2) prod exp L_m
+
+Section: docs/diagnosis.md#two-faults-at-once
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,10 @@
 """What a run says at system level: where the tool settled after each movement, and its way there.
 
 Only `command` and `measured` of the run set are looked at, here and in everything that follows.
+
+    e_m = median of the readings of the last 0.6 s at rest after movement m
+
+Section: docs/diagnosis.md#settled-evidence-where-the-tool-rests
 """
 
 from __future__ import annotations

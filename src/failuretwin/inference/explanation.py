@@ -1,4 +1,7 @@
-"""Diagnoses in plain words: the verdict, what speaks for it, what else it may be, what to do."""
+"""Diagnoses in plain words: the verdict, what speaks for it, what else it may be, what to do.
+
+Section: docs/diagnosis.md#posterior-estimates-and-abstention
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,10 @@
 
 The mode itself says where the motor settles, or how its way changes; what remains is to place
 nodes where the movements point, and to give each its prior.
+
+    phi(z) = where it settles + settled_offset(z)    weights of z: the trapezoidal rule
+
+Section: docs/diagnosis.md#fault-models-where-each-fault-puts-its-motor
 """
 
 from __future__ import annotations

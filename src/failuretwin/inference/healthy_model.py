@@ -1,4 +1,12 @@
-"""Where a robot without a fault settles, how surely, and what chance may do to a movement."""
+"""Where a robot without a fault settles, and how surely.
+
+    angle = base + b + c g - f d,    r_m = e_m - path(angle),    S = J diag(s^2) J^T + sn^2 I
+
+with bias b, compliance c, load torque g, friction f, direction d, residual r_m [m] and its
+covariance S [m2]. The base is the target, or where a lost command has left the motor.
+
+Section: docs/diagnosis.md#healthy-model-where-a-healthy-arm-settles
+"""
 
 from __future__ import annotations
 
@@ -32,7 +40,7 @@ class HealthyModel:
     Attributes:
         twin: Kinematics.
         imperfections: Offsets, scatter and rates of lost commands.
-        blur: Factor on all scatter and noise; 1 for a robot as it is.
+        scatter_factor: Factor on all scatter and noise; 1 for a robot as it is.
     """
 
     twin: DigitalTwin

@@ -1,4 +1,10 @@
-"""What a motion can tell apart: groups of faults that look alike, smallest faults that show."""
+"""Isolability: which faults a motion can tell apart, and the smallest that show.
+
+Two faults are told apart if the one that is true is expected to be 3 nats ahead at typical size; a
+size is found from the one on at which it is 5 nats ahead.
+
+Section: docs/isolability.md#how-it-is-computed
+"""
 
 from __future__ import annotations
 

@@ -3,6 +3,11 @@
 As one motor moves and the others settle as healthy ones, the tool runs on a circle. Near the
 angle that brings it nearest to where it was seen, the squared distance is a parabola: four
 numbers say all that a movement can say of this motor, and any fault of it is weighed by them.
+
+    D^2(phi) = D0^2 + P (phi - phi*)^2
+    exp L_m(phi) = sum over a of w_a (1 - eps) t_nu(D_a^2(phi)) + eps / V
+
+Section: docs/diagnosis.md#joint-likelihood-what-a-movement-says-of-one-motor
 """
 
 from __future__ import annotations
@@ -43,7 +48,7 @@ class JointLikelihood(ArrayStruct):
     """Evidence on the settled angle of one motor, (..., outcome) each.
 
     Leading axes are run and movement, and one more where another motor takes several angles.
-    Alternatives that are not possible are zero throughout, their weight aside.
+    Outcomes that are not possible are zero throughout, their weight aside.
 
     Attributes:
         mode: Angle that brings the tool nearest to where it was seen [rad].

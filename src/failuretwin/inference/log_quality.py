@@ -1,4 +1,7 @@
-"""What is wrong with a log itself, before anyone asks what is wrong with the robot."""
+"""What is wrong with a log itself, before anyone asks what is wrong with the robot.
+
+Section: docs/diagnosis.md#readings-which-samples-count
+"""
 
 from __future__ import annotations
 

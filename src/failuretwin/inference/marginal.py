@@ -1,8 +1,13 @@
-"""Faults as laws: where a motor settles with a fault, over nodes of all that is unknown of it.
+"""The marginal likelihood of a fault: the sum over its change point and all else unknown of it.
 
-The fault begins with some movement; movements before it are those of a healthy robot. Sums over
-the first movement and the nodes are exact; what each node says of a movement comes from the
-profile of the motor.
+    p(run | h) = sum over m0, z of p(m0, z) prod_{m<m0} exp L_m(healthy)
+                                            prod_{m>=m0} exp L_m(phi(z))
+
+Movements before the change point m0 are those of a healthy robot. A `FaultModel` holds the nodes z
+and the angle phi of each; what a node says of a movement comes from the joint likelihood of its
+motor. Sums over m0 and the nodes are exact.
+
+Section: docs/diagnosis.md#marginal-likelihood-change-point-and-size
 """
 
 from __future__ import annotations

@@ -3,6 +3,10 @@
 Where the motor stands then is a chain: at the target of the last movement that it made, or, if it
 stuck on the way, anywhere between. The chain is summed exactly, for every movement with which the
 fault may have begun.
+
+    state(m) = sum over places of state(m-1) p(stays, arrives or stops on the way) exp L_m(place)
+
+Section: docs/diagnosis.md#missed-movements-lost-commands-and-sticking-now-and-then
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""When a fault may have begun: which movement it spoils first, and what that says of the onset."""
+"""When a fault may have begun: which movement it spoils first, and what that says of the onset.
+
+    p(m0) = P0 [m0 = 1] + (1 - P0) T(m0) / sum of T
+
+Section: docs/diagnosis.md#priors-odds-onset-sizes
+"""
 
 from __future__ import annotations
 

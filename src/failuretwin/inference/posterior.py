@@ -1,4 +1,9 @@
-"""Some runs with every hypothesis weighed: the posterior, and the diagnosis of each in words."""
+"""From marginal likelihoods to the posterior, and to the diagnosis of each run.
+
+    p(h | run) = p(h) p(run | h) / sum over h' of p(h') p(run | h')
+
+Section: docs/diagnosis.md#posterior-estimates-and-abstention
+"""
 
 from __future__ import annotations
 

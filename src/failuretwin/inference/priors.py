@@ -1,4 +1,9 @@
-"""What is believed of faults before a run is seen."""
+"""What is believed before a run is seen: onsets, ranges of sizes, odds of health.
+
+The odds of each mode and its sizes stand in its class.
+
+Section: docs/diagnosis.md#priors-odds-onset-sizes
+"""
 
 from __future__ import annotations
 

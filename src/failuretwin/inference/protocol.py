@@ -1,4 +1,7 @@
-"""What every diagnoser offers, and how one of the user's own is found by its name."""
+"""What every diagnoser offers, and how one of the user's own is found by its name.
+
+Section: docs/learned.md#a-method-of-your-own
+"""
 
 from __future__ import annotations
 

@@ -9,6 +9,8 @@ told from readings: those count as often as the sensor reads.
 A joint that slides does move the tool along a line. A path is taken for drawn only if it is
 straight from corner to corner all along, which that of a slide that gathers speed is not;
 once drawn out, the steady part of its way counts as a line.
+
+Section: docs/diagnosis.md#readings-which-samples-count
 """
 
 from __future__ import annotations

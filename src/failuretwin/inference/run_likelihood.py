@@ -1,4 +1,10 @@
-"""Some runs, ready to be weighed: what was seen, and what a healthy robot would do."""
+"""What some runs say of a healthy robot and of each motor: all that fault models draw from.
+
+L_m(healthy), L_m(phi) of each motor, and the same of the readings on the way, (run, movement) each,
+every part worked out once, when it is asked for.
+
+Section: docs/diagnosis.md#density-of-a-settled-position
+"""
 
 from __future__ import annotations
 

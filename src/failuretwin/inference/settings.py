@@ -1,4 +1,7 @@
-"""Lengths and angles by which runs are read: those of the arm and of its sensor."""
+"""Lengths and angles by which runs are read: those of the arm and of its sensor.
+
+Section: docs/diagnosis.md#settled-evidence-where-the-tool-rests
+"""
 
 from __future__ import annotations
 

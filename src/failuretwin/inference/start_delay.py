@@ -1,4 +1,7 @@
-"""How long after its command a movement begins: one distribution, wherever it is asked for."""
+"""How long after its command a movement begins: one distribution, wherever it is asked for.
+
+Section: docs/diagnosis.md#transient-likelihood-readings-on-the-way
+"""
 
 from __future__ import annotations
 

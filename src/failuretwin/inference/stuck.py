@@ -3,6 +3,10 @@
 The onset falls in one of two intervals for each movement: on the plateau before it (the motor
 then stands where it had settled) or on its ramp (it stands somewhere on the way). From there on
 the motor keeps its angle and the others behave as healthy ones.
+
+    p(phi | m0) = 0.8 p(phi | where the motor was then) + 0.2 / range,    L_m(phi) of a held motor
+
+Section: docs/diagnosis.md#fault-models-where-each-fault-puts-its-motor
 """
 
 from __future__ import annotations

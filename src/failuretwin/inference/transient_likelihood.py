@@ -1,10 +1,12 @@
 """What the way says: whether the motors moved from plateau to plateau as each fault would have it.
 
-Where each movement began and ended is taken from the settled poses, in the way that explains them
-best under the fault in question; how it got there is judged here. What became of a movement whose
-end was not seen is judged by its way and by where the next one began. When exactly a movement began
-is not known: the lag differs from run to run, and a stalled bus may hold the start up for a second.
-All motors share that shift, and it is summed over.
+    log p(way) = 0.1 log sum over tau of p(tau) prod over readings of t_4(reading - path(t - tau))
+
+Movements begin and end at the settled poses that explain them best under the fault in question.
+What became of one whose end was not seen is judged by its way and by where the next one began. The
+start delay tau is shared by all motors, and summed over; a tool may stray as no fault explains.
+
+Section: docs/diagnosis.md#transient-likelihood-readings-on-the-way
 """
 
 from __future__ import annotations

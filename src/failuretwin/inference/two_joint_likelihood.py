@@ -3,6 +3,12 @@
 Two motors reach nearly any place of the plane or the sphere that they span in up to two ways (elbow
 up, elbow down). Near each, the density of the place is Gaussian in the two angles, so that of a run
 with motors that are off by linear functions of unknown amounts is found by a Kalman filter.
+
+    p(e_m | x) = sum over ways of exp(log_weight) N(x; x_way, P^-1)
+
+with x the angles of both motors and P the 2 x 2 lever of both in units of the others' scatter.
+
+Section: docs/diagnosis.md#unknown-faults
 """
 
 from __future__ import annotations

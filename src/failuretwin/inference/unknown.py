@@ -3,6 +3,10 @@
 Faults that the set leaves out, one motor or two that are off in any regular way or none, and, for
 what is nothing of that kind, a healthy robot with far more scatter. Each has odds of its own, and
 the best counts alone: many poor explanations are no good one.
+
+    log p(run | unknown) = max over explanations of log odds + log p(run | explanation)
+
+Section: docs/diagnosis.md#unknown-faults
 """
 
 from __future__ import annotations

@@ -1,0 +1,169 @@
+"""Pages and README: every name, file and link in them exists, and snippets use the public names."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import failuretwin
+
+ROOT = Path(failuretwin.__file__).parents[2]
+DOCS = sorted((ROOT / "docs").glob("*.md"))
+PAGES = [*DOCS, ROOT / "README.md", ROOT / "CHANGELOG.md"]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+ENTRY_POINTS = {"failuretwin.modes"}
+"""Groups of entry points: dotted, but no module."""
+READERS_OWN = {
+    *("arm_diagnoser.py", "bent_shaft.py", "my_methods.py", "FILE.py"),
+    *("cal.toml", "faults.toml", "map.toml", "MAP.toml", "mine.toml", "my_arm.toml"),
+    "my_robot.toml",
+}
+"""Files in examples that the reader writes or gets."""
+FOLDERS = ("benchmarks", "docs", "examples", "src", "tests")
+
+FENCE = re.compile(r"```(\w*)\n(.*?)```", re.DOTALL)
+NAME = re.compile(r"`(failuretwin(?:\.\w+)+)")
+PUBLIC = re.compile(r"\bft\.([A-Za-z]\w*)")
+FILE = re.compile(r"`([\w./-]+\.(?:md|py|toml|urdf))`")
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+
+
+def named(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+def snippets(page: Path) -> list[str]:
+    """Return the Python of a page, or of a script."""
+    text = page.read_text("utf-8")
+    if page.suffix == ".py":
+        return [text]
+    return [code for language, code in FENCE.findall(text) if language == "python"]
+
+
+def resolve(dotted: str) -> Any:
+    """Return the module, class, function or field of that name; raise if there is none."""
+    parts = dotted.split(".")
+    for count in range(len(parts), 0, -1):
+        try:
+            found: Any = import_module(".".join(parts[:count]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[count:]:
+            fields = getattr(found, "__dataclass_fields__", {})
+            found = fields[part] if part in fields else getattr(found, part)
+        return found
+    raise ModuleNotFoundError(dotted)
+
+
+def deep_imports(source: str) -> Iterator[str]:
+    """Yield the imports of anything but `failuretwin` itself and its public names."""
+    public = set(failuretwin.__all__)
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (a.name for a in node.names if a.name.startswith("failuretwin."))
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            root, _, deeper = node.module.partition(".")
+            names = [a.name for a in node.names if deeper or a.name not in public]
+            if root == "failuretwin":
+                yield from (f"{node.module}.{name}" for name in names)
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of the headings of a page."""
+    text = FENCE.sub("", page.read_text("utf-8"))
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def glossary_rows() -> list[list[str]]:
+    lines = (ROOT / "docs" / "glossary.md").read_text("utf-8").splitlines()
+    rows = [line for line in lines if line.startswith("| ") and not line.startswith("| symbol")]
+    return [[cell.strip() for cell in row.split("|")[1:-1]] for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("from failuretwin.core.runs import RunTable", ["failuretwin.core.runs.RunTable"]),
+        ("import failuretwin.app", ["failuretwin.app"]),
+        ("from failuretwin import no_such_name", ["failuretwin.no_such_name"]),
+        ("import failuretwin as ft\nfrom failuretwin import load_robot\nimport numpy", []),
+    ],
+)
+def test_deep_imports_are_noticed(source, found):
+    assert list(deep_imports(source)) == found
+
+
+@pytest.mark.parametrize("name", ["failuretwin.core.no_such_module", "failuretwin.core.runs.Nope"])
+def test_a_name_that_is_not_there_is_noticed(name):
+    with pytest.raises((AttributeError, ModuleNotFoundError)):
+        resolve(name)
+
+
+@pytest.mark.parametrize("page", [*PAGES, *EXAMPLES], ids=named)
+def test_snippets_import_public_names_alone(page):
+    assert [name for code in snippets(page) for name in deep_imports(code)] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_names_on_the_page_exist(page):
+    text = page.read_text("utf-8")
+    for name in set(NAME.findall(text)) - ENTRY_POINTS:
+        resolve(name)
+    assert set(PUBLIC.findall(text)) <= set(failuretwin.__all__)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_files_on_the_page_exist(page):
+    files = [path.as_posix() for name in FOLDERS for path in (ROOT / name).rglob("*")]
+    for name in set(FILE.findall(page.read_text("utf-8"))) - READERS_OWN:
+        assert any(path.endswith(f"/{name}") for path in files), name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_links_on_the_page_lead_somewhere(page):
+    for link in LINK.findall(FENCE.sub("", page.read_text("utf-8"))):
+        path, _, anchor = link.partition("#")
+        if "://" in path:
+            continue
+        target = page.parent / path if path else page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+@pytest.mark.parametrize("page", DOCS, ids=named)
+def test_a_page_opens_with_code(page):
+    before_first_heading = page.read_text("utf-8").partition("\n## ")[0]
+    assert FENCE.search(before_first_heading)
+
+
+def test_the_index_links_every_page():
+    index = (ROOT / "docs" / "index.md").read_text("utf-8")
+    others = {page.name for page in DOCS} - {"index.md"}
+    assert others <= {link.partition("#")[0] for link in LINK.findall(index)}
+    assert "docs/index.md" in LINK.findall((ROOT / "README.md").read_text("utf-8"))
+
+
+def test_every_row_of_the_glossary_has_a_name_and_a_section():
+    rows = glossary_rows()
+    assert len(rows) > 40
+    for row in rows:
+        assert len(row) == 6, row
+        assert NAME.search(row[2]), row
+        assert LINK.search(row[5]), row
+
+
+def test_sections_named_by_docstrings_exist():
+    found = set()
+    for path in (ROOT / "src").rglob("*.py"):
+        found |= set(re.findall(r"docs/(\w+\.md)(?:#([\w-]+))?", path.read_text("utf-8")))
+    assert len(found) > 10
+    for page, anchor in found:
+        assert not anchor or anchor in anchors(ROOT / "docs" / page), (page, anchor)
+        assert (ROOT / "docs" / page).exists()
