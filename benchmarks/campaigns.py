@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import failuretwin as ft
-from failuretwin.app.calibration_tables import mean_gain
 from failuretwin.connection.calibration.calibrate import fit_calibration
 from failuretwin.connection.calibration.cross_validation import predict, robust_scale
+from failuretwin.connection.calibration.result import mean_gain
 from failuretwin.data_knowledge.raw_sessions import find_sessions
 from failuretwin.digital_model.robot import Robot
 

@@ -22,7 +22,7 @@ import failuretwin as ft
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis, paper_hypotheses
 from failuretwin.core.numerics import Weighted
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.metrics import (
+from failuretwin.decision.scoring_rules import (
     calibrated_error,
     check_ranks,
     equal_edges,

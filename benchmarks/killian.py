@@ -24,7 +24,7 @@ import failuretwin as ft
 from failuretwin.connection.calibration.calibrate import calibrate
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis, single_faults
 from failuretwin.decision.evaluation import Judged, score_line
-from failuretwin.decision.metrics import wilson_interval
+from failuretwin.decision.proportions import wilson_interval
 from failuretwin.decision.results import write_json_lines
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections

@@ -20,6 +20,7 @@ from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
 from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of, signals_of
 from failuretwin.decision.learned.networks import (
     NETWORKS,
+    Batch,
     Pace,
     Shape,
     Standard,
@@ -28,7 +29,7 @@ from failuretwin.decision.learned.networks import (
     training,
 )
 from failuretwin.decision.learned.storage import export_numpy, export_onnx
-from failuretwin.decision.learned.training_data import CHUNK_RUNS, Chunk, Stream, TrainingData
+from failuretwin.decision.training import CHUNK_RUNS, Stream, TrainingData
 from failuretwin.digital_model.calibrated_robot import load_calibration
 
 PAPER_ITERATIONS, PAPER_JOBS = 5050, 20
@@ -65,7 +66,7 @@ def share_waited(name: str, encoder: FeatureEncoder, data: TrainingData) -> tupl
     stream = Stream(data, encoder)
     waits: list[float] = []
 
-    def timed(chunks: Iterator[Chunk]) -> Iterator[Chunk]:
+    def timed(chunks: Iterator[Batch]) -> Iterator[Batch]:
         while True:
             begun = time.perf_counter()
             chunk = next(chunks)

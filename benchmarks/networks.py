@@ -19,7 +19,7 @@ from failuretwin.data_knowledge.generate import simulate
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.decision.learned.networks import NETWORKS
 from failuretwin.decision.learned.storage import load_network, save_network
-from failuretwin.decision.metrics import (
+from failuretwin.decision.scoring_rules import (
     equal_edges,
     log_score,
     log_score_gain,
@@ -46,7 +46,8 @@ def train_missing(folder: Path, robot: Robot, seeds: int, iterations: int) -> No
                     TrainingPlan(name, iterations, seed), robot, imperfections
                 )
                 save_network(diagnoser, path)
-                print(f"{name} seed {seed}: {found}", flush=True)
+                said = f"{found.accuracy:.4f} right, {found.log_score:.4f} nats a run"
+                print(f"{name} seed {seed}: {said}", flush=True)
 
 
 def judged(diagnoses: Sequence[Diagnosis]) -> tuple[float, float, float]:

@@ -26,7 +26,7 @@ from failuretwin.connection.calibration.settling_fit import (
     sort_movements,
 )
 from failuretwin.core.hypothesis import HEALTHY
-from failuretwin.decision.metrics import wilson_interval
+from failuretwin.decision.proportions import wilson_interval
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections, Variation, vary
 from failuretwin.digital_model.robot import Robot

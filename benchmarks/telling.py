@@ -8,13 +8,8 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.decision.metrics import (
-    Share,
-    calibrated_error,
-    equal_edges,
-    log_score,
-    reliability,
-)
+from failuretwin.decision.proportions import Share
+from failuretwin.decision.scoring_rules import calibrated_error, equal_edges, log_score, reliability
 
 
 def share(count: int, total: int) -> str:

@@ -10,55 +10,115 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from failuretwin.connection.calibration.calibrate import calibrate
+    from failuretwin.connection.calibration.result import Calibration, save_calibration
+    from failuretwin.connection.links.base import Sink, Source
     from failuretwin.core.errors import InputError
+    from failuretwin.core.hypothesis import Diagnosis, Fault, Hypothesis
+    from failuretwin.core.runs import run_set
     from failuretwin.data_knowledge.generate import Plan, iterate, simulate
     from failuretwin.data_knowledge.read import ReadOptions, read_runs
-    from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser
-    from failuretwin.digital_model.robot import load_robot
+    from failuretwin.decision.evaluation import compare, evaluate
+    from failuretwin.decision.learned.log_pool import HybridDiagnoser
+    from failuretwin.decision.learned.storage import load_network
+    from failuretwin.decision.results import read_results
+    from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser, monitor
+    from failuretwin.decision.streaming.fleet import StreamingFleet
+    from failuretwin.decision.training import train
+    from failuretwin.digital_model.calibrated_robot import load_calibration
+    from failuretwin.digital_model.robot import Robot, load_robot
     from failuretwin.digital_model.twin import DigitalTwin
     from failuretwin.failure_behavior.mode import FaultMode, SizedMode
     from failuretwin.failure_behavior.registry import register_mode
-    from failuretwin.inference.diagnoser import BayesDiagnoser
-    from failuretwin.inference.isolability import isolability
+    from failuretwin.inference.diagnoser import BayesDiagnoser, diagnose
+    from failuretwin.inference.isolability import IsolabilityReport, isolability
+    from failuretwin.inference.onset import OnsetPrior
     from failuretwin.inference.priors import Priors
+    from failuretwin.inference.protocol import Diagnoser
 
 __version__ = "0.1.0"
 
 _HOME = {
     "BayesDiagnoser": "inference.diagnoser",
+    "Calibration": "connection.calibration.result",
+    "Diagnoser": "inference.protocol",
+    "Diagnosis": "core.hypothesis",
     "DigitalTwin": "digital_model.twin",
+    "Fault": "core.hypothesis",
     "FaultMode": "failure_behavior.mode",
+    "HybridDiagnoser": "decision.learned.log_pool",
+    "Hypothesis": "core.hypothesis",
     "InputError": "core.errors",
+    "IsolabilityReport": "inference.isolability",
+    "OnsetPrior": "inference.onset",
     "Plan": "data_knowledge.generate",
     "Priors": "inference.priors",
     "ReadOptions": "data_knowledge.read",
+    "Robot": "digital_model.robot",
+    "Sink": "connection.links.base",
     "SizedMode": "failure_behavior.mode",
+    "Source": "connection.links.base",
     "StreamingDiagnoser": "decision.streaming.diagnoser",
+    "StreamingFleet": "decision.streaming.fleet",
+    "calibrate": "connection.calibration.calibrate",
+    "compare": "decision.evaluation",
+    "diagnose": "inference.diagnoser",
+    "evaluate": "decision.evaluation",
     "isolability": "inference.isolability",
     "iterate": "data_knowledge.generate",
+    "load_calibration": "digital_model.calibrated_robot",
+    "load_network": "decision.learned.storage",
     "load_robot": "digital_model.robot",
+    "monitor": "decision.streaming.diagnoser",
+    "read_results": "decision.results",
     "read_runs": "data_knowledge.read",
     "register_mode": "failure_behavior.registry",
+    "run_set": "core.runs",
+    "save_calibration": "connection.calibration.result",
     "simulate": "data_knowledge.generate",
+    "train": "decision.training",
 }
 
 __all__ = [
     "BayesDiagnoser",
+    "Calibration",
+    "Diagnoser",
+    "Diagnosis",
     "DigitalTwin",
+    "Fault",
     "FaultMode",
+    "HybridDiagnoser",
+    "Hypothesis",
     "InputError",
+    "IsolabilityReport",
+    "OnsetPrior",
     "Plan",
     "Priors",
     "ReadOptions",
+    "Robot",
+    "Sink",
     "SizedMode",
+    "Source",
     "StreamingDiagnoser",
+    "StreamingFleet",
     "__version__",
+    "calibrate",
+    "compare",
+    "diagnose",
+    "evaluate",
     "isolability",
     "iterate",
+    "load_calibration",
+    "load_network",
     "load_robot",
+    "monitor",
+    "read_results",
     "read_runs",
     "register_mode",
+    "run_set",
+    "save_calibration",
     "simulate",
+    "train",
 ]
 
 

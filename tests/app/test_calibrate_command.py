@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from failuretwin import load_robot
-from failuretwin.app.calibration_tables import (
+from failuretwin.app.calibration_report import (
     figure,
     left_out_line,
-    mean_gain,
     parameter_groups,
     verdict_line,
 )
@@ -24,6 +23,7 @@ from failuretwin.connection.calibration.result import (
     HeldOut,
     LeftOut,
     Parameter,
+    mean_gain,
     read_calibration,
     save_calibration,
 )

@@ -80,11 +80,11 @@ def test_exported_csv_is_read_back(log):
 
 TELL_PROGRESS = """
 from contextlib import contextmanager
-from failuretwin.app import cli, progress
+from failuretwin.app import cli, tables
 @contextmanager
 def telling(*_):
     yield lambda runs: print(runs, flush=True)
-progress.progress_bar = telling
+tables.progress_bar = telling
 cli.main()
 """
 

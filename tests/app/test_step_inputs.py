@@ -7,9 +7,13 @@ import pytest
 from click.testing import CliRunner
 
 from failuretwin.app.cli import cli
-from failuretwin.app.inputs import learn_loops, split_step_tests, with_step_tests
 from failuretwin.connection.calibration.calibrate import fit_calibration
 from failuretwin.connection.calibration.result import save_calibration
+from failuretwin.connection.calibration.step_parameters import (
+    learn_loops,
+    split_step_tests,
+    with_step_tests,
+)
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.read import read_runs
 from failuretwin.inference.diagnoser import BayesDiagnoser

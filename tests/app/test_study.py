@@ -25,7 +25,7 @@ from failuretwin.app.study import (
     run_study,
     stand_in_test_set,
 )
-from failuretwin.app.study_page import TABLE_2, TABLE_3, class_ratios, mean_confusion, spread_of
+from failuretwin.app.study_page import TABLE_2, TABLE_3, mean_confusion, ratio_spreads, spread_of
 from failuretwin.core.errors import InputError
 from waiting import WAIT_S, wait_for, workers_of
 
@@ -61,7 +61,7 @@ def test_the_plan_is_the_papers():
 
 def test_ratios_of_a_known_confusion():
     """Worked out by hand: the second class is never named."""
-    rows = class_ratios([result([[3, 0, 1], [2, 0, 2], [1, 0, 3]])] * 2)
+    rows = ratio_spreads([result([[3, 0, 1], [2, 0, 2], [1, 0, 3]])] * 2)
     (precision, recall, f1), never, _ = rows
     assert (precision.mean, recall.mean, f1.mean) == pytest.approx((0.5, 0.75, 0.6))
     assert precision.deviation == 0.0

@@ -57,7 +57,7 @@ def test_diagnoses_are_evaluated_as_they_come():
     assert scores.scores.log_score == pytest.approx(-(3 * math.log(0.75) + math.log(0.25)) / 4)
     assert scores.brier == pytest.approx((3 * 0.125 + 1.125) / 4)
     assert (scores.alarms.missed.count, scores.alarms.missed.total) == (2, 3)
-    assert scores.alarms.faulty_untold == 1
+    assert scores.alarms.faulty_abstained == 1
     assert scores.calibration.equal.error == pytest.approx(0.75 - 2 / 3)
     assert scores.coverage == []
     assert scores.judged.protocol == "P0"

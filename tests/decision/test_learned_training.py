@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from failuretwin.app.commands.train import train as command
 
+from failuretwin.app.commands.learn import train as command
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
@@ -20,8 +20,7 @@ from failuretwin.decision.learned.networks import (
     shuffled_batches,
     training,
 )
-from failuretwin.decision.learned.training_data import VARIANTS, TrainingData, widened
-from failuretwin.decision.training import TrainingPlan, train
+from failuretwin.decision.training import VARIANTS, TrainingData, TrainingPlan, train, widened
 
 SHAPE = Shape(channels=10, classes=3, motors=2, shared=2)
 ALL = pytest.mark.parametrize("name", list(NETWORKS))

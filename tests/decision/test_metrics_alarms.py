@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from failuretwin.decision.metrics import Share, count_alarms
+from failuretwin.decision.proportions import Share, count_alarms
 
 
 def test_any_other_verdict_on_a_healthy_run_is_a_false_alarm():

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import confusion_matrix, f1_score, precision_recall_fscore_support
 
-from failuretwin.decision.metrics import NO_VERDICT, judged_truth, score, wilson_interval
+from failuretwin.decision.proportions import NO_VERDICT, judged_truth, score, wilson_interval
 
 TRUTH = ["a", "a", "a", "b", "b", "c"]
 SAID = ["a", "a", "b", "b", "a", "a"]

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import norm
 
-from failuretwin.decision.metrics import Coverage, IntervalCase, Share, coverage_by_mode
+from failuretwin.decision.proportions import Coverage, IntervalCase, Share, coverage_by_mode
 
 
 def test_truths_are_counted_on_either_side():

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats import expon
 
 from failuretwin.core.errors import InputError
-from failuretwin.decision.metrics import Share, alarm_threshold, delays_after_onset
+from failuretwin.decision.proportions import Share, alarm_threshold, delays_after_onset
 
 TIME = np.arange(11.0)
 HEALTHY = [0.1, 0.2, 0.1, 0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1]
@@ -33,42 +33,42 @@ def measured(fault, true_fault, onset, share=0.0):
 def test_delay_is_the_time_from_onset_to_alarm():
     found = measured([step(5), step(2)], [step(7), step(2)], [3.0, 0.0])
     assert found.threshold == 0.3
-    assert found.detection.tolist() == [2.0, 2.0]
-    assert found.isolation.tolist() == [4.0, 2.0]
+    assert found.detection.delay.tolist() == [2.0, 2.0]
+    assert found.isolation.delay.tolist() == [4.0, 2.0]
     assert found.false_alarms == Share(0, 1)
-    assert found.median_detection == 2.0
+    assert found.detection.median == 2.0
 
 
 def test_run_that_ends_without_an_alarm_is_censored():
     found = measured([step(99), step(4)], [step(99), step(99)], [3.0, 3.0])
-    assert found.detection.tolist() == [np.inf, 1.0]
-    assert found.isolation.tolist() == [np.inf, np.inf]
-    assert found.followed.tolist() == [7.0, 7.0]
-    assert found.undetected == Share(1, 2)
-    assert found.unisolated == Share(2, 2)
-    assert found.median_isolation == np.inf
+    assert found.detection.delay.tolist() == [np.inf, 1.0]
+    assert found.isolation.delay.tolist() == [np.inf, np.inf]
+    assert found.detection.followed.tolist() == [7.0, 7.0]
+    assert found.detection.never == Share(1, 2)
+    assert found.isolation.never == Share(2, 2)
+    assert found.isolation.median == np.inf
 
 
 def test_alarm_before_the_onset_is_no_delay():
     found = measured([step(1), step(4)], [step(1), step(4)], [3.0, 3.0])
-    np.testing.assert_array_equal(found.detection, [np.nan, 1.0])
-    np.testing.assert_array_equal(found.isolation, [np.nan, 1.0])
+    np.testing.assert_array_equal(found.detection.delay, [np.nan, 1.0])
+    np.testing.assert_array_equal(found.isolation.delay, [np.nan, 1.0])
     assert found.early == Share(1, 2)
-    assert found.undetected == Share(0, 1)
+    assert found.detection.never == Share(0, 1)
 
 
 def test_another_fault_in_front_is_no_isolation():
     fault = step(3)
     found = measured([fault, fault], [0.5 * fault, 0.51 * fault], [3.0, 3.0])
-    assert found.isolation.tolist() == [np.inf, 0.0]
-    assert found.detection.tolist() == [0.0, 0.0]
+    assert found.isolation.delay.tolist() == [np.inf, 0.0]
+    assert found.detection.delay.tolist() == [0.0, 0.0]
 
 
 def test_no_answer_is_no_alarm():
     silent = np.where(TIME > 6, np.nan, step(99))
     found = measured(silent, silent, [2.0])
-    assert found.detection.tolist() == [np.inf]
-    assert found.followed.tolist() == [4.0]
+    assert found.detection.delay.tolist() == [np.inf]
+    assert found.detection.followed.tolist() == [4.0]
 
 
 @given(
@@ -102,9 +102,9 @@ def test_higher_share_of_false_alarms_is_never_slower():
     for share in (0.0, 0.05, 0.2, 0.5):
         found = delays_after_onset(time, fault, 0.9 * fault, onset, share)
         assert found.false_alarms.value <= share
-        medians.append(found.median_detection)
-        kept = np.isfinite(found.detection)
-        assert (found.isolation[kept] >= found.detection[kept]).all()
+        medians.append(found.detection.median)
+        kept = np.isfinite(found.detection.delay)
+        assert (found.isolation.delay[kept] >= found.detection.delay[kept]).all()
     assert medians == sorted(medians, reverse=True)
     assert medians[0] > medians[-1]
 
@@ -120,10 +120,10 @@ def test_median_is_right_though_runs_end_too_soon():
     fault = np.vstack([np.zeros_like(time), fault])
     onset = np.r_[np.nan, np.zeros(3000)]
     found = delays_after_onset(time, fault, fault, onset, 0.0)
-    assert found.undetected.value > 0.3
+    assert found.detection.never.value > 0.3
     expected = expon(scale=3.0).median()
-    assert found.median_detection == pytest.approx(expected, rel=0.06)
-    assert np.median(found.detection[np.isfinite(found.detection)]) < 0.7 * expected
+    assert found.detection.median == pytest.approx(expected, rel=0.06)
+    assert np.median(found.detection.delay[np.isfinite(found.detection.delay)]) < 0.7 * expected
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import bootstrap
 
 from failuretwin.core.errors import InputError
-from failuretwin.decision.metrics import log_score_gain, mcnemar
+from failuretwin.decision.scoring_rules import log_score_gain, mcnemar
 
 
 @pytest.mark.parametrize("only_first", range(9))

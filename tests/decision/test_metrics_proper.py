@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from sklearn.metrics import brier_score_loss, log_loss
 
-from failuretwin.decision.metrics import brier_score, log_score
+from failuretwin.decision.scoring_rules import brier_score, log_score
 
 NAMES = ("a", "b", "c", "d")
 

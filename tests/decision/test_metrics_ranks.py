@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from failuretwin.core.errors import InputError
-from failuretwin.decision.metrics import check_ranks, rank_of_truth
+from failuretwin.decision.scoring_rules import check_ranks, rank_of_truth
 
 DRAWS = 99
 
@@ -63,7 +63,7 @@ def test_the_shape_tells_what_is_wrong():
     rng = np.random.default_rng(4)
     narrow = check_ranks(normal_ranks(4000, rng, width=0.7), DRAWS, rng).count
     assert min(narrow[0], narrow[-1]) > 1.5 * narrow[len(narrow) // 2]
-    high = check_ranks(normal_ranks(4000, rng, shift=0.4), DRAWS, rng).band
+    high = check_ranks(normal_ranks(4000, rng, shift=0.4), DRAWS, rng)
     assert (high.ecdf >= high.rank).all(), "estimates too high put truths at low ranks"
 
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from sklearn.calibration import calibration_curve
 
 from failuretwin.core.errors import InputError
-from failuretwin.decision.metrics import (
+from failuretwin.decision.scoring_rules import (
     adaptive_edges,
     calibrated_error,
     equal_edges,

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
-from failuretwin.decision.metrics import Share, wilson_interval
+from failuretwin.decision.proportions import Share, wilson_interval
 
 
 @given(trials=st.integers(1, 4000), share=st.floats(0, 1))

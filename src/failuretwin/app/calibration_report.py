@@ -1,24 +1,22 @@
-"""One self-contained HTML page from which an engineer judges a calibration. Needs `plots`."""
+"""What `calibrate` says: tables on the terminal, and one page to judge a calibration by.
+
+Parameters with intervals, held-out sessions, what was left out. The page is self-contained HTML and
+needs the extra `plots`.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from failuretwin import __version__
-from failuretwin.app.calibration_tables import (
-    beats_uncalibrated,
-    channels,
-    held_out_table,
-    left_out_line,
-    parameter_groups,
-    verdict_line,
-)
-from failuretwin.app.plots import BLUE, GREY, RED, clean, figure_class, png, render_page
-from failuretwin.app.tables import Table
+from failuretwin.app.plots import BLUE, GREY, RED, clean, new_figure, png, render_page
+from failuretwin.app.tables import Table, show
 from failuretwin.connection.calibration.cross_validation import (
     ExampleTransient,
     Predictions,
@@ -26,9 +24,10 @@ from failuretwin.connection.calibration.cross_validation import (
     predict,
     settling_of,
 )
-from failuretwin.connection.calibration.result import Calibration, HeldOut
+from failuretwin.connection.calibration.result import Calibration, HeldOut, Parameter, mean_gain
+from failuretwin.core.runs import AXES
 from failuretwin.core.types import FloatArray
-from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.robot import Robot, shown_unit
 from failuretwin.digital_model.settling import Settling
 
 if TYPE_CHECKING:
@@ -36,33 +35,235 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+
+def print_calibration(found: Calibration, robot: Robot) -> None:
+    """Print everything that was learned and how far it can be trusted."""
+    way = "motor readings" if found.used_readings else "the tool path alone"
+    show(f"{robot.name}: {found.movements} settled movements of {found.runs} runs, {way}\n")
+    show(_parameter_table(found.parameters, robot))
+    show(*(f"  {_title(p)}: {p.note}" for p in found.parameters if not p.identified))
+    show(*(f"  {remark}" for remark in found.remarks))
+    if found.left_out:
+        show(f"\nleft out: {left_out_line(found)}")
+    if found.held_out:
+        show("\nsessions predicted by what the others say (settled error)\n")
+        show(held_out_table(found, robot))
+    show(f"\n{verdict_line(found)}")
+
+
+def _parameter_table(parameters: tuple[Parameter, ...], robot: Robot) -> Table:
+    rows = []
+    for p in parameters:
+        scale, unit = shown_unit(p.unit, robot)
+        value, low, high = (f"{scale * x:.4g}" for x in (p.value, p.low, p.high))
+        known = "" if p.identified else "not identified"
+        rows.append((_title(p), value, f"{low} to {high}", unit, known))
+    return Table(("parameter", "value", "95 % interval", "unit", ""), rows)
+
+
+def _title(parameter: Parameter) -> str:
+    return f"{parameter.name}, {parameter.motor}" if parameter.motor else parameter.name
+
+
+def channels(robot: Robot, of_motors: bool) -> tuple[list[str], float, str]:
+    """Return the name of each motor or tool axis, factor and name of the unit that people read."""
+    if not of_motors:
+        return [f"tool {axis}" for axis in AXES], 1e3, "mm"
+    scale, unit = shown_unit("rad", robot)
+    return [name.replace("_", " ") for name in robot.motor_names], scale, unit
+
+
+def held_out_table(found: Calibration, robot: Robot) -> Table:
+    """Return the settled error of each unseen session, uncalibrated and predicted, and the gain."""
+    names, scale, unit = channels(robot, found.used_readings)
+    rows = []
+    for entry in found.held_out:
+        pairs = scale * np.array([entry.before, entry.after]).T
+        cells = (f"{before:.2f} -> {after:.2f}" for before, after in pairs)
+        gain = f"{entry.gain:+.2f} +- {1.96 * entry.gain_error:.2f}"
+        rows.append((entry.session, str(entry.movements), *cells, gain))
+    settled = (f"{name} [{unit}]" for name in names)
+    return Table(("session", "movements", *settled, "gain [nats a movement]"), rows)
+
+
+def left_out_line(found: Calibration) -> str:
+    """Return how many runs and movements were left out and why, in one line."""
+    kinds = Counter((entry.movement == 0, entry.motor, entry.reason) for entry in found.left_out)
+    return "; ".join(_counted(count, *kind) for kind, count in kinds.most_common())
+
+
+def _counted(count: int, whole_run: bool, motor: str, reason: str) -> str:
+    what = ("run" if whole_run else "movement") + ("" if count == 1 else "s")
+    return f"{count} {what}: {motor} {reason}" if motor else f"{count} {what}: {reason}"
+
+
+def verdict_line(found: Calibration) -> str:
+    """Return whether the fit beats the uncalibrated twin on sessions that it has not seen."""
+    better = found.beats_uncalibrated
+    if better is None:
+        return (
+            "not checked on unseen logs: it takes two sessions, each long enough to learn from. "
+            "Record another day and calibrate on both."
+        )
+    gain, error = mean_gain(found.held_out)
+    nats = f"{gain:+.2f} nats a movement (95 % interval {gain - error:+.2f} to {gain + error:+.2f})"
+    if better:
+        return f"on unseen sessions the calibrated twin beats the uncalibrated one: {nats}"
+    return (
+        f"on unseen sessions the calibration does NOT beat the uncalibrated twin: {nats}. Do not "
+        "use it; record more healthy logs."
+    )
+
+
+# The rows of a calibration page: figures rounded as far as they are known, and interval bars.
+
+MEANING = {
+    "bias": "error of the resting motor that is there in every pose",
+    "compliance": "how far a motor gives way under the load torque of the arm",
+    "friction": "how far it stops short, seen in the direction of travel",
+    "scatter": "what is left, from movement to movement (scale of its Student t distribution)",
+    "tail_dof": "degrees of freedom of the scatter: 30 is nearly normal, 3 has heavy tails",
+    "delay, mean over runs": "dead time on top of the servo loop",
+    "ramp shortening, mean over runs": "share of its time by which a ramp ends early",
+    "lag": "time constant of a first-order lag on top of the servo loop",
+    "late starts": "movements that start late, all motors together",
+    "late start, median": "the median delay of a late start",
+    "readings stop, median": "time from a movement to the last reading before a late one",
+    "lost commands": "movements on time for which a motor does not get its command",
+    "lost commands when late": "the same for movements that start late",
+    "spoilt readings": "readings that are missing or out of range",
+    "loop gain P": "proportional gain of the servo loop, from step tests",
+    "loop gain I": "integral gain of the servo loop, from step tests",
+    "filter time": "time constant of the loop's input filter, from step tests",
+    "speed limit": "largest speed of the motor, from step tests",
+    "dead time": "time from a command to the first motion, from step tests",
+    "overshoot": "how far a step goes beyond where it settles",
+    "settling time after the ramp": "until a step stays where it settles",
+}
+TITLES = {"tail_dof": "tails"}
+SHORT_S = 0.2
+"""Times below this are shown in milliseconds [s]."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One parameter as text, with its 95 % interval, and where these stand on its bar [%].
+
+    Attributes:
+        who: The motors; empty for the whole robot.
+        tick: Where the value stands.
+        note: What is missing where the logs do not identify it.
+    """
+
+    who: str
+    value: str
+    interval: str
+    left: float
+    width: float
+    tick: float
+    identified: bool
+    note: str
+
+
+@dataclass(frozen=True)
+class Group:
+    """The same parameter of all motors; `zero` lies on the bars [%], None: beyond them."""
+
+    title: str
+    meaning: str
+    unit: str
+    zero: float | None
+    rows: tuple[Row, ...]
+
+
+def parameter_groups(found: Calibration, robot: Robot) -> list[Group]:
+    """Return the parameters as text, those of the same name together."""
+    by_name: dict[str, list[Parameter]] = {}
+    for parameter in found.parameters:
+        by_name.setdefault(parameter.name, []).append(parameter)
+    return [_group(name, members, robot) for name, members in by_name.items()]
+
+
+def _group(name: str, members: Sequence[Parameter], robot: Robot) -> Group:
+    scale, unit = _unit(members, robot)
+    ends = scale * np.array([(p.low, p.value, p.high) for p in members])
+    known = ends[[p.identified for p in members]]
+    low, high = _span(known if len(known) else ends)
+    at = np.clip(100.0 * (ends - low) / (high - low), 0.0, 100.0)
+    zero = -100.0 * low / (high - low)
+    return Group(
+        title=TITLES.get(name, name),
+        meaning=MEANING.get(name, ""),
+        unit=unit,
+        zero=zero if 0.0 <= zero <= 100.0 else None,
+        rows=tuple(map(_row, members, ends, at)),
+    )
+
+
+def _unit(members: Sequence[Parameter], robot: Robot) -> tuple[float, str]:
+    unit = members[0].unit
+    if unit == "share":
+        return 100.0, "%"
+    if unit == "s" and max(abs(p.high) for p in members) < SHORT_S:
+        return 1e3, "ms"
+    return (1.0, "") if unit == "-" else shown_unit(unit, robot)
+
+
+def _span(ends: np.ndarray) -> tuple[float, float]:
+    """Return the ends of the bars' common scale; it begins at zero unless that is far away."""
+    low, high = float(ends.min()), float(ends.max())
+    if low > 0.0 and low < 0.6 * high:
+        low = 0.0
+    margin = 0.04 * (high - low) or 1.0
+    return (low if low == 0.0 else low - margin), high + margin
+
+
+def _row(parameter: Parameter, ends: FloatArray, at: FloatArray) -> Row:
+    low, value, high = (figure(x, ends[2] - ends[0]) for x in ends)
+    told = parameter.identified
+    return Row(
+        who=parameter.motor.replace("_", " ").replace("+", ", "),
+        value=value if told else "",
+        interval=f"{low} to {high}" if told else "",
+        left=float(at[0]),
+        width=float(at[2] - at[0]),
+        tick=float(at[1]),
+        identified=told,
+        note=parameter.note,
+    )
+
+
+def figure(value: float, width: float) -> str:
+    """Return a value with as many digits as an interval of this width leaves meaning."""
+    if width <= 0.0 or not np.isfinite(width):
+        return f"{value:.3g}"
+    decimals = int(np.clip(1 - np.floor(np.log10(width / 2.0)), 0, 6))
+    return f"{value + 0.0:.{decimals}f}"
+
+
 # Pictures of a calibration: what it expects, what is left, and how a ramp fits.
 
-MOST_COLUMNS = 4
-PANEL_IN = 3.2
-WIDTH_IN = 11.6
+MOST_COLUMNS, PANEL_IN, WIDTH_IN = 4, 3.2, 11.6
 DIRECTIONS = ((1.0, BLUE, "towards larger angles"), (-1.0, RED, "towards smaller angles"))
 LOAD_FLOOR_NM = 1e-3
 """Load torque below which a motor counts as unloaded in the pictures [N m]."""
 
 
 def _panels(names: list[str]) -> tuple[Figure, list[Axes]]:
-    """Return a figure with a panel for each channel, to be handed to `finish`."""
-    count = len(names)
-    columns = min(count, MOST_COLUMNS)
-    rows = -(-count // columns)
-    figure = figure_class()(figsize=(WIDTH_IN, PANEL_IN * rows + 0.4), layout="constrained")
-    panels = [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
-    for panel, name in zip(panels, names, strict=True):
-        panel.set_title(name, fontsize=10)
+    """Return a figure with a panel for each channel, to be handed to `_finish`."""
+    columns = min(len(names), MOST_COLUMNS)
+    rows = -(-len(names) // columns)
+    figure = new_figure(WIDTH_IN, PANEL_IN * rows + 0.4)
+    panels = [figure.add_subplot(rows, columns, i + 1, title=n) for i, n in enumerate(names)]
     return figure, panels
 
 
-def finish(figure: Figure, panels: Sequence[Axes], below: str = "", beside: str = "") -> Figure:
+def _finish(figure: Figure, panels: Sequence[Axes], below: str = "", beside: str = "") -> Figure:
     """Return a figure with its axes labelled and one legend for all panels."""
     for panel in panels:
         if below:
             panel.set_xlabel(below, fontsize=9)
+        panel.title.set_fontsize(10)
         panel.tick_params(labelsize=8)
         clean(panel)
     panels[0].set_ylabel(beside)
@@ -90,7 +291,7 @@ def load_figure(seen: Predictions, settling: Settling, robot: Robot) -> Figure:
             panel.plot(ends, scale * line, color=colour, lw=1.8, label=label)
         panel.axhline(0.0, color=GREY, lw=0.8, zorder=0)
         panel.set_xlabel("load torque [N m]" if loaded else "target [deg], no load", fontsize=9)
-    return finish(figure, panels, beside=f"settled error [{unit}]")
+    return _finish(figure, panels, beside=f"settled error [{unit}]")
 
 
 def expected_figure(seen: Predictions, robot: Robot) -> Figure:
@@ -101,18 +302,17 @@ def expected_figure(seen: Predictions, robot: Robot) -> Figure:
         kept = seen.counts[:, k]
         expected, error = (scale * e[kept, k] for e in (seen.expected, seen.error))
         reach = _reach(expected, error)
-        panel.plot([-reach, reach], [0.0, 0.0], color=GREY, lw=1.5, label="uncalibrated twin")
-        panel.plot([-reach, reach], [-reach, reach], color=BLUE, lw=1.5, label="calibrated twin")
+        ends = [-reach, reach]
+        panel.plot(ends, [0.0, 0.0], color=GREY, lw=1.5, label="uncalibrated twin")
+        panel.plot(ends, ends, color=BLUE, lw=1.5, label="calibrated twin")
         panel.plot(expected, error, ".", ms=5, color="black", alpha=0.45, label="settled movement")
-        panel.set_xlim(-reach, reach)
-        panel.set_ylim(-reach, reach)
-        panel.set_box_aspect(1.0)
+        panel.set(xlim=ends, ylim=ends, box_aspect=1.0)
         beyond = int(np.sum(np.abs(error) > reach))
         if beyond:
             panel.annotate(f"{beyond} beyond", (0.03, 0.94), xycoords="axes fraction", fontsize=8)
         before, after = (1.4826 * float(np.median(np.abs(e))) for e in (error, error - expected))
-        panel.set_title(f"{name}: {before:.2f} to {after:.2f} {unit}", fontsize=10)
-    return finish(figure, panels, f"expected error [{unit}]", f"settled error [{unit}]")
+        panel.set_title(f"{name}: {before:.2f} to {after:.2f} {unit}")
+    return _finish(figure, panels, f"expected error [{unit}]", f"settled error [{unit}]")
 
 
 def _reach(expected: FloatArray, error: FloatArray) -> float:
@@ -137,46 +337,43 @@ def quantile_figure(seen: Predictions, dof: float, robot: Robot) -> Figure:
         panel.plot(theory, left, ".", ms=4, color="black", alpha=0.7, label="settled movement")
         reach = 1.08 * float(np.abs(np.concatenate([left, theory, [1.0]])).max())
         panel.set_ylim(-reach, reach)
-    return finish(figure, panels, "expected quantile [scales]", "what is left [scales]")
+    return _finish(figure, panels, "expected quantile [scales]", "what is left [scales]")
 
 
 def ramp_figure(ramp: ExampleTransient, robot: Robot) -> Figure:
     """Return one movement: command, twin before and after calibration, and readings."""
     names, scale, unit = channels(robot, ramp.of_motors)
     figure, panels = _panels(names)
-    lines: tuple[tuple[FloatArray, dict[str, Any]], ...] = (
-        (ramp.command, {"color": GREY, "lw": 2.2, "label": "command"}),
-        (ramp.plain, {"color": RED, "lw": 1.2, "ls": "--", "label": "uncalibrated"}),
-        (ramp.calibrated, {"color": BLUE, "lw": 1.4, "label": "calibrated"}),
-        (ramp.reading, {"color": "black", "ls": "", "marker": ".", "ms": 6, "label": "readings"}),
-    )
     for k, panel in enumerate(panels):
-        for values, style in lines:
-            panel.plot(ramp.time, scale * values[:, k], **style)
+        command, plain, calibrated, reading = (
+            scale * values[:, k]
+            for values in (ramp.command, ramp.plain, ramp.calibrated, ramp.reading)
+        )
+        panel.plot(ramp.time, command, color=GREY, lw=2.2, label="command")
+        panel.plot(ramp.time, plain, "--", color=RED, lw=1.2, label="uncalibrated")
+        panel.plot(ramp.time, calibrated, color=BLUE, lw=1.4, label="calibrated")
+        panel.plot(ramp.time, reading, ".", color="black", ms=6, label="readings")
     what = "angle" if ramp.of_motors else "position"
-    return finish(figure, panels, "time since the command [s]", f"{what} [{unit}]")
+    return _finish(figure, panels, "time since the command [s]", f"{what} [{unit}]")
 
 
 def session_figure(held_out: Sequence[HeldOut], robot: Robot, of_motors: bool) -> Figure:
     """Return the size of the settled error of each unseen session, before and after."""
     names, scale, unit = channels(robot, of_motors)
-    height = max(1.9, 0.34 * len(held_out) + 1.2)
-    figure = figure_class()(figsize=(WIDTH_IN, height), layout="constrained")
+    figure = new_figure(WIDTH_IN, max(1.9, 0.34 * len(held_out) + 1.2))
     panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
     rows = np.arange(len(held_out))[::-1]
-    bars = (
-        (0.19, GREY, "uncalibrated", [entry.before for entry in held_out]),
-        (-0.19, BLUE, "calibrated", [entry.after for entry in held_out]),
+    before, after = (
+        scale * np.array([getattr(e, n) for e in held_out]) for n in ("before", "after")
     )
     for k, (panel, name) in enumerate(zip(panels, names, strict=True)):
-        for shift, colour, label, sizes in bars:
-            size = scale * np.array(sizes)[:, k]
-            panel.barh(rows + shift, size, 0.36, color=colour, label=label)
-        panel.set_title(name, fontsize=10)
+        panel.barh(rows + 0.19, before[:, k], 0.36, color=GREY, label="uncalibrated")
+        panel.barh(rows - 0.19, after[:, k], 0.36, color=BLUE, label="calibrated")
+        panel.set_title(name)
         panel.set_yticks(rows, [entry.session for entry in held_out], fontsize=8)
         panel.tick_params(axis="y", length=0)
         panel.set_ylim(-0.6, len(held_out) - 0.4)
-    return finish(figure, panels, f"settled error [{unit}]")
+    return _finish(figure, panels, f"settled error [{unit}]")
 
 
 # The page.
@@ -186,10 +383,8 @@ def write_calibration_page(
     found: Calibration, runs: xr.Dataset, robot: Robot, folder: Path
 ) -> None:
     """Write `index.html` into an existing folder; the runs are those learned from or judged on."""
-    units, better = robot.profile.servo_units, beats_uncalibrated(found)
+    units, better = robot.profile.servo_units, found.beats_uncalibrated
     left_out = [(e.run, str(e.movement or "all"), f"{e.motor} {e.reason}") for e in found.left_out]
-    seen, settling = predict(found, runs, robot), settling_of(found, robot)
-    ramp = example_transient(found, runs, robot)
     text = render_page(
         "calibration.html.j2",
         {
@@ -197,24 +392,21 @@ def write_calibration_page(
             "robot": robot.name,
             "verdict": verdict_line(found).rstrip("."),
             "grade": "unknown" if better is None else "good" if better else "bad",
-            "facts": _facts(found, settling),
+            "facts": _facts(found, settling_of(found, robot).payload),
             "sessions": held_out_table(found, robot),
             "groups": parameter_groups(found, robot),
             "count_deg": None if units is None else units.deg_per_count,
             "left_out": Table(("run", "movement", "why"), left_out),
             "left_out_line": left_out_line(found),
-            "pictures": _pictures(found, seen, settling, ramp, robot),
-            "unseen": seen.unseen,
-            "dof": settling.tail_dof,
-            "ramp": ramp,
+            **_pictures(found, runs, robot),
         },
     )
     (folder / "index.html").write_text(text, encoding="utf-8")
 
 
-def _facts(found: Calibration, settling: Settling) -> Table:
+def _facts(found: Calibration, payload: float) -> Table:
     way = "the motors' own readings" if found.used_readings else "the tool path alone"
-    payload, protocol = settling.payload, found.imperfections.protocol
+    protocol = found.imperfections.protocol
     rows = [
         ("learned from", found.imperfections.source),
         ("sessions", f"{len(found.sessions)}: {', '.join(found.sessions)}"),
@@ -226,14 +418,10 @@ def _facts(found: Calibration, settling: Settling) -> Table:
     return Table(("", ""), rows, header=False)
 
 
-def _pictures(
-    found: Calibration,
-    seen: Predictions,
-    settling: Settling,
-    ramp: ExampleTransient | None,
-    robot: Robot,
-) -> dict[str, str]:
-    """Return those pictures that there is something to show in, by name."""
+def _pictures(found: Calibration, runs: xr.Dataset, robot: Robot) -> dict[str, Any]:
+    """Return those pictures that there is something to show in, by name, and what they are of."""
+    seen, settling = predict(found, runs, robot), settling_of(found, robot)
+    ramp = example_transient(found, runs, robot)
     figures = {}
     if found.held_out:
         figures["sessions"] = session_figure(found.held_out, robot, found.used_readings)
@@ -244,4 +432,5 @@ def _pictures(
             figures["load"] = load_figure(seen, settling, robot)
     if ramp is not None:
         figures["ramp"] = ramp_figure(ramp, robot)
-    return {name: png(figure) for name, figure in figures.items()}
+    pictures = {name: png(figure) for name, figure in figures.items()}
+    return {"pictures": pictures, "unseen": seen.unseen, "dof": settling.tail_dof, "ramp": ramp}

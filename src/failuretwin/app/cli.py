@@ -13,15 +13,16 @@ import sys
 import click
 
 from failuretwin import __version__
-from failuretwin.app.commands.data import import_, simulate
+from failuretwin.app.commands.data import import_, robot, simulate
 from failuretwin.app.commands.diagnose import diagnose, evaluate
 from failuretwin.app.commands.learn import calibrate, study, train
 from failuretwin.app.commands.live import emulate, watch
-from failuretwin.app.commands.robot import robot
 from failuretwin.core.errors import FailureTwinError
 
+CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100, "show_default": True}
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+
+@click.group(context_settings=CONTEXT)
 @click.version_option(__version__, prog_name="failuretwin")
 def cli() -> None:
     """Tell from commands and the tool path alone which motor of a robot arm failed, and how."""

@@ -6,7 +6,7 @@ import math
 import re
 import sys
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
@@ -22,17 +22,9 @@ from rich.text import Text
 
 from failuretwin.app.commands.options import LiveOptions
 from failuretwin.app.shadow import SILENCE_S, Change, Changes, Shadow, Snapshot
+from failuretwin.connection.links import ros_messages
 from failuretwin.connection.links.base import LinkCounts, Pace, Sink, Source, source_from_text
-from failuretwin.connection.links.ros_messages import (
-    LEVEL_ERROR,
-    LEVEL_NAMES,
-    LEVEL_OK,
-    LEVEL_STALE,
-    LEVEL_WARN,
-    RosTopics,
-    load_topics,
-    statuses,
-)
+from failuretwin.connection.links.ros_messages import LEVEL_NAMES, RosTopics, load_topics, statuses
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.bags.messages import BagTopics
 from failuretwin.digital_model.calibrated_robot import load_calibration
@@ -82,12 +74,7 @@ def connect(
 ) -> tuple[Source, list[Sink]]:
     """Return what a SOURCE on the command line stands for, and where its network publishes.
 
-    Args:
-        text: One of `SOURCES`.
-        robot: The robot.
-        live: Its topics on a network, what an emulated robot is like, and the pace of time.
-        seed: Seed of all chance of an emulated robot.
-        stack: Closes everything in the end.
+    The text is one of `SOURCES`; the stack closes everything in the end.
 
     Raises:
         InputError: If it does not exist, cannot be reached, is none of these, or is told what only
@@ -148,10 +135,10 @@ def _rosbridge(
 # The live view on a terminal: motors, residual, posterior over time, what changed.
 
 STYLES = {
-    LEVEL_OK: "green",
-    LEVEL_WARN: "yellow",
-    LEVEL_ERROR: "bold red",
-    LEVEL_STALE: "magenta",
+    ros_messages.LEVEL_OK: "green",
+    ros_messages.LEVEL_WARN: "yellow",
+    ros_messages.LEVEL_ERROR: "bold red",
+    ros_messages.LEVEL_STALE: "magenta",
 }
 BLOCKS = " ▁▂▃▄▅▆▇█"
 COLUMNS = 60
@@ -232,13 +219,11 @@ class View:
 
     def _posterior(self) -> Table:
         """Return the posterior over time, a row for each hypothesis that ever mattered."""
-        weight: dict[str, float] = {}
+        weight = Counter[str]()
         for column in self._history:
-            for name, probability in column.items():
-                weight[name] = weight.get(name, 0.0) + probability
-        ranked = sorted(weight, key=lambda name: -weight[name])[:SHOWN_HYPOTHESES]
+            weight.update(column)
         table = Table(box=None, show_header=False, pad_edge=False)
-        for name in ranked:
+        for name, _ in weight.most_common(SHOWN_HYPOTHESES):
             blocks = "".join(_block(column.get(name)) for column in self._history)
             last = self._history[-1].get(name)
             table.add_row(name, blocks, "" if last is None else f"{100 * last:5.1f} %")

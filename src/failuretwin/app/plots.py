@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from failuretwin import __version__
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import AXES, unique_names
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.store import filling
 from failuretwin.decision.evaluation import Evaluation, Judged, as_unknown_line, score_line
-from failuretwin.decision.metrics import Reliability, Share, judged_truth
+from failuretwin.decision.proportions import Share, judged_truth
+from failuretwin.decision.scoring_rules import Reliability
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.explanation import plain_name
 
@@ -32,6 +33,8 @@ MM_PER_M = 1000.0
 TITLE_COLUMNS = 100
 """Letters of the title that fit on one line of the picture."""
 BLUE, RED, GREY = "#1f5f99", "#c8402f", "#9aa3ab"
+SMALL: dict[str, Any] = {"fontsize": 8, "frameon": False}
+"""How legends look."""
 
 
 def figure_class() -> Any:
@@ -40,13 +43,15 @@ def figure_class() -> Any:
     Raises:
         InputError: If matplotlib is missing.
     """
-    try:
+    with needs_extra("pictures need matplotlib", "plots"):
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise InputError(
-            f"pictures need matplotlib ({error}). Install it: pip install 'failuretwin[plots]'."
-        ) from error
     return Figure
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of this size [in] that arranges its panels by itself."""
+    made: Figure = figure_class()(figsize=(width, height), layout="constrained")
+    return made
 
 
 def png(figure: Figure) -> str:
@@ -77,31 +82,31 @@ def run_figure(
 ) -> Figure:
     """Return the picture of one run: each axis, the distance, and the posterior.
 
-    Args:
-        time: (time,) [s].
-        desired: Path that the commands ask for, (time, axis) [m].
-        measured: Tool path, (time, axis) [m], NaN where there is no sample.
-        diagnosis: What was found.
+    The path that the commands ask for and the one measured are (time, axis) [m], the latter NaN
+    where there is no sample.
     """
-    figure = figure_class()(figsize=(11.0, 6.2), layout="constrained")
+    figure = new_figure(11.0, 6.2)
     seen = np.asarray(np.isfinite(measured).all(axis=1))
     shown = slice(0, len(time) - int(np.argmax(seen[::-1])) if seen.any() else len(time))
     time, desired, measured = time[shown], MM_PER_M * desired[shown], MM_PER_M * measured[shown]
     dense = seen[shown].mean() > 0.95
-    style = {"ls": "-", "lw": 1.2} if dense else {"ls": "none", "marker": ".", "ms": 4}
+    style: dict[str, Any] = {"lw": 1.2} if dense else {"ls": "none", "marker": ".", "ms": 4}
     grid = figure.add_gridspec(4, 2, width_ratios=[2.1, 1.0])
-    panels = [figure.add_subplot(grid[row, 0]) for row in range(4)]
-    for row, (panel, axis) in enumerate(zip(panels, AXES, strict=False)):
+    *tool, off = (figure.add_subplot(grid[row, 0]) for row in range(4))
+    for row, (panel, axis) in enumerate(zip(tool, AXES, strict=True)):
         panel.plot(time, desired[:, row], color=GREY, lw=2.0, label="commanded")
         panel.plot(time, measured[:, row], color=BLUE, label="measured", **style)
         panel.set_ylabel(f"tool {axis} [mm]")
         panel.tick_params(labelbottom=False)
-    panels[0].legend(
-        loc="lower right", bbox_to_anchor=(1.0, 0.98), fontsize=8, ncols=2, frameon=False
-    )
-    panels[3].plot(time, np.linalg.norm(measured - desired, axis=1), color=RED, **style)
-    _mark_onset(panels[3], diagnosis.onset_s)
-    for panel in panels:
+    tool[0].legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=2, **SMALL)
+    off.plot(time, np.linalg.norm(measured - desired, axis=1), color=RED, **style)
+    off.set(xlabel="time [s]", ylabel="off by [mm]")
+    off.set_ylim(bottom=0.0)
+    if diagnosis.onset_s:
+        off.axvline(diagnosis.onset_s, color="black", lw=1.0, ls="--")
+        place = (diagnosis.onset_s, 0.85)
+        off.annotate(" fault begins", place, xycoords=("data", "axes fraction"), fontsize=8)
+    for panel in (*tool, off):
         panel.set_xlim(-0.02 * time[-1], 1.02 * time[-1])
         clean(panel)
     _plot_posterior(figure.add_subplot(grid[:, 1]), diagnosis)
@@ -111,25 +116,13 @@ def run_figure(
     return figure
 
 
-def _mark_onset(panel: Axes, onset_s: float | None) -> None:
-    panel.set_ylabel("off by [mm]")
-    panel.set_xlabel("time [s]")
-    panel.set_ylim(bottom=0.0)
-    if onset_s:
-        panel.axvline(onset_s, color="black", lw=1.0, ls="--")
-        at = ("data", "axes fraction")
-        panel.annotate(" fault begins", (onset_s, 0.85), xycoords=at, fontsize=8)
-
-
 def _plot_posterior(panel: Axes, diagnosis: Diagnosis) -> None:
     names = list(diagnosis.posterior)[::-1]
     values = [100.0 * diagnosis.posterior[name] for name in names]
     colours = [BLUE if name == diagnosis.diagnosis else GREY for name in names]
     panel.barh(range(len(names)), values, color=colours)
     panel.set_yticks(range(len(names)), [plain(name) for name in names], fontsize=9)
-    panel.set_xlim(0.0, 115.0)
-    panel.set_xticks([0, 50, 100])
-    panel.set_xlabel("probability [%]")
+    panel.set(xlim=(0.0, 115.0), xticks=[0, 50, 100], xlabel="probability [%]")
     for y, value in enumerate(values):
         panel.annotate(f"{value:.1f}", (value + 1.5, y), va="center", fontsize=8)
     panel.set_title("what is wrong?", fontsize=10)
@@ -155,12 +148,8 @@ def render_page(template: str, values: Mapping[str, Any]) -> str:
     Raises:
         InputError: If jinja2 is missing.
     """
-    try:
+    with needs_extra("pictures need jinja2", "plots"):
         from jinja2 import Environment, PackageLoader, StrictUndefined
-    except ImportError as error:
-        raise InputError(
-            f"pictures need jinja2 ({error}). Install it: pip install 'failuretwin[plots]'."
-        ) from error
     loader = PackageLoader("failuretwin.app", "")
     pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
     return pages.get_template(template).render(values)
@@ -173,7 +162,8 @@ def write_page(
     judged = Judged.of(diagnoses)
     values = {
         "runs": [
-            (d, *_truth_cell(d), _embedded(p)) for d, p in zip(diagnoses, pictures, strict=True)
+            (d, *_truth_cell(d), base64.b64encode(p.read_bytes()).decode("ascii"))
+            for d, p in zip(diagnoses, pictures, strict=True)
         ],
         "robot": robot,
         "method": diagnoses[0].method,
@@ -194,10 +184,6 @@ def _truth_cell(diagnosis: Diagnosis) -> tuple[str, bool]:
     return plain(diagnosis.truth), truth != diagnosis.diagnosis
 
 
-def _embedded(picture: Path) -> str:
-    return base64.b64encode(picture.read_bytes()).decode("ascii")
-
-
 # Picture of the reliability diagram.
 
 NAME = "reliability.png"
@@ -212,22 +198,18 @@ def write_reliability(evaluation: Evaluation, folder: Path) -> None:
     """
     if evaluation.calibration is None:
         raise InputError("no run got a verdict, so there is no reliability to draw.")
-    title = f"{evaluation.scores.runs} runs, protocol {evaluation.judged.protocol}"
-    figure = reliability_figure(evaluation.calibration.equal, title)
+    figure = reliability_figure(evaluation.calibration.equal, evaluation.runs_and_protocol)
     with filling(folder) as partial:
         figure.savefig(partial / NAME, dpi=130)
 
 
 def reliability_figure(bins: Reliability, title: str) -> Figure:
     """Return how often verdicts are right by how sure they are, and how many there are."""
-    figure = figure_class()(figsize=(5.6, 6.4), layout="constrained")
-    grid = figure.add_gridspec(2, 1, height_ratios=[4.0, 1.0])
-    upper = figure.add_subplot(grid[0])
+    figure = new_figure(5.6, 6.4)
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[4.0, 1.0])
     _plot_shares(upper, bins)
-    lower = figure.add_subplot(grid[1], sharex=upper)
     lower.bar(bins.edges[:-1], bins.count, np.diff(bins.edges), align="edge", color=GREY, ec="w")
-    lower.set_xlabel("stated probability of the verdict")
-    lower.set_ylabel("runs")
+    lower.set(xlabel="stated probability of the verdict", ylabel="runs")
     clean(upper)
     clean(lower)
     figure.suptitle(title, fontsize=11)
@@ -251,8 +233,5 @@ def _plot_shares(panel: Axes, bins: Reliability) -> None:
         capsize=3,
         label="share right, 95 % interval",
     )
-    panel.set_xlim(0.0, 1.02)
-    panel.set_ylim(-0.02, 1.02)
-    panel.set_ylabel("share of verdicts that are right")
-    panel.tick_params(labelbottom=False)
-    panel.legend(loc="upper left", fontsize=8, frameon=False)
+    panel.set(xlim=(0.0, 1.02), ylim=(-0.02, 1.02), ylabel="share of verdicts that are right")
+    panel.legend(loc="upper left", **SMALL)

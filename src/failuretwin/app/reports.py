@@ -16,7 +16,7 @@ from failuretwin.connection.tracked_diagnosis import Tracked
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.store import replacing
-from failuretwin.decision import metrics
+from failuretwin.decision import proportions, scoring_rules
 from failuretwin.decision.evaluation import (
     Calibration,
     Comparison,
@@ -60,7 +60,7 @@ def _mark(diagnosis: Diagnosis) -> str:
     """Return whether a verdict is right; empty where there is none or the truth is not known."""
     if diagnosis.truth is None or diagnosis.diagnosis is None:
         return ""
-    truth = metrics.judged_truth(diagnosis.truth, diagnosis.posterior)
+    truth = proportions.judged_truth(diagnosis.truth, diagnosis.posterior)
     return "right" if truth == diagnosis.diagnosis else "WRONG"
 
 
@@ -74,7 +74,7 @@ def print_scores(judged: Judged) -> None:
     show("", class_table(judged.scores), "", _confusion_table(judged.scores))
 
 
-def class_table(scores: metrics.Scores) -> Table:
+def class_table(scores: proportions.Scores) -> Table:
     """Return precision, recall and F1 of each class."""
     return figures_table(
         ("class", "runs", "precision", "recall", "F1"),
@@ -85,7 +85,7 @@ def class_table(scores: metrics.Scores) -> Table:
     )
 
 
-def _confusion_table(scores: metrics.Scores) -> Table:
+def _confusion_table(scores: proportions.Scores) -> Table:
     return figures_table(
         ("truth", *(f"({i})" for i in range(len(scores.classes)))),
         [
@@ -102,7 +102,7 @@ def _confusion_table(scores: metrics.Scores) -> Table:
 def print_evaluation(evaluation: Evaluation, truth_given: bool) -> None:
     """Print every score; without a run set given, no true onset or magnitude can be known."""
     print_scores(evaluation.judged)
-    show(f"\n{_runs_and_protocol(evaluation, 'all ')}", summary_table(evaluation))
+    show(f"\nall {evaluation.runs_and_protocol}", summary_table(evaluation))
     if evaluation.calibration is not None:
         show("", _reliability_table(evaluation.calibration.equal))
     if evaluation.coverage:
@@ -113,16 +113,12 @@ def print_evaluation(evaluation: Evaluation, truth_given: bool) -> None:
         show("\ncoverage of intervals: needs true onsets and magnitudes, give --truth RUNS")
 
 
-def _runs_and_protocol(evaluation: Evaluation, first: str = "") -> str:
-    return f"{first}{evaluation.scores.runs} runs, protocol {evaluation.judged.protocol}"
-
-
 def summary_table(evaluation: Evaluation) -> Table:
     """Return name and value of each score of all runs together."""
     scores, alarms = evaluation.scores, evaluation.alarms
     false_alarms = _percent(alarms.false_alarms) + _abstained(alarms.healthy_abstained)
     rows = [
-        ("accuracy", _percent(metrics.Share(scores.right, scores.runs))),
+        ("accuracy", _percent(proportions.Share(scores.right, scores.runs))),
         ("macro-F1", f"{scores.macro_f1:.3f}, mean over the classes that were true of any run"),
         ("false-alarm rate", false_alarms),
         ("missed-detection rate", _percent(alarms.missed) + _abstained(alarms.faulty_abstained)),
@@ -131,10 +127,10 @@ def summary_table(evaluation: Evaluation) -> Table:
     ]
     if evaluation.calibration is not None:
         rows += _calibration_rows(evaluation.calibration)
-    return Table(("Score", _runs_and_protocol(evaluation)), rows, header=False)
+    return Table(("Score", evaluation.runs_and_protocol), rows, header=False)
 
 
-def _percent(share: metrics.Share) -> str:
+def _percent(share: proportions.Share) -> str:
     """Return a share and its Wilson interval in per cent; a dash for a share of nothing."""
     if not share.total:
         return "-"
@@ -159,10 +155,10 @@ def _calibration_rows(calibration: Calibration) -> list[tuple[str, str]]:
     ]
 
 
-def _reliability_table(bins: metrics.Reliability) -> Table:
+def _reliability_table(bins: scoring_rules.Reliability) -> Table:
     rows = []
     for i in np.flatnonzero(bins.count):
-        right = metrics.Share(int(bins.right[i]), int(bins.count[i]))
+        right = proportions.Share(int(bins.right[i]), int(bins.count[i]))
         low, high = right.interval
         edges = f"{bins.edges[i]:.1f} to {bins.edges[i + 1]:.1f}"
         ratios = f"{bins.confidence[i]:.3f}", f"{right.value:.3f}", f"{low:.3f} to {high:.3f}"
@@ -174,7 +170,7 @@ def _reliability_table(bins: metrics.Reliability) -> Table:
     )
 
 
-def coverage_table(coverage: Sequence[metrics.Coverage]) -> Table:
+def coverage_table(coverage: Sequence[proportions.Coverage]) -> Table:
     """Return a row for each quantity of each fault mode."""
     rows = []
     for row in coverage:
@@ -206,11 +202,7 @@ def comparison_rows(comparison: Comparison) -> list[tuple[str, str]]:
     if a or b:
         unknown = f"by A {a} runs, by B {b}: their truth is not among its hypotheses"
         rows.append(("judged as unknown", unknown))
-    return rows + _gain_rows(comparison.gain)
-
-
-def _gain_rows(gain: metrics.LogScoreGain) -> list[tuple[str, str]]:
-    rows = []
+    gain = comparison.gain
     if gain.first_impossible or gain.second_impossible or gain.both_impossible:
         impossible = (
             f"only by A in {gain.first_impossible} runs, only by B in {gain.second_impossible}, by "
@@ -289,19 +281,15 @@ def _left_out_lines(others: Sequence[Hypothesis]) -> list[str]:
     pairs = sum(len(h.faults) > 1 for h in others)
     names = [f"{pairs} pair{'s' * (pairs > 1)} of faults"] * (pairs > 0)
     names += [str(h) for h in others if not h.known]
-    if not names:
-        return []
-    return [f"what motions tell apart is said of single faults only, not of {' and '.join(names)}"]
+    said = "what motions tell apart is said of single faults only, not of "
+    return [said + " and ".join(names)] * bool(names)
 
 
 def group_lines(found: IsolabilityReport) -> list[str]:
     """Return the groups, with the sizes at which their faults look alike."""
-    groups = [
-        " or ".join(_name(name, found.typical.get(name)) for name in group)
-        for group in found.groups
-    ]
-    if not groups:
+    if not found.groups:
         return []
+    groups = (" or ".join(_name(n, found.typical.get(n)) for n in group) for group in found.groups)
     sized = any(name in found.typical for group in found.groups for name in group)
     when = " when faults are as large as this" if sized else ""
     return [f"cannot be told apart by such motions{when}: {'; '.join(groups)}"]

@@ -89,11 +89,7 @@ class Shadow:
         return self._reference.late_s
 
     def step(self, timeout_s: float) -> bool:
-        """Take one event, or see that time goes on, and return whether there may be more.
-
-        Args:
-            timeout_s: Longest wait for an event [s].
-        """
+        """Take one event, or see after a wait [s] that time goes on; return if more may come."""
         event = self._source.poll(min(timeout_s, TICK_S))
         if event is not None:
             self._take(event)
@@ -167,12 +163,7 @@ GARBAGE_EVERY_S = 10.0
 
 @dataclass(frozen=True)
 class Change:
-    """Something that changed.
-
-    Attributes:
-        stream_time: When [s].
-        text: What, in words.
-    """
+    """Something that changed, in words, at a time of the stream [s]."""
 
     stream_time: float
     text: str

@@ -12,10 +12,10 @@ import numpy as np
 
 from failuretwin import __version__
 from failuretwin.app import plots
-from failuretwin.app.plots import BLUE, GREY, MM_PER_M, RED
+from failuretwin.app.plots import BLUE, GREY, MM_PER_M, RED, SMALL
 from failuretwin.app.study import (
     FEATURES,
-    PRINTED_RATE,
+    RATES,
     REPRODUCING_RATE,
     Exam,
     StudyPlan,
@@ -26,6 +26,7 @@ from failuretwin.app.tables import Table
 from failuretwin.core.runs import AXES
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.store import replacing
+from failuretwin.decision.proportions import class_ratios
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -71,17 +72,14 @@ TABLE_3 = {
 
 # From the results of the trainings to the numbers of the paper's tables.
 
-SETS = ("training", "validation", "test")
+COLOURS = {"training": GREY, "validation": BLUE, "test": RED}
+SETS = tuple(COLOURS)
 """What accuracies are taken on."""
 
 
-def of_kind(trainings: Sequence[Training], features: str, learning_rate: float) -> list[Training]:
+def of_kind(trainings: Sequence[Training], features: str, rate: float) -> list[Training]:
     """Return the repetitions of one kind of training."""
-    return [
-        training
-        for training in trainings
-        if (training.job.features, training.job.learning_rate) == (features, learning_rate)
-    ]
+    return [t for t in trainings if (t.job.features, t.job.learning_rate) == (features, rate)]
 
 
 def spread_of(values: Sequence[float] | FloatArray) -> Spread:
@@ -97,17 +95,13 @@ def accuracies(repeats: Sequence[Training], name: str) -> list[Spread]:
     return [spread_of(column) for column in rows.T]
 
 
-def class_ratios(repeats: Sequence[Training]) -> list[tuple[Spread, ...]]:
+def ratio_spreads(repeats: Sequence[Training]) -> list[tuple[Spread, ...]]:
     """Return precision, recall and F1 of each class on the test set.
 
     Precision and F1 are NaN in a repetition that never names the class, as in the paper.
     """
-    counts = np.array([training.confusion for training in repeats], dtype=np.float64)
-    hits = np.diagonal(counts, axis1=1, axis2=2)
-    true, named = counts.sum(axis=2), counts.sum(axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        f1 = np.where(named > 0.0, 2.0 * hits / (named + true), np.nan)
-        ratios = np.stack([hits / named, hits / true, f1], axis=-1)  # (repeat, class, ratio)
+    ratios = class_ratios(np.array([training.confusion for training in repeats]))
+    ratios[np.isnan(ratios[..., 0]), 2] = np.nan  # (repeat, class, ratio)
     return [tuple(spread_of(column) for column in rows.T) for rows in np.moveaxis(ratios, 1, 0)]
 
 
@@ -123,8 +117,6 @@ def mean_confusion(repeats: Sequence[Training]) -> FloatArray:
 
 # Pictures of the study. Need the extra `plots`.
 
-COLOURS = {"training": GREY, "validation": BLUE, "test": RED}
-
 
 def training_figure(
     trainings: Sequence[Training], learning_rate: float, iterations: Sequence[int]
@@ -133,7 +125,7 @@ def training_figure(
 
     The published accuracies are lines in the panel of augmented features.
     """
-    figure = plots.figure_class()(figsize=(11.0, 4.2), layout="constrained")
+    figure = plots.new_figure(11.0, 4.2)
     panels = figure.subplots(1, len(FEATURES), sharey=True)
     for panel, features in zip(panels, FEATURES, strict=True):
         repeats = of_kind(trainings, features, learning_rate)
@@ -152,11 +144,10 @@ def training_figure(
             if features == "augmented":
                 panel.axhline(100.0 * TABLE_2[name].mean, color=COLOURS[name], lw=0.8, ls=":")
         panel.set_title(f"{features} features", fontsize=10)
-        panel.set_xlabel("iterations")
-        panel.set_ylim(0.0, 102.0)
+        panel.set(xlabel="iterations", ylim=(0.0, 102.0))
         plots.clean(panel)
     panels[0].set_ylabel("right [%]")
-    panels[0].legend(loc="lower right", fontsize=8, frameon=False)
+    panels[0].legend(loc="lower right", **SMALL)
     return figure
 
 
@@ -166,7 +157,7 @@ def path_figure(runs: xr.Dataset, run: int, twin: DigitalTwin) -> Figure:
     measured = as_floats(runs["measured"].values[run])
     simulated = twin.path(twin.respond(as_floats(runs["command"].values[run]), time))
     seen = np.isfinite(measured).all(axis=1)
-    figure = plots.figure_class()(figsize=(11.0, 5.4), layout="constrained")
+    figure = plots.new_figure(11.0, 5.4)
     panels = figure.subplots(2, len(AXES), sharex=True)
     for column, axis in enumerate(AXES):
         upper, lower = panels[:, column]
@@ -178,19 +169,14 @@ def path_figure(runs: xr.Dataset, run: int, twin: DigitalTwin) -> Figure:
         lower.set_xlabel("time [s]")
         plots.clean(upper)
         plots.clean(lower)
-    panels[0, 0].legend(fontsize=8, frameon=False)
+    panels[0, 0].legend(**SMALL)
     panels[1, 0].set_ylabel("residual [mm]")
     return figure
 
 
 def confusion_figure(shares: Mapping[str, FloatArray], classes: Sequence[str]) -> Figure:
-    """Return confusion matrices side by side.
-
-    Args:
-        shares: Share of each truth that got each diagnosis, by title, (truth, diagnosis).
-        classes: Names of the classes.
-    """
-    figure = plots.figure_class()(figsize=(6.0 * len(shares), 5.6), layout="constrained")
+    """Return confusion matrices side by side, by title: shares as of `mean_confusion`."""
+    figure = plots.new_figure(6.0 * len(shares), 5.6)
     panels = figure.subplots(1, len(shares), sharey=True, squeeze=False)[0]
     for panel, (title, share) in zip(panels, shares.items(), strict=True):
         panel.imshow(np.nan_to_num(share), vmin=0.0, vmax=1.0, cmap="Blues")
@@ -208,8 +194,6 @@ def confusion_figure(shares: Mapping[str, FloatArray], classes: Sequence[str]) -
 
 
 # The page.
-
-RATES = (REPRODUCING_RATE, PRINTED_RATE)
 
 
 def write_study_page(
@@ -263,7 +247,7 @@ def _progress(trainings: Sequence[Training], plan: StudyPlan) -> Table:
 
 def _table_3(trainings: Sequence[Training], features: str, names: Sequence[str]) -> Table:
     """Return ratios of each class at the reproducing rate beside those of the paper."""
-    ours = class_ratios(of_kind(trainings, features, REPRODUCING_RATE))
+    ours = ratio_spreads(of_kind(trainings, features, REPRODUCING_RATE))
     rows = [
         (plots.plain(name), *map(text, ours[names.index(name)]), *map(text, published))
         for name, published in TABLE_3.items()

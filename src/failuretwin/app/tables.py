@@ -122,12 +122,7 @@ REPORT_EVERY_S = 5.0
 
 @contextmanager
 def progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Give a function to call with the number of steps just done.
-
-    Args:
-        what: What is being done, such as ``simulating``.
-        total: Number of steps in all.
-    """
+    """Give a function to call with the number of steps just done, of `total` in all."""
     if not sys.stderr.isatty():
         yield _progress_lines(what, total)
         return

@@ -104,7 +104,8 @@ def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     try:
         return cls(**values)
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        told = str(error).startswith(where)
+        raise InputError(f"{error}" if told else f"{where}: {error}") from error
 
 
 def _required(field: dataclasses.Field[Any]) -> bool:

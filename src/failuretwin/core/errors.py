@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 
 
@@ -30,3 +31,23 @@ def unknown_name(kind: str, got: str, valid: Iterable[str]) -> InputError:
     near = get_close_matches(got, names, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     return InputError(f"unknown {kind} {got!r}.{hint} Valid: {', '.join(names)}.")
+
+
+@contextmanager
+def needs_extra(who: str, extra: str) -> Iterator[None]:
+    """Import optional libraries in this block.
+
+    Args:
+        who: What needs them, and their names, such as ``"pictures need matplotlib"``.
+        extra: The extra of this package that brings them.
+
+    Raises:
+        InputError: If one is missing; it says how to install it.
+    """
+    try:
+        yield
+    except ImportError as error:
+        them = "them" if " and " in who else "it"
+        raise InputError(
+            f"{who} ({error}). Install {them}: pip install 'failuretwin[{extra}]'."
+        ) from error

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias, cast
 
 from failuretwin import __version__
 from failuretwin.core.errors import InputError
@@ -32,6 +32,10 @@ from failuretwin.digital_model.robot import Robot, load_robot
 
 if TYPE_CHECKING:
     import xarray as xr
+
+
+RunsLike: TypeAlias = "xr.Dataset | str | Path | Sequence[str | Path]"
+"""A run set, or where one is read from."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,13 @@ def read_runs(
     if RECOVERY_ERROR in worst.attrs:  # of several files the worst one is told
         runs.attrs |= {name: worst.attrs[name] for name in (RECOVERY_ERROR, RECOVERY_WORST)}
     return runs
+
+
+def as_runs(runs: RunsLike, robot: Robot | str = "armpi_fpv") -> xr.Dataset:
+    """Return a run set as it is, or read it from wherever a path points; see `read_runs`."""
+    if hasattr(runs, "data_vars"):
+        return cast("xr.Dataset", runs)
+    return read_runs(runs, robot)
 
 
 def _read_source(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,13 +19,14 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import truth_of
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.decision import metrics
-from failuretwin.decision.results import Record, Results, some_names
+from failuretwin.data_knowledge.read import RunsLike, as_runs
+from failuretwin.decision import proportions, scoring_rules
+from failuretwin.decision.results import Record, Results, read_results, some_names
 
 if TYPE_CHECKING:
     import xarray as xr
 
-Given = Results | Iterable[Diagnosis | Record]
+Given = Results | Iterable[Diagnosis | Record] | str | Path
 
 # What was true of the runs, where a run set or a log knows it.
 
@@ -46,12 +48,7 @@ class RunTruth:
 
 @dataclass(frozen=True)
 class Truths:
-    """The truth of the runs of a run set.
-
-    Attributes:
-        name: What to call the run set in errors, such as its path.
-        by_run: By the name of the run.
-    """
+    """The truth of the runs of a run set, by their names; `name` is what errors call the set."""
 
     name: str
     by_run: Mapping[str, RunTruth]
@@ -121,7 +118,7 @@ class Judged:
         given = as_results(results).diagnoses
         known = [d.truth if truths is None else truths[d.run].fault for d in given]
         pairs = [(d, true) for d, true in zip(given, known, strict=True) if true]
-        truth = tuple(metrics.judged_truth(true, d.posterior) for d, true in pairs)
+        truth = tuple(proportions.judged_truth(true, d.posterior) for d, true in pairs)
         return cls(
             diagnoses=tuple(d for d, _ in pairs),
             truth=truth,
@@ -146,13 +143,15 @@ class Judged:
         return [d.posterior for d in self.diagnoses]
 
     @cached_property
-    def scores(self) -> metrics.Scores:
+    def scores(self) -> proportions.Scores:
         """Right, wrong and the log score; of one run at least."""
-        return metrics.score(self.truth, self.verdicts, self.posteriors)
+        return proportions.score(self.truth, self.verdicts, self.posteriors)
 
 
 def as_results(given: Given, name: str = "the results") -> Results:
-    """Return diagnoses with a name; those that have one keep it."""
+    """Return diagnoses with a name; those that have one keep it, a path is read."""
+    if isinstance(given, str | Path):
+        return read_results(Path(given))
     return given if isinstance(given, Results) else Results(name, tuple(given))
 
 
@@ -169,7 +168,7 @@ def score_line(judged: Judged) -> str:
     )
 
 
-def _log_score_text(surprise: metrics.LogScore) -> str:
+def _log_score_text(surprise: scoring_rules.LogScore) -> str:
     """Return the log score in words; says so where a truth was ruled out altogether."""
     text = f"{surprise.mean:.3f} nats a run"
     if not surprise.impossible:
@@ -197,16 +196,13 @@ def as_unknown_line(judged: Judged) -> str:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibration of the probability of the most probable hypothesis.
+    """Calibration of the verdict's probability, in bins of equal width and of about equal counts.
 
-    Attributes:
-        equal: Bins of equal width.
-        adaptive: Bins of about as many runs each.
-        by_chance: Errors that a perfectly calibrated method would show in `equal`, (draw,).
+    By chance alone, a perfectly calibrated method would show these errors in `equal`, (draw,).
     """
 
-    equal: metrics.Reliability
-    adaptive: metrics.Reliability
+    equal: scoring_rules.Reliability
+    adaptive: scoring_rules.Reliability
     by_chance: FloatArray
 
 
@@ -223,28 +219,34 @@ class Evaluation:
     """
 
     judged: Judged
-    alarms: metrics.Alarms
+    alarms: proportions.Alarms
     brier: float
     calibration: Calibration | None
-    coverage: Sequence[metrics.Coverage]
+    coverage: Sequence[proportions.Coverage]
 
     @property
-    def scores(self) -> metrics.Scores:
+    def scores(self) -> proportions.Scores:
         """Right, wrong and the log score."""
         return self.judged.scores
+
+    @property
+    def runs_and_protocol(self) -> str:
+        """What was judged, in words."""
+        return f"{self.scores.runs} runs, protocol {self.judged.protocol}"
 
 
 def evaluate(
     results: Given,
-    truth: xr.Dataset | Truths | None = None,
+    truth: RunsLike | Truths | None = None,
     rng: np.random.Generator | None = None,
 ) -> Evaluation:
     """Return all scores of the diagnoses whose truth is known.
 
     Args:
-        results: Diagnoses, as a diagnoser returns them or `read_results` reads them.
-        truth: Run set that knows the truth; None: what the diagnoses themselves say. Without it
-            nothing is known of the coverage of intervals.
+        results: Diagnoses, as a diagnoser returns them or `read_results` reads them, or the path
+            of such a file.
+        truth: Run set that knows the truth, or where it is; None: what the diagnoses say. Without
+            it nothing is known of the coverage of intervals.
         rng: Source of chance, for the calibration error that chance alone would show; None: seed 0.
 
     Raises:
@@ -257,10 +259,10 @@ def evaluate(
     intervals = () if truths is None else _intervals(judged, truths)
     return Evaluation(
         judged=judged,
-        alarms=metrics.count_alarms(judged.truth, judged.verdicts),
-        brier=float(metrics.brier_score(judged.truth, judged.posteriors).mean()),
+        alarms=proportions.count_alarms(judged.truth, judged.verdicts),
+        brier=float(scoring_rules.brier_score(judged.truth, judged.posteriors).mean()),
         calibration=_calibration(judged, rng or np.random.default_rng(0)),
-        coverage=metrics.coverage_by_mode(intervals),
+        coverage=proportions.coverage_by_mode(intervals),
     )
 
 
@@ -270,8 +272,10 @@ def _no_truth(name: str) -> InputError:
     )
 
 
-def _truths(given: xr.Dataset | Truths | None) -> Truths | None:
-    return given if given is None or isinstance(given, Truths) else Truths.of(given)
+def _truths(given: RunsLike | Truths | None) -> Truths | None:
+    if given is None or isinstance(given, Truths):
+        return given
+    return Truths.of(as_runs(given))
 
 
 def _calibration(judged: Judged, rng: np.random.Generator) -> Calibration | None:
@@ -281,15 +285,15 @@ def _calibration(judged: Judged, rng: np.random.Generator) -> Calibration | None
         return None
     chance = np.array([posterior[verdict] for verdict, posterior in pairs if verdict is not None])
     stated, right = np.minimum(chance, 1.0), judged.right[decided]  # sums may round above 1
-    equal = metrics.equal_edges()
+    equal = scoring_rules.equal_edges()
     return Calibration(
-        equal=metrics.reliability(stated, right, equal),
-        adaptive=metrics.reliability(stated, right, metrics.adaptive_edges(stated)),
-        by_chance=metrics.calibrated_error(stated, equal, rng),
+        equal=scoring_rules.reliability(stated, right, equal),
+        adaptive=scoring_rules.reliability(stated, right, scoring_rules.adaptive_edges(stated)),
+        by_chance=scoring_rules.calibrated_error(stated, equal, rng),
     )
 
 
-def _intervals(judged: Judged, truths: Truths) -> Iterator[metrics.IntervalCase]:
+def _intervals(judged: Judged, truths: Truths) -> Iterator[proportions.IntervalCase]:
     """Yield the intervals of runs whose fault was found, with the values that they should hold."""
     for diagnosis, right in zip(judged.diagnoses, judged.truth, strict=True):
         if diagnosis.diagnosis != right:
@@ -301,7 +305,7 @@ def _intervals(judged: Judged, truths: Truths) -> Iterator[metrics.IntervalCase]
             ("magnitude", diagnosis.magnitude_90, known.magnitude),
         ):
             if interval is not None and np.isfinite(true):
-                yield metrics.IntervalCase(mode, quantity, *interval, true)
+                yield proportions.IntervalCase(mode, quantity, *interval, true)
 
 
 # Two methods on the same runs: which is better?
@@ -309,11 +313,9 @@ def _intervals(judged: Judged, truths: Truths) -> Iterator[metrics.IntervalCase]
 
 @dataclass(frozen=True)
 class Comparison:
-    """What two methods say of the same runs.
+    """What two methods, by name and protocol, say of the same runs.
 
     Attributes:
-        first: Name and protocol of the first.
-        second: Name and protocol of the second.
         split: Which runs they got right.
         gain: Nats a run that the second saves.
         as_unknown: Runs that the first and the second judge as `unknown`, since the truth is not
@@ -322,8 +324,8 @@ class Comparison:
 
     first: str
     second: str
-    split: metrics.McNemar
-    gain: metrics.LogScoreGain
+    split: scoring_rules.McNemar
+    gain: scoring_rules.LogScoreGain
     as_unknown: tuple[int, int]
 
     @property
@@ -336,7 +338,7 @@ class Comparison:
 def compare(
     first: Given,
     second: Given,
-    truth: xr.Dataset | Truths | None = None,
+    truth: RunsLike | Truths | None = None,
     rng: np.random.Generator | None = None,
 ) -> Comparison:
     """Compare two methods run by run, matched by run name, each by its own hypotheses.
@@ -358,8 +360,8 @@ def compare(
     return Comparison(
         first=_named(one),
         second=_named(other),
-        split=metrics.mcnemar(ours.right, theirs.right),
-        gain=metrics.log_score_gain(
+        split=scoring_rules.mcnemar(ours.right, theirs.right),
+        gain=scoring_rules.log_score_gain(
             ours.scores.log_scores.nats,
             theirs.scores.log_scores.nats,
             rng or np.random.default_rng(0),

@@ -52,11 +52,7 @@ KNOWN = frozenset(field.name for field in fields(Record))
 
 @dataclass(frozen=True)
 class Results:
-    """Diagnoses by one method, each run once.
-
-    Attributes:
-        name: What to call them in errors and tables, such as the file that they are in.
-        diagnoses: One a run.
+    """Diagnoses by one method, each run once; `name` is what errors and tables call them.
 
     Raises:
         InputError: If a run is there twice, which would count it twice.

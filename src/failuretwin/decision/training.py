@@ -1,49 +1,269 @@
-"""Training a network for a real robot: on the calibrated twin, without any recorded failure."""
+"""Training a network for a real robot: on the calibrated twin, without any recorded failure.
+
+It learns from runs as various as a real robot may make them, without end, which other processes
+make meanwhile.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+import multiprocessing
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from failuretwin.core.errors import FailureTwinError
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
+from failuretwin.core.runs import RunTable, concatenate
+from failuretwin.core.types import IntArray
+from failuretwin.data_knowledge.generate import Plan, simulate_runs
+from failuretwin.decision.evaluation import Judged
 from failuretwin.decision.learned.diagnoser import LearnedDiagnoser
-from failuretwin.decision.learned.feature_encoder import FeatureEncoder, expectation_of
+from failuretwin.decision.learned.feature_encoder import (
+    FeatureEncoder,
+    Floats,
+    expectation_of,
+    signals_of,
+)
 from failuretwin.decision.learned.log_pool import HybridDiagnoser, fit_pool_weights
-from failuretwin.decision.learned.networks import Standard
-from failuretwin.decision.learned.training_data import Stream, TrainingData, widened
-from failuretwin.decision.metrics import log_score
-from failuretwin.digital_model.calibrated_robot import load_calibration
-from failuretwin.digital_model.nonidealities import Imperfections
+from failuretwin.decision.learned.networks import Batch, Standard, epoch
+from failuretwin.decision.proportions import Scores
+from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
+from failuretwin.digital_model.nonidealities import SETTLING_LISTS, Imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.failure_behavior.mode import FaultMode
+from failuretwin.failure_behavior.modes import SteadyStateError, Stuck
+from failuretwin.failure_behavior.random_movements import RandomMovements
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser
-from failuretwin.inference.protocol import Diagnoser
 
 if TYPE_CHECKING:
     import xarray as xr
+
+Range = tuple[float, float]
+
+COUNT_RAD = float(np.deg2rad(0.24))
+"""One count of the servos whose errors the ranges below were found on [rad]."""
+RUNS_PER_CLASS = 10**9
+"""Runs of each class that a seed has room for: more than any training sees."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One kind of runs.
+
+    Attributes:
+        error_counts: Range of steady-state errors [counts of 0.24 deg].
+        onset_s: Range of the onset of stuck faults [s]; 0: before the run.
+        first_motor_deg: Range of the first motor's targets to both sides [deg]; None: as the
+            robot's profile says.
+    """
+
+    error_counts: Range
+    onset_s: Range
+    first_motor_deg: float | None = None
+
+
+VARIANTS = (
+    Variant((4.0, 20.0), (0.49, 0.49), 70.0),
+    Variant((5.0, 20.0), (0.0, 0.0)),
+    Variant((7.0, 35.0), (0.49, 0.49)),
+    Variant((10.0, 50.0), (0.49, 0.49)),
+    Variant((4.0, 12.0), (0.49, 0.49), 70.0),
+    Variant((4.0, 20.0), (0.0, 2.0)),
+)
+"""Small errors are the hard ones, so they come most often; the paper's are 10 to 50 counts."""
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """An endless supply of labelled runs, the same for the same seed.
+
+    Attributes:
+        robot: The robot.
+        imperfections: Its healthy behaviour, with the variation to draw robots from.
+        seed: Seed of all chance.
+        variants: Kinds of runs, equally frequent.
+        engine: What moves the robot; see `Plan`.
+        hypotheses: The classes; none: the paper's.
+        modes: Fault modes by id; a variant says how large the paper's are and when they begin.
+    """
+
+    robot: Robot
+    imperfections: Imperfections
+    seed: int = 0
+    variants: tuple[Variant, ...] = VARIANTS
+    engine: str = "servo"
+    hypotheses: tuple[Hypothesis, ...] = ()
+    modes: Mapping[str, FaultMode] = field(default_factory=lambda: dict(MODES))
+
+    def __post_init__(self) -> None:
+        if not self.hypotheses:
+            object.__setattr__(self, "hypotheses", paper_hypotheses(self.robot.motor_names))
+
+    @property
+    def movements(self) -> tuple[int, int]:
+        """Fewest and most movements of a run."""
+        count = RandomMovements().count
+        return count, count
+
+    def chunk(self, number: int, runs: int, encoder: FeatureEncoder) -> tuple[Floats, IntArray]:
+        """Return some runs as features, with their classes, in random order.
+
+        Each number of a chunk has runs of its own, and as many of one variant as of another.
+        """
+        made = [(at, encoder.encode(signals_of(table))) for at, table in self._made(number, runs)]
+        order, features = (np.concatenate(parts) for parts in zip(*made, strict=True))
+        shuffled = np.random.default_rng([self.seed, number, 1]).permutation(runs)
+        return features[shuffled], self._classes(number, runs)[order[shuffled]]
+
+    def run_set(self, number: int, runs: int) -> xr.Dataset:
+        """Return the runs of a chunk as a run set that knows their truth."""
+        return concatenate([table.to_dataset() for _, table in self._made(number, runs)])
+
+    def _classes(self, number: int, runs: int) -> IntArray:
+        rng = np.random.default_rng([self.seed, number])
+        return rng.integers(0, len(self.hypotheses), runs)
+
+    def _made(self, number: int, runs: int) -> Iterator[tuple[IntArray, RunTable]]:
+        """Give the runs of each variant, and their places among the classes of the chunk."""
+        classes = self._classes(number, runs)
+        for kind, variant in enumerate(self.variants):
+            places = np.arange(kind, runs, len(self.variants))
+            if len(places):
+                numbers = [
+                    int(classes[i]) * RUNS_PER_CLASS + number * runs + int(i) for i in places
+                ]
+                yield places, simulate_runs(self._plan(variant), numbers)
+
+    def _plan(self, variant: Variant) -> Plan:
+        return Plan(
+            robot=_with_range(self.robot, variant.first_motor_deg),
+            hypotheses=self.hypotheses,
+            runs_per_class=RUNS_PER_CLASS,
+            seed=self.seed,
+            imperfections=self.imperfections,
+            movements=RandomMovements(),
+            modes={**self.modes, **_modes_of(variant)},
+            engine=self.engine,
+        )
+
+
+def _modes_of(variant: Variant) -> Mapping[str, FaultMode]:
+    low, high = variant.error_counts
+    return {
+        "stuck": Stuck(onset_s=variant.onset_s),
+        "steady_state_error": SteadyStateError(magnitude=(low * COUNT_RAD, high * COUNT_RAD)),
+    }
+
+
+def _with_range(robot: Robot, degrees: float | None) -> Robot:
+    """Return the robot with another range of the first motor's targets."""
+    if degrees is None:
+        return robot
+    first, *others = robot.motors
+    limit = float(np.deg2rad(degrees))
+    motors = (replace(first, movement_range=(-limit, limit)), *others)
+    return replace(robot, profile=replace(robot.profile, motors=motors))
+
+
+def widened(imperfections: Imperfections, factor: float) -> Imperfections:
+    """Return imperfections whose robots differ `factor` times as much from each other.
+
+    A calibration knows its figures well on the day of its logs; on another day, and with another
+    tool, they are a little different.
+    """
+    variation = imperfections.variation
+    if variation is None:
+        return imperfections
+    wider: dict[str, Any] = {
+        name: tuple(factor * value for value in getattr(variation, name)) for name in SETTLING_LISTS
+    }
+    wider["rates"] = factor * variation.rates
+    return replace(imperfections, variation=replace(variation, **wider))
+
+
+# Training batches that never end, made by other processes while a network learns.
+
+CHUNK_RUNS = 576
+"""Runs made at a time."""
+AHEAD = 2
+"""Batchs made ahead for each process, so that none waits."""
+
+
+def cores() -> int:
+    """Return how many processes this machine can run at a time."""
+    return os.cpu_count() or 1
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Batches of runs straight from the generator.
+
+    They depend on `data` alone, not on how many processes make the runs.
+
+    Attributes:
+        data: What runs are made.
+        encoder: What networks see of them.
+        batch_runs: Runs in a batch.
+        uses: Batches that a run is part of before it is thrown away; 1: none is seen twice.
+    """
+
+    data: TrainingData
+    encoder: FeatureEncoder
+    batch_runs: int = 64
+    uses: int = 6
+
+    @contextmanager
+    def chunks(self) -> Iterator[Iterator[Batch]]:
+        """Give chunks of fresh runs without end; leaving the block ends the processes.
+
+        Scripts must be guarded by ``if __name__ == "__main__":``.
+        """
+        workers = max(1, cores() - 1)
+        pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
+        try:
+            yield self._in_order(pool, AHEAD * workers)
+        except BrokenProcessPool as error:
+            raise FailureTwinError(
+                "a process that makes runs has died. Look for what ended it, such as too little "
+                "memory, and start again."
+            ) from error
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+    def _in_order(self, pool: ProcessPoolExecutor, ahead: int) -> Iterator[Batch]:
+        given: deque[Future[Batch]] = deque()
+        number = 0
+        while True:
+            while len(given) <= ahead:
+                given.append(pool.submit(self.data.chunk, number, CHUNK_RUNS, self.encoder))
+                number += 1
+            yield given.popleft().result()
+
+    def batches(self, chunks: Iterator[Batch]) -> Iterator[Batch]:
+        """Give batches from chunks: each fresh chunk is shuffled with those still in use."""
+        rng = np.random.default_rng([self.data.seed, CHUNK_RUNS])
+        in_use: deque[Batch] = deque(maxlen=self.uses)
+        for chunk in chunks:
+            in_use.append(chunk)
+            features, classes = (np.concatenate(parts) for parts in zip(*in_use, strict=True))
+            yield from epoch(features, classes, self.batch_runs, rng)
+
+
+# Training itself, and how well the result does on another engine.
 
 WIDER = 2.0
 """Robots in training differ this many times as much as the calibration leaves open."""
 VALIDATION_SEED = 1_000_003
 """Added to the seed for runs of the other engine, so that none of their chance is shared."""
-
-
-@dataclass(frozen=True)
-class Validation:
-    """How diagnoses do on simulated runs of the physics engine that nothing was learned from.
-
-    Attributes:
-        runs: How many there were.
-        right: Share that is right.
-        log_score: Mean log score [nats a run].
-    """
-
-    runs: int
-    right: float
-    log_score: float
 
 
 @dataclass(frozen=True)
@@ -67,8 +287,8 @@ class TrainingPlan:
 
 
 def train(
-    robot: Robot,
-    imperfections: Imperfections | None = None,
+    robot: RobotLike = "armpi_fpv",
+    imperfections: HealthyLike = None,
     plan: TrainingPlan = TrainingPlan(),
     *,
     with_bayes: bool = False,
@@ -78,19 +298,14 @@ def train(
     Other processes make the runs: guard scripts by ``if __name__ == "__main__":``. Keep a network
     with `save_network`.
 
-    Args:
-        robot: The robot.
-        imperfections: Its healthy behaviour, such as a calibration; None: as its profile says.
-        plan: How much to train.
-        with_bayes: Whether to pool the network with the Bayesian diagnosis, by fitted weights.
+    Its healthy behaviour is that of some imperfections, such as a calibration; None: as its profile
+    says. The pool with the Bayesian diagnosis has fitted weights.
     """
-    if imperfections is None:
-        known = load_calibration(None, robot)
-        robot, imperfections = known.robot, known.imperfections
-    network, _, _ = train_network(plan, robot, imperfections)
+    known = calibrated(robot, imperfections)
+    network, _, _ = train_network(plan, known.robot, known.imperfections)
     if not with_bayes:
         return network
-    bayes = BayesDiagnoser(DigitalTwin(robot), imperfections)
+    bayes = BayesDiagnoser(known)
     return HybridDiagnoser(bayes, network, network.weights_)
 
 
@@ -99,19 +314,12 @@ def train_network(
     robot: Robot,
     imperfections: Imperfections,
     on_iteration: Callable[[int], None] = lambda done: None,
-) -> tuple[LearnedDiagnoser, Validation, Validation]:
+) -> tuple[LearnedDiagnoser, Scores, Scores]:
     """Train a network on the twin with imperfections and calibrate its probabilities.
 
-    Nothing is chosen on the way: the network of the last iteration is the result.
-
-    Args:
-        plan: How much to train.
-        robot: The robot.
-        imperfections: Its healthy behaviour, such as a calibration.
-        on_iteration: Called after each batch with the number of those done.
-
-    Returns:
-        The network, how it does, and how it does pooled with the Bayesian diagnosis.
+    Nothing is chosen on the way: the network of the last iteration is the result. After each batch
+    `on_iteration` is called with the number of those done. Returns the network, and the scores of
+    it and of its pool with the Bayesian diagnosis on runs that nothing was learned from.
     """
     encoder = FeatureEncoder("robust", robot, expectation_of(robot, imperfections))
     hypotheses = plan.hypotheses or paper_hypotheses(robot.motor_names)
@@ -138,7 +346,8 @@ def train_network(
     _calibrate(network, bayes, other.run_set(0, half))
     judges = other.run_set(1, half)
     both = HybridDiagnoser(bayes, network, network.weights_)
-    return network, _judge(network, judges), _judge(both, judges)
+    alone, pooled = (Judged.of(d.diagnose(judges)).scores for d in (network, both))
+    return network, alone, pooled
 
 
 def _calibrate(network: LearnedDiagnoser, bayes: BayesDiagnoser, runs: xr.Dataset) -> None:
@@ -150,11 +359,3 @@ def _calibrate(network: LearnedDiagnoser, bayes: BayesDiagnoser, runs: xr.Datase
     network.weights_ = fit_pool_weights(
         np.array(by_bayes), network.predict_proba(runs), np.array(truth, dtype=np.int64)
     )
-
-
-def _judge(diagnoser: Diagnoser, runs: xr.Dataset) -> Validation:
-    diagnoses = diagnoser.diagnose(runs)
-    truth = [str(d.truth) for d in diagnoses]
-    right = float(np.mean([d.diagnosis == true for d, true in zip(diagnoses, truth, strict=True)]))
-    score = log_score(truth, [d.posterior for d in diagnoses])
-    return Validation(len(diagnoses), right, score.mean)

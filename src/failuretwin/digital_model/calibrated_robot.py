@@ -19,7 +19,7 @@ from failuretwin.digital_model.nonidealities import (
     Imperfections,
     generic_imperfections,
 )
-from failuretwin.digital_model.robot import Motor, Robot
+from failuretwin.digital_model.robot import Motor, Robot, load_robot
 from failuretwin.digital_model.servo import ServoLoop
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -70,6 +70,30 @@ class CalibratedRobot:
         return DigitalTwin(self.robot)
 
 
+RobotLike = DigitalTwin | CalibratedRobot | Robot | str | Path
+"""A robot in any form: a twin, what a calibration made of it, or a bundled name or profile."""
+HealthyLike = Imperfections | str | Path | None
+"""What a healthy robot does: figures, the name or path of a calibration, None: by its profile."""
+
+
+def calibrated(robot: RobotLike, healthy: HealthyLike = None) -> CalibratedRobot:
+    """Return a robot with what is known of it, whatever form both are given in.
+
+    Args:
+        robot: The robot; a `CalibratedRobot` is returned as it is where `healthy` is None.
+        healthy: What it does that its twin does not.
+
+    Raises:
+        InputError: If there is no such robot or calibration, or it is of another robot.
+    """
+    if isinstance(robot, CalibratedRobot) and healthy is None:
+        return robot
+    model = robot.robot if isinstance(robot, DigitalTwin | CalibratedRobot) else load_robot(robot)
+    if isinstance(healthy, Imperfections):
+        return CalibratedRobot(model, healthy)
+    return load_calibration(healthy, model)
+
+
 def with_loops(robot: Robot, loops: Sequence[CalibratedLoop]) -> Robot:
     """Return a robot with other servo loops and speed limits for some of its motors.
 
@@ -106,14 +130,22 @@ def load_calibration(name_or_path: str | Path | None, robot: Robot) -> Calibrate
     path = _file_of(str(name_or_path or robot.name), robot)
     table = read_toml(path)
     record = _record(table.pop(CALIBRATION_TABLE, {}), path)
-    _check_robot(record.robot, robot, path)
+    if record.robot not in ("", robot.name):
+        raise InputError(
+            f"{path}: is a calibration of robot {record.robot!r}, not of {robot.name!r}. Name the "
+            "right robot (--robot) or calibrate this one."
+        )
     imperfections = _completed(from_table(Imperfections, table, str(path)), len(robot.motors))
     _check_fit(imperfections, robot, path)
     return CalibratedRobot(with_loops(robot, record.loops), imperfections)
 
 
 def _file_of(name_or_path: str, robot: Robot) -> Path:
-    path, known = Path(name_or_path), _known_files(robot)
+    """Return the file of a name: that of the profile or one beside it; or of a path."""
+    path, own = Path(name_or_path), robot.imperfections_file
+    known = {}
+    if own is not None:
+        known = {robot.name: own} | {p.stem: p for p in sorted(own.parent.glob("*.toml"))}
     if name_or_path in known:
         return known[name_or_path]
     if path.suffix != ".toml" and not path.exists():
@@ -123,14 +155,6 @@ def _file_of(name_or_path: str, robot: Robot) -> Path:
             "TOML file, such as `failuretwin calibrate` writes."
         )
     return path
-
-
-def _known_files(robot: Robot) -> dict[str, Path]:
-    """Return the files that go by a name: that of the profile, and those that lie beside it."""
-    own = robot.imperfections_file
-    if own is None:
-        return {}
-    return {robot.name: own} | {path.stem: path for path in sorted(own.parent.glob("*.toml"))}
 
 
 def _completed(imperfections: Imperfections, motors: int) -> Imperfections:
@@ -157,14 +181,6 @@ def _record(table: object, path: Path) -> _Record:
         raise InputError(f"{path}: {CALIBRATION_TABLE} is {table!r}, expected a table.")
     known = {name: table[name] for name in ("robot", "loops") if name in table}
     return from_table(_Record, known, f"{path}: {CALIBRATION_TABLE}")
-
-
-def _check_robot(owner: str, robot: Robot, path: Path) -> None:
-    if owner not in ("", robot.name):
-        raise InputError(
-            f"{path}: is a calibration of robot {owner!r}, not of {robot.name!r}. Name the right "
-            "robot (--robot) or calibrate this one."
-        )
 
 
 def _check_fit(imperfections: Imperfections, robot: Robot, path: Path) -> None:

@@ -1,7 +1,7 @@
 """The robot of one run and its bad luck: all that imperfections leave to chance.
 
-Chance and computation are apart: everything is drawn here, from one generator for each run;
-what follows from it is deterministic and works on many runs at once.
+Chance and computation are apart: everything is drawn first, from one generator for each run; the
+motions and the sensors' readings that follow are deterministic, for many runs at once.
 """
 
 from __future__ import annotations
@@ -151,9 +151,6 @@ def _draw_readings(
     return np.maximum.accumulate(times), glitch, noise
 
 
-# The motions of the imperfect healthy robot, for many runs at once; all chance is drawn before.
-
-
 def delay_commands(movements: Movements, late: FloatArray) -> Movements:
     """Return the movements as commanded when each late start also delays all that follow.
 
@@ -210,9 +207,6 @@ def lagged(reference: FloatArray, time: FloatArray, lag: FloatArray) -> FloatArr
         first, step = reference[run, 0], float(time[1] - time[0])
         out[run] = first_order_lag(reference[run].T, first, step, lag[run]).T
     return out
-
-
-# The sensors: from the true angles of many runs to readings of motors and of the tool's path.
 
 
 def sense(

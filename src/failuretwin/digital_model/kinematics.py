@@ -123,14 +123,7 @@ class SerialChain:
             raise InputError("a chain needs one moving joint at least; this one has none.")
 
     def position(self, q: FloatArray) -> FloatArray:
-        """Return tool positions in the base frame.
-
-        Args:
-            q: Joint values in chain order, (..., joint) [rad or m].
-
-        Returns:
-            (..., 3) [m].
-        """
+        """Return tool positions (..., 3) [m], base frame, for `q` (..., joint) [rad or m]."""
         flat = self._flatten(q)
         out = np.empty((len(flat), 3))
         for rows in _chunks(len(flat)):
@@ -140,13 +133,9 @@ class SerialChain:
         return out.reshape(*np.shape(q)[:-1], 3)
 
     def position_and_jacobian(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return tool positions (..., 3) [m] and their derivative by the joints.
+        """Return tool positions (..., 3) [m] and Jacobians (..., 3, joint) [m/rad or m/m].
 
-        Args:
-            q: Joint values in chain order, (..., joint) [rad or m].
-
-        Returns:
-            Positions (..., 3) [m] and Jacobians (..., 3, joint) [m/rad or m/m], base frame.
+        Both are in the base frame; `q` are joint values in chain order, (..., joint) [rad or m].
         """
         flat = self._flatten(q)
         point_out = np.empty((len(flat), 3))
@@ -178,19 +167,17 @@ class SerialChain:
         point: Vector = tuple(float(x) for x in self.T_jt[:3, 3])  # type: ignore[assignment]
         columns: list[Vector] = []
         for joint, value in zip(reversed(self.joints), q[::-1], strict=True):
+            tangent: Vector = (0.0, 0.0, 1.0)
             if joint.prismatic:
-                columns = [_turn(joint.T_pj, column) for column in columns]
-                if derivatives:
-                    columns.insert(0, _turn(joint.T_pj, (0.0, 0.0, 1.0)))
-                point = _move(joint.T_pj, (point[0], point[1], _add(point[2], value)))
+                point = (point[0], point[1], _add(point[2], value))
             else:
                 c, s = np.cos(value), np.sin(value)
-                turned = _spin(c, s, point)
-                columns = [_turn(joint.T_pj, _spin(c, s, column)) for column in columns]
-                if derivatives:
-                    tangent = (_scale(-1.0, turned[1]), turned[0], 0.0)
-                    columns.insert(0, _turn(joint.T_pj, tangent))
-                point = _move(joint.T_pj, turned)
+                point = _spin(c, s, point)
+                columns = [_spin(c, s, column) for column in columns]
+                tangent = (_scale(-1.0, point[1]), point[0], 0.0)
+            if derivatives:
+                columns = [_turn(joint.T_pj, column) for column in (tangent, *columns)]
+            point = _move(joint.T_pj, point)
         return point, columns
 
 

@@ -169,13 +169,14 @@ class Robot:
     @property
     def imperfections_file(self) -> Path | None:
         """File with the imperfections of the healthy robot, if the profile names one."""
-        name = self.profile.imperfections
-        return None if name is None else self.folder / name
+        return self._beside(self.profile.imperfections)
 
     @property
     def physics_file(self) -> Path | None:
         """File with motors and gears for the physics engine, if the profile names one."""
-        name = self.profile.physics
+        return self._beside(self.profile.physics)
+
+    def _beside(self, name: str | None) -> Path | None:
         return None if name is None else self.folder / name
 
 
@@ -199,20 +200,12 @@ def load_robot(name_or_path: str | Path | Robot) -> Robot:
     """
     if isinstance(name_or_path, Robot):
         return name_or_path
-    return _load_profile(_find_profile(name_or_path))
-
-
-def _find_profile(name_or_path: str | Path) -> Path:
     path = Path(name_or_path)
-    if path.suffix == ".toml":
-        return path
-    if str(name_or_path) not in bundled_robots():
-        error = unknown_name("robot", str(name_or_path), bundled_robots())
-        raise InputError(f"{error} Or give the path of a profile that ends in .toml.")
-    return bundled_folder() / f"{name_or_path}.toml"
-
-
-def _load_profile(path: Path) -> Robot:
+    if path.suffix != ".toml":
+        if str(name_or_path) not in bundled_robots():
+            error = unknown_name("robot", str(name_or_path), bundled_robots())
+            raise InputError(f"{error} Or give the path of a profile that ends in .toml.")
+        path = bundled_folder() / f"{name_or_path}.toml"
     profile = from_table(Profile, read_toml(path), str(path))
     _check_unique([motor.name for motor in profile.motors], "motor name", path)
     joints = [motor.joint for motor in profile.motors]

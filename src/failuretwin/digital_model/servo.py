@@ -1,7 +1,7 @@
-"""The servo loop of the published Simulink model, solved exactly between samples.
+"""The servo loop of the published Simulink model, with and without a limit of its speed.
 
 Each motor is a PI loop around a second-order input filter and the joint follows exactly:
-closed loop (P s + I) / (s (tau s + 1)^2 + P s + I).
+closed loop (P s + I) / (s (tau s + 1)^2 + P s + I). All is solved exactly between samples.
 """
 
 from __future__ import annotations
@@ -74,16 +74,13 @@ def respond(loops: Sequence[ServoLoop], command: FloatArray, step: float) -> Flo
 def first_order_lag(
     reference: FloatArray, before: FloatArray, step: float, tau: float
 ) -> FloatArray:
-    """Return references behind a first-order lag; exact for straight lines between samples.
+    """Return references (..., time) behind a first-order lag; exact for lines between samples.
 
     Args:
         reference: (..., time), sampled every `step` [s].
-        before: What the lag has put out at the first sample, (...).
+        before: What the lag has put out at the first sample, (...); the result begins with it.
         step: Time between samples [s].
         tau: Time constant [s].
-
-    Returns:
-        (..., time), beginning with `before`.
     """
     from scipy.signal import lfilter
 
@@ -97,13 +94,10 @@ def first_order_lag(
     return out
 
 
-# The servo loop of a motor that can turn no faster than its speed limit.
-
-
 def respond_limited(
     gains: FloatArray, limit: FloatArray, reference: FloatArray, step: float
 ) -> FloatArray:
-    """Return the angles of motors that start at rest at their first reference.
+    """Return the angles of motors that start at rest and can turn no faster than `limit`.
 
     Both regimes, free and at the limit, are solved exactly for references that are linear between
     samples; which of them holds is decided at the beginning of every sample.
@@ -119,8 +113,10 @@ def respond_limited(
     """
     free, held = _transitions(gains, step)
     begin = reference[..., :1]
-    drive = _drive(reference - begin, free, step)
-    most = limit[:, None]
+    relative, most = reference - begin, limit[:, None]
+    told = np.stack([relative[..., :-1], np.diff(relative, axis=-1) / step], axis=-1)
+    # What the reference adds in every time step, (time - 1, variant, test, 4).
+    drive = np.ascontiguousarray(np.moveaxis(told @ free[:, None, 3:], 2, 0))
     response = np.zeros((reference.shape[-1], *reference.shape[:2]))
     x = np.zeros((*reference.shape[:2], 3))
     for i, driven in enumerate(drive):
@@ -134,13 +130,6 @@ def respond_limited(
             x = ahead[..., :3]
         response[i + 1] = x[..., 2]
     return begin + np.moveaxis(response, 0, -1)
-
-
-def _drive(reference: FloatArray, free: FloatArray, step: float) -> FloatArray:
-    """Return what the reference adds in every time step, (time - 1, variant, test, 4)."""
-    slope = np.diff(reference, axis=-1) / step
-    told = np.stack([reference[..., :-1], slope], axis=-1)
-    return np.ascontiguousarray(np.moveaxis(told @ free[:, None, 3:], 2, 0))
 
 
 def _transitions(gains: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:

@@ -60,11 +60,15 @@ class Settling(Bounded):
         return offset + sag(robot, pose, np.asarray(self.compliance), self.payload)
 
 
-def loads_in_range(robot: Robot, payload: float) -> FloatArray:
-    """Return gravity torques at 500 poses spread over the motors' ranges, (pose, motor) [N m]."""
+def poses_in_range(robot: Robot) -> FloatArray:
+    """Return 500 physical poses spread over the motors' ranges, (pose, motor) [rad]."""
     low, high = np.array([motor.movement_range for motor in robot.motors]).T
-    poses = np.random.default_rng(0).uniform(low, high, (500, len(low)))
-    return robot.loads.torque(poses * robot.sense, payload)
+    return np.random.default_rng(0).uniform(low, high, (500, len(low))) * robot.sense
+
+
+def loads_in_range(robot: Robot, payload: float) -> FloatArray:
+    """Return gravity torques at `poses_in_range`, (pose, motor) [N m]."""
+    return robot.loads.torque(poses_in_range(robot), payload)
 
 
 def largest_load(robot: Robot, payload: float) -> FloatArray:

@@ -50,25 +50,15 @@ class DigitalTwin:
         return servo.respond(loops, command, uniform_step(grid))
 
     def path(self, position: ArrayLike) -> FloatArray:
-        """Return what the tool sensor sees of motor angles.
+        """Return what the tool sensor sees, (..., axis) [m] in the base frame.
 
         Args:
-            position: Angles in the log's sense, (..., motor) [rad].
-
-        Returns:
-            Tool positions in the base frame, (..., axis) [m].
+            position: Motor angles in the log's sense, (..., motor) [rad].
         """
         return self.robot.chain.position(self._sensor_pose(position))
 
     def path_and_jacobian(self, position: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return `path` and its derivative by the angles in the log's sense.
-
-        Args:
-            position: Angles in the log's sense, (..., motor) [rad].
-
-        Returns:
-            Tool positions (..., axis) [m] and Jacobians (..., axis, motor) [m/rad].
-        """
+        """Return `path` and its derivative by the angles, (..., axis, motor) [m/rad]."""
         point, jacobian = self.robot.chain.position_and_jacobian(self._sensor_pose(position))
         return point, jacobian if self._turned is None else jacobian * self._turned
 
@@ -129,11 +119,7 @@ class Engine(Protocol):
     def angles(self, drive: Drive, time: FloatArray) -> FloatArray:
         """Return the angles that the motors take, (run, time, motor) [rad], log's sense.
 
-        The arm is at rest at the first reference when the run begins.
-
-        Args:
-            drive: What the motors are told, and what hampers them.
-            time: Uniform grid, (time,) [s].
+        The arm is at rest at the first reference; `time` is a uniform grid, (time,) [s].
         """
         ...
 
@@ -151,7 +137,8 @@ class ServoEngine:
     def angles(self, drive: Drive, time: FloatArray) -> FloatArray:
         """Return the angles that the motors take, (run, time, motor) [rad], log's sense."""
         free = DigitalTwin(self.robot).respond(drive.reference, time)
-        position = self._hold(free, drive, time)
+        limits = np.array([motor.speed_limit for motor in self.robot.motors])
+        position = hold(free, drive.held, time, limits)
         if drive.compliance is None:
             return position
         payload = 0.0 if drive.payload is None else drive.payload[:, None]
@@ -159,11 +146,5 @@ class ServoEngine:
             yielding = sag(self.robot, position, drive.compliance[:, None], payload)
             if drive.weakness is not None:
                 yielding /= 1.0 - drive.weakness
-            position = self._hold(free + yielding, drive, time)
+            position = hold(free + yielding, drive.held, time, limits)
         return position
-
-    def _hold(self, position: FloatArray, drive: Drive, time: FloatArray) -> FloatArray:
-        if drive.held is None:
-            return position
-        limits = np.array([motor.speed_limit for motor in self.robot.motors])
-        return hold(position, drive.held, time, limits)

@@ -152,8 +152,16 @@ class Urdf:
             InputError: If a named joint is not on the path or of a type that cannot move.
         """
         path = self.path(base_link, tool_link)
+        types = {joint.name: joint.type for joint in path}
         for name in moving:
-            self._check_movable(name, path)
+            if name not in types:
+                error = unknown_name("joint on the way to the tool", name, types)
+                raise InputError(f"{self.source}: {error}")
+            if types[name] not in MOVING_TYPES:
+                raise InputError(
+                    f"{self.source}: joint {name!r} is {types[name]}, so no motor can move it. "
+                    f"Expected one of {', '.join(MOVING_TYPES)}."
+                )
         T = np.eye(4)
         joints = []
         for joint in path:
@@ -188,19 +196,6 @@ class Urdf:
         weighs = mass[:, None] > 0
         centre = np.divide(moment, mass[:, None], out=np.zeros_like(moment), where=weighs)
         return Loads(chain, mass, centre)
-
-    def _check_movable(self, name: str, path: tuple[UrdfJoint, ...]) -> None:
-        names = [joint.name for joint in path]
-        if name not in names:
-            raise InputError(
-                f"{self.source}: {unknown_name('joint on the way to the tool', name, names)}"
-            )
-        joint = path[names.index(name)]
-        if joint.type not in MOVING_TYPES:
-            raise InputError(
-                f"{self.source}: joint {name!r} is {joint.type}, so no motor can move it. "
-                f"Expected one of {', '.join(MOVING_TYPES)}."
-            )
 
 
 def _snap(T: FloatArray) -> FloatArray:
@@ -261,7 +256,7 @@ def _read_joint(element: ElementTree.Element, path: Path) -> UrdfJoint:
     if type_ not in MOVING_TYPES + HELD_TYPES:
         raise InputError(f"{where}: {unknown_name('joint type', type_, MOVING_TYPES + HELD_TYPES)}")
     origin, limit = element.find("origin"), element.find("limit")
-    axis = _triple(element.find("axis"), "xyz", (1.0, 0.0, 0.0), where)
+    axis = _triple(element.find("axis"), "xyz", where, "1 0 0")
     length = math.hypot(*axis)
     if type_ in HELD_TYPES:
         axis, length = (1.0, 0.0, 0.0), 1.0  # exporters write zeros where no axis is needed
@@ -274,10 +269,7 @@ def _read_joint(element: ElementTree.Element, path: Path) -> UrdfJoint:
         type=type_,
         parent=parent.get("link", ""),
         child=child.get("link", ""),
-        T_pc=transform(
-            _triple(origin, "xyz", (0.0, 0.0, 0.0), where),
-            _triple(origin, "rpy", (0.0, 0.0, 0.0), where),
-        ),
+        T_pc=transform(_triple(origin, "xyz", where), _triple(origin, "rpy", where)),
         axis=(axis[0] / length, axis[1] / length, axis[2] / length),
         low=-np.inf if unlimited else _number(limit, "lower", where),
         high=np.inf if unlimited else _number(limit, "upper", where),
@@ -287,10 +279,10 @@ def _read_joint(element: ElementTree.Element, path: Path) -> UrdfJoint:
     )
 
 
-def _triple(element: ElementTree.Element | None, key: str, default: Triple, where: str) -> Triple:
-    text = None if element is None else element.get(key)
-    if text is None:
-        return default
+def _triple(
+    element: ElementTree.Element | None, key: str, where: str, default: str = "0 0 0"
+) -> Triple:
+    text = default if element is None else element.get(key, default)
     values = _three_numbers(text)
     if values is None:
         raise InputError(f"{where}: {key}={text!r}, expected three finite numbers.")

@@ -205,9 +205,6 @@ def _reason(joint: UrdfJoint, on_path: bool) -> str:
     return "its axis runs through the tool point"
 
 
-# What may be wrong, each matter in one clear sentence or two.
-
-
 def _of_names(severity: Severity, names: Collection[str], text: str) -> list[Finding]:
     """Return a finding with the names where `text` says NAMES; none if there are no names."""
     quoted = [repr(name) for name in names]

@@ -8,9 +8,9 @@ Section: docs/diagnosis.md#posterior-estimates-and-abstention
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeGuard
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis, paper_hypotheses, parse_hypotheses
 from failuretwin.core.runs import check_motors, check_runs, truth_of
 from failuretwin.core.types import BoolArray
+from failuretwin.data_knowledge.read import RunsLike, as_runs
+from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.evidence import Evidence
@@ -37,16 +39,18 @@ CHUNK_RUNS = 64
 """Runs of five movements at a time: keeps the work on nodes in about 100 MB."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class BayesDiagnoser:
     """Posterior over hypotheses from where the tool settled in a run, and how it got there.
+
+    ``BayesDiagnoser("armpi_fpv").diagnose("runs.nc")`` is enough.
 
     Attributes:
         twin: Digital twin of the robot.
         imperfections: How the healthy robot differs from it; None: as its profile says.
         hypotheses: What may be the case, as `Hypothesis` or in its text form, such as
-            ``["healthy", "motor_1:stuck", "unknown"]``, with the prior odds of their
-            modes; None: the paper's classes. A single one is always certain.
+            ``["healthy", "motor_1:stuck", "unknown"]``, with the prior odds of their fault modes;
+            None: the paper's classes. A single one is always certain.
         priors: Beliefs about onset and size.
         whole_run: Whether readings on the way count beside settled poses, where it is known how
             late this robot starts to move.
@@ -57,12 +61,35 @@ class BayesDiagnoser:
     """
 
     twin: DigitalTwin
-    imperfections: Imperfections | None = None
-    hypotheses: Sequence[Hypothesis | str] | None = None
-    priors: Priors = field(default_factory=Priors)
-    whole_run: bool = True
+    imperfections: Imperfections | None
+    hypotheses: Sequence[Hypothesis | str] | None
+    priors: Priors
+    whole_run: bool
 
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        twin: RobotLike,
+        imperfections: HealthyLike = None,
+        hypotheses: Sequence[Hypothesis | str] | None = None,
+        priors: Priors | None = None,
+        whole_run: bool = True,
+    ) -> None:
+        """Take values or their text form.
+
+        Args:
+            twin: The robot: a twin, a calibrated robot, a robot, its name or its profile.
+            imperfections: Figures, or the name or path of a calibration, whose servo loops count
+                too; None: as the profile says.
+            hypotheses: None: the paper's classes.
+            priors: None: the usual ones.
+            whole_run: Whether readings on the way count.
+        """
+        if not (isinstance(twin, DigitalTwin) and _are_figures(imperfections)):
+            known = calibrated(twin, imperfections)
+            twin, imperfections = known.twin, known.imperfections
+        values = (twin, imperfections, hypotheses, priors or Priors(), whole_run)
+        for entry, value in zip(fields(self), values, strict=True):
+            object.__setattr__(self, entry.name, value)
         for hypothesis in self.hypothesis_set:
             check_diagnosable(hypothesis)
 
@@ -100,14 +127,15 @@ class BayesDiagnoser:
         unseen[:, 1:] |= unseen[:, :-1]  # what follows tells where it ended
         return unseen
 
-    def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
-        """Return the diagnosis of each run of a run set.
+    def diagnose(self, runs: RunsLike) -> list[Diagnosis]:
+        """Return the diagnosis of each run of a run set, or of any logs by their path.
 
         Reads `command` and `measured` alone; the truth, where there is any, is only passed on.
 
         Raises:
             InputError: If the run set is of another robot or no run holds a movement.
         """
+        runs = as_runs(runs, self.twin.robot)
         self._check(runs)
         seen = Evidence(runs, self.healthy_model.settings)
         evidence, moving = seen.sound.settled, None
@@ -142,6 +170,33 @@ class BayesDiagnoser:
         known, end = self.priors.onset.known_s, float(runs["time"].values[-1])
         if known is not None and known > end:
             raise InputError(f"the onset is given as {known:g} s, but the runs end at {end:g} s.")
+
+
+def _are_figures(healthy: HealthyLike) -> TypeGuard[Imperfections | None]:
+    """Return whether nothing has to be loaded: with a twin, None leaves its robot as it is."""
+    return healthy is None or isinstance(healthy, Imperfections)
+
+
+def diagnose(
+    runs: RunsLike,
+    robot: RobotLike = "armpi_fpv",
+    calibration: HealthyLike = None,
+    hypotheses: Sequence[Hypothesis | str] | None = None,
+    priors: Priors | None = None,
+) -> list[Diagnosis]:
+    """Diagnose runs in one call; see `BayesDiagnoser` for more.
+
+    Args:
+        runs: A run set, or the path of anything that `read_runs` reads.
+        robot: The robot, its name or its profile.
+        calibration: What `calibrate` learned of it, by name or path; None: what its profile names.
+        hypotheses: What may be the case; None: the paper's nine classes.
+        priors: Beliefs about onset and size; None: the usual ones.
+
+    Raises:
+        InputError: If something cannot be read, or does not fit together.
+    """
+    return BayesDiagnoser(robot, calibration, hypotheses, priors).diagnose(runs)
 
 
 def _runs_at_a_time(movements: int) -> int:

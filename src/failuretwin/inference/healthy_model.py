@@ -18,7 +18,7 @@ import numpy as np
 from failuretwin.core.movements import Movements
 from failuretwin.core.numerics import Ellipsoid
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
 from failuretwin.digital_model.nonidealities import Imperfections, Timing
 from failuretwin.digital_model.settling import Settling, loads_in_range
 from failuretwin.digital_model.twin import SAG_ROUNDS, DigitalTwin
@@ -48,11 +48,9 @@ class HealthyModel:
     scatter_factor: float = 1.0
 
     @classmethod
-    def of(cls, twin: DigitalTwin, imperfections: Imperfections | None) -> HealthyModel:
+    def of(cls, twin: RobotLike, imperfections: HealthyLike = None) -> HealthyModel:
         """Return the model of a robot; None: of the calibration that its profile names."""
-        if imperfections is not None:
-            return cls(twin, imperfections)
-        known = load_calibration(None, twin.robot)
+        known = calibrated(twin, imperfections)
         return cls(known.twin, known.imperfections)
 
     @cached_property

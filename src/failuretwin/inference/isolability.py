@@ -26,6 +26,7 @@ from failuretwin.core.hypothesis import (
 from failuretwin.core.movements import find_movements
 from failuretwin.core.runs import RunTable
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.digital_model.nonidealities import (
     GENERIC_SCATTER_RAD,
     Imperfections,
@@ -208,10 +209,10 @@ class IsolabilityReport:
 
 
 def isolability(
-    twin: DigitalTwin,
+    twin: RobotLike,
     command: ArrayLike,
     time: ArrayLike,
-    imperfections: Imperfections | None = None,
+    imperfections: HealthyLike = None,
     hypotheses: Sequence[Hypothesis | str] | None = None,
     priors: Priors | None = None,
     onset_s: float = 0.0,
@@ -219,11 +220,12 @@ def isolability(
     """Return what a planned motion can tell apart; nothing needs to be measured.
 
     Args:
-        twin: Digital twin of the robot.
+        twin: The robot: its twin, itself, its name or its profile.
         command: Reference angles, (time, motor), or of several motions, (motion, time, motor)
             [rad]; each motion is taken as a run of its own.
         time: Uniform time grid from 0, (time,) [s].
-        imperfections: How the healthy robot differs from the twin; None: as its profile says.
+        imperfections: How the healthy robot differs from the twin, or a calibration by name or
+            path; None: as its profile says.
         hypotheses: What may be the case, single faults, as `Hypothesis` or in the text form, such
             as ``["motor_2:stuck", "motor_2:drift"]``; healthy always may. None: the paper's
             classes.
@@ -234,13 +236,13 @@ def isolability(
         InputError: If nothing moves, the shapes do not fit, the onset is not within the motion, or
             a hypothesis has several faults, or cannot be read or weighed.
     """
-    motors = twin.robot.motor_names
-    asked = paper_hypotheses(motors) if hypotheses is None else parse_hypotheses(hypotheses, motors)
     model = HealthyModel.of(twin, imperfections)
+    motors = model.motor_names
+    asked = paper_hypotheses(motors) if hypotheses is None else parse_hypotheses(hypotheses, motors)
     judge = ExpectedLogBayesFactor(
         model, tuple(dict.fromkeys((HEALTHY, *asked))), priors or Priors()
     )
-    motions = _motions(twin, command, time)
+    motions = _motions(model.twin, command, time)
     _check_onset(onset_s, float(motions["time"].values[-1]))
     trials = MonteCarloFaults(judge, motions, onset_s)
     considered = {h: _sizes(h, judge.priors) for h in judge.hypotheses}

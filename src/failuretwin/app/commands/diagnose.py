@@ -23,7 +23,6 @@ from failuretwin.app.commands.options import (
 @click.option(
     "--method",
     default="bayes",
-    show_default=True,
     metavar="bayes|MODEL|bayes+MODEL|module:Class",
     help="How to diagnose: by Bayes' rule, by a network that `train` wrote, by both, or by a class "
     "of your own.",
@@ -81,6 +80,7 @@ def diagnose(
     downwards), such a file (.mat), a bag (.bag, .mcap), or a CSV file with --columns.
     """
     del seed  # nothing here is drawn by chance
+    from failuretwin.app import reports
     from failuretwin.app.inputs import (
         chosen_diagnoser,
         expected_name,
@@ -88,18 +88,8 @@ def diagnose(
         read_inputs,
         warn_mismatch,
     )
-    from failuretwin.app.reports import (
-        isolability_summary,
-        print_diagnoses,
-        print_scores,
-        tracking_line,
-    )
     from failuretwin.app.tables import progress_bar, show
-    from failuretwin.connection.tracked_diagnosis import (
-        diagnose_tracked,
-        keep_history,
-        open_history,
-    )
+    from failuretwin.connection import tracked_diagnosis as tracking
     from failuretwin.core.errors import InputError
     from failuretwin.decision.evaluation import Judged
     from failuretwin.decision.results import write_csv, write_json_lines
@@ -131,13 +121,13 @@ def diagnose(
                 "--track keeps its history beside the calibration: name one (--calibration FILE; "
                 "`failuretwin calibrate` makes it)."
             )
-        history = open_history(bayes, calibration)
+        history = tracking.open_history(bayes, calibration)
     runs = read_inputs(inputs, model, reading)
     warn_mismatch(runs, expected_name(diagnoser, bayes))
     tracked = None
     if history is not None:
         with progress_bar("diagnosing", runs.sizes["run"]) as advance:
-            tracked = diagnose_tracked(runs, bayes, history, advance)
+            tracked = tracking.diagnose_tracked(runs, bayes, history, advance)
     diagnoses = diagnoser.diagnose(runs) if tracked is None else tracked.diagnoses
     if json_file is not None:
         write_json_lines(diagnoses, json_file)
@@ -151,13 +141,13 @@ def diagnose(
             pictures = plot_runs(runs, diagnoses, known.twin, folder)
             write_page(diagnoses, pictures, model.name, folder / "index.html")
     if tracked is not None:
-        keep_history(tracked)
-    print_diagnoses(diagnoses)
+        tracking.keep_history(tracked)
+    reports.print_diagnoses(diagnoses)
     if method == "bayes":
-        show(*isolability_summary(runs, bayes))
-    print_scores(Judged.of(diagnoses))
+        show(*reports.isolability_summary(runs, bayes))
+    reports.print_scores(Judged.of(diagnoses))
     if tracked is not None:
-        click.echo(f"\n{tracking_line(tracked)}")
+        click.echo(f"\n{reports.tracking_line(tracked)}")
 
 
 @click.command()

@@ -47,20 +47,21 @@ def calibrate(
     folders that hold some) add servo loops and speed limits.
     """
     del seed  # nothing here depends on chance
-    from failuretwin.app.calibration_tables import beats_uncalibrated, print_calibration
-    from failuretwin.app.inputs import learn_loops, read_inputs, split_step_tests, with_step_tests
+    from failuretwin.app.calibration_report import print_calibration
+    from failuretwin.app.inputs import read_inputs
+    from failuretwin.connection.calibration import step_parameters
     from failuretwin.connection.calibration.calibrate import calibrate as learn
     from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
     from failuretwin.digital_model.robot import load_robot
 
     check_calibration_file(out)
-    tests, others = split_step_tests(logs, reading.columns)
-    steps = learn_loops(tests, load_robot(robot))
+    tests, others = step_parameters.split_step_tests(logs, reading.columns)
+    steps = step_parameters.learn_loops(tests, load_robot(robot))
     model = steps.robot
     runs = read_inputs(others, model, reading)
     source = ", ".join(str(log) for log in logs)
     found = learn(runs, model, name or out.stem, source, hold_out)
-    found = with_step_tests(found, steps)
+    found = step_parameters.with_step_tests(found, steps)
     if report is not None:
         from failuretwin.app.calibration_report import write_calibration_page
         from failuretwin.data_knowledge.store import filling
@@ -70,7 +71,7 @@ def calibrate(
     save_calibration(found, model, out)
     print_calibration(found, model)
     click.echo(f"written to {out}")
-    if beats_uncalibrated(found) is not False:
+    if found.beats_uncalibrated is not False:
         click.echo(f"use it with `failuretwin diagnose --calibration {out}`")
 
 
@@ -81,14 +82,12 @@ def calibrate(
     "--network",
     type=click.Choice(["cnn", "motorwise", "lstm"]),
     default="cnn",
-    show_default=True,
     help="A convolutional network, one that looks at every motor alike, or the paper's LSTM.",
 )
 @click.option(
     "--iterations",
     type=click.IntRange(min=1),
     default=6000,
-    show_default=True,
     help="Batches of 64 runs to learn from.",
 )
 @click.option(
@@ -137,9 +136,10 @@ def train(
         )
     save_network(diagnoser, out)
     click.echo(
-        f"of {alone.runs} simulated runs of the physics engine {100.0 * alone.right:.1f} % right, "
-        f"log score {alone.log_score:.3f} nats a run, temperature {diagnoser.temperature_:.2f}; "
-        f"blended with Bayes {100.0 * both.right:.1f} %, {both.log_score:.3f} nats"
+        f"of {alone.runs} simulated runs of the physics engine {100.0 * alone.accuracy:.1f} % "
+        f"right, log score {alone.log_score:.3f} nats a run, "
+        f"temperature {diagnoser.temperature_:.2f}; "
+        f"blended with Bayes {100.0 * both.accuracy:.1f} %, {both.log_score:.3f} nats"
     )
     click.echo(f"written to {out}; use it with `failuretwin diagnose --method {out}`")
     click.echo(f"or together with Bayes: --method bayes+{out}")

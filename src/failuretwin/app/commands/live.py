@@ -92,7 +92,6 @@ the last fault has begun or been repaired [s]."""
     "--to",
     "target",
     default="ros1",
-    show_default=True,
     metavar="ros1|FILE.mcap",
     help="Publish as a ROS 1 node until interrupted, or write a recording at once: one minute, or "
     "until 20 s after the last fault has begun or been repaired, unless --duration says otherwise.",

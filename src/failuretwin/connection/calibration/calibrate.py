@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,8 +44,9 @@ from failuretwin.connection.calibration.timing_fit import (
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import FloatArray
+from failuretwin.data_knowledge.read import RunsLike, as_runs
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
-from failuretwin.digital_model.robot import Robot, shown_unit
+from failuretwin.digital_model.robot import Robot, load_robot, shown_unit
 from failuretwin.inference.isolability import fault_probabilities
 
 if TYPE_CHECKING:
@@ -212,13 +214,17 @@ robot of which nothing is known: errors redrawn for every movement pass for scat
 
 
 def calibrate(
-    runs: xr.Dataset, robot: Robot, name: str, source: str, hold_out: str | None = None
+    runs: RunsLike,
+    robot: Robot | str | Path = "armpi_fpv",
+    name: str = "calibrated",
+    source: str = "",
+    hold_out: str | None = None,
 ) -> Calibration:
     """Calibrate a robot from logs that should be healthy.
 
     Args:
-        runs: The logs.
-        robot: The robot.
+        runs: The logs as a run set, or where they are.
+        robot: The robot, its name or its profile.
         name: What to call the calibration in results.
         source: Which logs these are.
         hold_out: Text in the names of sessions that are not learned from, only judged; None: all
@@ -227,6 +233,8 @@ def calibrate(
     Raises:
         InputError: If the logs are labelled faulty or look so, or too few movements are left.
     """
+    robot = load_robot(robot)
+    runs = as_runs(runs, robot)
     check_motors(runs, robot.name, robot.motor_names)
     runs, labelled = _without_faulty_labels(runs)
     inside = _held_out_runs(runs, hold_out)

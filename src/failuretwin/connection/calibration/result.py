@@ -6,6 +6,8 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from failuretwin import __version__
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
@@ -86,6 +88,15 @@ class HeldOut:
     gain_error: float
 
 
+def mean_gain(held_out: tuple[HeldOut, ...]) -> tuple[float, float]:
+    """Return the mean gain over all movements [nats] and half its 95 % interval."""
+    count = np.array([entry.movements for entry in held_out], dtype=float)
+    gain = np.array([entry.gain for entry in held_out])
+    error = np.array([entry.gain_error for entry in held_out])
+    share = count / count.sum()
+    return float(share @ gain), 1.96 * float(np.sqrt(np.sum((share * error) ** 2)))
+
+
 @dataclass(frozen=True)
 class Calibration:
     """What healthy logs teach of a robot.
@@ -122,6 +133,14 @@ class Calibration:
             InputError: If the calibration names a motor that the robot does not have.
         """
         return CalibratedRobot(with_loops(robot, self.loops), self.imperfections)
+
+    @property
+    def beats_uncalibrated(self) -> bool | None:
+        """Whether unseen sessions say that this is better than no calibration; None: no say."""
+        if not self.held_out:
+            return None
+        gain, error = mean_gain(self.held_out)
+        return gain - error > 0.0
 
 
 # Calibrations as TOML files: the imperfections, which the twin reads, and how they were found.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,12 +48,13 @@ Runs = Any
 """A run set, or an array of features: (run, point, channel), or (run, channel) of one point."""
 
 
+@dataclass(eq=False, repr=False)
 class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     """A network that says how probable each class is.
 
     Takes run sets where it has an encoder, and arrays of features anyway.
 
-    Args:
+    Attributes:
         network: Name of the network; see `NETWORKS`.
         encoder: Turns run sets into features; None: arrays only.
         iterations: Batches to learn from in `fit`.
@@ -60,8 +62,6 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         decay: Whether it falls to zero at the end along half a cosine.
         batch_runs: Runs in a batch.
         random_state: Seed of weights, dropout and order.
-
-    Attributes:
         classes_: The classes, sorted if they came from `fit`.
         network_: The trained network.
         standard_: Mean and spread of each channel.
@@ -70,23 +70,13 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         weights_: Its part in a pool with the Bayesian diagnosis; None: was never fitted.
     """
 
-    def __init__(
-        self,
-        network: str = "cnn",
-        encoder: FeatureEncoder | None = None,
-        iterations: int = 500,
-        learning_rate: float = 1e-3,
-        decay: bool = True,
-        batch_runs: int = 32,
-        random_state: int | None = None,
-    ) -> None:
-        self.network = network
-        self.encoder = encoder
-        self.iterations = iterations
-        self.learning_rate = learning_rate
-        self.decay = decay
-        self.batch_runs = batch_runs
-        self.random_state = random_state
+    network: str = "cnn"
+    encoder: FeatureEncoder | None = None
+    iterations: int = 500
+    learning_rate: float = 1e-3
+    decay: bool = True
+    batch_runs: int = 32
+    random_state: int | None = None
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()
@@ -94,17 +84,12 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return tags
 
     def fit(self, X: Runs, y: ArrayLike | None = None) -> LearnedDiagnoser:
-        """Learn from runs.
-
-        Args:
-            X: A run set or an array of features.
-            y: Class of each run; None: as the run set says.
+        """Learn from runs and the class of each; None: as the run set says.
 
         Raises:
             InputError: If there is no class to learn from.
         """
-        if _is_run_set(X) and y is None:
-            y = truth_of(X)
+        y = _truth(X, y)
         self.movements_ = None
         if _is_run_set(X):
             counts = movement_counts(X)
@@ -134,14 +119,10 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         movements: tuple[int, int],
         on_iteration: Callable[[int], None] = lambda done: None,
     ) -> LearnedDiagnoser:
-        """Learn from batches that somebody else makes, such as a `Stream`.
+        """Learn from batches that somebody else makes, such as a `Stream`: not standardised yet.
 
-        Args:
-            batches: Features, not standardised, and numbers of the classes.
-            standard: Mean and spread of the features.
-            classes: Names of the classes.
-            movements: Fewest and most movements of a run.
-            on_iteration: Called after each batch with the number of those done.
+        `movements` are the fewest and most of a run; `on_iteration` is called after each batch with
+        the number of those done.
         """
         seed = check_random_state(self.random_state).randint(2**31)
         self.n_features_in_, self.movements_ = POINTS, movements
@@ -175,18 +156,16 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         self.weights_: PoolWeights | None = None
 
     def calibrate(self, X: Runs, y: ArrayLike | None = None) -> LearnedDiagnoser:
-        """Set the temperature of the best mean log score on these runs; never use a test set.
+        """Set the temperature of the best mean log score on runs that were not learned from.
 
-        Args:
-            X: Runs that the network has not learned from.
-            y: Class of each; None: as the run set says.
+        Never use a test set. The class of each run is `y`; None: as the run set says.
 
         Raises:
             InputError: If a class is not among those that the network knows.
         """
         scores = self.scores(X)
         number = {name: i for i, name in enumerate(self.classes_.tolist())}
-        truth = np.asarray(truth_of(X) if y is None else y).tolist()
+        truth = np.asarray(_truth(X, y)).tolist()
         strange = sorted({str(name) for name in truth if name not in number})
         if strange:
             raise InputError(
@@ -223,15 +202,8 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     def score(
         self, X: Runs, y: ArrayLike | None = None, sample_weight: ArrayLike | None = None
     ) -> float:
-        """Return the share of runs that are right.
-
-        Args:
-            X: A run set or an array of features.
-            y: Class of each run; None: as the run set says.
-            sample_weight: Weight of each run.
-        """
-        truth = truth_of(X) if _is_run_set(X) and y is None else y
-        return float(super().score(X, truth, sample_weight))
+        """Return the (weighted) share of runs that are right; y of None: as the run set says."""
+        return float(super().score(X, _truth(X, y), sample_weight))
 
     def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
         """Return the diagnosis of each run of a run set.
@@ -301,13 +273,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
 
 def network_shape(encoder: FeatureEncoder | None, channels: int, classes: int) -> Shape:
-    """Return the shape of a network for some features.
-
-    Args:
-        encoder: What makes the features.
-        channels: Their channels.
-        classes: Number of classes.
-    """
+    """Return the shape of a network for the features of an encoder."""
     if encoder is None or encoder.features != "robust":
         return Shape(channels, classes)
     return Shape(channels, classes, len(encoder.robot.motors), len(SHARED))
@@ -315,6 +281,11 @@ def network_shape(encoder: FeatureEncoder | None, channels: int, classes: int) -
 
 def _is_run_set(X: Runs) -> bool:
     return hasattr(X, "data_vars")
+
+
+def _truth(X: Runs, y: ArrayLike | None) -> ArrayLike | None:
+    """Return the class of each run: as told, else as the run set says."""
+    return truth_of(X) if _is_run_set(X) and y is None else y
 
 
 def _points(features: Floats) -> Floats:
@@ -340,9 +311,7 @@ TEMPERATURES = (0.05, 20.0)
 def best_temperature(scores: FloatArray, truth: IntArray) -> float:
     """Return the temperature of the best mean log score (Guo et al., ICML 2017).
 
-    Args:
-        scores: (run, class).
-        truth: Number of the true class, (run,).
+    Takes scores (run, class) and the number of the true class, (run,).
     """
     from scipy.optimize import minimize_scalar
 

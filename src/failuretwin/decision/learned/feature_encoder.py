@@ -101,21 +101,16 @@ def _at_points(signals: Signals) -> tuple[FloatArray, FloatArray]:
     index = np.minimum(stride * np.arange(POINTS), len(signals.time) - 1)
     seen, at = signals.seen, signals.time[index]
     measured = np.zeros((len(signals.command), POINTS, 3))
-    for run, known in enumerate(seen):
-        if known.all():
-            measured[run] = signals.measured[run, index]
-        elif known.any():
-            for axis in range(3):
-                measured[run, :, axis] = np.interp(
-                    at, signals.time[known], signals.measured[run, known, axis]
-                )
+    for run in np.flatnonzero(seen.any(axis=1)):
+        known = seen[run]
+        for axis in range(3):
+            readings = signals.measured[run, known, axis]
+            measured[run, :, axis] = np.interp(at, signals.time[known], readings)
     return signals.command[:, index], measured
 
 
-PER_MOTOR = ("turn", "misfit", "angle", "command")
-"""Channels of each motor; those of the first motor come first."""
 SHARED = ("x", "y", "z", "seen")
-"""Channels that belong to no motor, after those of the motors."""
+"""Channels that belong to no motor; before them come turn, misfit, angle and command of each."""
 
 TURN_RAD = 0.01
 """Turns below this are shown in proportion, larger ones by their logarithm [rad]: 2.4 counts."""
@@ -154,12 +149,7 @@ def expectation_of(robot: Robot, imperfections: Imperfections) -> Expectation:
 
 @dataclass(frozen=True)
 class RobustFeatures:
-    """Turns a run into 100 points of residuals in motor space.
-
-    Attributes:
-        robot: Kinematics and masses.
-        expected: Where a healthy arm is expected to be.
-    """
+    """Turns a run into 100 points of residuals in motor space, beside an expected healthy arm."""
 
     robot: Robot
     expected: Expectation
@@ -175,25 +165,17 @@ class RobustFeatures:
     def __call__(self, signals: Signals) -> FloatArray:
         """Return the features, (run, point, channel), each of about unit size."""
         index, seen = _points(signals)
-        run = np.arange(len(index))[:, None]
+        run, known = np.arange(len(index))[:, None], seen[..., None]
         pose = self._healthy_pose(signals, index)
         origin, axis, tool = joint_frames(self.robot, pose * self.robot.sensor_sense)
-        measured = np.where(seen[..., None], signals.measured[run, index], tool)
+        measured = np.where(known, signals.measured[run, index], tool)
         turn, misfit = _explained(origin, axis, tool, measured)
         turn = turn * self.robot.sensor_sense
-        off = _compressed(measured - tool, DISTANCE_M) * seen[..., None]
-        known = seen[..., None]
-        per_motor = np.stack(
-            [
-                _compressed(turn, TURN_RAD) * known,
-                _compressed(misfit, DISTANCE_M) * known,
-                (pose + turn) * known,
-                pose,
-            ],
-            axis=-1,
-        )
-        flat = per_motor.reshape(*pose.shape[:2], -1)
-        return np.concatenate([flat, off, seen[..., None]], axis=-1)
+        off = _compressed(measured - tool, DISTANCE_M) * known
+        turned, left = _compressed(turn, TURN_RAD), _compressed(misfit, DISTANCE_M)
+        where = (turned * known, left * known, (pose + turn) * known, pose)
+        per_motor = np.stack(where, axis=-1)
+        return np.concatenate([per_motor.reshape(*pose.shape[:2], -1), off, known], axis=-1)
 
     def _healthy_pose(self, signals: Signals, index: IntArray) -> FloatArray:
         """Return where a healthy arm would be at some samples, (run, point, motor) [rad]."""
@@ -237,12 +219,9 @@ def _direction(command: FloatArray) -> FloatArray:
 def joint_frames(robot: Robot, pose: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return where the joints are and point to, and where the tool is, in the base frame.
 
-    Args:
-        robot: Its chain; joints that slide are not supported.
-        pose: Angles that the tool sensor's path belongs to, (..., motor) [rad].
-
-    Returns:
-        Origins (..., motor, 3) [m], unit axes (..., motor, 3) and tool points (..., 3) [m].
+    The pose, (..., motor) [rad], is that which the tool sensor's path belongs to; joints that slide
+    are not supported. Origins are (..., motor, 3) [m], unit axes (..., motor, 3) and tool points
+    (..., 3) [m].
     """
     lead = pose.shape[:-1]
     rotation = np.broadcast_to(np.eye(3), (*lead, 3, 3))
@@ -263,11 +242,7 @@ def joint_frames(robot: Robot, pose: FloatArray) -> tuple[FloatArray, FloatArray
 def _explained(
     origin: FloatArray, axis: FloatArray, tool: FloatArray, measured: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the turn of each joint that brings the tool nearest, and the distance left.
-
-    Returns:
-        (..., joint) [rad] and (..., joint) [m].
-    """
+    """Return the turn of each joint that brings the tool nearest [rad], and what is left [m]."""
     here, there = tool[..., None, :] - origin, measured[..., None, :] - origin
     along = np.sum(axis * (there - here), axis=-1)
     here = here - np.sum(axis * here, axis=-1, keepdims=True) * axis
@@ -308,13 +283,6 @@ class FeatureEncoder:
     def __post_init__(self) -> None:
         if self.features not in FEATURE_SETS:
             raise unknown_name("feature set", self.features, FEATURE_SETS)
-
-    @property
-    def channels(self) -> int:
-        """Channels of each point."""
-        motors = len(self.robot.motors)
-        robust = len(PER_MOTOR) * motors + len(SHARED)
-        return {"original": motors + 3, "augmented": 6, "robust": robust}[self.features]
 
     @property
     def protocol(self) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     import xarray as xr
 
 HEALTHY = "healthy"
+UNSIZED: dict[str, Any] = dict.fromkeys(
+    ("onset_s", "onset_90", "magnitude", "magnitude_unit", "magnitude_90")
+)
+"""What is not known of a fault that only the network names."""
 LEAST = 1e-300
 """Probabilities that have underflowed count as this, so that a logarithm of them exists."""
 
@@ -37,13 +41,7 @@ def log_pool(bayes: FloatArray, network: FloatArray, weights: PoolWeights) -> Fl
 
 
 def gated(bayes: FloatArray, network: FloatArray, healthy: int) -> FloatArray:
-    """Return probabilities (run, class): of healthy by the first, of faults by the second.
-
-    Args:
-        bayes: (run, class).
-        network: (run, class).
-        healthy: Number of the healthy class.
-    """
+    """Return probabilities (run, class): of class `healthy` by Bayes, of others by the network."""
     faults = np.maximum(network, LEAST)
     faults[:, healthy] = 0.0
     rest = 1.0 - bayes[:, [healthy]]
@@ -53,12 +51,9 @@ def gated(bayes: FloatArray, network: FloatArray, healthy: int) -> FloatArray:
 
 
 def fit_pool_weights(bayes: FloatArray, network: FloatArray, truth: IntArray) -> PoolWeights:
-    """Return the weights of the best mean log score.
+    """Return the weights of the best mean log score of some runs.
 
-    Args:
-        bayes: Probabilities of simulated runs by the model, (run, class).
-        network: The same by the network.
-        truth: Number of the true class, (run,).
+    Takes the probabilities by either part, (run, class), and the number of the true class, (run,).
     """
     from scipy.optimize import minimize
 
@@ -124,12 +119,5 @@ class HybridDiagnoser:
             f"{network.method}",
         )
         if joined.diagnosis != bayes.diagnosis:
-            joined = replace(
-                joined,
-                onset_s=None,
-                onset_90=None,
-                magnitude=None,
-                magnitude_unit=None,
-                magnitude_90=None,
-            )
+            joined = replace(joined, **UNSIZED)
         return worded(joined, [Hypothesis.parse(name) for name in joined.ranked])

@@ -186,9 +186,8 @@ class Pace:
 
     def rate(self, done: int) -> float:
         """Return the learning rate after some iterations."""
-        if not self.decay:
-            return self.learning_rate
-        return self.learning_rate * 0.5 * (1.0 + math.cos(math.pi * done / self.iterations))
+        share = 0.5 * (1.0 + math.cos(math.pi * done / self.iterations)) if self.decay else 1.0
+        return self.learning_rate * share
 
 
 def device() -> torch.device:
@@ -197,12 +196,9 @@ def device() -> torch.device:
 
 
 def training(network: nn.Module, batches: Iterable[Batch], pace: Pace) -> Iterator[int]:
-    """Train a network and give the number of iterations after each, so that it can be looked at.
+    """Train a network in place and give the number of iterations after each, to look at it.
 
-    Args:
-        network: Changed in place.
-        batches: As many as `pace` has iterations, or more.
-        pace: How to learn.
+    There must be as many batches as `pace` has iterations, or more.
     """
     where = device()
     network.to(where)
@@ -211,8 +207,7 @@ def training(network: nn.Module, batches: Iterable[Batch], pace: Pace) -> Iterat
     source = iter(batches)
     for done in range(pace.iterations):
         features, classes = next(source)
-        for group in optimizer.param_groups:
-            group["lr"] = pace.rate(done)
+        optimizer.param_groups[0]["lr"] = pace.rate(done)
         network.train()
         optimizer.zero_grad()
         scores = network(torch.from_numpy(features).to(where))
@@ -245,14 +240,7 @@ def shuffled_batches(
 def epoch(
     features: Floats, classes: IntArray, size: int, rng: np.random.Generator
 ) -> Iterator[Batch]:
-    """Give batches of arrays once through in random order; what is left at the end is left out.
-
-    Args:
-        features: (run, point, channel).
-        classes: (run,).
-        size: Runs in a batch.
-        rng: Source of chance.
-    """
+    """Give batches of arrays once through in random order; what is left at the end is left out."""
     order = rng.permutation(len(features))
     for first in range(0, len(order) - size + 1, size):
         chosen = order[first : first + size]

@@ -14,7 +14,7 @@ import platform
 import textwrap
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, field
+from dataclasses import asdict, dataclass, field
 from importlib.resources import files
 from io import BytesIO
 from pathlib import Path
@@ -28,7 +28,7 @@ from torch.fx.passes.shape_prop import ShapeProp
 
 from failuretwin import __version__
 from failuretwin.core.config import fingerprint, from_table
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.data_knowledge.store import reason, replacing
 from failuretwin.decision.learned.diagnoser import LearnedDiagnoser, network_shape
 from failuretwin.decision.learned.feature_encoder import (
@@ -51,6 +51,11 @@ SUFFIX = ".npz"
 _WEIGHT = "weight/"
 _NOT_STORED = ("encoder", "network")
 """Arguments of the estimator that have a place of their own in the file."""
+UNREADABLE = (
+    *(OSError, ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile),
+    *(KeyError, RuntimeError),
+)
+"""What reading a damaged file may raise."""
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -72,8 +77,7 @@ def save_network(diagnoser: LearnedDiagnoser, path: str | Path) -> None:
     configuration = json.dumps(_configuration(diagnoser)).encode()
     arrays: Arrays = {
         "configuration": np.frombuffer(configuration, dtype=np.uint8),
-        "mean": diagnoser.standard_.mean,
-        "spread": diagnoser.standard_.spread,
+        **vars(diagnoser.standard_),
         **{_WEIGHT + name: array for name, array in _weights(diagnoser).items()},
     }
     with replacing(path) as partial, partial.open("wb") as file:
@@ -118,11 +122,7 @@ def arm_fingerprint(robot: Robot) -> str:
 
 
 def load_network(path: str | Path, robot: Robot | None = None) -> LearnedDiagnoser:
-    """Read a trained network.
-
-    Args:
-        path: The file.
-        robot: The robot that it was trained for; None: the bundled one of the name in the file.
+    """Read a trained network for its robot; None: the bundled one of the name in the file.
 
     Raises:
         InputError: If the file cannot be read, is no network, or is one for another robot.
@@ -134,10 +134,7 @@ def load_network(path: str | Path, robot: Robot | None = None) -> LearnedDiagnos
         return _restored(json.loads(arrays["configuration"].tobytes()), arrays, robot, path)
     except InputError:
         raise
-    except (
-        *(OSError, ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile),
-        *(KeyError, RuntimeError),
-    ) as error:
+    except UNREADABLE as error:
         raise InputError(
             f"{path}: cannot be read as a network ({reason(error)}). Expected a file that "
             "`failuretwin train` wrote."
@@ -163,18 +160,13 @@ def _restored(
     diagnoser.standard_ = Standard(arrays["mean"], arrays["spread"])
     diagnoser.classes_ = np.array(configuration["classes"])
     diagnoser.temperature_ = float(configuration["temperature"])
-    movements, weights = configuration["movements"], configuration["weights"]
+    movements, pool = configuration["movements"], configuration["weights"]
     diagnoser.movements_ = movements and (int(movements[0]), int(movements[1]))
-    diagnoser.weights_ = weights and from_table(PoolWeights, weights, f"{path}: weights")
+    diagnoser.weights_ = pool and from_table(PoolWeights, pool, f"{path}: weights")
     shape = network_shape(encoder, len(diagnoser.standard_.mean), len(diagnoser.classes_))
     network = build_network(configuration["network"], shape)
-    network.load_state_dict(
-        {
-            name.removeprefix(_WEIGHT): torch.from_numpy(array)
-            for name, array in arrays.items()
-            if name.startswith(_WEIGHT)
-        }
-    )
+    weights = {n.removeprefix(_WEIGHT): a for n, a in arrays.items() if n.startswith(_WEIGHT)}
+    network.load_state_dict({name: torch.from_numpy(array) for name, array in weights.items()})
     diagnoser.network_ = network
     diagnoser.n_features_in_ = configuration["features_in"]
     return diagnoser
@@ -203,11 +195,8 @@ def _restored_encoder(
             f"{robot.name!r}. Name the right robot (--robot), or train a network for this one."
         )
     expected = table["expected"]
-    return FeatureEncoder(
-        table["features"],
-        robot,
-        expected and from_table(Expectation, expected, f"{path}: expected"),
-    )
+    expected = expected and from_table(Expectation, expected, f"{path}: expected")
+    return FeatureEncoder(table["features"], robot, expected)
 
 
 # What a network does, recorded operator by operator.
@@ -222,14 +211,8 @@ _REDUCTIONS = {"mean": "ReduceMean", "amax": "ReduceMax"}
 _PLAIN = {"relu": "Relu", "add": "Add", "cat": "Concat"}
 
 
-@dataclass(frozen=True)
-class _Operator:
-    """An operator of ONNX: its kind, names of what it takes and makes, and attributes."""
-
-    kind: str
-    inputs: Sequence[str]
-    outputs: Sequence[str]
-    attributes: Attributes
+_Operator = tuple[str, Sequence[str], Sequence[str], Attributes]
+"""An operator of ONNX: its kind, names of what it takes and makes, and attributes."""
 
 
 @dataclass
@@ -245,7 +228,7 @@ class _Recording:
     ) -> list[str]:
         """Add an operator; return the names of its outputs."""
         names = [f"{kind}_{len(self.operators)}_{i}" for i in range(outputs)]
-        self.operators.append(_Operator(kind, inputs, names, how or {}))
+        self.operators.append((kind, inputs, names, how or {}))
         return names
 
     def constant(self, values: Any) -> str:
@@ -328,7 +311,7 @@ def _record(diagnoser: LearnedDiagnoser) -> _Recording:
         else:
             (x,) = inputs
     (x,) = made.add("Div", x, made.constant(np.float32(diagnoser.temperature_)))
-    made.operators.append(_Operator("Softmax", [x], [OUTPUT], {"axis": 1}))
+    made.operators.append(("Softmax", [x], [OUTPUT], {"axis": 1}))
     return made
 
 
@@ -342,18 +325,14 @@ def export_onnx(diagnoser: LearnedDiagnoser, path: Path) -> None:
         InputError: If onnx is missing.
         OutputError: If it cannot be written.
     """
-    try:
+    with needs_extra("ONNX files need onnx", "learn"):
         import onnx
         from onnx import TensorProto, helper, numpy_helper
-    except ImportError as error:
-        raise InputError(
-            f"ONNX files need onnx ({error}). Install it: pip install 'failuretwin[learn]'."
-        ) from error
     made = _record(diagnoser)
     channels, classes = len(diagnoser.standard_.mean), len(diagnoser.classes_)
     model = helper.make_model(
         helper.make_graph(
-            [helper.make_node(o.kind, o.inputs, o.outputs, **o.attributes) for o in made.operators],
+            [helper.make_node(kind, x, y, **how) for kind, x, y, how in made.operators],
             "diagnosis",
             [helper.make_tensor_value_info(INPUT, TensorProto.FLOAT, ["run", POINTS, channels])],
             [helper.make_tensor_value_info(OUTPUT, TensorProto.FLOAT, ["run", classes])],
@@ -385,7 +364,7 @@ def export_numpy(diagnoser: LearnedDiagnoser, path: Path) -> None:
         "classes": [str(name) for name in diagnoser.classes_],
         "features": diagnoser.encoder.features,
         "points": POINTS,
-        "operators": [astuple(operator) for operator in made.operators],
+        "operators": made.operators,
     }
     buffer = BytesIO()
     arrays = {**_feature_constants(diagnoser.encoder), **made.constants}

@@ -20,8 +20,7 @@ from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.store import reason, replacing
 from failuretwin.decision.streaming.fleet import MOVEMENTS, StreamingFleet
-from failuretwin.digital_model.nonidealities import Imperfections
-from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.priors import MONITORING
 
@@ -207,12 +206,13 @@ class StreamingDiagnoser:
         return None if found is None else replace(found, run="stream")
 
 
-def monitor(twin: DigitalTwin, imperfections: Imperfections | None = None) -> StreamingDiagnoser:
+def monitor(twin: RobotLike, imperfections: HealthyLike = None) -> StreamingDiagnoser:
     """Return what watches a robot at work: settled poses, and faults are rare.
 
     Args:
-        twin: Digital twin of the robot.
-        imperfections: How the healthy robot differs from it; None: as its profile says.
+        twin: The robot: its twin, itself, its name or its profile.
+        imperfections: How the healthy robot differs from it, or a calibration by name or path;
+            None: as its profile says.
     """
     method = BayesDiagnoser(twin, imperfections, priors=MONITORING, whole_run=False)
     return StreamingDiagnoser(method)

@@ -187,9 +187,39 @@ class _Arms:
         mujoco = load_mujoco()
         self._data = [mujoco.MjData(models[0].compiled) for _ in range(engine.threads)]
         each = zip(self._models, reference, strength, strict=True)
-        self._state = np.array([_rest_state(engine, self._data[0], *of_run) for of_run in each])
+        self._state = np.array([self._rest_state(*of_run) for of_run in each])
         self._setpoint = self._last = reference
         self._strength = strength
+
+    def _rest_state(
+        self, model: PhysicsModel, setpoint: FloatArray, strength: FloatArray
+    ) -> FloatArray:
+        """Return the full state (state,) of an arm at rest: servo and flex balance the weight.
+
+        The gears' friction is relaxed. Set-points [rad] and strengths are those of each motor.
+        """
+        data = self._data[0]
+        mujoco = load_mujoco()
+        give_drive = 1.0 / (strength * self._engine.figures("stiffness"))
+        give_flex = 1.0 / self._engine.figures("flex_stiffness")
+        mujoco.mj_resetData(model.compiled, data)
+        load, before, share = np.zeros_like(setpoint), np.zeros_like(setpoint), 1.0
+        for _ in range(ITERATIONS):
+            data.qpos[model.drive] = setpoint - give_drive * load
+            data.qpos[model.flex] = -give_flex * load
+            mujoco.mj_forward(model.compiled, data)
+            change = data.qfrc_bias[model.drive] - load
+            if np.abs(change * (give_drive + give_flex)).max() < AT_REST_RAD:
+                break
+            # Soft servos give way so far that the load swings to and fro: smaller steps converge.
+            share *= 0.5 if change @ before < -0.5 * before @ before else 1.0
+            load, before = load + share * change, change
+        sticks = model.friction >= 0
+        data.plastic[model.friction[sticks]] = data.qpos[model.drive[sticks]]
+        full = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        state = np.empty(mujoco.mj_stateSize(model.compiled, full))
+        mujoco.mj_getState(model.compiled, data, state, full)
+        return state
 
     @property
     def angle(self) -> FloatArray:
@@ -266,47 +296,6 @@ class _Arms:
         control[:, :, 0] = share * (stiffness * followed[:, :-1] + derivative * speed)
         control[:, :, 1] = share
         return control.reshape(*control.shape[:2], -1)
-
-
-def _rest_state(
-    engine: PhysicsEngine,
-    data: Any,
-    model: PhysicsModel,
-    setpoint: FloatArray,
-    strength: FloatArray,
-) -> FloatArray:
-    """Return the full physics state (state,) of an arm at rest, as `mujoco.rollout` takes it.
-
-    Servo and flex balance the weight, the gears' friction is relaxed.
-
-    Args:
-        engine: The engine.
-        data: A `mujoco.MjData` of the model, overwritten.
-        model: The model of the run.
-        setpoint: Set-points in the physical sense, (motor,) [rad].
-        strength: Share of its stiffness that each servo has, (motor,).
-    """
-    mujoco = load_mujoco()
-    give_drive = 1.0 / (strength * engine.figures("stiffness"))
-    give_flex = 1.0 / engine.figures("flex_stiffness")
-    mujoco.mj_resetData(model.compiled, data)
-    load, before, share = np.zeros_like(setpoint), np.zeros_like(setpoint), 1.0
-    for _ in range(ITERATIONS):
-        data.qpos[model.drive] = setpoint - give_drive * load
-        data.qpos[model.flex] = -give_flex * load
-        mujoco.mj_forward(model.compiled, data)
-        change = data.qfrc_bias[model.drive] - load
-        if np.abs(change * (give_drive + give_flex)).max() < AT_REST_RAD:
-            break
-        # Soft servos give way so far that the load swings to and fro: smaller steps converge.
-        share *= 0.5 if change @ before < -0.5 * before @ before else 1.0
-        load, before = load + share * change, change
-    sticks = model.friction >= 0
-    data.plastic[model.friction[sticks]] = data.qpos[model.drive[sticks]]
-    full = mujoco.mjtState.mjSTATE_FULLPHYSICS
-    state = np.empty(mujoco.mj_stateSize(model.compiled, full))
-    mujoco.mj_getState(model.compiled, data, state, full)
-    return state
 
 
 def limit_speed(reference: FloatArray, step: float, speed: FloatArray) -> FloatArray:

@@ -28,6 +28,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.digital_model.kinematics import GRAVITY
 from failuretwin.digital_model.robot import Motor, Robot
+from failuretwin.digital_model.settling import poses_in_range
 from failuretwin.digital_model.urdf import Urdf, read_root, read_urdf
 
 # What the physics engine needs to know of motors and gears, and where it is written down.
@@ -349,7 +350,6 @@ ROTOR_SHARE = 0.2
 """Inertia of a rotor behind its gear over the largest inertia of the joint, at least."""
 SPARE_TORQUE = 2.0
 """Torque of a motor over its largest load, at least; a URDF that states less has a placeholder."""
-POSES = 500
 
 
 def default_parameters(robot: Robot) -> PhysicsParameters:
@@ -360,9 +360,7 @@ def default_parameters(robot: Robot) -> PhysicsParameters:
     """
     load, inertia, effort = _arm_facts(robot)
     figures = np.stack([load, inertia, effort], axis=1).tolist()
-    motors = tuple(
-        _assumed(motor, *of_motor) for motor, of_motor in zip(robot.motors, figures, strict=True)
-    )
+    motors = tuple(_assumed(m, *facts) for m, facts in zip(robot.motors, figures, strict=True))
     return PhysicsParameters("assumed: derived from masses and limits of the URDF", motors)
 
 
@@ -400,11 +398,9 @@ def _arm_facts(robot: Robot) -> tuple[FloatArray, FloatArray, FloatArray]:
     mujoco = load_mujoco()
     model = arm_spec(robot).compile()
     data = mujoco.MjData(model)
-    low, high = np.array([motor.movement_range for motor in robot.motors]).T
-    poses = np.random.default_rng(0).uniform(low, high, (POSES, len(low))) * robot.sense
-    load, inertia = np.zeros((2, len(low)))
+    load, inertia = np.zeros((2, len(robot.motors)))
     mass = np.zeros((model.nv, model.nv))
-    for pose in poses:
+    for pose in poses_in_range(robot):
         data.qpos[:] = pose
         mujoco.mj_forward(model, data)
         mujoco.mj_fullM(model, data, mass)

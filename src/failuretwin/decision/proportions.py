@@ -13,31 +13,22 @@ import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.decision.metrics.scoring_rules import LogScore, log_score
-
-Z_95 = 1.959963984540054
-"""Two-sided 95 % point of the normal distribution."""
+from failuretwin.decision.scoring_rules import LogScore, log_score
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     """Return the Wilson 95 % interval of a share (Wilson, JASA 1927)."""
+    from scipy.stats import binomtest
+
     if trials == 0:
         return 0.0, 1.0
-    share, z2 = successes / trials, Z_95**2
-    centre = (share + z2 / (2 * trials)) / (1 + z2 / trials)
-    spread = math.sqrt(share * (1 - share) / trials + z2 / (4 * trials**2))
-    half = Z_95 * spread / (1 + z2 / trials)
-    return max(0.0, centre - half), min(1.0, centre + half)
+    low, high = binomtest(int(successes), int(trials)).proportion_ci(method="wilson")
+    return float(low), float(high)
 
 
 @dataclass(frozen=True)
 class Share:
-    """So many of so many.
-
-    Attributes:
-        count: How many.
-        total: Of how many.
-    """
+    """So many (`count`) of so many (`total`)."""
 
     count: int
     total: int
@@ -63,12 +54,9 @@ UNKNOWN, HEALTHY = "unknown", "healthy"
 def judged_truth(truth: str, hypotheses: Container[str]) -> str:
     """Return the hypothesis that is right for a run: its truth, or `unknown` where that means it.
 
-    `unknown` stands for every fault that is not named, so where it is among the hypotheses and
-    the true fault is not, it is the right answer. A healthy robot has no fault and stays healthy.
-
-    Args:
-        truth: True hypothesis of the run.
-        hypotheses: Those that were given a probability.
+    `unknown` stands for every fault that is not named, so where it is among the hypotheses (those
+    given a probability) and the true fault is not, it is the right answer. A healthy robot has no
+    fault and stays healthy.
     """
     if truth == HEALTHY or truth in hypotheses or UNKNOWN not in hypotheses:
         return truth
@@ -80,7 +68,6 @@ class ClassScore:
     """Scores of one class; NaN where the ratio has no meaning (0 / 0).
 
     Attributes:
-        name: The hypothesis.
         runs: Runs of which it is the truth.
         precision: Share of its diagnoses that are right; NaN if it was never diagnosed.
         recall: Share of its runs that are found; NaN if it is never the truth.
@@ -145,21 +132,20 @@ class Scores:
 
     def by_class(self) -> list[ClassScore]:
         """Return precision, recall and F1 of each class."""
-        truth, said = self.confusion.sum(axis=1), self.confusion.sum(axis=0)
-        return [
-            ClassScore(
-                name=name,
-                runs=int(truth[i]),
-                precision=_ratio(self.confusion[i, i], said[i]),
-                recall=_ratio(self.confusion[i, i], truth[i]),
-                f1=_ratio(2 * self.confusion[i, i], truth[i] + said[i]),
-            )
-            for i, name in enumerate(self.classes)
-        ]
+        runs, ratios = self.confusion.sum(axis=1).tolist(), class_ratios(self.confusion).tolist()
+        rows = zip(self.classes, runs, ratios, strict=True)
+        return [ClassScore(name, count, *ratio) for name, count, ratio in rows]
 
 
-def _ratio(part: int, whole: int) -> float:
-    return float(part / whole) if whole else math.nan
+def class_ratios(confusion: IntArray) -> FloatArray:
+    """Return precision, recall and F1 of each class, (..., class, 3), as of `ClassScore`.
+
+    Confusion matrices are counts (..., truth, diagnosis).
+    """
+    hits = np.diagonal(confusion, axis1=-2, axis2=-1)
+    true, said = confusion.sum(axis=-1), confusion.sum(axis=-2)
+    with np.errstate(invalid="ignore"):  # 0 / 0 has no meaning: NaN
+        return np.stack([hits / said, hits / true, 2 * hits / (true + said)], axis=-1)
 
 
 def score(
@@ -167,13 +153,7 @@ def score(
     diagnosis: Sequence[str | None],
     posterior: Sequence[Mapping[str, float]],
 ) -> Scores:
-    """Score diagnoses against the truth.
-
-    Args:
-        truth: True hypothesis of each run.
-        diagnosis: Most probable hypothesis of each run; None: no verdict, a class of its own.
-        posterior: Probabilities of each run.
-    """
+    """Score the diagnosis of each run; no verdict (None) is a class of its own."""
     said_of = [NO_VERDICT if said is None else said for said in diagnosis]
     names = [name for p in posterior for name in p]
     classes = tuple(dict.fromkeys([*names, *truth, *said_of]))
@@ -208,12 +188,7 @@ class Alarms:
 
 
 def count_alarms(truth: Sequence[str], diagnosis: Sequence[str | None]) -> Alarms:
-    """Count false alarms and missed detections.
-
-    Args:
-        truth: True hypothesis of each run.
-        diagnosis: Diagnosis of each run; None: no verdict.
-    """
+    """Count false alarms and missed detections, run by run; a diagnosis of None is no verdict."""
     pairs = list(zip(truth, diagnosis, strict=True))
     healthy = [said for true, said in pairs if true == HEALTHY]
     faulty = [said for true, said in pairs if true != HEALTHY]
@@ -232,14 +207,9 @@ def count_alarms(truth: Sequence[str], diagnosis: Sequence[str | None]) -> Alarm
 
 @dataclass(frozen=True)
 class IntervalCase:
-    """An interval and the truth that it should hold.
+    """An interval of a quantity of a fault mode, such as ``"onset"``, and the truth it should hold.
 
-    Attributes:
-        mode: Fault mode that it is about.
-        quantity: What is estimated, such as ``"onset"``.
-        low: Lower end, in the unit of the quantity.
-        high: Upper end, in the same unit.
-        truth: True value, in the same unit.
+    All in the unit of the quantity.
     """
 
     mode: str
@@ -254,8 +224,6 @@ class Coverage:
     """How often the intervals of one quantity hold the truth; ends count as inside.
 
     Attributes:
-        mode: Fault mode.
-        quantity: What is estimated.
         inside: Intervals that hold the truth, of all.
         below: Truths below their interval.
         above: Truths above their interval.
@@ -279,15 +247,14 @@ def coverage_by_mode(cases: Iterable[IntervalCase]) -> list[Coverage]:
     groups: dict[tuple[str, str], list[IntervalCase]] = {}
     for case in cases:
         groups.setdefault((case.mode, case.quantity), []).append(case)
-    return [_coverage(*key, group) for key, group in groups.items()]
-
-
-def _coverage(mode: str, quantity: str, cases: list[IntervalCase]) -> Coverage:
-    below = sum(case.truth < case.low for case in cases)
-    above = sum(case.truth > case.high for case in cases)
-    inside = Share(len(cases) - below - above, len(cases))
-    points = sum(case.low == case.high for case in cases)
-    return Coverage(mode, quantity, inside, below, above, points)
+    coverage = []
+    for key, group in groups.items():
+        below = sum(case.truth < case.low for case in group)
+        above = sum(case.truth > case.high for case in group)
+        points = sum(case.low == case.high for case in group)
+        inside = Share(len(group) - below - above, len(group))
+        coverage.append(Coverage(*key, inside, below, above, points))
+    return coverage
 
 
 # How soon after its onset a fault is noticed and named, at a stated rate of false alarms.
@@ -297,58 +264,63 @@ ISOLATED = 0.5
 
 
 @dataclass(frozen=True)
-class Delays:
-    """Delays of the faulty runs, in their order.
+class CensoredDelays:
+    """From onset to an event in the faulty runs, in their order.
 
     Attributes:
-        threshold: An alarm is a probability of any fault above this.
-        false_alarms: Healthy runs that alarm with it, of all healthy runs.
-        detection: From onset to alarm, (faulty run,) [s]; infinite: none before the run ended; NaN:
-            the alarm came before the onset, which is a false alarm and no delay.
-        isolation: From onset to the first alarm with the right fault in front, (faulty run,) [s];
-            infinite and NaN as above.
+        delay: (faulty run,) [s]; infinite: no event before the run ended; NaN: an alarm came before
+            the onset, which is a false alarm and no delay.
         followed: From onset to the end of the run, (faulty run,) [s]: a delay that is infinite is
             only known to be longer than this.
     """
 
-    threshold: float
-    false_alarms: Share
-    detection: FloatArray
-    isolation: FloatArray
+    delay: FloatArray
     followed: FloatArray
 
     @property
-    def early(self) -> Share:
-        """Faulty runs with an alarm before the onset, of all faulty runs."""
-        return Share(int(np.isnan(self.detection).sum()), len(self.detection))
+    def never(self) -> Share:
+        """Runs that ended without the event, of those without an early alarm."""
+        return Share(int(np.isinf(self.delay).sum()), int((~np.isnan(self.delay)).sum()))
 
     @property
-    def undetected(self) -> Share:
-        """Runs that ended without an alarm, of those without an early one."""
-        return _never(self.detection)
+    def median(self) -> float:
+        """Where the product-limit curve falls to one half (Kaplan & Meier, JASA 1958) [s].
 
-    @property
-    def unisolated(self) -> Share:
-        """Runs that ended without the right fault in front, of those without an early alarm."""
-        return _never(self.isolation)
+        Infinite where it never does; NaN where there is no run.
+        """
+        from scipy.stats import CensoredData, ecdf
 
-    @property
-    def median_detection(self) -> float:
-        """Median delay of detection [s], runs that ended too soon counted as censored."""
-        return _median(self.detection, self.followed)
+        ended = np.isinf(self.delay)
+        if self.never.count == self.never.total:
+            return float("inf") if self.never.total else float("nan")
+        data = CensoredData(self.delay[np.isfinite(self.delay)], right=self.followed[ended])
+        curve = ecdf(data).sf
+        low = curve.probabilities <= 0.5 + 1e-12
+        return float(curve.quantiles[low.argmax()]) if low.any() else float("inf")
 
-    @property
-    def median_isolation(self) -> float:
-        """Median delay of isolation [s], runs that ended too soon counted as censored."""
-        return _median(self.isolation, self.followed)
+
+@dataclass(frozen=True)
+class Delays:
+    """How soon faults are noticed (`detection`) and the right one is in front (`isolation`).
+
+    Attributes:
+        threshold: An alarm is a probability of any fault above this.
+        false_alarms: Healthy runs that alarm with it, of all healthy runs.
+        early: Faulty runs with an alarm before the onset, of all faulty runs.
+    """
+
+    threshold: float
+    false_alarms: Share
+    early: Share
+    detection: CensoredDelays
+    isolation: CensoredDelays
 
 
 def alarm_threshold(healthy: FloatArray, share: float) -> float:
     """Return the lowest threshold that at most `share` of the healthy runs ever exceed.
 
-    Args:
-        healthy: Probability of any fault, (healthy run, time); NaN: no answer yet.
-        share: Stated rate of false alarms [runs with one a run], 0 <= share < 1.
+    `healthy` is the probability of any fault, (healthy run, time), NaN where there is no answer
+    yet; `share` is the stated rate of false alarms [runs with one a run], 0 <= share < 1.
 
     Raises:
         InputError: If there are no healthy runs or the share is not one.
@@ -392,12 +364,13 @@ def delays_after_onset(
     faulty, began = ~healthy, onset[~healthy]
     early = np.any(alarm[faulty] & (time < began[:, None]), axis=1)
     answered = np.where(np.isnan(fault[faulty]), -np.inf, time).max(axis=1)
+    followed = np.maximum(answered - began, 0.0)
+    first = (_first_after(time, event[faulty], began, early) for event in (alarm, named))
     return Delays(
-        threshold=threshold,
-        false_alarms=Share(int(alarm[healthy].any(axis=1).sum()), int(healthy.sum())),
-        detection=_first_after(time, alarm[faulty], began, early),
-        isolation=_first_after(time, named[faulty], began, early),
-        followed=np.maximum(answered - began, 0.0),
+        threshold,
+        Share(int(alarm[healthy].any(axis=1).sum()), int(healthy.sum())),
+        Share(int(early.sum()), len(early)),
+        *(CensoredDelays(delay, followed) for delay in first),
     )
 
 
@@ -407,27 +380,3 @@ def _first_after(
     """Return the time from each onset to the first event at or after it [s]."""
     at = np.where(event & (time >= onset[:, None]), time, np.inf).min(axis=1)
     return np.where(early, np.nan, at - onset)
-
-
-def _never(delay: FloatArray) -> Share:
-    valid = delay[~np.isnan(delay)]
-    return Share(int(np.isinf(valid).sum()), len(valid))
-
-
-def _median(delay: FloatArray, followed: FloatArray) -> float:
-    """Return where the product-limit curve falls to one half (Kaplan & Meier, JASA 1958) [s].
-
-    Infinite where it never does; NaN where there is no run.
-    """
-    from scipy.stats import CensoredData, ecdf
-
-    valid = ~np.isnan(delay)
-    ended = valid & np.isinf(delay)
-    if not valid.any():
-        return float("nan")
-    if ended.sum() == valid.sum():
-        return float("inf")
-    data = CensoredData(uncensored=delay[valid & ~ended], right=followed[ended])
-    curve = ecdf(data).sf
-    low = curve.probabilities <= 0.5 + 1e-12
-    return float(curve.quantiles[low.argmax()]) if low.any() else float("inf")

@@ -46,12 +46,7 @@ class LogScore:
 
 
 def log_score(truth: Sequence[str], posterior: Sequence[Mapping[str, float]]) -> LogScore:
-    """Return the log score of each run.
-
-    Args:
-        truth: True hypothesis of each run.
-        posterior: Probabilities of each run; a truth that is not among them has none.
-    """
+    """Return the log score of each run; a truth that is not in its posterior has no probability."""
     chance = np.array([p.get(t, 0.0) for p, t in zip(posterior, truth, strict=True)])
     with np.errstate(divide="ignore"):  # no probability: an infinite score, as it should be
         return LogScore(-np.log(chance) + 0.0)  # + 0.0: certainty is 0, not -0
@@ -62,10 +57,6 @@ def brier_score(truth: Sequence[str], posterior: Sequence[Mapping[str, float]]) 
 
     The original form for several classes (Brier, Monthly Weather Review 1950): 0 is perfect, 2 is
     certainty of something wrong. A truth that no hypothesis stands for adds 1.
-
-    Args:
-        truth: True hypothesis of each run.
-        posterior: Probabilities of each run.
     """
     return np.array(
         [
@@ -126,11 +117,7 @@ def adaptive_edges(confidence: FloatArray, bins: int = 10) -> FloatArray:
     """Return edges between which about as many runs lie in each bin (Nixon et al., CVPR 2019).
 
     Edges lie midway between runs. Runs of equal confidence stay together, so there may be fewer
-    bins, and some may be empty.
-
-    Args:
-        confidence: Stated probability of each run, (run,).
-        bins: Most bins to make.
+    bins than asked for, and some may be empty.
 
     Raises:
         InputError: If there is not one bin and one run at least.
@@ -143,12 +130,9 @@ def adaptive_edges(confidence: FloatArray, bins: int = 10) -> FloatArray:
 
 
 def reliability(confidence: FloatArray, right: BoolArray, edges: FloatArray) -> Reliability:
-    """Sort runs into bins of confidence and count how often they are right.
+    """Sort runs by the probability of their verdict, (run,), and count how often it is right.
 
-    Args:
-        confidence: Probability of the most probable hypothesis, (run,).
-        right: Whether that is the truth, (run,).
-        edges: Increasing edges that enclose every confidence, (bins + 1,).
+    The edges of the bins, (bins + 1,), increase and enclose every confidence.
 
     Raises:
         InputError: If there are no runs, a confidence is not within 0 to 1 or beyond the edges.
@@ -174,16 +158,8 @@ def calibrated_error(
     """Return the calibration errors that a perfectly calibrated method would show by chance.
 
     With few runs the error is well above 0 even where every probability is true; compare with
-    these (consistency resampling, Broecker & Smith, Weather and Forecasting 2007).
-
-    Args:
-        confidence: Stated probability of each run, (run,); taken to be true.
-        edges: Edges of the bins, as for `reliability`.
-        rng: Source of chance.
-        draws: How many sets of answers to draw.
-
-    Returns:
-        Expected calibration error of each set, (draws,).
+    these (consistency resampling, Broecker & Smith, Weather and Forecasting 2007). The stated
+    probabilities, (run,), are taken to be true; the error is that of each set of answers, (draws,).
     """
     _check_confidence(confidence)
     inside, runs = _bin_of(confidence, edges), len(confidence)
@@ -217,48 +193,37 @@ LEVEL = 0.95
 
 
 @dataclass(frozen=True)
-class EcdfBand:
-    """Band that the distribution of uniform ranks leaves nowhere, at the level `LEVEL`.
-
-    Saeilynoja, Buerkner and Vehtari, Statistics and Computing 2022: binomial intervals at each
-    point, widened together until the chance of leaving any of them is right.
-
-    Attributes:
-        rank: Share of all ranks up to the point, (point,).
-        ecdf: Share of runs with a rank up to there, (point,).
-        low: Lower edge of the band, (point,).
-        high: Upper edge of the band, (point,).
-    """
-
-    rank: FloatArray
-    ecdf: FloatArray
-    low: FloatArray
-    high: FloatArray
-
-
-@dataclass(frozen=True)
 class RankCheck:
-    """Whether ranks are uniform.
+    """Whether ranks are uniform: whether their distribution keeps to a band.
+
+    Uniform ranks leave the band nowhere, at the level `LEVEL` (Saeilynoja, Buerkner and Vehtari,
+    Statistics and Computing 2022): binomial intervals at each point, widened together until the
+    chance of leaving any of them is right.
 
     Attributes:
         count: Runs in each bin of the chi-squared test, (bin,).
         expected: Runs expected there, (bin,).
         chi2_p: Chance of a chi-squared as large, if ranks were uniform.
-        band: The distribution of the ranks and the band that it should keep to.
+        rank: Share of all ranks up to the point, (point,).
+        ecdf: Share of runs with a rank up to there, (point,).
+        low: Lower edge of the band, (point,).
+        high: Upper edge of the band, (point,).
         band_p: Chance of uniform ranks to leave their narrowest band as far.
     """
 
     count: IntArray
     expected: FloatArray
     chi2_p: float
-    band: EcdfBand
+    rank: FloatArray
+    ecdf: FloatArray
+    low: FloatArray
+    high: FloatArray
     band_p: float
 
     @property
     def uniform(self) -> bool:
         """True where the distribution stays within the band."""
-        inside = (self.band.low <= self.band.ecdf) & (self.band.ecdf <= self.band.high)
-        return bool(inside.all())
+        return bool(((self.low <= self.ecdf) & (self.ecdf <= self.high)).all())
 
 
 def rank_of_truth(draws: FloatArray, truth: FloatArray, rng: np.random.Generator) -> IntArray:
@@ -276,12 +241,7 @@ def rank_of_truth(draws: FloatArray, truth: FloatArray, rng: np.random.Generator
 
 
 def check_ranks(ranks: IntArray, draws: int, rng: np.random.Generator) -> RankCheck:
-    """Check that ranks are uniform over 0..draws.
-
-    Args:
-        ranks: Rank of the truth of each run, (run,).
-        draws: How many draws each truth was ranked among.
-        rng: Source of chance, for the band.
+    """Check that ranks, (run,), of the truth among so many draws are uniform over 0..draws.
 
     Raises:
         InputError: If there are no ranks, or some are not within 0..draws.
@@ -294,22 +254,18 @@ def check_ranks(ranks: IntArray, draws: int, rng: np.random.Generator) -> RankCh
     bin_of = np.arange(draws + 1) * bins // (draws + 1)
     count = np.bincount(bin_of[ranks], minlength=bins)
     expected = np.bincount(bin_of) * len(ranks) / (draws + 1)
-    band, band_p = _ecdf_band(ranks, draws, rng)
-    return RankCheck(count, expected, float(chisquare(count, expected).pvalue), band, band_p)
-
-
-def _ecdf_band(ranks: IntArray, draws: int, rng: np.random.Generator) -> tuple[EcdfBand, float]:
-    runs = len(ranks)
+    p, runs = float(chisquare(count, expected).pvalue), len(ranks)
     points = np.unique(np.linspace(0, draws - 1, min(POINTS, draws)).astype(np.int64))
     share = (points + 1) / (draws + 1)
-    count = np.cumsum(np.bincount(ranks, minlength=draws + 1))[points]
+    up_to = np.cumsum(np.bincount(ranks, minlength=draws + 1))[points]
     tail, column = _tail_table(runs, share), np.arange(len(share))
     steps = rng.multinomial(runs, np.diff(share, prepend=0.0, append=1.0), size=NULL_DRAWS)
     uniform = tail[np.cumsum(steps[:, :-1], axis=1), column].min(axis=1)
     kept = tail >= np.quantile(uniform, 1.0 - LEVEL, method="lower")
     low, high = kept.argmax(axis=0), runs - kept[::-1].argmax(axis=0)
-    band = EcdfBand(share, count / runs, low / runs, high / runs)
-    return band, float(np.mean(uniform <= tail[count, column].min()))
+    band_p = float(np.mean(uniform <= tail[up_to, column].min()))
+    band = (share, up_to / runs, low / runs, high / runs)
+    return RankCheck(count, expected, p, *band, band_p)
 
 
 def _tail_table(runs: int, share: FloatArray) -> FloatArray:
@@ -333,11 +289,9 @@ CHUNK = 1_000_000
 class McNemar:
     """Exact McNemar test of two methods on the same runs (McNemar, Psychometrika 1947).
 
+    Counts the runs that both, only the first, only the second and neither got right.
+
     Attributes:
-        both: Runs that both got right.
-        first_only: Runs that only the first got right.
-        second_only: Runs that only the second got right.
-        neither: Runs that both got wrong.
         p: Two-sided chance of a split of the runs on which they differ at least as uneven, if both
             methods were equally good (binomial with one half).
     """
@@ -359,8 +313,7 @@ class LogScoreGain:
         finite_mean: The same over the runs whose truth neither ruled out; NaN if there are none.
         interval: 95 % bootstrap interval of `finite_mean` (percentiles; Efron 1979).
         runs: Runs behind `finite_mean`.
-        first_impossible: Runs whose truth only the first method ruled out.
-        second_impossible: Runs whose truth only the second ruled out.
+        first_impossible: Runs whose truth only the first method ruled out; so with the second.
         both_impossible: Runs whose truth both ruled out: no difference there.
     """
 
@@ -374,11 +327,7 @@ class LogScoreGain:
 
 
 def mcnemar(first: BoolArray, second: BoolArray) -> McNemar:
-    """Compare which runs two methods got right.
-
-    Args:
-        first: Whether the first method was right, (run,).
-        second: The same of the second, on the same runs, (run,).
+    """Compare which runs two methods got right, (run,) each.
 
     Raises:
         InputError: If they do not have the same runs.
@@ -394,13 +343,9 @@ def mcnemar(first: BoolArray, second: BoolArray) -> McNemar:
 def log_score_gain(
     first: FloatArray, second: FloatArray, rng: np.random.Generator, draws: int = RESAMPLES
 ) -> LogScoreGain:
-    """Compare the log scores of two methods run by run.
+    """Compare the log scores of two methods run by run, (run,) [nats]; some may be infinite.
 
-    Args:
-        first: Log score of each run by the first method, (run,) [nats]; may be infinite.
-        second: The same by the second method, on the same runs, (run,) [nats].
-        rng: Source of chance.
-        draws: Bootstrap samples.
+    The interval is of `draws` bootstrap samples.
 
     Raises:
         InputError: If they do not have the same runs.
