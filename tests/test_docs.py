@@ -13,7 +13,7 @@ import pytest
 
 import failuretwin
 
-ROOT = Path(failuretwin.__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 DOCS = sorted((ROOT / "docs").glob("*.md"))
 PAGES = [*DOCS, ROOT / "README.md", ROOT / "CHANGELOG.md"]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -25,12 +25,15 @@ READERS_OWN = {
     "my_robot.toml",
 }
 """Files in examples that the reader writes or gets."""
+STRANGERS = {"Dataset", "Guess"}
+"""Classes of xarray and of the reader."""
 FOLDERS = ("benchmarks", "docs", "examples", "src", "tests")
 
 FENCE = re.compile(r"```(\w*)\n(.*?)```", re.DOTALL)
 NAME = re.compile(r"`(failuretwin(?:\.\w+)+)")
 PUBLIC = re.compile(r"\bft\.([A-Za-z]\w*)")
 FILE = re.compile(r"`([\w./-]+\.(?:md|py|toml|urdf))`")
+CLASS = re.compile(r"`(?:\w+\.)*?([A-Z][a-z]+\w*)(?:\.([a-z_]\w*))?\b[^`]*`")
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
@@ -81,6 +84,26 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
+@pytest.fixture(scope="module")
+def classes() -> dict[str, set[str]]:
+    """Return the fields, constants and methods of each class of the package."""
+    found: dict[str, set[str]] = {}
+    for path in (ROOT / "src").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                found.setdefault(node.name, set()).update(_parts(node))
+    return found
+
+
+def _parts(node: ast.ClassDef) -> Iterator[str]:
+    for part in node.body:
+        if isinstance(part, ast.FunctionDef):
+            yield part.name
+        elif isinstance(part, ast.AnnAssign | ast.Assign):
+            targets = part.targets if isinstance(part, ast.Assign) else [part.target]
+            yield from (target.id for target in targets if isinstance(target, ast.Name))
+
+
 def glossary_rows() -> list[list[str]]:
     lines = (ROOT / "docs" / "glossary.md").read_text("utf-8").splitlines()
     rows = [line for line in lines if line.startswith("| ") and not line.startswith("| symbol")]
@@ -117,6 +140,14 @@ def test_names_on_the_page_exist(page):
     for name in set(NAME.findall(text)) - ENTRY_POINTS:
         resolve(name)
     assert set(PUBLIC.findall(text)) <= set(failuretwin.__all__)
+
+
+@pytest.mark.parametrize("page", [*DOCS, ROOT / "README.md"], ids=named)
+def test_classes_on_the_page_exist(page, classes):
+    text = FENCE.sub("", page.read_text("utf-8"))
+    for name, part in CLASS.findall(text):
+        assert name in {*classes, *STRANGERS}, name
+        assert not part or part in classes[name], f"{name}.{part}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=named)
