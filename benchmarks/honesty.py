@@ -34,9 +34,8 @@ from failuretwin.failure_behavior.fault import FaultValue
 from failuretwin.failure_behavior.modes import SteadyStateError, Stuck
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.evidence import Evidence
-from failuretwin.inference.onset import OnsetPrior
 from failuretwin.inference.posterior import marginal_likelihood_of
-from failuretwin.inference.priors import Priors
+from failuretwin.inference.priors import OnsetPrior, Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 EARLY = 0.5

@@ -49,7 +49,7 @@ def write_bag(path: Path, events: list[Event], robot: Robot) -> None:
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    from failuretwin.data_knowledge.bags.file import MONITORING_DEFINITION
+    from failuretwin.data_knowledge.bag_file import MONITORING_DEFINITION
 
     store = get_typestore(Stores.ROS1_NOETIC)
     type_ = "cm/msg/msg_cm"

@@ -30,18 +30,16 @@ if TYPE_CHECKING:
     from failuretwin.digital_model.twin import DigitalTwin
     from failuretwin.failure_behavior.mode import FaultMode, SizedMode
     from failuretwin.failure_behavior.registry import register_mode
-    from failuretwin.inference.diagnoser import BayesDiagnoser, diagnose
+    from failuretwin.inference.diagnoser import BayesDiagnoser, Diagnoser, diagnose
     from failuretwin.inference.isolability import IsolabilityReport, isolability
-    from failuretwin.inference.onset import OnsetPrior
-    from failuretwin.inference.priors import Priors
-    from failuretwin.inference.protocol import Diagnoser
+    from failuretwin.inference.priors import OnsetPrior, Priors
 
 __version__ = "0.1.0"
 
 _HOME = {
     "BayesDiagnoser": "inference.diagnoser",
     "Calibration": "connection.calibration.result",
-    "Diagnoser": "inference.protocol",
+    "Diagnoser": "inference.diagnoser",
     "Diagnosis": "core.hypothesis",
     "DigitalTwin": "digital_model.twin",
     "Fault": "core.hypothesis",
@@ -50,7 +48,7 @@ _HOME = {
     "Hypothesis": "core.hypothesis",
     "InputError": "core.errors",
     "IsolabilityReport": "inference.isolability",
-    "OnsetPrior": "inference.onset",
+    "OnsetPrior": "inference.priors",
     "Plan": "data_knowledge.generate",
     "Priors": "inference.priors",
     "ReadOptions": "data_knowledge.read",

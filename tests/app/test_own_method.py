@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from failuretwin import read_runs
 from failuretwin.app.cli import cli
 from failuretwin.core.errors import InputError
-from failuretwin.inference.protocol import diagnoser_from_text
+from failuretwin.inference.diagnoser import diagnoser_from_text
 
 OWN = """
 from failuretwin.core.hypothesis import Diagnosis

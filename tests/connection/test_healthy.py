@@ -22,8 +22,7 @@ from failuretwin.digital_model.nonidealities import (
 from failuretwin.digital_model.settling import Settling
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.onset import OnsetPrior
-from failuretwin.inference.priors import priors_of
+from failuretwin.inference.priors import OnsetPrior, priors_of
 
 PATH_NOISE_M, OUTLIER_RATE = 0.001, 0.01
 

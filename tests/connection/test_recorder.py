@@ -14,7 +14,7 @@ from failuretwin.connection.links.base import OK, Answer, CommandSent, Pace, Rea
 from failuretwin.connection.links.recording import Recorder, replay
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.data_knowledge.bags.file import read_messages
+from failuretwin.data_knowledge.bag_file import read_messages
 
 pytest.importorskip("mcap")
 pytest.importorskip("mujoco")

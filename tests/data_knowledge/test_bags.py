@@ -11,7 +11,7 @@ from failuretwin import BayesDiagnoser
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.data_knowledge.bags.read import BagTopics, is_bag, read_bag
+from failuretwin.data_knowledge.bags import BagTopics, is_bag, read_bag
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.raw_sessions import read_session
 from failuretwin.data_knowledge.timed_log import Targets, timed_run

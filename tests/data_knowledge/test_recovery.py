@@ -17,8 +17,8 @@ from failuretwin.data_knowledge.recovery import (
     published_time_bases,
     recover_movements,
 )
-from failuretwin.data_knowledge.recovery.inverse_kinematics import plane_arm
-from failuretwin.data_knowledge.recovery.ramps import Free, PathPart, Ramps, fit_ramps
+from failuretwin.data_knowledge.recovery_inverse_kinematics import plane_arm
+from failuretwin.data_knowledge.recovery_ramps import Free, PathPart, Ramps, fit_ramps
 from failuretwin.digital_model.calibrated_robot import load_calibration
 
 FROM_ZERO = np.linspace(0.0, 10.0, 1000)

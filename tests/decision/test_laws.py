@@ -19,12 +19,11 @@ from failuretwin.inference.fault_models import (
     size_nodes,
     transient_model,
 )
-from failuretwin.inference.onset import OnsetPrior
 from failuretwin.inference.posterior import (
     marginal_likelihood_of,
     marginal_likelihoods,
 )
-from failuretwin.inference.priors import Priors
+from failuretwin.inference.priors import OnsetPrior, Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.stuck import stuck_model
 

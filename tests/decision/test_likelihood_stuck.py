@@ -19,7 +19,7 @@ from slide_runs import (
 
 from failuretwin.digital_model.nonidealities import Timing
 from failuretwin.inference.marginal import marginal_likelihood
-from failuretwin.inference.onset import OnsetPrior
+from failuretwin.inference.priors import OnsetPrior
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.stuck import stuck_model
 

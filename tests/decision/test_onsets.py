@@ -7,8 +7,14 @@ from hypothesis import strategies as st
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
-from failuretwin.inference.onset import OnsetIntervals, OnsetPrior, next_movement, plateau_or_ramp
-from failuretwin.inference.priors import MONITORING, Priors
+from failuretwin.inference.priors import (
+    MONITORING,
+    OnsetIntervals,
+    OnsetPrior,
+    Priors,
+    next_movement,
+    plateau_or_ramp,
+)
 
 lengths = st.lists(st.floats(0.0, 5.0), min_size=1, max_size=8)
 earlies = st.floats(0.0, 1.0)

@@ -8,9 +8,8 @@ from failuretwin.core.hypothesis import HEALTHY, Hypothesis
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.inference.evidence import settled_evidence
-from failuretwin.inference.onset import OnsetPrior
 from failuretwin.inference.posterior import marginal_likelihood_of
-from failuretwin.inference.priors import Priors
+from failuretwin.inference.priors import OnsetPrior, Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 PAIRS = tuple(
@@ -78,7 +77,7 @@ def test_a_second_fault_that_cannot_show_changes_nothing(twin, imperfect, monkey
     from failuretwin.core.numerics import log_of
     from failuretwin.inference import posterior as weighing
     from failuretwin.inference.marginal import FaultModel
-    from failuretwin.inference.onset import immediate
+    from failuretwin.inference.priors import immediate
 
     def nothing(likelihood, fault, priors):
         motor = weighing.motor_of(likelihood, fault)

@@ -12,8 +12,8 @@ from hypothesis.extra.numpy import arrays
 
 from failuretwin import load_robot
 from failuretwin.core.errors import InputError
-from failuretwin.digital_model.physics.engine import PhysicsEngine, limit_speed, refine
-from failuretwin.digital_model.physics.model import (
+from failuretwin.digital_model.physics_engine import PhysicsEngine, limit_speed, refine
+from failuretwin.digital_model.physics_model import (
     TOOL,
     arm_spec,
     build_model,

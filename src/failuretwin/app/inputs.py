@@ -14,7 +14,7 @@ from failuretwin.app.commands.options import LogOptions
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.core.hypothesis import Hypothesis, parse_hypotheses
-from failuretwin.data_knowledge.bags.read import BagTopics
+from failuretwin.data_knowledge.bags import BagTopics
 from failuretwin.data_knowledge.column_guess import column_map_text, guess_columns
 from failuretwin.data_knowledge.csv_log import read_column_map
 from failuretwin.data_knowledge.matlab import RECOVERY_ERROR, RECOVERY_WORST
@@ -24,8 +24,7 @@ from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.digital_model.nonidealities import GENERIC_NAME
 from failuretwin.digital_model.robot import Robot
-from failuretwin.inference.diagnoser import BayesDiagnoser
-from failuretwin.inference.protocol import Diagnoser, diagnoser_from_text
+from failuretwin.inference.diagnoser import BayesDiagnoser, Diagnoser, diagnoser_from_text
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -26,7 +26,7 @@ from failuretwin.connection.links import ros_messages
 from failuretwin.connection.links.base import LinkCounts, Pace, Sink, Source, source_from_text
 from failuretwin.connection.links.ros_messages import LEVEL_NAMES, RosTopics, load_topics, statuses
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.bags.messages import BagTopics
+from failuretwin.data_knowledge.bag_messages import BagTopics
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.injection import ScheduledFault

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeAlias, cast
 from failuretwin import __version__
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import RunTable, concatenate
-from failuretwin.data_knowledge.bags.read import BagTopics, is_bag, read_bag
+from failuretwin.data_knowledge.bags import BagTopics, is_bag, read_bag
 from failuretwin.data_knowledge.csv_log import ColumnMap, read_mapped_csv
 from failuretwin.data_knowledge.matlab import (
     RECOVERY_ERROR,

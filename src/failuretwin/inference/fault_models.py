@@ -21,7 +21,7 @@ from failuretwin.failure_behavior.fault import Arrival
 from failuretwin.failure_behavior.mode import FaultMode, Range
 from failuretwin.inference.joint_likelihood import JointLikelihood
 from failuretwin.inference.marginal import FaultModel
-from failuretwin.inference.onset import immediate, next_movement
+from failuretwin.inference.priors import immediate, next_movement
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 # Nodes of an unknown that holds for the whole run: dense where a movement may point.

@@ -19,7 +19,7 @@ from failuretwin.core.numerics import Weighted, log_of, log_sum
 from failuretwin.core.types import FloatArray
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.marginal import ChangePointPosterior, Estimate, MarginalLikelihood
-from failuretwin.inference.onset import next_movement
+from failuretwin.inference.priors import next_movement
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 SHARES = 12

@@ -7,17 +7,180 @@ Section: docs/diagnosis.md#priors-odds-onset-sizes
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from failuretwin.core.errors import InputError
+from failuretwin.core.movements import Movements
+from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import FaultMode, Range
 from failuretwin.failure_behavior.modes import SteadyStateError
-from failuretwin.inference.onset import OnsetPrior
+from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.settings import USUAL, InferenceSettings
+
+# When a fault may have begun: which movement it spoils first, and what that says of the onset.
+
+QUADRATURE = np.linspace(0.05, 0.95, 10)
+"""Points at which an interval of time is sampled, as shares of its length."""
+
+
+@dataclass(frozen=True)
+class OnsetPrior:
+    """When a fault may have begun; onsets too late to show in the run are not considered.
+
+    Attributes:
+        prior_before_run: Probability that the fault was there before the run; of a stuck motor,
+            that it was stuck before the run or gets stuck on its first ramp. The rest is spread
+            evenly over the time after that. None: as the mode says.
+        free: Probability that the held angle of a stuck motor is unrelated to the commands,
+            anywhere in range.
+        known_s: The onset of a stuck motor, where it is known [s].
+
+    Raises:
+        InputError: If a probability or the onset makes no sense.
+    """
+
+    prior_before_run: float | None = None
+    free: float = 0.2
+    known_s: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in (("prior_before_run", self.prior_before_run), ("free", self.free)):
+            if value is not None and not 0.0 <= value <= 1.0:
+                raise InputError(f"{name} is {value:g}, expected a probability from 0 to 1.")
+        if self.known_s is not None and not 0.0 <= self.known_s < np.inf:
+            raise InputError(f"known_s is {self.known_s:g}, expected 0 or more [s].")
+
+    def before_run(self, mode: str) -> float:
+        """Return the probability that a fault of this mode was there before the run."""
+        return MODES[mode].before_run if self.prior_before_run is None else self.prior_before_run
+
+
+@dataclass(frozen=True)
+class OnsetIntervals:
+    """The time in which an onset spoils each movement first [s].
+
+    With the probability P0 that the fault was there before the run, and the length T of each,
+
+        p(m0) = P0 [m0 = 1] + (1 - P0) T(m0) / sum of T
+
+    Attributes:
+        begin: Begin of each; of the first movement, the start of the run. (run, movement), or
+            (run, movement, part) where a movement has several; NaN without a movement.
+        end: End of each, same axes.
+        at_first: How P0 is shared among the parts of the first movement, (part,), whose time then
+            counts no more: P0 stands for it. None: there is one part, and its time counts.
+    """
+
+    begin: FloatArray
+    end: FloatArray
+    at_first: FloatArray | None = None
+
+    @property
+    def length(self) -> FloatArray:
+        """T, axes as of `begin` [s]; 0 without a movement."""
+        return np.nan_to_num(np.maximum(self.end - self.begin, 0.0))
+
+    def weights(self, prior_before_run: float) -> FloatArray:
+        """Return p(m0), the prior probability of each interval, axes as of `begin`.
+
+        Args:
+            prior_before_run: P0.
+        """
+        length = self.length
+        if self.at_first is not None:
+            length[:, 0] = 0.0
+        total = length.sum(axis=tuple(range(1, length.ndim)), keepdims=True)
+        share = np.where(total > 0.0, prior_before_run, 1.0)
+        weights = (1.0 - share) * length / np.where(total > 0.0, total, 1.0)
+        weights[:, 0] += share[:, 0] * (1.0 if self.at_first is None else self.at_first)
+        return weights
+
+    def holding(self, onset_s: float) -> FloatArray:
+        """Return 1 for the interval that holds a known onset, or the last if none does, else 0."""
+        inside = (self.begin <= onset_s) & (onset_s < self.end)
+        by_run = inside.reshape(len(inside), -1)
+        by_run[~by_run.any(axis=1), -1] = True
+        return by_run.reshape(inside.shape).astype(np.float64)
+
+    def samples(
+        self, prior_before_run: float, points: FloatArray = QUADRATURE
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return onsets [s] and their share of their interval, each (run, movement, sample).
+
+        A fault that was there before the run counts as an onset at 0.
+
+        Args:
+            prior_before_run: P0.
+            points: Where in an interval onsets are sampled, as shares of its length.
+        """
+        weight = self.weights(prior_before_run)[:, 0]
+        some = weight > prior_before_run
+        before = np.divide(prior_before_run, weight, out=np.ones_like(weight), where=some)
+        return self.spread(before, points)
+
+    def spread(
+        self, before: FloatArray, points: FloatArray = QUADRATURE
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return `samples` with a given share of those before the run.
+
+        Args:
+            before: That share of the first interval of each run, (run,).
+            points: Where in an interval onsets are sampled, as shares of its length.
+        """
+        begin = np.nan_to_num(self.begin)[..., None]
+        onset = begin + np.concatenate([[0.0], points]) * self.length[..., None]
+        onset[..., 0] = 0.0
+        share = np.full(onset.shape, 1.0 / len(points))
+        share[..., 0] = 0.0
+        share[:, 0, 0], share[:, 0, 1:] = before, (1.0 - before[:, None]) / len(points)
+        return onset, share
+
+    def onsets(self, prior_before_run: float) -> Callable[[int], tuple[FloatArray, FloatArray]]:
+        """Return `samples` of a run by its index, with an axis for nodes: (movement, 1, sample)."""
+        onset, share = self.samples(prior_before_run)
+        return lambda run: (onset[run, :, None], share[run, :, None])
+
+
+def next_movement(movements: Movements) -> OnsetIntervals:
+    """Return the intervals of a fault that acts on the movements that start after its onset."""
+    return OnsetIntervals(_before(movements.start), movements.start)
+
+
+def immediate(evidence: SettledEvidence) -> OnsetIntervals:
+    """Return the intervals of a fault that acts at once: up to where the tool is seen at rest.
+
+    Of a movement that is never seen at rest: up to the last reading or the next movement.
+    """
+    middle = 0.5 * (np.minimum(evidence.begin, evidence.end) + evidence.end)
+    end = np.where(evidence.movements.exists, middle, np.nan)
+    return OnsetIntervals(_before(end), end)
+
+
+def plateau_or_ramp(start: FloatArray, reached: FloatArray) -> OnsetIntervals:
+    """Return the intervals of a motor that gets stuck on a plateau or on the ramp that follows.
+
+    That before the run or on the first ramp is P0; half of it each.
+
+    Args:
+        start: When each ramp begins, (run, movement) [s].
+        reached: When it ends, (run, movement) [s].
+
+    Returns:
+        Intervals (run, movement, plateau | ramp).
+    """
+    plateau = np.minimum(_before(reached), start)
+    begin, end = np.stack([plateau, start], axis=-1), np.stack([start, reached], axis=-1)
+    return OnsetIntervals(begin, end, np.array([0.5, 0.5]))
+
+
+def _before(end: FloatArray) -> FloatArray:
+    """Return the end of the interval before each, (run, movement); of the first, 0."""
+    return np.concatenate([np.zeros_like(end[:, :1]), end[:, :-1]], axis=1)
 
 
 @dataclass(frozen=True)

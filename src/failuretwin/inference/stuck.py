@@ -17,7 +17,7 @@ from failuretwin.core.numerics import log_fall, log_norm, log_of, log_sum, log_t
 from failuretwin.core.types import FloatArray
 from failuretwin.inference.fault_models import nodes_around
 from failuretwin.inference.marginal import FaultModel
-from failuretwin.inference.onset import OnsetIntervals, OnsetPrior, plateau_or_ramp
+from failuretwin.inference.priors import OnsetIntervals, OnsetPrior, plateau_or_ramp
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 COARSE_NODES = 49

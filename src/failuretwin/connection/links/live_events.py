@@ -17,8 +17,8 @@ from failuretwin.connection.links.base import CommandSent, Event, EventQueue, Li
 from failuretwin.connection.links.ros_messages import RosTopics
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.bags.file import BagMessage
-from failuretwin.data_knowledge.bags.messages import (
+from failuretwin.data_knowledge.bag_file import BagMessage
+from failuretwin.data_knowledge.bag_messages import (
     KINDS,
     NS_PER_S,
     Kind,
@@ -26,7 +26,7 @@ from failuretwin.data_knowledge.bags.messages import (
     joint_rows,
     tool_rows,
 )
-from failuretwin.data_knowledge.bags.read import Track, motor_track
+from failuretwin.data_knowledge.bags import Track, motor_track
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 

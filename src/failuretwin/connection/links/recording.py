@@ -32,8 +32,8 @@ from failuretwin.connection.links.ros_messages import (
 )
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.bags.messages import NS_PER_S
-from failuretwin.data_knowledge.bags.read import BagTopics, is_bag, read_bag
+from failuretwin.data_knowledge.bag_messages import NS_PER_S
+from failuretwin.data_knowledge.bags import BagTopics, is_bag, read_bag
 from failuretwin.data_knowledge.raw_sessions import RawSession, find_sessions, read_session
 from failuretwin.data_knowledge.timed_log import Samples, Targets, TimedLog
 from failuretwin.digital_model.robot import Robot

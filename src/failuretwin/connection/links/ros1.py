@@ -33,7 +33,7 @@ from failuretwin.connection.links.ros_messages import (
     RosWriter,
 )
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.bags.messages import Role
+from failuretwin.data_knowledge.bag_messages import Role
 from failuretwin.digital_model.robot import Robot
 
 # Questions to the ROS master that end in time, whatever state it is in.

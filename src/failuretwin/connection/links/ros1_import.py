@@ -16,8 +16,8 @@ from types import ModuleType
 from typing import Any
 
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.bags.file import MONITORING_DEFINITION, message_fields
-from failuretwin.data_knowledge.bags.messages import STANDARD_TYPES, Kind, kind_of
+from failuretwin.data_knowledge.bag_file import MONITORING_DEFINITION, message_fields
+from failuretwin.data_knowledge.bag_messages import STANDARD_TYPES, Kind, kind_of
 
 DEBIAN_FOLDER = "/usr/lib/python3/dist-packages"
 ROS_MODULES = (

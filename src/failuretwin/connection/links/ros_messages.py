@@ -16,7 +16,7 @@ from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.types import MS_PER_S, FloatArray
-from failuretwin.data_knowledge.bags.messages import (
+from failuretwin.data_knowledge.bag_messages import (
     MONITORING,
     NS_PER_S,
     Kind,

@@ -15,7 +15,7 @@ from failuretwin.connection.links.ros_messages import (
     RosTopics,
 )
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.bags.messages import Kind, Role, kind_of_type
+from failuretwin.data_knowledge.bag_messages import Kind, Role, kind_of_type
 from failuretwin.digital_model.robot import Robot
 
 CONNECT_S = 5.0

@@ -10,8 +10,8 @@ import numpy as np
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.inference.diagnoser import Diagnoser
 from failuretwin.inference.explanation import worded
-from failuretwin.inference.protocol import Diagnoser
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -20,8 +20,8 @@ from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
-from failuretwin.decision.streaming.samples import KEEP_S, FrozenSensorDetector
 from failuretwin.decision.streaming.tracking import MovementTracker
+from failuretwin.decision.streaming.window import KEEP_S, FrozenSensorDetector
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.log_quality import LogQuality
 from failuretwin.inference.posterior import (

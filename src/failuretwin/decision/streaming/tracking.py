@@ -16,8 +16,7 @@ from failuretwin.core.movements import (
     movements_of_samples,
 )
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.decision.streaming.samples import SampleBuffer
-from failuretwin.decision.streaming.window import MovementWindow
+from failuretwin.decision.streaming.window import MovementWindow, SampleBuffer
 from failuretwin.inference.evidence import (
     JUST_AFTER_S,
     SETTLING_S,

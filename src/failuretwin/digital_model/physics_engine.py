@@ -11,7 +11,7 @@ import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.digital_model.physics.model import (
+from failuretwin.digital_model.physics_model import (
     MotorPhysics,
     PhysicsModel,
     PhysicsParameters,

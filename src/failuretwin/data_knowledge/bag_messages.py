@@ -18,7 +18,7 @@ import numpy as np
 
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.types import MS_PER_S, FloatArray, IntArray, as_floats
-from failuretwin.data_knowledge.bags.file import BagMessage, BagTopic
+from failuretwin.data_knowledge.bag_file import BagMessage, BagTopic
 
 NS_PER_S = 1_000_000_000
 HEADER = {"header": "std_msgs/msg/Header"}

@@ -11,8 +11,8 @@ import numpy as np
 
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import BoolArray, FloatArray, frozen_array
-from failuretwin.data_knowledge.recovery.inverse_kinematics import EXACT_M, MOTORS, PlaneArm
-from failuretwin.data_knowledge.recovery.ramps import (
+from failuretwin.data_knowledge.recovery_inverse_kinematics import EXACT_M, MOTORS, PlaneArm
+from failuretwin.data_knowledge.recovery_ramps import (
     Free,
     PathPart,
     Ramps,

@@ -14,14 +14,14 @@ import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray, IntArray, as_floats
-from failuretwin.data_knowledge.bags.file import (
+from failuretwin.data_knowledge.bag_file import (
     BagMessage,
     BagTopic,
     is_bag,
     read_messages,
     read_topics,
 )
-from failuretwin.data_knowledge.bags.messages import (
+from failuretwin.data_knowledge.bag_messages import (
     NS_PER_S,
     ROLES,
     BagTopics,

@@ -15,9 +15,9 @@ import numpy as np
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.recovery.exact import NoWholeUnitsError, solve_run
-from failuretwin.data_knowledge.recovery.inverse_kinematics import PlaneArm, plane_arm
-from failuretwin.data_knowledge.recovery.ramps import (
+from failuretwin.data_knowledge.recovery_exact import NoWholeUnitsError, solve_run
+from failuretwin.data_knowledge.recovery_inverse_kinematics import PlaneArm, plane_arm
+from failuretwin.data_knowledge.recovery_ramps import (
     Free,
     PathPart,
     Ramps,

@@ -1,1 +1,0 @@
-"""ROS bags and MCAP files, read without ROS."""
