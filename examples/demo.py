@@ -7,43 +7,27 @@ commands and glitch. Run with `make demo`; the picture is demo.png, or what the 
 import sys
 from pathlib import Path
 
-import numpy as np
-
-from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
-from failuretwin.app.plots import run_figure
-from failuretwin.app.reports import print_diagnoses, print_scores
-from failuretwin.app.tables import progress_bar
-from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.decision.evaluation import Judged
-from failuretwin.digital_model.calibrated_robot import load_calibration
+import failuretwin as ft
 
 RUNS_PER_CLASS = 10
 PICTURE = Path(sys.argv[1] if len(sys.argv) > 1 else "demo.png")
 
-robot = load_robot("armpi_fpv")
-plan = Plan(
-    robot=robot,
-    hypotheses=paper_hypotheses(robot.motor_names),
-    runs_per_class=RUNS_PER_CLASS,
-    seed=3,
-    imperfections=load_calibration("armpi_fpv", robot).imperfections,
-)
-with progress_bar("simulating", plan.size) as advance:
-    runs = simulate(plan, on_progress=advance)
+plan = ft.Plan("armpi_fpv", runs_per_class=RUNS_PER_CLASS, seed=3, imperfections="armpi_fpv")
+print(f"simulating and diagnosing {plan.size} runs ...")
+runs = ft.simulate(plan)
+diagnoses = ft.diagnose(runs, "armpi_fpv")
 
-twin = DigitalTwin(robot)
-diagnoses = BayesDiagnoser(twin).diagnose(runs)
-print_diagnoses(diagnoses)
-print_scores(Judged.of(diagnoses))
+for first in range(0, len(diagnoses), RUNS_PER_CLASS):
+    same = diagnoses[first : first + RUNS_PER_CLASS]
+    right = sum(d.diagnosis == d.truth for d in same)
+    print(f"{same[0].truth:30s} {right:2d} of {len(same)} right, such as: {same[0].verdict}")
+scores = ft.evaluate(diagnoses).judged.scores
+low, high = (100 * end for end in scores.interval)
+share = f"{scores.right} of {scores.runs} simulated runs right"
+print(f"{share} (95 % interval {low:.0f} to {high:.0f} %)")
 
 shown = next(i for i, d in enumerate(diagnoses) if d.truth == d.diagnosis == "motor_3:stuck")
-run = runs.isel(run=shown)
-figure = run_figure(
-    run["time"].values,
-    twin.path(run["command"].values),
-    np.asarray(run["measured"].values),
-    diagnoses[shown],
-)
-figure.savefig(PICTURE, dpi=110)
-print(f"\npicture of run {diagnoses[shown].run}: {PICTURE}")
+run, twin = runs.isel(run=shown), ft.DigitalTwin(ft.load_robot("armpi_fpv"))
+asked, seen = twin.path(run["command"].values), run["measured"].values
+ft.run_figure(run["time"].values, asked, seen, diagnoses[shown]).savefig(PICTURE, dpi=110)
+print(f"picture of run {diagnoses[shown].run}: {PICTURE}")

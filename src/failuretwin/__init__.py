@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from failuretwin.app.plots import run_figure
     from failuretwin.connection.calibration.calibrate import calibrate
     from failuretwin.connection.calibration.result import Calibration, save_calibration
     from failuretwin.connection.links.base import Sink, Source
@@ -71,6 +72,7 @@ _HOME = {
     "read_results": "decision.results",
     "read_runs": "data_knowledge.read",
     "register_mode": "failure_behavior.registry",
+    "run_figure": "app.plots",
     "run_set": "core.runs",
     "save_calibration": "connection.calibration.result",
     "simulate": "data_knowledge.generate",
@@ -113,6 +115,7 @@ __all__ = [
     "read_results",
     "read_runs",
     "register_mode",
+    "run_figure",
     "run_set",
     "save_calibration",
     "simulate",

@@ -7,8 +7,9 @@ import pytest
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
-from failuretwin.data_knowledge.generate import Plan, deterministic, simulate
+from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.nonidealities import deterministic
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.expected_bayes_factors import (
     ExpectedLogBayesFactor,

@@ -41,7 +41,11 @@ from failuretwin.digital_model.disturbances import (
     sense,
     stack,
 )
-from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfections, Range
+from failuretwin.digital_model.nonidealities import (
+    NO_IMPERFECTIONS,
+    Imperfections,
+    deterministic,
+)
 from failuretwin.digital_model.physics_engine import PhysicsEngine
 from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.settling import Settling, loads_in_range
@@ -449,29 +453,3 @@ def noise_free_path(
     luck = draw_disturbances(deterministic(imperfections), twin.robot, count, 0.0, rng)
     drive = drive_of(movements, movements.reference(time), time, injection, stack([luck] * runs))
     return twin.path(ServoEngine(twin.robot).angles(drive, time))
-
-
-def deterministic(imperfections: Imperfections) -> Imperfections:
-    """Return imperfections that leave nothing to chance; ranges shrink to their middles."""
-    timing, settling = imperfections.timing, imperfections.settling
-    if settling is not None:
-        settling = replace(settling, scatter=(0.0,) * len(settling.scatter))
-    return replace(
-        imperfections,
-        settling=settling,
-        timing=replace(
-            timing,
-            delay_s=_middle(timing.delay_s),
-            lag_s=_middle(timing.lag_s),
-            ramp_shortening=_middle(timing.ramp_shortening),
-            late_rate=0.0,
-        ),
-        lost_commands=(),
-        readings=None,
-        variation=None,
-    )
-
-
-def _middle(ends: Range) -> Range:
-    middle = 0.5 * (ends[0] + ends[1])
-    return middle, middle

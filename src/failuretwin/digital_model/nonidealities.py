@@ -236,3 +236,29 @@ def _scale_rates(imperfections: Imperfections, factor: float) -> Imperfections:
         ),
         readings=readings,
     )
+
+
+def deterministic(imperfections: Imperfections) -> Imperfections:
+    """Return imperfections that leave nothing to chance; ranges shrink to their middles."""
+    timing, settling = imperfections.timing, imperfections.settling
+    if settling is not None:
+        settling = replace(settling, scatter=(0.0,) * len(settling.scatter))
+    return replace(
+        imperfections,
+        settling=settling,
+        timing=replace(
+            timing,
+            delay_s=_middle(timing.delay_s),
+            lag_s=_middle(timing.lag_s),
+            ramp_shortening=_middle(timing.ramp_shortening),
+            late_rate=0.0,
+        ),
+        lost_commands=(),
+        readings=None,
+        variation=None,
+    )
+
+
+def _middle(ends: Range) -> Range:
+    middle = 0.5 * (ends[0] + ends[1])
+    return middle, middle
