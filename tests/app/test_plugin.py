@@ -9,7 +9,7 @@ import pytest
 
 from failuretwin import BayesDiagnoser, DigitalTwin, Plan, load_robot, simulate
 from failuretwin.core.hypothesis import parse_hypotheses
-from failuretwin.digital_model.nonidealities import load_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from user_modes import code_on_the_page, registered_from
 
 SHAFTS = [f"motor_{k}:bent_shaft" for k in (1, 2, 3)]
@@ -44,7 +44,7 @@ def test_the_mode_on_the_page_takes_15_lines_at_most():
 def right(runs_each, seed, folder):
     """Return how many runs with each motor's shaft bent, and healthy ones, are told right."""
     robot = load_robot("armpi_fpv")
-    known = load_imperfections("armpi_fpv", robot)
+    known = load_calibration("armpi_fpv", robot).imperfections
     with registered_from(code_on_the_page(), folder):
         states = parse_hypotheses(["healthy", *SHAFTS], robot.motor_names)
         runs = simulate(Plan(robot, states, runs_each, seed, known))

@@ -37,7 +37,7 @@ print(*(importlib.util.find_spec(name) is None for name in ("apt", "gi", "catkin
 def test_without_ros_the_user_is_told_what_to_install():
     code = """
 import sys
-from failuretwin.connection.ros1 import packages
+from failuretwin.connection.links import ros1_import as packages
 sys.modules["rospy"] = None
 packages.DEBIAN_FOLDER = "/nowhere"
 try:

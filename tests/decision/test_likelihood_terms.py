@@ -23,11 +23,12 @@ from slide_runs import (
 )
 
 from failuretwin.digital_model.nonidealities import LostCommand
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.fault_models import (
-    constant_fault_model,
-    drift_model,
-    slow_model,
-    steady_state_error_model,
+    growing_offset_model,
+    offset_model,
+    redrawn_offset_model,
+    transient_model,
 )
 from failuretwin.inference.marginal import marginal_likelihood
 from failuretwin.inference.missed_movements import missed_movements_likelihood
@@ -69,7 +70,10 @@ def test_errors_drawn_anew_have_the_evidence_of_all_sizes(run_on, off):
         for first, chance in enumerate(first_affected(STARTS_S)):
             total += chance / 3 * brute.before(first) * np.prod(each[first:])
     found = told(
-        marginal_likelihood(likelihood, steady_state_error_model(likelihood, 0, USUAL_RANGES, 0.9))
+        marginal_likelihood(
+            likelihood,
+            redrawn_offset_model(likelihood, 0, MODES["steady_state_error"], USUAL_RANGES, 0.9),
+        )
     )
     assert found == pytest.approx(np.log(total), abs=0.05)
 
@@ -84,7 +88,8 @@ def test_the_size_of_errors_has_the_quantiles_of_their_rms(run_on, count):
     likelihood, _ = run_on(targets, targets + off, normal)
     size = (
         marginal_likelihood(
-            likelihood, steady_state_error_model(likelihood, 0, [(0.01, 0.12)], 1.0)
+            likelihood,
+            redrawn_offset_model(likelihood, 0, MODES["steady_state_error"], [(0.01, 0.12)], 1.0),
         )
         .estimate(0)
         .size
@@ -130,7 +135,7 @@ def test_a_constant_error_has_the_evidence_of_all_sizes(run_on, bias, first):
     likelihood, brute = run_on(TARGETS, stands)
     size, chance = uniform(0.02, 0.85, signed=True)
     found = told(
-        marginal_likelihood(likelihood, constant_fault_model(likelihood, 0, "encoder_bias", 0.9))
+        marginal_likelihood(likelihood, offset_model(likelihood, 0, MODES["encoder_bias"], 0.9))
     )
     expected = lasting_by_force(brute, np.tile(size, (4, 1)), chance)
     assert found == pytest.approx(expected, abs=0.06)
@@ -142,7 +147,7 @@ def test_a_wrong_scale_has_the_evidence_of_all_sizes(run_on, scale):
     likelihood, brute = run_on(TARGETS, np.multiply(TARGETS, 1.0 + scale))
     size, chance = uniform(0.03, 0.75, signed=True)
     found = told(
-        marginal_likelihood(likelihood, constant_fault_model(likelihood, 0, "encoder_scale", 0.9))
+        marginal_likelihood(likelihood, offset_model(likelihood, 0, MODES["encoder_scale"], 0.9))
     )
     assert found == pytest.approx(
         lasting_by_force(brute, np.multiply.outer(TARGETS, size), chance), abs=0.03
@@ -157,7 +162,7 @@ def test_play_has_the_evidence_of_all_sizes(run_on, play):
     size, chance = uniform(0.02, 0.15, signed=False)
     offsets = np.multiply.outer(-0.5 * direction, size)
     found = told(
-        marginal_likelihood(likelihood, constant_fault_model(likelihood, 0, "backlash", 0.9))
+        marginal_likelihood(likelihood, offset_model(likelihood, 0, MODES["backlash"], 0.9))
     )
     assert found == pytest.approx(lasting_by_force(brute, offsets, chance), abs=0.03)
 
@@ -180,13 +185,15 @@ def test_a_drift_has_the_evidence_of_all_rates_and_onsets(run_on, rate, onset_s)
             places = brute.targets[:, None] + np.multiply.outer(since, size[::20])
             says = brute.from_on(first, places) @ chance[::20] * 20
             total += weight * brute.before(first) * says
-    found = told(marginal_likelihood(likelihood, drift_model(likelihood, 0, 0.9)))
+    found = told(
+        marginal_likelihood(likelihood, growing_offset_model(likelihood, 0, MODES["drift"], 0.9))
+    )
     assert found == pytest.approx(np.log(total), abs=0.1 if onset_s == 0.0 else 0.7)
 
 
 def test_a_drift_may_begin_at_any_time(run_on):
     """One in ten begin in the run, evenly up to where the last movement is seen at rest."""
-    fault_model = drift_model(run_on(TARGETS, TARGETS)[0], 0, 0.9)
+    fault_model = growing_offset_model(run_on(TARGETS, TARGETS)[0], 0, MODES["drift"], 0.9)
     onset, part = fault_model.onsets(0)
     share = np.exp(fault_model.log_prior[0])[..., None] * part
     end = settled_middles()[-1]
@@ -206,7 +213,11 @@ def test_a_slow_motor_gets_as_far_as_its_time_goes(run_on, share, done):
         here += done * (target - here)
         stands.append(here)
     likelihood, brute = run_on(TARGETS, stands)
-    size = marginal_likelihood(likelihood, slow_model(likelihood, 0, 0.9)).estimate(0).size
+    size = (
+        marginal_likelihood(likelihood, transient_model(likelihood, 0, MODES["slow"], 0.9))
+        .estimate(0)
+        .size
+    )
     sizes = np.linspace(0.15, 0.85, 12)
     np.testing.assert_allclose(np.unique(size.values), sizes)
     expected = np.zeros(12)
@@ -217,7 +228,9 @@ def test_a_slow_motor_gets_as_far_as_its_time_goes(run_on, share, done):
             places.append(here)
         for first, chance in enumerate(first_affected(STARTS_S)):
             expected[k] += chance * brute.before(first) * brute.from_on(first, np.array(places))
-    found = told(marginal_likelihood(likelihood, slow_model(likelihood, 0, 0.9)))
+    found = told(
+        marginal_likelihood(likelihood, transient_model(likelihood, 0, MODES["slow"], 0.9))
+    )
     assert found == pytest.approx(np.log(expected.mean()), abs=1e-3)
     np.testing.assert_allclose(
         size.weights / size.weights.sum(), expected / expected.sum(), atol=1e-4

@@ -19,7 +19,7 @@ from slide_runs import (
 )
 
 from failuretwin.digital_model.nonidealities import LostCommand
-from failuretwin.inference.evidence import settled_evidence, transient_samples
+from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.run_likelihood import RunLikelihood
 
@@ -58,8 +58,7 @@ def way_by_force(origin, target, moving, movement, spread_m=0.0, doubt=0.3):
 def test_the_way_counts_by_a_tenth(slide, run_of, late_s, aside_m):
     """Two in a hundred movements go astray, by a tenth of the reach."""
     runs = run_of(np.array(TARGETS)[:, None], path_to(TARGETS, late_s, aside_m), ("motor_1",))
-    settled = settled_evidence(runs)
-    moving = transient_samples(runs, settled)
+    settled, moving = Evidence(runs).settled, Evidence(runs).transient
     likelihood = RunLikelihood(settled, HealthyModel(slide, PLAIN), moving)
     assert moving.seen.any(axis=-1).all()
     for m, ends in enumerate(zip([0.0, *TARGETS[:-1]], TARGETS, strict=True)):
@@ -102,8 +101,7 @@ def test_the_way_after_tells_where_an_unseen_movement_ended(slide, run_of, lost,
 
     runs = run_of(np.array(TARGETS)[:, None], gap, ("motor_1",))
     lossy = replace(PLAIN, lost_commands=(LostCommand(("motor_1",), 0.1, 0.1),))
-    settled = settled_evidence(runs)
-    moving = transient_samples(runs, settled)
+    settled, moving = Evidence(runs).settled, Evidence(runs).transient
     assert moving.seen.any(axis=-1)[0].tolist() == [m != unseen for m in range(4)]
     likelihood = RunLikelihood(settled, HealthyModel(slide, lossy), moving)
     after = unseen + 1

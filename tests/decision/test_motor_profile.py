@@ -146,7 +146,7 @@ def test_a_full_turn_makes_no_difference_where_a_motor_may_turn_around(tmp_path,
     model = HealthyModel(twin, NO_IMPERFECTIONS)
     runs = run_of(targets, twin.path(targets), ("motor_1", "motor_2", "motor_3"))
     profile = RunLikelihood(settled_evidence(runs), model).profile(1)
-    assert profile.around
+    assert profile.wraps
     found = [profile.log_terms(profile.mode + off, True) for off in (turned, turned - 2.0 * np.pi)]
     np.testing.assert_allclose(*found, rtol=1e-9)
 

@@ -24,7 +24,9 @@ from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.digital_model.nonidealities import GENERIC_NAME
 from failuretwin.digital_model.robot import Robot
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser, Diagnoser, diagnoser_from_text
+from failuretwin.inference.posterior import check_diagnosable
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -120,7 +122,12 @@ def parse_cli_hypotheses(text: str | None, robot: Robot) -> tuple[Hypothesis, ..
     """
     if text is None:
         return None
-    hypotheses = parse_hypotheses(text.split(","), robot.motor_names)
+    try:
+        hypotheses = parse_hypotheses(text.split(","), robot.motor_names)
+    except InputError as error:
+        raise InputError(f"{error} Modes: {', '.join(MODES)}.") from error
+    for hypothesis in hypotheses:
+        check_diagnosable(hypothesis)
     if len(hypotheses) < 2:
         raise InputError(
             f"--hypotheses names only {hypotheses[0]}, so every run would be that for certain. "

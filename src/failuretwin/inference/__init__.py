@@ -9,18 +9,18 @@ section of docs/diagnosis.md (words and symbols: docs/glossary.md):
 
     readings, log_quality    which samples were measured, and what is wrong with them
     evidence, settings       e_m, where the tool settled; transient samples on the way
-    healthy_model            where a healthy arm settles; residual and covariance S
+    healthy_model            where a healthy arm settles; residual and covariance S; start delay
     command_loss             w_a, which commands got lost: a hidden Markov chain; late starts
     joint_likelihood         what a movement says of the angle of one motor: a parabola
-    start_delay, transient_likelihood    what the readings on the way say
+    transient_likelihood     what the readings on the way say
     run_likelihood           all of it for some runs: what every hypothesis draws from
     marginal                 the sum over change point m0 and nodes z
-    onset, priors            p(m0), ranges of sizes, odds
+    priors                   p(m0), ranges of sizes, odds
     fault_models, stuck      nodes z, and the angle phi at which each puts the motor
     missed_movements         faults that leave a motor where it was: a chain of places
     double_faults, two_joint_likelihood, unknown    two motors; what no hypothesis explains
     posterior                evidence times prior; the diagnosis of each run
-    diagnoser, protocol      BayesDiagnoser, and what any method must offer
+    diagnoser                BayesDiagnoser, and what any method must offer
     explanation              the verdict in words
     isolability, expected_bayes_factors    which faults a motion can tell apart
 """
