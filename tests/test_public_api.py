@@ -77,3 +77,12 @@ def test_a_motion_is_judged_by_the_name_of_its_robot():
     command[:, 0] = np.clip((time - 1.0) * 0.5, 0.0, 0.4)
     found = ft.isolability("armpi_fpv", command, time, hypotheses=["motor_1:stuck"])
     assert found.hypotheses == ("healthy", "motor_1:stuck")
+
+
+def test_streams_calibrations_and_twins_take_names(tmp_path):
+    assert ft.StreamingFleet("armpi_fpv", robots=3).robots == 3
+    assert ft.StreamingDiagnoser("armpi_fpv").update(0.0, None, None).diagnosis is None
+    assert ft.load_calibration("armpi_fpv").robot.name == "armpi_fpv"
+    assert ft.DigitalTwin("ur5e").robot.name == "ur5e"
+    with pytest.raises(ft.InputError, match=r"nothing\.jsonl: cannot be read"):
+        ft.read_results(str(tmp_path / "nothing.jsonl"))

@@ -14,6 +14,8 @@ from failuretwin.core.errors import InputError
 from failuretwin.inference.diagnoser import diagnoser_from_text
 
 OWN = """
+from dataclasses import replace
+
 from failuretwin.core.hypothesis import Diagnosis
 
 
@@ -25,6 +27,22 @@ class Guess:
         posterior = {"healthy": 0.25, f"{self.motors[0]}:stuck": 0.75}
         names = [str(name) for name in runs["run"].values]
         return [Diagnosis(run=name, posterior=posterior, method="a guess") for name in names]
+
+
+class Sloppy(Guess):
+    def diagnose(self, runs):
+        shares = {"healthy": 0.9, "motor_1:stuck": 0.5}
+        return [replace(told, posterior=shares) for told in super().diagnose(runs)]
+
+
+class Anonymous(Guess):
+    def diagnose(self, runs):
+        return [replace(told, run="x") for told in super().diagnose(runs)]
+
+
+class NeedsNothing(Guess):
+    def __init__(self):
+        pass
 
 
 class Short(Guess):
@@ -64,6 +82,14 @@ def test_one_diagnosis_for_each_run_is_expected(own, twin, simulated):
         diagnoser_from_text("my_methods:Short", twin).diagnose(read_runs(simulated))
 
 
+def test_what_is_no_probability_is_refused(own, twin, simulated):
+    runs = read_runs(simulated)
+    with pytest.raises(InputError, match=r"Sloppy: the posterior of run .* Expected probabilities"):
+        diagnoser_from_text("my_methods:Sloppy", twin).diagnose(runs)
+    with pytest.raises(InputError, match="Anonymous: its diagnoses do not name the runs"):
+        diagnoser_from_text("my_methods:Anonymous", twin).diagnose(runs)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -72,6 +98,7 @@ def test_one_diagnosis_for_each_run_is_expected(own, twin, simulated):
         (":Guess", r"module '' cannot be imported"),
         ("my_methods:Gess", r"unknown class of my_methods 'Gess'\. Did you mean 'Guess'\?"),
         ("my_methods:", r"unknown class of my_methods ''"),
+        ("my_methods:NeedsNothing", r"cannot be made \(.*Expected a class whose __init__ takes"),
         ("my_methods:Mute", r"my_methods:Mute: has no method `diagnose`"),
     ],
 )

@@ -111,16 +111,9 @@ class Plan:
     ) -> None:
         """Take values or their text form.
 
-        Args:
-            robot: The robot, its name or the path of its profile.
-            hypotheses: States, as `Hypothesis` or text; None: the paper's nine classes.
-            runs_per_class: Runs of each.
-            seed: Seed of all chance.
-            imperfections: A value, or the name or path of a calibration, whose servo loops the
-                robot then has.
-            movements: None: as in the paper.
-            modes: None: all that are known, with their usual distributions.
-            engine: ``servo`` or ``physics``.
+        A robot by name or profile; hypotheses as text, None: the paper's nine classes;
+        imperfections by the name or path of a calibration, whose servo loops the robot then has;
+        movements, None: as in the paper; modes, None: all that are known, as they usually are.
         """
         model = load_robot(robot)
         if not isinstance(imperfections, Imperfections):

@@ -83,7 +83,7 @@ def write_json_lines(diagnoses: Iterable[Diagnosis], path: Path) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
-def read_results(path: Path) -> Results:
+def read_results(path: str | Path) -> Results:
     """Read what `write_json_lines` wrote, or another program with the same keys.
 
     What is null or left out is not known; keys beyond those of `Record` are passed over.
@@ -92,7 +92,7 @@ def read_results(path: Path) -> Results:
         InputError: If the file cannot be read, a line is not a diagnosis, or a run is there twice.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read ({error}). {EXPECTED}") from error
     records = [

@@ -110,19 +110,22 @@ def with_loops(robot: Robot, loops: Sequence[CalibratedLoop]) -> Robot:
     return replace(robot, profile=replace(robot.profile, motors=motors))
 
 
-def load_calibration(name_or_path: str | Path | None, robot: Robot) -> CalibratedRobot:
+def load_calibration(
+    name_or_path: str | Path | None, robot: Robot | str | Path = "armpi_fpv"
+) -> CalibratedRobot:
     """Load a calibration, or imperfections typed by hand.
 
     Args:
         name_or_path: ``none``, the name of `robot` for the calibration of its profile, the name of
             another file beside that, or a TOML file. None: the calibration of its profile, generic
             imperfections if that names none.
-        robot: The robot it is for.
+        robot: The robot it is for, its name or its profile.
 
     Raises:
         InputError: If there is none under this name, or it belongs to another robot or does not fit
             its motors.
     """
+    robot = load_robot(robot)
     if name_or_path is None and robot.imperfections_file is None:
         return CalibratedRobot(robot, generic_imperfections(robot))
     if name_or_path == "none":

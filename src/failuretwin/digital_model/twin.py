@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model import servo
-from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.settling import hold, sag
 
 
@@ -24,6 +24,9 @@ class DigitalTwin:
     """
 
     robot: Robot
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "robot", load_robot(self.robot))
 
     def respond(self, command: ArrayLike, time: ArrayLike) -> FloatArray:
         """Return the motor angles that follow from commands.

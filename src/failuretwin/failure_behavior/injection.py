@@ -122,6 +122,11 @@ class Injection:
             after = group.mode.on_reference(group.faults, before, time)
             if after is before:
                 continue
+            if np.shape(after) != before.shape or not np.isfinite(after).all():
+                raise InputError(
+                    f"fault mode {group.mode.mode!r}: on_reference gave {after!r:.60}. Expected "
+                    f"finite angles [rad] of shape {before.shape}, (run, time)."
+                )
             if followed is reference:
                 followed = reference.copy()
             followed[group.runs, :, group.motor] = after

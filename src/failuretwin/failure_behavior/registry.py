@@ -51,7 +51,8 @@ class ModeRegistry(Mapping[str, FaultMode]):
             InputError: If there is none.
         """
         if mode not in self:
-            raise unknown_name("fault mode", mode, self)
+            known = unknown_name("fault mode", mode, self)
+            raise InputError(f"{known} If it is one of your own, name its module with --plugin.")
         return self[mode]
 
     def _all(self) -> dict[str, FaultMode]:
@@ -90,6 +91,11 @@ def _check_complete(mode: FaultMode) -> None:
         raise InputError(
             f"{mode!r} is no fault mode. Expected an object of a class derived from FaultMode, "
             "such as register_mode(BentShaft())."
+        )
+    if mode.mode in ("healthy", "unknown"):
+        raise InputError(
+            f"{type(mode).__name__}.mode is {mode.mode!r}, which stands for no fault mode. Give it "
+            "an id of its own."
         )
     for field, example in (("mode", "bent_shaft"), ("unit", "rad")):
         value = getattr(mode, field, None)

@@ -2,7 +2,8 @@
 
     w_a(m) = p(l(a)) sum over a' that lead to a of w_a'(m-1) exp L_m-1(a') / sum over all a'
 
-with outcomes a of a movement, and the losses l(a) that lead there.
+with outcomes a of a movement, and the losses l(a) that lead there. The fault mode `lost_commands`,
+a motor that loses far more, is weighed in `missed_movements`.
 
 Section: docs/diagnosis.md#lost-commands-a-hidden-markov-chain
 """
@@ -129,7 +130,8 @@ class CommandOutcomes(ArrayStruct):
         lost: Motors that lose their command, (outcome, motor).
         base: Angles that the motors then go for, (run, movement, outcome, motor) [rad].
         direction: Sign of their last travel, (run, movement, outcome, motor).
-        log_weight: Log probability of each, (run, movement, outcome).
+        log_weight: Log probability of each and of no outlier, log w_a (1 - eps),
+            (run, movement, outcome).
     """
 
     lost: BoolArray

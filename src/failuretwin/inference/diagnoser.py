@@ -246,7 +246,12 @@ def diagnoser_from_text(text: str, twin: DigitalTwin) -> Diagnoser:
     if not hasattr(module, class_name):
         classes = [name for name, value in vars(module).items() if isinstance(value, type)]
         raise InputError(f"{text}: {unknown_name(f'class of {module_name}', class_name, classes)}")
-    diagnoser = getattr(module, class_name)(twin)
+    try:
+        diagnoser = getattr(module, class_name)(twin)
+    except TypeError as error:
+        raise InputError(
+            f"{text}: cannot be made ({error}). Expected a class whose __init__ takes the twin."
+        ) from error
     if not callable(getattr(diagnoser, "diagnose", None)):
         raise InputError(
             f"{text}: has no method `diagnose`. Expected a class with diagnose(runs) that returns "
@@ -272,9 +277,27 @@ class _Completed:
         count = runs.sizes["run"]
         if len(found) != count or not all(isinstance(d, Diagnosis) for d in found):
             raise InputError(f"{self.name}: diagnose(runs) gave no Diagnosis for each of {count}.")
+        if [d.run for d in found] != [str(name) for name in runs["run"].values]:
+            raise InputError(f"{self.name}: its diagnoses do not name the runs, in their order.")
         truth: Sequence[str | None] = [None] * count if faults is None else faults
-        made = [replace(d, truth=true) for d, true in zip(found, truth, strict=True)]
+        made = [
+            replace(d, truth=true, posterior=self._posterior(d))
+            for d, true in zip(found, truth, strict=True)
+        ]
         return [d if d.verdict else worded(d, list(map(Hypothesis.parse, d.ranked))) for d in made]
+
+    def _posterior(self, diagnosis: Diagnosis) -> dict[str, float]:
+        """Return the posterior as plain numbers; refuse what is none."""
+        told = {str(name): float(share) for name, share in diagnosis.posterior.items()}
+        for name in told:
+            Hypothesis.parse(name)
+        shares = np.array(list(told.values()))
+        if not (len(shares) and (shares >= 0.0).all() and abs(shares.sum() - 1.0) < 1e-6):
+            raise InputError(
+                f"{self.name}: the posterior of run {diagnosis.run} is {told}. Expected "
+                "probabilities from 0 to 1 that sum to 1."
+            )
+        return told
 
 
 def _imported(name: str, text: str) -> Any:

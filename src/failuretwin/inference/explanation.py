@@ -97,7 +97,7 @@ def _size_and_onset(diagnosis: Diagnosis, hypothesis: Hypothesis) -> str:
     if len(hypothesis.faults) != 1 or diagnosis.magnitude is None:
         return since if onset else ""
     fault, size = hypothesis.faults[0], diagnosis.magnitude
-    told = onset or MODES[fault.mode].signature is Signature.HELD
+    told = onset or MODES.find(fault.mode).signature is Signature.HELD
     return size_words(fault, size) + (since if told else "")
 
 
@@ -108,7 +108,7 @@ def size_words(fault: Fault, size: float) -> str:
         fault: Of any known mode.
         size: Its magnitude, in the unit of its mode.
     """
-    mode = MODES[fault.mode]
+    mode = MODES.find(fault.mode)
     factor, unit = _TOLD_UNITS.get(mode.unit, (1.0, mode.unit))
     return mode.size_words.format(size=factor * size, unit=unit)
 
@@ -144,7 +144,7 @@ def advice_lines(hypothesis: Hypothesis) -> list[str]:
     """Return what may have broken and what to do now, a line each."""
     lines = []
     for fault in hypothesis.faults:
-        mode = MODES[fault.mode]
+        mode = MODES.find(fault.mode)
         if mode.mechanisms:
             lines.append(f"possible causes: {', '.join(mode.mechanisms)}")
         if mode.advice:

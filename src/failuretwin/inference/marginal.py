@@ -5,7 +5,8 @@
 
 Movements before the change point m0 are those of a healthy robot. A `FaultModel` holds the nodes z
 and the angle phi of each; what a node says of a movement comes from the joint likelihood of its
-motor. Sums over m0 and the nodes are exact.
+motor. Sums over m0 and the nodes are exact. Where readings on the way count, each L_m is the sum of
+the settled and the transient log likelihood.
 
 Section: docs/diagnosis.md#marginal-likelihood-change-point-and-size
 """

@@ -6,6 +6,8 @@ the motor keeps its angle and the others behave as healthy ones.
 
     p(phi | m0) = 0.8 p(phi | where the motor was then) + 0.2 / range,    L_m(phi) of a held motor
 
+(0.95 and 0.05 where the onset is known).
+
 Section: docs/diagnosis.md#fault-models-where-each-fault-puts-its-motor
 """
 

@@ -20,6 +20,7 @@ from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.movements import find_movements
 from failuretwin.core.runs import check_motors, check_runs, truth_of
 from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.data_knowledge.read import RunsLike, as_runs
 from failuretwin.decision.learned.feature_encoder import (
     POINTS,
     SHARED,
@@ -205,8 +206,8 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         """Return the (weighted) share of runs that are right; y of None: as the run set says."""
         return float(super().score(X, _truth(X, y), sample_weight))
 
-    def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
-        """Return the diagnosis of each run of a run set.
+    def diagnose(self, runs: RunsLike) -> list[Diagnosis]:
+        """Return the diagnosis of each run of a run set, or of any logs by their path.
 
         Reads `command` and `measured` alone; the truth, where there is any, is only passed on.
 
@@ -215,6 +216,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         """
         check_is_fitted(self, "network_")
         robot = self._encoder().robot
+        runs = as_runs(runs, robot)
         check_runs(runs, "the run set")
         check_motors(runs, robot.name, robot.motor_names)
         quality = log_quality(runs)

@@ -128,12 +128,12 @@ class StreamingDiagnoser:
 
     def __init__(
         self,
-        diagnoser: BayesDiagnoser,
+        diagnoser: BayesDiagnoser | RobotLike,
         rate_hz: float | None = None,
         movements: int = MOVEMENTS,
     ) -> None:
         self._fleet = StreamingFleet(diagnoser, 1, rate_hz, movements)
-        self._motors = diagnoser.twin.robot.motor_names
+        self._motors = self._fleet.diagnoser.twin.robot.motor_names
         self._diagnosis: Diagnosis | None = None
 
     def update(

@@ -22,6 +22,7 @@ from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.decision.streaming.tracking import MovementTracker
 from failuretwin.decision.streaming.window import KEEP_S, FrozenSensorDetector
+from failuretwin.digital_model.calibrated_robot import RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.log_quality import LogQuality
 from failuretwin.inference.posterior import (
@@ -81,11 +82,13 @@ class StreamingFleet:
 
     def __init__(
         self,
-        diagnoser: BayesDiagnoser,
+        diagnoser: BayesDiagnoser | RobotLike,
         robots: int,
         rate_hz: float | None = None,
         movements: int = MOVEMENTS,
     ) -> None:
+        if not isinstance(diagnoser, BayesDiagnoser):
+            diagnoser = BayesDiagnoser(diagnoser)
         motors = len(diagnoser.twin.robot.motors)
         if robots < 1 or movements < 1 or not (rate_hz is None or rate_hz > 0.0):
             raise InputError(
