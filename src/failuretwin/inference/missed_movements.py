@@ -1,8 +1,8 @@
 """Faults that make a motor miss single movements: lost commands, sticking now and then.
 
-Where the motor stands then is a chain: at the target of the last movement that it made, or, if it
-stuck on the way, anywhere between. (What a healthy robot loses by chance: `command_loss`.) The chain is summed exactly, for every movement with which the
-fault may have begun.
+What a healthy robot loses by chance is `command_loss`. Where the motor stands then is a chain: at
+the target of the last movement that it made, or, if it stuck on the way, anywhere between. The
+chain is summed exactly, for every movement with which the fault may have begun.
 
     state(m) = sum over places of state(m-1) p(stays, arrives or stops on the way) exp L_m(place)
 
