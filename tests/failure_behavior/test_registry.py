@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -117,3 +119,21 @@ def test_a_module_that_is_run_again_replaces_its_mode(tmp_path):
     with registered_from(code_on_the_page(), tmp_path, "run_again") as mode:
         register_mode(type(mode)(magnitude=(0.1, 0.2)))
         assert MODES[mode.mode].magnitude == (0.1, 0.2)
+
+
+def test_an_installed_module_may_be_imported_before_the_modes_are_asked_for(tmp_path):
+    """As in a worker process, which unpickles a plan with a mode of its own."""
+    (tmp_path / "installed_mode.py").write_text(code_on_the_page())
+    info = tmp_path / "installed_mode-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: installed-mode\nVersion: 1\n")
+    (info / "entry_points.txt").write_text("[failuretwin.modes]\nshaft = installed_mode\n")
+    code = (
+        "import installed_mode\n"
+        "from failuretwin.failure_behavior.registry import MODES\n"
+        "print('bent_shaft' in MODES, len(MODES))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["True", "12"]

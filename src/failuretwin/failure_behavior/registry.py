@@ -60,7 +60,8 @@ class ModeRegistry(Mapping[str, FaultMode]):
             self._filled = True
             self._modes = {mode.mode: mode for mode in BUILT_IN}
             for entry in entry_points(group=ENTRY_POINTS):
-                _import_modes(entry.value, f"installed plugin {entry.name!r} ({entry.value})")
+                if not _is_being_imported(entry.value):  # else it registers its modes right now
+                    _import_modes(entry.value, f"installed plugin {entry.name!r} ({entry.value})")
         return self._modes
 
 
@@ -128,6 +129,11 @@ def load_plugin(source: str) -> None:
             f"{what}: the name {path.stem!r} belongs to {found} already. Expected a name that no "
             "other module has; rename the file."
         )
+
+
+def _is_being_imported(name: str) -> bool:
+    spec = getattr(sys.modules.get(name), "__spec__", None)
+    return bool(getattr(spec, "_initializing", False))
 
 
 def _import_modes(name: str, what: str) -> Path | None:
