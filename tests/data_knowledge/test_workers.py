@@ -242,6 +242,7 @@ produce(plan, Path(sys.argv[1]), Workforce(2), chunk_runs=4)
 """
 
 
+@pytest.mark.timeout(400)
 def test_killed_worker_is_replaced(tmp_path, plan):
     path = tmp_path / "two.zarr"
     marks = ".two.zarr.*.partial/done/*"
