@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import (
     HEALTHY,
     UNKNOWN,
@@ -13,7 +14,7 @@ from failuretwin.core.hypothesis import (
 )
 from failuretwin.failure_behavior.mode import FaultMode
 from failuretwin.failure_behavior.modes import EncoderBias
-from failuretwin.failure_behavior.registry import MODES
+from failuretwin.failure_behavior.registry import MODES, register_mode
 from failuretwin.inference.explanation import (
     explanation,
     percent,
@@ -22,6 +23,7 @@ from failuretwin.inference.explanation import (
     size_words,
     verdict,
 )
+from user_modes import forgotten_afterwards
 
 SIZED = {
     "stuck": (np.deg2rad(-12.3), "motor 3 stuck at -12 deg since 2.5 s, 98 % sure"),
@@ -90,10 +92,16 @@ def test_what_was_there_before_the_run_has_no_time(mode, onset_s):
         ("N m", 1.54, " (1.54 N m)"),
     ],
 )
-def test_size_and_unit_of_a_registered_mode_are_told_alike(monkeypatch, unit, size, words):
-    mode = type("BentShaft", (EncoderBias,), {"unit": unit, "size_words": FaultMode.size_words})()
-    monkeypatch.setattr("failuretwin.inference.explanation.MODES", {"bent_shaft": mode})
-    assert size_words(Fault("motor_3", "bent_shaft"), size) == words
+def test_size_and_unit_of_a_registered_mode_are_told_alike(unit, size, words):
+    own = {"mode": "bent_shaft", "unit": unit, "size_words": FaultMode.size_words}
+    with forgotten_afterwards():
+        register_mode(type("BentShaft", (EncoderBias,), own)())
+        assert size_words(Fault("motor_3", "bent_shaft"), size) == words
+
+
+def test_a_mode_that_is_not_known_here_is_told_with_what_to_do():
+    with pytest.raises(InputError, match=r"'stuk'\. Did you mean 'stuck'\?.*--plugin"):
+        size_words(Fault("motor_3", "stuk"), 0.1)
 
 
 def test_a_mode_without_words_is_told_by_its_id():

@@ -11,9 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.hypothesis import Diagnosis, Fault, Hypothesis, MovementEvidence
-from failuretwin.failure_behavior.mode import FaultMode, Signature
+from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 
 SURE = 0.95
@@ -98,15 +97,8 @@ def _size_and_onset(diagnosis: Diagnosis, hypothesis: Hypothesis) -> str:
     if len(hypothesis.faults) != 1 or diagnosis.magnitude is None:
         return since if onset else ""
     fault, size = hypothesis.faults[0], diagnosis.magnitude
-    told = onset or _mode_of(fault).signature is Signature.HELD
+    told = onset or MODES.find(fault.mode).signature is Signature.HELD
     return size_words(fault, size) + (since if told else "")
-
-
-def _mode_of(fault: Fault) -> FaultMode:
-    if fault.mode not in MODES:
-        known = unknown_name("fault mode", fault.mode, MODES)
-        raise InputError(f"{known} If it is one of your own, name its module with --plugin.")
-    return MODES[fault.mode]
 
 
 def size_words(fault: Fault, size: float) -> str:
@@ -116,7 +108,7 @@ def size_words(fault: Fault, size: float) -> str:
         fault: Of any known mode.
         size: Its magnitude, in the unit of its mode.
     """
-    mode = _mode_of(fault)
+    mode = MODES.find(fault.mode)
     factor, unit = _TOLD_UNITS.get(mode.unit, (1.0, mode.unit))
     return mode.size_words.format(size=factor * size, unit=unit)
 
@@ -152,7 +144,7 @@ def advice_lines(hypothesis: Hypothesis) -> list[str]:
     """Return what may have broken and what to do now, a line each."""
     lines = []
     for fault in hypothesis.faults:
-        mode = _mode_of(fault)
+        mode = MODES.find(fault.mode)
         if mode.mechanisms:
             lines.append(f"possible causes: {', '.join(mode.mechanisms)}")
         if mode.advice:
