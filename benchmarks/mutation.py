@@ -81,6 +81,8 @@ AREAS: dict[str, tuple[str, ...]] = {
     ),
     "inference/explanation.py": ("tests/decision/test_wording.py",),
     "inference": (
+        "tests/decision/test_start_delay.py",
+        "tests/decision/test_inference_settings.py",
         "tests/decision/test_law.py",
         "tests/decision/test_onsets.py",
         "tests/decision/test_size_nodes.py",
@@ -98,7 +100,6 @@ AREAS: dict[str, tuple[str, ...]] = {
     "connection/calibration/step_*.py": ("tests/connection/test_step_fit.py",),
     "connection/calibration/servo_loops.py": ("tests/connection/test_step_fit.py",),
     "connection/calibration": (
-        "tests/connection/test_loops.py",
         "tests/connection/test_calibration_intervals.py",
         "tests/connection/test_calibration_parts.py",
     ),
