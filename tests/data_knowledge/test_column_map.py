@@ -186,3 +186,101 @@ def test_a_csv_without_a_map_says_how_to_get_one(armpi, tmp_path):
 
     with pytest.raises(InputError, match=r"needs a column map.*--columns"):
         read_runs(tmp_path / "log.csv", armpi)
+
+
+# Columns that need no map: their names tell all.
+
+
+def plain_log(folder, armpi_twin, names, *, angle=1.0, length=1.0, tool="tool_{}", separator=","):
+    """Write a log of a ramp whose command columns have some names; return its path and angles."""
+    time = np.arange(50) * 0.1
+    command = np.outer(np.clip(time - 1.0, 0.0, 1.0), [0.5, -0.4, 0.3, 0.2])
+    place = armpi_twin.path(command)
+    columns = {"time": time} | {n: angle * c for n, c in zip(names, command.T, strict=False)}
+    columns |= {tool.format(axis): length * place[:, i] for i, axis in enumerate("xyz")}
+    pd.DataFrame(columns).to_csv(folder / "log.csv", index=False, sep=separator)
+    return folder / "log.csv", command, place
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (["q1", "q2", "q3", "q4"], {}),
+        (["joint_1", "joint_2", "joint_3", "joint_4"], {}),
+        (["target_q_0", "target_q_1", "target_q_2", "target_q_3"], {}),
+        (["target_q_0", "target_q_1", "target_q_2", "target_q_3"], {"separator": " "}),
+        (["q1_deg", "q2_deg", "q3_deg", "q4_deg"], {"angle": 180.0 / np.pi}),
+        (["cmd1_rad", "cmd2_rad", "cmd3_rad", "cmd4_rad"], {"tool": "tcp_{}_m"}),
+        (["q1", "q2", "q3", "q4"], {"length": 1000.0, "tool": "tool_{}_mm"}),
+    ],
+)
+def test_columns_in_joint_order_need_no_map(armpi, twin, tmp_path, names, words):
+    log, command, place = plain_log(tmp_path, twin, names, **words)
+
+    runs = read_runs(log, armpi)
+
+    np.testing.assert_allclose(runs["command"][0, ::10], command, atol=3e-3)
+    np.testing.assert_allclose(runs["measured"][0, ::10], place, atol=1e-9)
+    assert runs.attrs["source"] == "CSV, columns by their names"
+
+
+def test_columns_of_all_joints_go_by_their_place_in_the_urdf(tmp_path):
+    """A UR5e log has six joints; the profile leaves out the last, which cannot move the tool."""
+    time = np.arange(20) * 0.1
+    columns = {"timestamp": time} | {f"target_q_{k}": 0.1 * k * time for k in range(6)}
+    columns |= {"x": time, "y": time, "z": time, "target_qd_0": time}
+    pd.DataFrame(columns).to_csv(tmp_path / "log.csv", index=False)
+
+    runs = read_runs(tmp_path / "log.csv", "ur5e")
+
+    np.testing.assert_allclose(runs["command"][0, -1], [0.0, 0.19, 0.38, 0.57, 0.76], atol=1e-6)
+
+
+def test_a_map_wins_over_names(armpi, twin, tmp_path):
+    log, command, _ = plain_log(tmp_path, twin, ["q1", "q2", "q3", "q4"])
+    mapping = """
+        time = { column = "time" }
+        command = { columns = ["q4", "q2", "q3", "q1"] }
+        tool = { columns = ["tool_x", "tool_y", "tool_z"] }
+    """
+    (tmp_path / "map.toml").write_text(mapping)
+
+    runs = read(tmp_path, armpi)
+
+    np.testing.assert_allclose(runs["command"][0, -1, 0], command[-1, 3], atol=3e-3)
+    assert log.exists()
+
+
+@pytest.mark.parametrize(
+    ("rename", "message"),
+    [
+        ({"time": "time", "extra": "timestamp"}, "the time of the log may be time or timestamp"),
+        ({"extra": "joint_2"}, "the command of motor_2 may be q2 or joint_2"),
+        ({"q3": "third"}, "which columns are the commands, one for each motor, of time, q1, q2"),
+        ({"q1": "actual_q1"}, "which columns are the commands"),
+        ({"tool_z": "height"}, r"which columns are the tool \(x, y, z\) or the readings"),
+        ({"extra": "flange_x"}, "the place of the tool in x may be tool_x or flange_x"),
+    ],
+)
+def test_what_names_leave_open_is_told_with_the_candidates(armpi, twin, tmp_path, rename, message):
+    log, _, _ = plain_log(tmp_path, twin, ["q1", "q2", "q3", "q4"])
+    pd.read_csv(log).assign(extra=0.0).rename(columns=rename).to_csv(log, index=False)
+
+    with pytest.raises(InputError, match=rf"{message}.*--columns"):
+        read_runs(log, armpi)
+
+
+@pytest.mark.parametrize(
+    ("scales", "message"),
+    [
+        ({"angle": 57.3}, r"the unit of q1, whose numbers reach 28.*no _rad or _deg"),
+        ({"length": 1000.0}, r"the unit of tool_x, whose numbers reach .*no _mm or _cm or _m"),
+    ],
+)
+def test_numbers_in_no_named_unit_that_cannot_be_si_are_not_guessed(
+    armpi, twin, tmp_path, scales, message
+):
+    log, _, _ = plain_log(tmp_path, twin, ["q1", "q2", "q3", "q4"], **scales)
+
+    with pytest.raises(InputError, match=message):
+        read_runs(log, armpi)

@@ -33,6 +33,12 @@ LONGEST_CORNER = 4
 SAME_MOVEMENT_S = 0.25
 """Motors that start within this time [s] move together: a bus serves six servos in about 0.02 s,
 and of a smooth start the shortest travel is seen last."""
+REST_S = 0.3
+"""A reference that a hand guides rests where no motor moves for this long [s]: twice the 0.15 s by
+which such an arm trails, so that it is seen at rest as well."""
+GUIDED_BENDS = 2.0
+"""Changes of speed without a stop, for each start of a movement, from which a reference is taken
+for guided by hand [-]; planned ramps that cut each other short have one at most."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +120,8 @@ def find_movements(command: FloatArray, time: FloatArray) -> Movements:
     """Find the movements in references from the corners of the piecewise linear `command`.
 
     A movement starts where a motor sets out or turns back; motors that do so within 0.25 s of each
-    other belong to the same movement, and a curve is one movement from rest to rest. Corners are
+    other belong to the same movement, and a curve is one movement from rest to rest; so is all that
+    a hand guides (teleoperation), however often motors turn back in it. Corners are
     placed between the samples, where the lines before and after them meet. The target of a ramp
     that is interrupted is the angle it has come to.
 
@@ -154,6 +161,15 @@ class _Corners:
         before = np.concatenate([[0.0], self.speed[:-1]])
         return self.time[(self.speed != 0.0) & (before * self.speed <= 0.0)]
 
+    def bends(self) -> int:
+        """Return how often the motor changes its speed without a stop."""
+        return int(np.sum((self.speed[1:] != 0.0) & (self.speed[:-1] != 0.0)))
+
+    def stretches(self) -> FloatArray:
+        """Return begin and end of every line on which the motor moves, (line, 2) [s]."""
+        lines = np.stack([self.time[:-1], self.time[1:]], axis=1)
+        return lines[self.speed[:-1] != 0.0]
+
 
 def _movements_of_run(
     command: FloatArray, time: FloatArray
@@ -161,6 +177,8 @@ def _movements_of_run(
     """Return start (movement,), target and ramp duration (movement, motor) of one run."""
     motors = [_corners(reference, time) for reference in command.T]
     start = _merge_starts(np.sort(np.concatenate([c.starts() for c in motors])))
+    if max(c.bends() for c in motors) > GUIDED_BENDS * len(start):
+        start = _after_rests(start, np.concatenate([c.stretches() for c in motors]))
     end = np.append(start[1:], time[-1])
     target, ramp = np.empty((2, len(start), len(motors)))
     for k, corners in enumerate(motors):
@@ -222,6 +240,21 @@ def _merge_starts(starts: FloatArray) -> FloatArray:
     for start in starts.tolist():
         if not kept or start - kept[-1] > SAME_MOVEMENT_S:
             kept.append(start)
+    return np.array(kept)
+
+
+def _after_rests(start: FloatArray, moving: FloatArray) -> FloatArray:
+    """Return the starts that follow a rest of all motors, or that nothing comes before.
+
+    Args:
+        start: When motors set out, (movement,) [s].
+        moving: Begin and end of every line on which one moves, (line, 2) [s].
+    """
+    kept = []
+    for at in start:
+        before = moving[moving[:, 0] < at - SAME_MOVEMENT_S, 1]
+        if not len(before) or at - before.max() >= REST_S:
+            kept.append(at)
     return np.array(kept)
 
 

@@ -115,6 +115,19 @@ class Ellipsoid:
         )
         return np.stack(rows, axis=-1) / self.determinant[..., None]
 
+    @property
+    def inverse_root(self) -> FloatArray:
+        """A with A^T A = S^-1, upper triangular, (..., 3, 3): whitens deviations."""
+        xx, yy, zz, xy, xz, yz = (part / self.determinant for part in self.adjugate)
+        root = np.zeros((*self.determinant.shape, 3, 3))
+        root[..., 0, 0] = np.sqrt(xx)
+        root[..., 0, 1], root[..., 0, 2] = xy / root[..., 0, 0], xz / root[..., 0, 0]
+        root[..., 1, 1] = np.sqrt(yy - root[..., 0, 1] ** 2)
+        root[..., 1, 2] = (yz - root[..., 0, 1] * root[..., 0, 2]) / root[..., 1, 1]
+        rest = zz - root[..., 0, 2] ** 2 - root[..., 1, 2] ** 2
+        root[..., 2, 2] = np.sqrt(np.maximum(rest, 0.0))
+        return root
+
     def log_norm(self, dof: float) -> FloatArray:
         """Return the log density at the centre of a Student t with this scale matrix, (...)."""
         return log_norm(dof) - 0.5 * np.log(self.determinant)

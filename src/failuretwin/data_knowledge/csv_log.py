@@ -23,6 +23,8 @@ LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 ANGLE_UNITS = {"rad": 1.0, "deg": np.pi / 180.0}
 SERVO = "servo"
 ISO = "iso"
+BLANKS = r"\s+"
+"""Separator of columns with any number of blanks between them."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""One door for all inputs: run sets, raw sessions, published MATLAB files, bags, any CSV."""
+"""One door for all inputs: run sets, raw sessions, MATLAB files, bags, LeRobot, RTDE, any CSV."""
 
 from __future__ import annotations
 
@@ -12,7 +12,15 @@ from failuretwin import __version__
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import RunTable, concatenate
 from failuretwin.data_knowledge.bags import BagTopics, is_bag, read_bag
+from failuretwin.data_knowledge.column_guess import told_columns
 from failuretwin.data_knowledge.csv_log import ColumnMap, read_mapped_csv
+from failuretwin.data_knowledge.lerobot import (
+    INFO_FILE,
+    LeRobotAngles,
+    is_lerobot,
+    lerobot_version,
+    read_lerobot,
+)
 from failuretwin.data_knowledge.matlab import (
     RECOVERY_ERROR,
     RECOVERY_WORST,
@@ -26,8 +34,9 @@ from failuretwin.data_knowledge.raw_sessions import (
     read_session,
     session_runs,
 )
+from failuretwin.data_knowledge.rtde import is_rtde, read_rtde
 from failuretwin.data_knowledge.store import SUFFIXES, load_run_set
-from failuretwin.data_knowledge.timed_log import timed_run
+from failuretwin.data_knowledge.timed_log import TimedLog, timed_run
 from failuretwin.digital_model.robot import Robot, load_robot
 
 if TYPE_CHECKING:
@@ -36,6 +45,9 @@ if TYPE_CHECKING:
 
 RunsLike: TypeAlias = "xr.Dataset | str | Path | Sequence[str | Path]"
 """A run set, or where one is read from."""
+VIRTUAL_TOOL = "tool path = forward kinematics of the readings"
+"""What a run set says of itself where no sensor watched the tool: its motors' encoders did."""
+RTDE_SOURCE = "RTDE; a tool path in it is computed by the controller from its encoders"
 
 
 @dataclass(frozen=True)
@@ -47,6 +59,7 @@ class ReadOptions:
         published_labels: Take the truth from folder names that end in ``_label_K`` and freeze the
             motor of labels 1 to 4.
         columns: What the columns of CSV files are.
+        lerobot: What the numbers of LeRobot data sets are.
         topics: Which topics of bags are what, where their types do not tell.
         approximate: Published paths without commands: accept commands that reproduce the desired
             path only in the least-squares sense.
@@ -55,6 +68,7 @@ class ReadOptions:
     how: As = "measured"
     published_labels: bool = False
     columns: ColumnMap | None = None
+    lerobot: LeRobotAngles | None = None
     topics: BagTopics | None = None
     approximate: bool = False
 
@@ -68,8 +82,9 @@ def read_runs(
 
     Args:
         sources: Run sets (.nc, .zarr), folders with raw sessions or published MATLAB files (they
-            are searched downwards), such files (.mat), bags (.bag, .mcap, folders of ROS 2) or
-            CSV files with a column map.
+            are searched downwards), such files (.mat), bags (.bag, .mcap, folders of ROS 2),
+            LeRobot data sets (folders), RTDE recordings, or CSV files, whose columns are found
+            by their names or named by a column map.
         robot: The robot that the logs are of, or its name.
         options: How logs become runs.
 
@@ -102,31 +117,41 @@ def _read_source(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Data
     if path.suffix in SUFFIXES:
         return [load_run_set(path)]
     if is_bag(path):
-        logs = read_bag(path, robot, options.topics)
-        return [_named(timed_run(log, robot), robot, "bag", {}) for log in logs]
+        return _log_datasets(read_bag(path, robot, options.topics), robot, "bag")
+    if is_lerobot(path):
+        source = f"LeRobot {lerobot_version(path)}, angles in {_lerobot_unit(options)}"
+        return _log_datasets(read_lerobot(path, robot, options.lerobot), robot, source)
     if path.is_dir():
         return _read_folder(path, robot, options)
     if path.suffix == ".mat":
         return [_matlab_dataset(path, robot, options)]
-    if path.suffix == ".csv":
-        return _read_csv(path, robot, options)
+    if path.suffix == ".csv" or is_rtde(path):
+        return _read_text(path, robot, options)
     raise InputError(
         f"{path}: not a kind of file that can be read. Expected a run set (.nc, .zarr), a "
-        "published MATLAB file (.mat), a bag (.bag, .mcap), a CSV file with a column map, or a "
-        f"folder that holds {', '.join(SESSION_FILES)}."
+        "published MATLAB file (.mat), a bag (.bag, .mcap), a CSV file, an RTDE recording, a "
+        f"LeRobot data set (a folder with {INFO_FILE}), or a folder that holds "
+        f"{', '.join(SESSION_FILES)}."
     )
+
+
+def _lerobot_unit(options: ReadOptions) -> str:
+    return "degrees (assumed)" if options.lerobot is None else options.lerobot.unit
 
 
 def _read_folder(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
     found = [_session_dataset(folder, robot, options) for folder in find_sessions(path)]
     found += [_matlab_dataset(file, robot, options) for file in find_matlab_files(path)]
+    sets = sorted(file.parents[1] for file in path.rglob(str(INFO_FILE)))
+    found += [part for folder in sets for part in _read_source(folder, robot, options)]
     if not found and options.columns is not None:
         files = sorted(path.rglob("*.csv"))
-        found = [part for file in files for part in _read_csv(file, robot, options)]
+        found = [part for file in files for part in _read_text(file, robot, options)]
     if not found:
         raise InputError(
-            f"{path}: no raw session in it or below, and no published MATLAB file. A session is a "
-            f"folder that holds {', '.join(SESSION_FILES)}. Other CSV files need --columns."
+            f"{path}: no raw session in it or below, no published MATLAB file and no LeRobot data "
+            f"set. A session is a folder that holds {', '.join(SESSION_FILES)}. Name other files "
+            "one by one, or all CSV files with --columns."
         )
     return found
 
@@ -135,7 +160,7 @@ def _session_dataset(folder: Path, robot: Robot, options: ReadOptions) -> xr.Dat
     session = read_session(folder, robot)
     table = session_runs(session, robot, options.how, published_labels=options.published_labels)
     choice = {"as": options.how, "published_labels": options.published_labels}
-    return _named(table, robot, f"raw session, as {options.how}", choice)
+    return _named(table, robot, f"raw session, as {options.how}; {VIRTUAL_TOOL}", choice)
 
 
 def _matlab_dataset(path: Path, robot: Robot, options: ReadOptions) -> xr.Dataset:
@@ -143,14 +168,28 @@ def _matlab_dataset(path: Path, robot: Robot, options: ReadOptions) -> xr.Datase
     return _named(table, robot, "published MATLAB file", {"approximate": options.approximate})
 
 
-def _read_csv(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
-    if options.columns is None:
-        raise InputError(
-            f"{path}: a CSV file needs a column map that says which column is what. Add --columns "
-            "MAP.toml: if that file does not exist yet, a guess is written there for you to check."
+def _read_text(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
+    """Return the runs of a text file: by the column map, else by what its header says."""
+    if options.columns is not None:
+        logs = read_mapped_csv(path, options.columns, robot)
+        return _log_datasets(logs, robot, "CSV with a column map")
+    if is_rtde(path):
+        return _log_datasets([read_rtde(path, robot)], robot, RTDE_SOURCE)
+    logs = read_mapped_csv(path, told_columns(path, robot), robot)
+    return _log_datasets(logs, robot, "CSV, columns by their names")
+
+
+def _log_datasets(logs: Sequence[TimedLog], robot: Robot, source: str) -> list[xr.Dataset]:
+    """Return a run set of each log, which says so where its tool path is none of a sensor."""
+    return [
+        _named(
+            timed_run(log, robot),
+            robot,
+            source if log.tool is not None else f"{source}; {VIRTUAL_TOOL}",
+            {},
         )
-    logs = read_mapped_csv(path, options.columns, robot)
-    return [_named(timed_run(log, robot), robot, "CSV with a column map", {}) for log in logs]
+        for log in logs
+    ]
 
 
 def _named(table: RunTable, robot: Robot, source: str, choice: Mapping[str, object]) -> xr.Dataset:

@@ -1,0 +1,239 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from failuretwin import DigitalTwin, ReadOptions, diagnose, load_robot, read_runs
+from failuretwin.core.errors import InputError
+from failuretwin.data_knowledge.lerobot import LeRobotAngles
+
+NAMES = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
+WIDE = {"low": (-110.0, -100.0, -97.0, -95.0, -180.0), "high": (110.0, 100.0, 97.0, 95.0, 180.0)}
+
+
+def frames(count, scale=1.0):
+    """Return commands and readings of some frames, (frame, channel): a ramp and what trails it."""
+    ramp = np.clip(np.arange(count) / 30.0 - 0.5, 0.0, 1.0)
+    action = np.outer(ramp, [20.0, -30.0, 25.0, 10.0, 5.0, 50.0]) * scale
+    return action, np.concatenate([action[:1], action[:-1]])
+
+
+def write_info(folder, version, names, fps=30):
+    feature = {"dtype": "float32", "shape": [6], "names": names}
+    info = {
+        "codebase_version": version,
+        "robot_type": "so101_follower",
+        "fps": fps,
+        "features": {"action": feature, "observation.state": feature},
+    }
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+
+
+def write_table(path, episodes):
+    """Write a parquet file as the recorder does: a row a frame, vectors of 32-bit numbers."""
+    pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed: extra lerobot")
+    import pyarrow.parquet as pq
+
+    columns = {"action": [], "observation.state": [], "timestamp": []}
+    columns |= {"frame_index": [], "episode_index": []}
+    for number, (action, state) in episodes.items():
+        columns["action"] += action.tolist()
+        columns["observation.state"] += state.tolist()
+        columns["timestamp"] += (np.arange(len(action)) / 30.0).tolist()
+        columns["frame_index"] += range(len(action))
+        columns["episode_index"] += [number] * len(action)
+    vector, whole = pa.list_(pa.float32(), 6), pa.int64()
+    kinds = [vector, vector, pa.float32(), whole, whole]
+    arrays = [pa.array(v, k) for v, k in zip(columns.values(), kinds, strict=True)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(pa.table(arrays, names=list(columns)), path)
+
+
+def write_v2(folder, scale=1.0):
+    write_info(folder, "v2.1", {"motors": [f"main_{name}" for name in NAMES]})
+    for number, count in enumerate((60, 90)):
+        episode = {number: frames(count, scale)}
+        write_table(folder / "data" / "chunk-000" / f"episode_{number:06d}.parquet", episode)
+    (folder / "meta" / "episodes.jsonl").write_text('{"episode_index": 0, "length": 60}\n')
+    return folder
+
+
+def write_v3(folder, scale=1.0, clip=np.inf):
+    write_info(folder, "v3.0", [f"{name}.pos" for name in NAMES])
+    episodes = {k: np.clip(frames(n, scale), -clip, clip) for k, n in enumerate((60, 90))}
+    write_table(folder / "data" / "chunk-000" / "file-000.parquet", episodes)
+    return folder
+
+
+@pytest.mark.parametrize("write", [write_v2, write_v3])
+def test_episodes_become_runs_with_commands_and_readings_in_radians(tmp_path, write):
+    runs = read_runs(write(tmp_path / "pick"), "so101")
+
+    assert runs["run"].values.tolist() == ["pick/episode_000000", "pick/episode_000001"]
+    assert runs.attrs["measured_rate_hz"] == pytest.approx(30.0)
+    np.testing.assert_allclose(runs["duration"], [59 / 30, 89 / 30], atol=0.011)
+    last = [0.34906585, -0.52359878, 0.43633231, 0.17453293, 0.08726646]  # 20, -30, 25, 10, 5 deg
+    np.testing.assert_allclose(runs["command"][1, -1], last, atol=1e-6)
+    position = runs["position"].values[1]
+    seen = np.isfinite(position).all(axis=1)
+    assert seen.sum() == 90
+    np.testing.assert_allclose(position[seen][-1], last, atol=1e-6)
+    half_way = 29  # read at frame 30 what was told at frame 29: 20 deg of 30/29 parts
+    np.testing.assert_allclose(
+        np.rad2deg(position[seen][30, 0]), 20.0 * (half_way / 30.0 - 0.5), atol=1e-4
+    )
+
+
+def test_the_tool_path_is_the_forward_kinematics_of_the_readings(tmp_path):
+    runs = read_runs(write_v3(tmp_path / "pick"), "so101")
+
+    robot = load_robot("so101")
+    position, measured = runs["position"].values[0], runs["measured"].values[0]
+    seen = np.isfinite(position).all(axis=1)
+    np.testing.assert_allclose(measured[seen], DigitalTwin(robot).path(position[seen]), atol=1e-12)
+    assert np.isnan(measured[~seen]).all()
+    assert runs.attrs["source"] == (
+        "LeRobot v3.0, angles in degrees (assumed); tool path = forward kinematics of the readings"
+    )
+
+
+def test_normalised_angles_span_the_range_that_the_map_gives(tmp_path):
+    folder = write_v3(tmp_path / "pick", scale=4.0, clip=100.0)
+
+    runs = read_runs(folder, "so101", ReadOptions(lerobot=LeRobotAngles("normalised", **WIDE)))
+
+    # 80 of 100 of 110 deg, -100 of 100 deg (clipped), 100 of 97, 40 of 95, 20 of 180
+    np.testing.assert_allclose(
+        np.rad2deg(runs["command"][0, -1]), [88.0, -100.0, 97.0, 38.0, 36.0], atol=1e-4
+    )
+    assert runs.attrs["source"].startswith("LeRobot v3.0, angles in normalised;")
+
+
+def test_where_a_command_is_clipped_nothing_is_read(tmp_path):
+    """The lift is told -120 times the share of its ramp: -100 from 5/6 of it on, frame 40 of 60."""
+    folder = write_v3(tmp_path / "pick", scale=4.0, clip=100.0)
+
+    runs = read_runs(folder, "so101", ReadOptions(lerobot=LeRobotAngles("normalised", **WIDE)))
+
+    seen = np.flatnonzero(np.isfinite(runs["position"].values[0]).all(axis=1))
+    assert len(seen) == 40
+    assert runs["time"].values[seen[-1]] == pytest.approx(39 / 30, abs=0.006)
+
+
+def test_sign_and_zero_turn_and_shift_joints(tmp_path):
+    angles = LeRobotAngles("deg", sign=(1, 1, -1, 1, 1), zero=(2.0, 0.0, 5.0, 0.0, 0.0))
+
+    runs = read_runs(write_v3(tmp_path / "pick"), "so101", ReadOptions(lerobot=angles))
+
+    np.testing.assert_allclose(
+        np.rad2deg(runs["command"][0, -1]), [18.0, -30.0, -20.0, 10.0, 5.0], atol=1e-4
+    )
+
+
+@pytest.mark.parametrize(
+    ("scale", "clip", "why"),
+    [(4.0, 100.0, "the largest is exactly 100"), (0.1, np.inf, r"none is larger than 3\.00")],
+)
+def test_angles_that_are_no_degrees_ask_for_a_map(tmp_path, scale, clip, why):
+    folder = write_v3(tmp_path / "pick", scale, clip)
+
+    with pytest.raises(InputError, match=rf"not degrees.*{why}.*--columns"):
+        read_runs(folder, "so101")
+
+
+def test_the_guessed_map_leads_to_a_verdict(tmp_path):
+    write_v3(tmp_path / "pick", scale=4.0, clip=100.0)
+    command = [sys.executable, "-m", "failuretwin", "diagnose", "pick", "--robot", "so101"]
+    command += ["--columns", "map.toml"]
+
+    def run():
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+
+    guess, result = run(), run()
+
+    assert guess.returncode == 2
+    assert "low = [-110.0, -100.0, -96.8, -95.0, -159.9]" in guess.stdout
+    assert result.returncode == 0, result.stderr
+    assert "pick/episode_000000" in result.stdout
+
+
+def test_a_joint_that_the_data_set_lacks_is_told_with_what_it_has(tmp_path):
+    with pytest.raises(InputError, match=r"no channel called 'shoulder_pan_joint'.*shoulder_pan\."):
+        read_runs(write_v3(tmp_path / "pick"), "ur5e")
+
+
+def test_joints_of_the_map_name_channels_of_other_names(tmp_path):
+    angles = LeRobotAngles(joints=("wrist_roll.pos", *[f"{n}.pos" for n in NAMES[1:5]]))
+
+    runs = read_runs(write_v3(tmp_path / "pick"), "so101", ReadOptions(lerobot=angles))
+
+    np.testing.assert_allclose(np.rad2deg(runs["command"][0, -1, 0]), 5.0, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [
+        ({"unit": "degrees"}, "unknown unit 'degrees'"),
+        ({"unit": "normalised"}, "need low and high"),
+    ],
+)
+def test_a_wrong_map_is_explained(told, message):
+    with pytest.raises(InputError, match=message):
+        LeRobotAngles(**told)
+
+
+def test_without_pyarrow_it_says_what_to_install(tmp_path, monkeypatch):
+    write_info(tmp_path, "v3.0", [f"{name}.pos" for name in NAMES])
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "file-000.parquet").write_bytes(b"")
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+
+    with pytest.raises(InputError, match=r"pip install 'failuretwin\[lerobot\]'"):
+        read_runs(tmp_path, "so101")
+
+
+def test_a_data_set_without_data_says_so(tmp_path):
+    write_info(tmp_path, "v3.0", [f"{name}.pos" for name in NAMES])
+
+    with pytest.raises(InputError, match="no parquet files below data/"):
+        read_runs(tmp_path, "so101")
+
+
+@pytest.fixture(scope="module")
+def teleoperated(data):
+    """Four episodes of a healthy arm, normalised: its elbow is clipped at exactly 100."""
+    pytest.importorskip("pyarrow", reason="pyarrow is not installed: extra lerobot")
+    folder = data / "so101"
+    if not folder.is_dir():
+        pytest.skip(f"no {folder}")
+    return folder
+
+
+def test_a_real_data_set_is_seen_to_be_normalised(teleoperated):
+    with pytest.raises(InputError, match="the largest is exactly 100"):
+        read_runs(teleoperated, "so101")
+
+
+def test_a_real_data_set_is_read_whole(teleoperated):
+    runs = read_runs(teleoperated, "so101", ReadOptions(lerobot=LeRobotAngles("deg")))
+
+    seen = np.isfinite(runs["position"].values).all(axis=2).sum(axis=1)
+    assert seen.tolist() == [373, 374, 372, 373]
+    assert runs["run"].values[3] == "so101/episode_000003"
+    np.testing.assert_allclose(runs["duration"], [12.4, 12.43, 12.37, 12.4], atol=0.011)
+
+
+def test_a_real_teleoperated_arm_gets_no_verdict_where_it_never_rests_freely(teleoperated):
+    """The healthy arm rests folded alone, its elbow told to go to the very end of its range."""
+    told = ReadOptions(lerobot=LeRobotAngles("normalised", **WIDE))
+
+    found = diagnose(read_runs(teleoperated, "so101", told), robot="so101")
+
+    assert [d.verdict for d in found] == 4 * [
+        "cannot tell, because the tool is not seen at rest after any movement"
+    ]
