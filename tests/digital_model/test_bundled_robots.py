@@ -3,9 +3,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from failuretwin import DigitalTwin, load_robot
+from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.arm_classes import generic_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.kinematics import mobility
-from failuretwin.digital_model.robot import bundled_folder, bundled_robots, profile_text
+from failuretwin.digital_model.profile_text import profile_text
+from failuretwin.digital_model.robot import bundled_folder, bundled_robots
+from failuretwin.digital_model.settling import largest_load
 from failuretwin.digital_model.urdf import read_urdf
 from failuretwin.digital_model.urdf_check import check_urdf
 
@@ -224,3 +230,37 @@ def test_a_profile_made_anew_has_the_same_kinematics(name, tmp_path):
     )
     for motor, joint in zip(anew.motors, anew.chain.joints, strict=True):
         assert joint.low <= motor.movement_range[0] < motor.movement_range[1] <= joint.high
+
+
+def test_so101_is_expected_to_behave_like_arms_of_its_class():
+    """Backlash 1.2 to 2.8 deg, droop 1.0 to 1.4 deg, 65 ms, 0.47 deg: measured by others."""
+    known = load_calibration(None, "so101")
+
+    healthy = known.imperfections
+    assert healthy.name == "SO-101 class, not calibrated"
+    half_play = np.rad2deg(healthy.settling.friction)
+    spread = np.rad2deg(healthy.variation.friction)
+    assert np.all((half_play - spread >= 0.55) & (half_play + spread <= 1.45))
+    droop = np.rad2deg(
+        np.array(healthy.settling.compliance) * largest_load(known.robot, payload=0.0)
+    )
+    assert 1.0 <= droop.max() <= 1.4
+    assert np.all(np.rad2deg(healthy.settling.scatter) >= 0.47)
+    assert np.mean(healthy.timing.delay_s) == pytest.approx(0.065)
+
+
+def test_what_is_known_of_the_class_saves_healthy_arms_from_sure_alarms():
+    known = load_calibration(None, "so101")
+    plan = Plan(known.robot, [Hypothesis()], 20, seed=3, imperfections=known.imperfections)
+    runs, alarms = simulate(plan), {}
+
+    for name, healthy in (
+        ("class", known.imperfections),
+        ("generic", generic_imperfections(known.robot)),
+    ):
+        found = BayesDiagnoser(known.twin, healthy).diagnose(runs)
+        alarms[name] = [d.probability for d in found if d.diagnosis != "healthy"]
+
+    assert len(alarms["generic"]) >= 15
+    assert len(alarms["class"]) <= 10
+    assert max(alarms["class"]) < 0.99

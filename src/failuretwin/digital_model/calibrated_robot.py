@@ -13,11 +13,11 @@ from typing import Any
 
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import (
     NO_IMPERFECTIONS,
     SETTLING_LISTS,
     Imperfections,
-    generic_imperfections,
 )
 from failuretwin.digital_model.robot import Motor, Robot, load_robot
 from failuretwin.digital_model.servo import ServoLoop
@@ -110,15 +110,19 @@ def with_loops(robot: Robot, loops: Sequence[CalibratedLoop]) -> Robot:
     return replace(robot, profile=replace(robot.profile, motors=motors))
 
 
+GENERIC = "generic"
+"""Name of what a kind of arm is like, whatever its profile names."""
+
+
 def load_calibration(
     name_or_path: str | Path | None, robot: Robot | str | Path = "armpi_fpv"
 ) -> CalibratedRobot:
     """Load a calibration, or imperfections typed by hand.
 
     Args:
-        name_or_path: ``none``, the name of `robot` for the calibration of its profile, the name of
-            another file beside that, or a TOML file. None: the calibration of its profile, generic
-            imperfections if that names none.
+        name_or_path: ``none``; ``generic`` for what this kind of arm is like; the name of `robot`
+            for the calibration of its profile, the name of another file beside that, or a TOML
+            file. None: the calibration of its profile, ``generic`` if that names none.
         robot: The robot it is for, its name or its profile.
 
     Raises:
@@ -126,7 +130,7 @@ def load_calibration(
             its motors.
     """
     robot = load_robot(robot)
-    if name_or_path is None and robot.imperfections_file is None:
+    if str(name_or_path) == GENERIC or (name_or_path is None and robot.imperfections_file is None):
         return CalibratedRobot(robot, generic_imperfections(robot))
     if name_or_path == "none":
         return CalibratedRobot(robot, NO_IMPERFECTIONS)
@@ -152,7 +156,7 @@ def _file_of(name_or_path: str, robot: Robot) -> Path:
     if name_or_path in known:
         return known[name_or_path]
     if path.suffix != ".toml" and not path.exists():
-        names = ", ".join(repr(name) for name in ("none", *known))
+        names = ", ".join(repr(name) for name in ("none", GENERIC, *known))
         raise InputError(
             f"no imperfections {name_or_path!r} of robot {robot.name!r}. Expected {names} or a "
             "TOML file, such as `failuretwin calibrate` writes."

@@ -15,7 +15,6 @@ import numpy as np
 from failuretwin.core.config import AtLeastZero, Bounded, Bounds, Share
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.types import FloatArray
-from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling
 
 Range = Annotated[tuple[float, float], Bounds(in_order=True)]
@@ -169,21 +168,6 @@ class Imperfections:
 
 
 NO_IMPERFECTIONS = Imperfections("none", "the published twin")
-
-GENERIC_NAME = "generic, not calibrated"
-"""What results say of a robot whose healthy behaviour has not been measured."""
-GENERIC_SCATTER_RAD = 0.01
-"""Settled scatter assumed of a robot of which nothing is known [rad], about half a degree."""
-
-
-def generic_imperfections(robot: Robot) -> Imperfections:
-    """Return wide healthy offsets for a robot whose own have not been measured."""
-    motors = len(robot.motors)
-    scatter = (GENERIC_SCATTER_RAD,) * motors
-    ideal = Settling.ideal(motors)
-    settling = replace(ideal, scatter=scatter, tail_dof=4.0, source="assumed, no calibration")
-    return Imperfections(GENERIC_NAME, "assumed", settling=settling)
-
 
 # Robots of a kind: imperfections drawn around given ones, for training and for honest doubt.
 

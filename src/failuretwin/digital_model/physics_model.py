@@ -26,6 +26,7 @@ import numpy as np
 from failuretwin.core.config import AtLeastZero, Bounded, Bounds, from_table, read_toml
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.digital_model.geometry import roll_pitch_yaw
 from failuretwin.digital_model.kinematics import GRAVITY
 from failuretwin.digital_model.robot import Motor, Robot
 from failuretwin.digital_model.settling import poses_in_range
@@ -169,6 +170,7 @@ def arm_spec(robot: Robot, payload: float = 0.0) -> Any:
     path = robot.urdf_file
     root = read_root(path)
     _strip(root, {motor.joint for motor in robot.motors})
+    _correct(root, robot)
     try:
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
     except ValueError as error:
@@ -180,10 +182,10 @@ def arm_spec(robot: Robot, payload: float = 0.0) -> Any:
     spec.option.disableflags |= (
         mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
     )
-    tool = spec.body(robot.profile.tool_link)
-    tool.add_site(name=TOOL)
+    tool, at = spec.body(robot.profile.tool_link), robot.profile.tool_xyz
+    tool.add_site(name=TOOL, pos=at)
     if payload > 0.0:
-        point = tool.add_body(name="payload", mass=payload, explicitinertial=True)
+        point = tool.add_body(name="payload", pos=at, mass=payload, explicitinertial=True)
         point.inertia = np.full(3, NEXT_TO_NOTHING)
     return spec
 
@@ -201,6 +203,22 @@ def _strip(root: ElementTree.Element, moving: set[str]) -> None:
             useless = part.tag == "axis" and element.get("type") == "fixed"
             if part.tag not in keep or useless:
                 element.remove(part)
+
+
+def _correct(root: ElementTree.Element, robot: Robot) -> None:
+    """Put the joints that the profile corrects where they really are."""
+    corrected = {c.joint for c in robot.profile.geometry.joints}
+    urdf = robot.profile.geometry.apply(read_urdf(robot.urdf_file))
+    poses = {joint.name: joint.T_pc for joint in urdf.joints if joint.name in corrected}
+    for element in root.findall("joint"):
+        T = poses.get(element.get("name", ""))
+        if T is None:
+            continue
+        for old in element.findall("origin"):
+            element.remove(old)
+        xyz, rpy = T[:3, 3].tolist(), roll_pitch_yaw(T[:3, :3])
+        texts = (" ".join(f"{value:.17g}" for value in triple) for triple in (xyz, rpy))
+        element.append(ElementTree.Element("origin", dict(zip(("xyz", "rpy"), texts, strict=True))))
 
 
 def _up(urdf: Urdf, base_link: str) -> FloatArray:

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-import json
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
-from string import Template
 
 import numpy as np
 
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, unknown_name
-from failuretwin.core.types import FloatArray, ServoUnits, frozen_array
+from failuretwin.core.types import BoolArray, FloatArray, ServoUnits, frozen_array
+from failuretwin.digital_model.geometry import (
+    AS_STATED,
+    NO_OFFSET,
+    NOT_MOVED,
+    Geometry,
+    Pose,
+    seen_chain,
+    with_tool,
+)
 from failuretwin.digital_model.kinematics import (
     CANNOT_MOVE,
     Loads,
@@ -25,8 +31,7 @@ from failuretwin.digital_model.kinematics import (
     levers,
 )
 from failuretwin.digital_model.servo import ServoLoop
-from failuretwin.digital_model.urdf import UrdfJoint, read_urdf
-from failuretwin.digital_model.urdf_check import JointReport, UrdfReport
+from failuretwin.digital_model.urdf import Triple, read_urdf
 
 POSES = ("log", "physical")
 
@@ -41,8 +46,11 @@ class Motor:
         loop: Its closed position loop.
         speed_limit: Largest speed [rad/s].
         movement_range: Lowest and highest target of random movements [rad].
+        travel: Lowest and highest angle that it may stand at [rad]; None: the limits of its joint.
         sense: Physical angle = sense * angle in commands and logs; +1 or -1.
         log_column: Column of raw logs that belongs to it.
+        home: Angle at rest, round which random movements keep where the limits are wide [rad];
+            None: the middle of the limits.
     """
 
     name: str
@@ -50,17 +58,21 @@ class Motor:
     loop: ServoLoop
     speed_limit: float
     movement_range: tuple[float, float]
+    travel: tuple[float, float] | None = None
     sense: float = 1.0
     log_column: str = ""
+    home: float | None = None
 
     def __post_init__(self) -> None:
         if self.sense not in (1.0, -1.0):
             raise InputError(f"motor {self.name!r}: sense is {self.sense}, expected 1 or -1.")
-        if not self.movement_range[0] < self.movement_range[1]:
-            raise InputError(
-                f"motor {self.name!r}: movement_range is {list(self.movement_range)}, expected the "
-                "lowest and the highest target [rad]."
-            )
+        ranges = {"movement_range": self.movement_range, "travel": self.travel}
+        for name, ends in ranges.items():
+            if ends is not None and not ends[0] < ends[1]:
+                raise InputError(
+                    f"motor {self.name!r}: {name} is {list(ends)}, expected the lowest and the "
+                    "highest angle [rad]."
+                )
         if set(self.name) & set(":+,") or not self.name:
             raise InputError(
                 f"motor name {self.name!r} cannot stand in hypotheses. Leave out ':', '+', ','."
@@ -75,8 +87,12 @@ class Profile:
         name: Name of the robot.
         urdf: URDF file, relative to the profile.
         base_link: Link that carries the base frame.
-        tool_link: Link whose origin is the tool point.
+        tool_link: Link that carries the tool point.
         motors: Motors that can move the tool point, in chain order.
+        tool_xyz: The tool point, in the frame of the tool link [m].
+        base_xyz_rpy: Pose of the base link in the frame of the tool positions that the sensor
+            tells; see `failuretwin.digital_model.geometry`.
+        geometry: How the arm differs from its URDF, and the sensor from a true one.
         sensor_pose: Which angles the tool sensor's path belongs to: ``log`` (a virtual sensor
             that applies the kinematics to angles in the log's sense) or ``physical``.
         servo_units: Count scale of commands and readings in raw logs, if they use one.
@@ -84,6 +100,8 @@ class Profile:
         physics: Motors and gears for the physics engine, a TOML file relative to the profile.
         inference: Lengths and angles by which its runs are read, where they are not the usual
             ones; see `InferenceSettings`.
+        arm_class: What kind of arm it is, for what is believed of it before it is calibrated; see
+            `failuretwin.digital_model.arm_classes`. Empty: by its reach.
         sources: Where each group of numbers comes from.
     """
 
@@ -92,11 +110,15 @@ class Profile:
     base_link: str
     tool_link: str
     motors: tuple[Motor, ...]
+    tool_xyz: Triple = NO_OFFSET
+    base_xyz_rpy: Pose = NOT_MOVED
+    geometry: Geometry = AS_STATED
     sensor_pose: str = "physical"
     servo_units: ServoUnits | None = None
     imperfections: str | None = None
     physics: str | None = None
     inference: dict[str, float] = field(default_factory=dict)
+    arm_class: str = ""
     sources: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -112,15 +134,21 @@ class Robot:
 
     Attributes:
         profile: Its profile.
-        chain: Its kinematics; one joint for each motor.
-        loads: What its motors carry.
-        folder: Where the profile lies.
+        chain: Its kinematics as the tool sensor sees it, in the sensor's frame; one joint for each
+            motor.
+        loads: What its motors carry; their chain is in the frame of the base link.
+        source: The file of its profile.
     """
 
     profile: Profile
     chain: SerialChain
     loads: Loads
-    folder: Path
+    source: Path
+
+    @property
+    def folder(self) -> Path:
+        """Where the profile lies."""
+        return self.source.parent
 
     @property
     def name(self) -> str:
@@ -147,6 +175,60 @@ class Robot:
         """Sense of the pose that the tool sensor's path belongs to, (motor,)."""
         log = self.profile.sensor_pose == "log"
         return frozen_array(np.ones(len(self.motors)) if log else self.sense)
+
+    @cached_property
+    def limits(self) -> FloatArray:
+        """Limits of the joints in the sense of commands, (motor, low | high) [rad or m].
+
+        Infinite where the URDF has none.
+        """
+        ends = np.array([(joint.low, joint.high) for joint in self.chain.joints])
+        known = [has_range(low, high) for low, high in ends.tolist()]
+        ends[~np.array(known)] = -np.inf, np.inf
+        return frozen_array(np.sort(ends * self.sense[:, None], axis=1))
+
+    @cached_property
+    def travel(self) -> FloatArray:
+        """Where each motor may stand, (motor, low | high) [rad or m].
+
+        What its profile says; else the limits of its joint, of one that turns no more than a full
+        turn about the middle of its movements, for angles a turn apart are one to the tool.
+        """
+        found = np.array([self._travel_of(k) for k in range(len(self.motors))])
+        return frozen_array(found)
+
+    def _travel_of(self, k: int) -> tuple[float, float]:
+        motor, (low, high) = self.motors[k], self.limits[k].tolist()
+        if motor.travel is not None:
+            return motor.travel
+        if self.slides[k]:
+            return (low, high) if math.isfinite(high - low) else motor.movement_range
+        if high - low <= 2.0 * math.pi:
+            return low, high
+        middle = 0.5 * sum(motor.movement_range)
+        return max(low, middle - math.pi), min(high, middle + math.pi)
+
+    @cached_property
+    def slides(self) -> BoolArray:
+        """Which motors slide [m] instead of turning [rad], (motor,)."""
+        return np.array([joint.prismatic for joint in self.chain.joints])
+
+    def own_unit(self, motor: str, unit: str) -> str:
+        """Return the unit of a magnitude at a motor: in metres where it slides, not in radians."""
+        slides = self.slides[self.motor_names.index(motor)]
+        return unit.replace("rad", "m", 1) if slides and unit.startswith("rad") else unit
+
+    @cached_property
+    def reach(self) -> float:
+        """How far the tool can be from the base at most [m]: links and slides laid end to end."""
+        chain = self.loads.chain
+        links = sum(float(np.linalg.norm(joint.T_pj[:3, 3])) for joint in chain.joints)
+        slides = sum(
+            max(abs(end) for end in motor.movement_range)
+            for motor, slides in zip(self.motors, self.slides, strict=True)
+            if slides
+        )
+        return links + slides + float(np.linalg.norm(chain.T_jt[:3, 3]))
 
     @property
     def servo_units(self) -> ServoUnits:
@@ -210,7 +292,13 @@ def load_robot(name_or_path: str | Path | Robot) -> Robot:
     _check_unique([motor.name for motor in profile.motors], "motor name", path)
     joints = [motor.joint for motor in profile.motors]
     _check_unique(joints, "joint", path)
-    urdf = read_urdf(path.parent / profile.urdf)
+    return _assembled(profile, path)
+
+
+def _assembled(profile: Profile, path: Path) -> Robot:
+    """Return the robot of a profile that lies at `path`."""
+    urdf = profile.geometry.apply(read_urdf(path.parent / profile.urdf))
+    joints = [motor.joint for motor in profile.motors]
     chain = urdf.chain(profile.base_link, profile.tool_link, joints)
     order = [joint.name for joint in chain.joints]
     if joints != order:
@@ -218,13 +306,21 @@ def load_robot(name_or_path: str | Path | Robot) -> Robot:
             f"{path}: motors are listed for joints {', '.join(joints)}; from base to tool the "
             f"order is {', '.join(order)}. List the motors in that order."
         )
+    chain = with_tool(chain, profile.tool_xyz)
     for motor, lever in zip(profile.motors, levers(chain), strict=True):
         if lever < CANNOT_MOVE:
             raise InputError(
                 f"{path}: motor {motor.name!r} ({motor.joint}) cannot move the tool point, so no "
                 "tool path can tell of it. Leave it out, or choose another tool_link."
             )
-    return Robot(profile, chain, urdf.loads(profile.base_link, chain), path.parent)
+    scale = profile.geometry.sensor_scale
+    if scale != 1.0 and any(joint.prismatic for joint in chain.joints):
+        raise InputError(
+            f"{path}: geometry: sensor_scale is {scale:g}, expected 1 for an arm with a joint that "
+            "slides. Put the scale into the unit of the logs."
+        )
+    seen = seen_chain(chain, profile.base_xyz_rpy, scale)
+    return Robot(profile, seen, urdf.loads(profile.base_link, chain), path)
 
 
 def _check_unique(names: Sequence[str], kind: str, path: Path) -> None:
@@ -233,121 +329,18 @@ def _check_unique(names: Sequence[str], kind: str, path: Path) -> None:
             raise InputError(f"{path}: {kind} {name!r} is used twice. Give each motor its own.")
 
 
-def shown_unit(unit: str, robot: Robot) -> tuple[float, str]:
-    """Return factor and name of the unit that people read: servo counts or degrees for angles."""
+def shown_unit(unit: str, robot: Robot, motor: str = "") -> tuple[float, str]:
+    """Return factor and name of the unit that people read: servo counts or degrees for angles.
+
+    Args:
+        unit: That of the figure; angles in radians.
+        robot: The robot.
+        motor: The motor that the figure is of; of one that slides, millimetres.
+    """
+    if motor and robot.own_unit(motor, unit) != unit:
+        return 1e3, unit.replace("rad", "mm", 1)
     if not unit.startswith("rad"):
         return 1.0, unit
     if robot.profile.servo_units is not None:
         return 1.0 / abs(robot.servo_units.rad_per_count), unit.replace("rad", "counts", 1)
     return float(np.rad2deg(1.0)), unit.replace("rad", "deg", 1)
-
-
-# A commented robot profile, written from what a URDF states and plain assumptions elsewhere.
-
-PROFILE_TEMPLATE = "profile.template"
-"""A profile with $placeholders, the last table being that of one motor. Its gains are near those
-published for the bus servos of the ArmPi FPV."""
-
-ASSUMED_SPEED = math.pi
-"""Speed limit where the URDF states none [rad/s or m/s]."""
-
-WIDEST_RAD = math.pi / 2
-"""Farthest target of random movements from the middle of the range [rad]."""
-
-WIDEST_M = 0.1
-"""The same for a joint that slides [m]."""
-
-LONGEST_RAMP_S = 1.0
-"""Time in which the speed limit must allow the longest travel: half of a movement [s]."""
-
-
-def profile_text(report: UrdfReport, profile: Path) -> str:
-    """Return a TOML profile for the robot of a URDF.
-
-    Args:
-        report: The URDF, looked over without errors.
-        profile: Where the profile will lie; it names the URDF relative to its own folder.
-
-    Raises:
-        InputError: If the report holds an error.
-    """
-    report.raise_errors()
-    template = (bundled_folder() / PROFILE_TEMPLATE).read_text(encoding="utf-8")
-    head, start, motor = template.partition("[[motors]]")
-    speeds = [m.motor or "" for m in report.motors if m.joint.velocity is None]
-    ranges = [m.motor or "" for m in report.motors if not has_range(m.joint.low, m.joint.high)]
-    common = Template(head).substitute(
-        name=_quote(report.name or report.source.stem),
-        urdf=_quote(_relative(report.source, profile.parent)),
-        base=_quote(report.base_link),
-        tool=_quote(report.tool_link),
-        unmoved=_unmoved(report.others),
-        speeds=_quote(_origin("URDF", speeds)),
-        ranges=_quote(_origin("URDF limits, narrowed to keep plateaus", ranges)),
-    )
-    return common + "\n".join(_motor(start + motor, one) for one in report.motors)
-
-
-def _motor(template: str, report: JointReport) -> str:
-    joint = report.joint
-    low, high, range_note = movement_range(joint)
-    return Template(template).substitute(
-        name=_quote(report.motor or ""),
-        joint=_quote(joint.name),
-        unit="m" if joint.type == "prismatic" else "rad",
-        speed=speed_limit(joint),
-        speed_note="Assumed." if joint.velocity is None else "From the URDF.",
-        low=low,
-        high=high,
-        range_note=range_note,
-    )
-
-
-def _unmoved(others: Sequence[JointReport]) -> str:
-    if not others:
-        return "\n# Every joint of the file can move the tool point, so each has a motor below.\n"
-    reasons = ((_quote(other.joint.name), " ".join(other.reason.split())) for other in others)
-    lines = [f"#   {name}: {reason}" for name, reason in reasons]
-    head = "# Joints without a motor below, since they cannot move the tool point:"
-    return "\n".join(["", head, *lines, ""])
-
-
-def _origin(stated: str, assumed: Sequence[str]) -> str:
-    return f"{stated}; assumed for {', '.join(assumed)}" if assumed else stated
-
-
-def speed_limit(joint: UrdfJoint) -> float:
-    """Return the speed limit of the URDF [rad/s or m/s], an assumed one where it has none."""
-    return ASSUMED_SPEED if joint.velocity is None else joint.velocity
-
-
-def movement_range(joint: UrdfJoint) -> tuple[float, float, str]:
-    """Return the lowest and the highest target [rad or m] and a sentence on where they are from.
-
-    Targets far apart leave no time at rest within a movement, so the limits are narrowed about
-    their middle.
-    """
-    widest = WIDEST_M if joint.type == "prismatic" else WIDEST_RAD
-    half = min(widest, speed_limit(joint) * LONGEST_RAMP_S / 2.0)
-    if not has_range(joint.low, joint.high):
-        return -half, half, "Assumed: the URDF has no limits."
-    if joint.high - joint.low <= 2.0 * half:
-        return joint.low, joint.high, "The limits of the URDF."
-    middle = (joint.low + joint.high) / 2.0
-    limits = f"{joint.low:.6g} to {joint.high:.6g}"
-    note = f"Limits of the URDF ({limits}) narrowed so that a movement keeps time at rest."
-    return middle - half, middle + half, note
-
-
-def _relative(target: Path, folder: Path) -> str:
-    """Return the way from `folder` to the file `target` with forward slashes."""
-    try:
-        way = os.path.relpath(target.resolve(), folder.resolve())
-    except ValueError:  # another drive
-        way = str(target.resolve())
-    return Path(way).as_posix()
-
-
-def _quote(text: str) -> str:
-    """Return `text` as a TOML string; its escapes are those of JSON."""
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

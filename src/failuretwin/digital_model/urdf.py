@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 
 from failuretwin.core.errors import InputError, unknown_name
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.kinematics import Joint, Loads, SerialChain, rotation_to_z
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
@@ -60,6 +60,13 @@ class UrdfJoint:
         """Whether a motor of its own can move it."""
         return self.type in MOVING_TYPES and self.mimic is None
 
+    @property
+    def reversed(self) -> UrdfJoint:
+        """A fixed joint, from its child to its parent."""
+        return replace(
+            self, parent=self.child, child=self.parent, T_pc=as_floats(np.linalg.inv(self.T_pc))
+        )
+
 
 @dataclass(frozen=True)
 class LinkFacts:
@@ -103,11 +110,16 @@ class Urdf:
         return [link for link in dict.fromkeys(self.links) if link not in children]
 
     def ways(self, base: str) -> dict[str, tuple[UrdfJoint, ...]]:
-        """Return the joints from `base` to each link that hangs from it, `base` itself first."""
+        """Return the joints from `base` to each link that hangs from it, `base` itself first.
+
+        What `base` is fixed to hangs from it too: a fixed joint leads either way.
+        """
         ways: dict[str, tuple[UrdfJoint, ...]] = {base: ()}
         waiting = [base]
         for link in waiting:
             onward = [j for j in self.joints if j.parent == link and j.child not in ways]
+            back = [j for j in self.joints if j.child == link and j.parent not in ways]
+            onward += [joint.reversed for joint in back if joint.type == "fixed"]
             ways |= {joint.child: (*ways[link], joint) for joint in onward}
             waiting += dict.fromkeys(joint.child for joint in onward)
         return ways
@@ -173,6 +185,19 @@ class Urdf:
                 joints.append(Joint(joint.name, slides, T_pj, joint.low, joint.high))
                 T = turn.T
         return SerialChain(tuple(joints), _snap(T))
+
+    def with_joints(self, changes: Mapping[str, Callable[[UrdfJoint], UrdfJoint]]) -> Urdf:
+        """Return the same with some joints changed, by name.
+
+        Raises:
+            InputError: If there is no such joint.
+        """
+        names = [joint.name for joint in self.joints]
+        for name in changes:
+            if name not in names:
+                raise InputError(f"{self.source}: {unknown_name('joint', name, names)}")
+        joints = (changes[j.name](j) if j.name in changes else j for j in self.joints)
+        return replace(self, joints=tuple(joints))
 
     def loads(self, base_link: str, chain: SerialChain) -> Loads:
         """Return what each joint of the `chain` from `base_link` carries; others are at zero.

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from failuretwin.core.errors import InputError, unknown_name
-from failuretwin.digital_model.kinematics import has_range, mobility
+from failuretwin.digital_model.kinematics import CANNOT_MOVE, has_range, mobility
 from failuretwin.digital_model.urdf import (
     HELD_TYPES,
     MOVING_TYPES,
@@ -23,6 +23,7 @@ from failuretwin.digital_model.urdf import (
     read_root,
     read_urdf,
 )
+from failuretwin.digital_model.urdf_tool import ToolChoice, choose_tool
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES = ("error", "warning", "note")
@@ -122,14 +123,22 @@ class UrdfReport:
             raise InputError(f"{self.source}: " + "\n  also: ".join(errors))
 
 
-def check_urdf(path: Path, base: str | None = None, tool: str | None = None) -> UrdfReport:
+NOISE_M = 0.0005
+"""Noise of a tool sensor of which nothing is known, on each axis [m]: assumed, a fair camera."""
+
+
+def check_urdf(
+    path: Path, base: str | None = None, tool: str | None = None, noise_m: float = NOISE_M
+) -> UrdfReport:
     """Look a URDF over; meshes, inertias and mimic joints are never needed for its kinematics.
 
     Args:
         path: The file.
         base: Link that carries the base frame; None: the root.
-        tool: Link whose origin is the tool point; None: the end of the branch with the most
-            moving joints.
+        tool: Link whose origin is the tool point; None: by its name, else the end of the branch
+            with the most moving joints.
+        noise_m: Noise of the tool sensor [m]; a joint that moves the tool by less for each radian
+            has no motor to watch.
 
     Raises:
         InputError: If the file cannot be read, is not XML, is a xacro template or not a URDF, or
@@ -141,44 +150,48 @@ def check_urdf(path: Path, base: str | None = None, tool: str | None = None) -> 
     urdf = read_urdf(path)
     report = replace(report, name=urdf.name)
     report = report.with_findings([*_name_findings(urdf), *_root_findings(urdf, base)])
-    return report if report.having("error") else _with_chain(report, urdf, base, tool)
+    return report if report.having("error") else _with_chain(report, urdf, base, tool, noise_m)
 
 
-def _with_chain(report: UrdfReport, urdf: Urdf, base: str | None, tool: str | None) -> UrdfReport:
+def _with_chain(
+    report: UrdfReport, urdf: Urdf, base: str | None, tool: str | None, noise_m: float
+) -> UrdfReport:
     base_link = urdf.roots[0] if base is None else base
-    tools = urdf.tools(base_link)
-    tool_link = tool if tool is not None else next(iter(tools), base_link)
+    choice = choose_tool(urdf, base_link) if tool is None else ToolChoice(tool, {})
+    tool_link = choice.link
     path = urdf.path(base_link, tool_link)
-    candidates = [f"{link} ({moving} moving)" for link, moving in tools.items()]
     report = replace(report, base_link=base_link, tool_link=tool_link).with_findings(
         [
             *_loop_findings(urdf, path),
-            *(_tool_findings(candidates, tool_link) if tool is None else []),
+            *_tool_findings(choice),
             *_joint_findings(urdf, path),
             *_mass_findings(urdf, path),
             *_mesh_findings(urdf.facts.values(), report.source.parent),
         ]
     )
-    return report if report.having("error") else _with_motors(report, urdf, path)
+    return report if report.having("error") else _with_motors(report, urdf, path, noise_m)
 
 
-def _with_motors(report: UrdfReport, urdf: Urdf, path: Sequence[UrdfJoint]) -> UrdfReport:
+def _with_motors(
+    report: UrdfReport, urdf: Urdf, path: Sequence[UrdfJoint], noise_m: float
+) -> UrdfReport:
     motors = [joint for joint in path if joint.has_motor]
     names = [joint.name for joint in motors]
     motion = mobility(urdf.chain(report.base_link, report.tool_link, names))
-    reached = zip(names, motion.lever.tolist(), motion.moves, strict=True)
-    levers = {name: lever for name, lever, moves in reached if moves}
+    moves = dict(zip(names, motion.lever.tolist(), strict=True))
+    levers = {name: lever for name, lever in moves.items() if lever >= max(noise_m, CANNOT_MOVE)}
+    short = {name: lever for name, lever in moves.items() if CANNOT_MOVE <= lever < noise_m}
     moving = urdf.ways(motors[0].child)
     return replace(
         report,
-        joints=_joint_reports(urdf, path, list(levers)),
+        joints=_joint_reports(urdf, path, list(levers), short),
         reach=motion.reach,
         moving_mass=sum(urdf.facts[n].mass or 0.0 for n in moving if n in urdf.facts),
-    ).with_findings(_lever_findings(levers, report.tool_link))
+    ).with_findings([*_lever_findings(levers, report.tool_link), *_short_findings(short, noise_m)])
 
 
 def _joint_reports(
-    urdf: Urdf, path: Sequence[UrdfJoint], movers: Sequence[str]
+    urdf: Urdf, path: Sequence[UrdfJoint], movers: Sequence[str], short: Collection[str]
 ) -> tuple[JointReport, ...]:
     on_path = {joint.name for joint in path}
     ordered = [*path, *(joint for joint in urdf.joints if joint.name not in on_path)]
@@ -186,14 +199,16 @@ def _joint_reports(
         JointReport(
             joint=joint,
             motor=f"motor_{movers.index(joint.name) + 1}" if joint.name in movers else None,
-            reason="" if joint.name in movers else _reason(joint, joint.name in on_path),
+            reason=""
+            if joint.name in movers
+            else _reason(joint, joint.name in on_path, joint.name in short),
             mass=urdf.facts[joint.child].mass if joint.child in urdf.facts else None,
         )
         for joint in ordered
     )
 
 
-def _reason(joint: UrdfJoint, on_path: bool) -> str:
+def _reason(joint: UrdfJoint, on_path: bool, short: bool) -> str:
     if joint.type == "fixed":
         return "fixed"
     if not on_path:
@@ -202,6 +217,8 @@ def _reason(joint: UrdfJoint, on_path: bool) -> str:
         return f"follows {joint.mimic}, held at zero"
     if not joint.has_motor:
         return f"{joint.type}, held at zero"
+    if short:
+        return "its axis runs too near to the tool point"
     return "its axis runs through the tool point"
 
 
@@ -265,13 +282,18 @@ def _loop_findings(urdf: Urdf, path: Sequence[UrdfJoint]) -> Iterator[Finding]:
     yield from _of_names("warning", beside, text + "changes nothing.")
 
 
-def _tool_findings(candidates: Sequence[str], tool: str) -> Iterator[Finding]:
-    if len(candidates) > 1:
+def _tool_findings(choice: ToolChoice) -> Iterator[Finding]:
+    listed = ", ".join(f"{link} ({moving} moving)" for link, moving in choice.candidates.items())
+    if choice.unclear:
+        yield Finding(
+            "error",
+            f"several arms could carry the tool: {listed}. Say which is meant with --tool LINK.",
+        )
+    elif len(choice.candidates) > 1:
         yield Finding(
             "note",
-            f"several branches end in a link that could be the tool: {', '.join(candidates)}. Took "
-            f"{tool!r}, the one with the most moving joints before it; choose another with --tool "
-            "LINK.",
+            f"several links could be the tool: {listed}. Took {choice.link!r}; choose another with "
+            "--tool LINK.",
         )
 
 
@@ -327,6 +349,17 @@ def _lever_findings(levers: Mapping[str, float], tool_link: str) -> Iterator[Fin
                 "faults of its motor will hardly show. A tool point farther from its axis would "
                 "help.",
             )
+
+
+def _short_findings(levers: Mapping[str, float], noise_m: float) -> Iterator[Finding]:
+    """Yield which joints move the tool by less than the noise of its sensor, by joint [m/rad]."""
+    for name, lever in levers.items():
+        yield Finding(
+            "note",
+            f"joint {name!r} moves the tool by {1e3 * lever:.2g} mm for each rad at most, less "
+            f"than the sensor's noise of {1e3 * noise_m:.2g} mm, so it has no motor to watch. A "
+            "marker off its axis would show it.",
+        )
 
 
 def _mass_findings(urdf: Urdf, path: Sequence[UrdfJoint]) -> Iterator[Finding]:

@@ -77,6 +77,9 @@ class FaultMode(ABC):
     """Magnitudes that diagnosis considers, all as likely; None: those that are drawn."""
     signed: ClassVar[bool] = False
     """Whether magnitudes also come with a minus."""
+    down_to_visible: ClassVar[bool] = False
+    """Whether the least magnitude considered is what can be seen of the motor, on robots whose
+    profile states none; `sizes` are then those of a motor that turns through half a turn."""
     misses: ClassVar[tuple[float, float]] = (1.0, 0.0)
     """Of `MISSED` movements, for each unit of magnitude: the probability that the motor stays where
     it stood, and that it stands somewhere on the way."""

@@ -189,6 +189,7 @@ class Backlash(SizedMode):
     mode: ClassVar[str] = "backlash"
     unit = "rad"
     sizes = (0.02, 0.15)
+    down_to_visible = True
     name = "{motor} has play"
     size_words = " of {size:.1f} {unit}"
     mechanisms = ("worn gear teeth", "loose horn screw")
@@ -281,6 +282,7 @@ class SteadyStateError(SizedMode):
     unit = "rad"
     signature = Signature.REDRAWN_OFFSET
     prior_odds = 1.0  # the paper's nine classes are equally many
+    down_to_visible = True
     name = "{motor} misses its targets"
     size_words = " by about {size:.1f} {unit}"
     mechanisms = ("worn position sensor", "slipping horn or gear",
@@ -327,6 +329,7 @@ class EncoderBias(SignedMode):
     mode: ClassVar[str] = "encoder_bias"
     unit = "rad"
     sizes = (0.02, 0.85)
+    down_to_visible = True
     name = "{motor} has a shifted zero"
     size_words = " by {size:+.1f} {unit}"
     mechanisms = ("slipped horn", "moved sensor", "lost calibration")
@@ -381,6 +384,7 @@ class Drift(SignedMode):
     prior_odds = 0.2
     signature = Signature.GROWING_OFFSET
     sizes = (0.005, 0.06)
+    down_to_visible = True
     name = "{motor} drifts"
     size_words = " by {size:+.2f} {unit}"
     mechanisms = ("warming position sensor", "slipping coupling", "failing holding current")

@@ -1,0 +1,130 @@
+"""What arms of a kind are like: the prior of a robot that nobody has calibrated.
+
+Means go into `Settling`, what arms of the kind differ by into `Variation`: constant for one robot,
+so that a diagnosis integrates it as common to all movements. Sag comes from the masses of the URDF:
+a motor yields so far under its own rms load.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from failuretwin.core.config import AtLeastZero, Bounded, Share
+from failuretwin.core.errors import unknown_name
+from failuretwin.digital_model.nonidealities import (
+    Imperfections,
+    LostCommand,
+    Variation,
+)
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.settling import Settling, loads_in_range
+
+GENERIC_NAME = "generic, not calibrated"
+"""What results say of a robot whose healthy behaviour has not been measured."""
+
+
+@dataclass(frozen=True)
+class ArmClass(Bounded):
+    """Typical figures of a kind of arm, every motor alike, and what its arms differ by.
+
+    Attributes:
+        bias_rad: Deviation of a motor's constant error [rad].
+        sag_rad: Yielding under the rms load of a motor, mean and deviation alike [rad].
+        friction_rad: How far a motor stops short, mean [rad].
+        friction_spread_rad: Deviation of that [rad].
+        scatter_rad: Scale of what is left, from movement to movement [rad].
+        tail_dof: Degrees of freedom of that scatter.
+        lost: Share of movements in which one given motor misses its command [-].
+        lost_together: The same of two given motors [-].
+    """
+
+    bias_rad: AtLeastZero
+    sag_rad: AtLeastZero
+    friction_rad: AtLeastZero
+    friction_spread_rad: AtLeastZero
+    scatter_rad: AtLeastZero
+    tail_dof: AtLeastZero
+    lost: Share
+    lost_together: Share
+
+
+ARM_CLASSES: Mapping[str, ArmClass] = {
+    "hobby servo": ArmClass(0.0065, 0.015, 0.007, 0.005, 0.006, 5.0, 0.03, 0.005),
+    "industrial": ArmClass(0.003, 0.001, 0.0003, 0.0003, 0.0004, 4.0, 0.003, 0.0003),
+    "cable-driven": ArmClass(0.02, 0.02, 0.015, 0.01, 0.01, 4.0, 0.01, 0.001),
+}
+"""Figures by class. Hobby servos: what published measurements of such servos agree on (settled
+errors of half a degree to one degree, a twentieth of commands lost on a shared bus), rounded;
+industrial arms: absolute accuracy of joints and repeatability as makers state them; cable-driven:
+assumed, wide. None was fitted to a robot that is judged."""
+LONG_ARM_M = 0.6
+"""Arms that reach farther are taken to be industrial where the profile names no class [m]."""
+
+
+def class_name(robot: Robot) -> str:
+    """Return the class of an arm: that of its profile, else by its reach.
+
+    Raises:
+        InputError: If the profile names one that is not known.
+    """
+    name = robot.profile.arm_class
+    if not name:
+        return "industrial" if robot.reach > LONG_ARM_M else "hobby servo"
+    if name not in ARM_CLASSES:
+        raise unknown_name("arm_class", name, list(ARM_CLASSES))
+    return name
+
+
+def generic_imperfections(robot: Robot) -> Imperfections:
+    """Return what arms of this kind do, for a robot whose own figures have not been measured.
+
+    Raises:
+        InputError: If the profile names a class of arms that is not known.
+    """
+    name = class_name(robot)
+    kind, motors = ARM_CLASSES[name], len(robot.motors)
+    load = np.sqrt(np.mean(loads_in_range(robot, 0.0) ** 2, axis=0))
+    loaded = load > LEAST_LOAD * max(float(load.max()), LEAST_LOAD)
+    compliance = np.where(loaded, kind.sag_rad / np.where(loaded, load, 1.0), 0.0)
+
+    def alike(value: float) -> tuple[float, ...]:
+        return (value,) * motors
+
+    settling = Settling(
+        bias=alike(0.0),
+        compliance=tuple(compliance.tolist()),
+        friction=alike(kind.friction_rad),
+        scatter=alike(kind.scatter_rad),
+        tail_dof=kind.tail_dof,
+        source=f"what arms of the class {name!r} are like, no calibration",
+    )
+    variation = Variation(
+        bias=alike(kind.bias_rad),
+        compliance=alike(1.0),
+        friction=alike(kind.friction_spread_rad),
+    )
+    return Imperfections(
+        GENERIC_NAME,
+        f"class of arm: {name}",
+        settling=settling,
+        lost_commands=_losses(robot, kind),
+        variation=variation,
+    )
+
+
+LEAST_LOAD = 1e-3
+"""Motors whose load is a smaller share of the largest are not loaded [-]."""
+
+
+def _losses(robot: Robot, kind: ArmClass) -> tuple[LostCommand, ...]:
+    """Return the losses of single motors and of every two."""
+    single = [LostCommand((name,), kind.lost, kind.lost) for name in robot.motor_names]
+    pairs = [
+        LostCommand(pair, kind.lost_together, kind.lost_together)
+        for pair in combinations(robot.motor_names, 2)
+    ]
+    return (*single, *pairs)

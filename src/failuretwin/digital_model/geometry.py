@@ -1,0 +1,132 @@
+"""What is known of an arm's geometry beside its URDF: frames, zeros and where its axes really are.
+
+    p_seen = (1 + k) R(rpy) p_base + xyz,     T_pc' = T_pc T(xyz_j, rpy_j) Rot(axis_j, zero_j)
+
+p_base is the tool point in the base link's frame and p_seen what the sensor tells of it [m]; k the
+sensor's scale error [-]. T_pc is the pose of joint j in its parent link as the URDF states it; the
+correction is in the joint's own frame, and the joint then stands at sense * command + zero.
+
+Section: docs/registration.md#what-the-profile-says
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+
+from failuretwin.core.config import AtLeastZero, Bounded, Bounds
+from failuretwin.core.types import FloatArray
+from failuretwin.digital_model.kinematics import SerialChain, rotation_to_z
+from failuretwin.digital_model.urdf import Triple, Urdf, UrdfJoint, transform
+
+NO_OFFSET = (0.0, 0.0, 0.0)
+NOT_MOVED = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+Pose = tuple[float, float, float, float, float, float]
+"""x, y, z [m], roll, pitch, yaw [rad]: turned about the fixed axes x, y, z, in this order."""
+
+
+@dataclass(frozen=True)
+class JointCorrection:
+    """How a joint differs from what the URDF states.
+
+    Attributes:
+        joint: Its name in the URDF.
+        zero: Angle of the URDF where commands say 0 [rad], or place [m].
+        xyz: Where its frame really is, in the frame that the URDF states [m].
+        rpy: How it is turned there [rad].
+    """
+
+    joint: str
+    zero: float = 0.0
+    xyz: Triple = NO_OFFSET
+    rpy: Triple = NO_OFFSET
+
+    def apply(self, joint: UrdfJoint) -> UrdfJoint:
+        """Return the joint as it really is; its limits are those of what is commanded."""
+        T = joint.T_pc @ transform(self.xyz, self.rpy)
+        moved = np.eye(4)
+        if joint.type == "prismatic":
+            moved[:3, 3] = self.zero * np.asarray(joint.axis)
+        else:
+            moved[:3, :3] = turned_about(joint.axis, self.zero)
+        low, high = joint.low - self.zero, joint.high - self.zero
+        return replace(joint, T_pc=T @ moved, low=low, high=high)
+
+
+@dataclass(frozen=True)
+class Geometry(Bounded):
+    """What was fitted of an arm and its sensor beside frames and tool point.
+
+    Attributes:
+        joints: Joints that differ from the URDF.
+        sensor_scale: Length that the sensor tells of a metre, 1 + k [-].
+        sensor_noise_m: What it leaves unexplained on each axis, a standard deviation [m]; 0: not
+            known.
+        source: Where the figures come from.
+    """
+
+    joints: tuple[JointCorrection, ...] = ()
+    sensor_scale: Annotated[float, Bounds(0.5, 2.0)] = 1.0
+    sensor_noise_m: AtLeastZero = 0.0
+    source: str = ""
+
+    def apply(self, urdf: Urdf) -> Urdf:
+        """Return the URDF with its joints where they really are.
+
+        Raises:
+            InputError: If it has no such joint.
+        """
+        return urdf.with_joints({c.joint: c.apply for c in self.joints})
+
+
+AS_STATED = Geometry()
+"""The arm is as its URDF states it."""
+
+
+def with_tool(chain: SerialChain, tool_xyz: Triple) -> SerialChain:
+    """Return the chain to a tool point given in the frame of the tool link [m]."""
+    if tool_xyz == NO_OFFSET:
+        return chain
+    return replace(chain, T_jt=chain.T_jt @ transform(tool_xyz, NO_OFFSET))
+
+
+def seen_chain(chain: SerialChain, base_xyz_rpy: Pose, scale: float = 1.0) -> SerialChain:
+    """Return the chain whose tool point is what the sensor tells, in the frame of the sensor.
+
+    Args:
+        chain: The chain from the base link; with joints that slide its scale must be 1.
+        base_xyz_rpy: Pose of the base link in the frame of the sensor.
+        scale: Length that the sensor tells of a metre.
+    """
+    if base_xyz_rpy == NOT_MOVED and scale == 1.0:
+        return chain
+    first, *others = (replace(joint, T_pj=_scaled(joint.T_pj, scale)) for joint in chain.joints)
+    x, y, z, roll, pitch, yaw = base_xyz_rpy
+    first = replace(first, T_pj=transform((x, y, z), (roll, pitch, yaw)) @ first.T_pj)
+    return SerialChain((first, *others), _scaled(chain.T_jt, scale))
+
+
+def _scaled(T: FloatArray, scale: float) -> FloatArray:
+    T = T.copy()
+    T[:3, 3] *= scale
+    return T
+
+
+def turned_about(axis: Triple, angle: float) -> FloatArray:
+    """Return the rotation (3, 3) about a unit vector by an angle [rad]."""
+    frame = rotation_to_z(axis)
+    return np.asarray(frame @ transform(NO_OFFSET, (0.0, 0.0, angle))[:3, :3] @ frame.T)
+
+
+def roll_pitch_yaw(R: FloatArray) -> Triple:
+    """Return the angles of a rotation (3, 3) as a URDF has them [rad]."""
+    pitch = float(np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0])))
+    if np.hypot(R[0, 0], R[1, 0]) < 1e-12:  # roll and yaw are about one axis: all is roll
+        return float(np.arctan2(-R[1, 2], R[1, 1])), pitch, 0.0
+    return (
+        float(np.arctan2(R[2, 1], R[2, 2])),
+        pitch,
+        float(np.arctan2(R[1, 0], R[0, 0])),
+    )

@@ -1,0 +1,112 @@
+"""Which link of a URDF carries the tool: by its name first, never a finger, a camera or an IMU."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from failuretwin.digital_model.urdf import Urdf
+
+TOOL_NAMES = (
+    r"tool0",
+    r"tcp|tool_?cent(er|re)_?point",
+    r"end_?effector|eef|ee",
+    r"tool|tip",
+    r"gripper|hand",
+    r"flange",
+)
+"""Names of links that carry a tool, the surest first; a name counts where it stands as a word."""
+BESIDE = r"finger|jaw|knuckle|thumb|pad|camera|cam|optical|imu|lidar|laser|sensor|marker|inertial"
+"""Names of what hangs on a hand and is no tool."""
+OWN_MOTORS = 2
+"""Motors of its own from which another branch is an arm and no finger."""
+
+
+@dataclass(frozen=True)
+class ToolChoice:
+    """Which link carries the tool.
+
+    Attributes:
+        link: The link; empty where no link can be chosen.
+        candidates: Links that could carry it, the best first, with their motors.
+        unclear: Whether nothing speaks for the first rather than for the others.
+    """
+
+    link: str
+    candidates: dict[str, int]
+    unclear: bool = False
+
+
+def choose_tool(urdf: Urdf, base: str) -> ToolChoice:
+    """Return which link carries the tool.
+
+    Args:
+        urdf: The robot.
+        base: Link that carries the base frame.
+    """
+    ends = {name: count for name, count in urdf.tools(base).items() if not is_beside(name)}
+    named = _named(urdf, base)
+    if named:
+        return ToolChoice(named[0], _counts(urdf, base, named), _on_other_arms(urdf, base, named))
+    if not ends:
+        ends = _before_fingers(urdf, base)
+    links = list(ends)
+    link = links[0] if links else base
+    return ToolChoice(link, ends, _on_other_arms(urdf, base, links))
+
+
+def is_beside(link: str) -> bool:
+    """Return whether a link is named like something that hangs on a hand and is no tool."""
+    return bool(_word(BESIDE, link))
+
+
+def _word(pattern: str, link: str) -> bool:
+    """Return whether a word of a name, which may be numbered or prefixed, is of a pattern."""
+    spaced = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", link).lower()
+    return bool(re.search(rf"(^|[_/.\-\s]|left|right)({pattern})s?\d*([_/.\-\s]|$)", spaced))
+
+
+def _named(urdf: Urdf, base: str) -> list[str]:
+    """Return links with the surest name that moving joints carry, most motors first."""
+    counts = {link: sum(joint.has_motor for joint in way) for link, way in urdf.ways(base).items()}
+    for pattern in TOOL_NAMES:
+        links = [
+            link
+            for link, count in counts.items()
+            if count and _word(pattern, link) and not is_beside(link)
+        ]
+        if links:
+            most = max(counts[link] for link in links)
+            links = [link for link in links if counts[link] == most]
+            return sorted(links, key=lambda link: (-len(urdf.path(base, link)), link))
+    return []
+
+
+def _counts(urdf: Urdf, base: str, links: list[str]) -> dict[str, int]:
+    return {link: sum(j.has_motor for j in urdf.path(base, link)) for link in links}
+
+
+def _on_other_arms(urdf: Urdf, base: str, links: list[str]) -> bool:
+    """Return whether another candidate hangs on motors of its own, as the first one does."""
+    movers = [{j.name for j in urdf.path(base, link) if j.has_motor} for link in links]
+    return any(
+        len(other - movers[0]) >= OWN_MOTORS and len(movers[0] - other) >= OWN_MOTORS
+        for other in movers[1:]
+    )
+
+
+def _before_fingers(urdf: Urdf, base: str) -> dict[str, int]:
+    """Return the last links before whatever hangs on them, where all ends are no tools."""
+    counts: dict[str, int] = {}
+    for link in urdf.tools(base):
+        for joint in reversed(urdf.path(base, link)):
+            if not is_beside(joint.parent):
+                counts |= _counts(urdf, base, [joint.parent])
+                break
+    length = {
+        link: sum(float(np.linalg.norm(j.T_pc[:3, 3])) for j in urdf.path(base, link))
+        for link in counts
+    }
+    return {link: counts[link] for link in sorted(counts, key=lambda k: (-counts[k], -length[k]))}
