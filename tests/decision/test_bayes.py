@@ -12,8 +12,7 @@ from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.inference import diagnoser as bayes
-from failuretwin.inference import fault_models as steady_state_error
-from failuretwin.inference import stuck
+from failuretwin.inference import fault_sizes, stuck
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.priors import Priors, priors_of
 from failuretwin.inference.run_likelihood import RunLikelihood
@@ -201,7 +200,7 @@ def test_finer_quadrature_changes_no_posterior(monkeypatch, twin, few, onset_s):
     diagnoser = BayesDiagnoser(twin, priors=priors_of(twin.robot, None, onset_s))
     coarse = posteriors(diagnoser.diagnose(few))
     monkeypatch.setattr(stuck, "COARSE_NODES", 601)
-    monkeypatch.setattr(steady_state_error, "ERROR_NODES", 150)
+    monkeypatch.setattr(fault_sizes, "ERROR_NODES", 150)
     monkeypatch.setattr(bayes, "CHUNK_RUNS", 3)
     np.testing.assert_allclose(posteriors(diagnoser.diagnose(few)), coarse, atol=0.02)
 
@@ -250,7 +249,9 @@ def test_wrong_onset_misleads(twin, imperfect, diagnoses):
 
 
 def test_ranges_of_errors_are_in_servo_units(armpi):
-    assert priors_of(armpi, (5, 20), None).error_ranges == ((5 * COUNT, 20 * COUNT),)
+    each = ((5 * COUNT, 20 * COUNT),)
+    expected = {"motor_1": each, "motor_2": each, "motor_3": each, "motor_4": each}
+    assert priors_of(armpi, (5, 20), None).error_ranges == expected
     assert priors_of(armpi, None, 1.5).onset.known_s == 1.5
     assert priors_of(armpi, None, None) == Priors()
 

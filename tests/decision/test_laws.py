@@ -14,11 +14,10 @@ from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.fault_models import (
     growing_offset_model,
     offset_model,
-    offset_nodes,
     redrawn_offset_model,
-    size_nodes,
     transient_model,
 )
+from failuretwin.inference.fault_sizes import redrawn_nodes, size_nodes
 from failuretwin.inference.posterior import (
     marginal_likelihood_of,
     marginal_likelihoods,
@@ -38,15 +37,19 @@ FAULT_MODELS = {
     "steady_state_error": lambda likelihood, early: redrawn_offset_model(
         likelihood, 1, MODES["steady_state_error"], RANGES, early
     ),
-    "drift": lambda likelihood, early: growing_offset_model(likelihood, 1, MODES["drift"], early),
+    "drift": lambda likelihood, early: growing_offset_model(
+        likelihood, 1, MODES["drift"], [(0.005, 0.06)], early
+    ),
     **{
         name: lambda likelihood, early, mode=MODES[name]: transient_model(
-            likelihood, 1, mode, early
+            likelihood, 1, mode, [mode.considered], early
         )
         for name in ("lag", "slow")
     },
     **{
-        name: lambda likelihood, early, mode=MODES[name]: offset_model(likelihood, 1, mode, early)
+        name: lambda likelihood, early, mode=MODES[name]: offset_model(
+            likelihood, 1, mode, [mode.considered], early
+        )
         for name in ("encoder_bias", "encoder_scale", "backlash", "torque_loss")
     },
 }
@@ -81,7 +84,7 @@ def test_prior_mass_of_a_law_is_one(likelihood, fault_model, early):
     mass = np.exp(found.log_prior).sum(axis=(1, 2))
     np.testing.assert_allclose(mass, 1.0, atol=1e-9)
     if found.redrawn is not None:
-        np.testing.assert_allclose(np.exp(found.redrawn).sum(axis=1), 1.0, atol=1e-12)
+        np.testing.assert_allclose(np.exp(found.redrawn).sum(axis=-1), 1.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("fault_model", FAULT_MODELS)
@@ -137,9 +140,9 @@ def test_sizes_are_as_likely_wherever_the_nodes_lie(seed, sizes, signed):
     is a straight line on each side of zero."""
     rng = np.random.default_rng(seed)
     best, width = rng.normal(0.0, 0.6, (2, 5)), rng.uniform(1e-4, 0.2, (2, 5))
-    nodes, log_mass = size_nodes(best, width, rng.random((2, 5)) < 0.7, sizes, signed)
+    nodes, log_mass = size_nodes(best, width, rng.random((2, 5)) < 0.7, [sizes], signed)
     low, high = sizes
-    for node, mass in zip(nodes, np.exp(log_mass), strict=True):
+    for node, mass in zip(nodes, np.exp(log_mass[:, 0]), strict=True):
         assert mass.sum() == pytest.approx(1.0)
         assert (np.diff(node) >= 0.0).all()
         assert node[mass > 0.0].min() >= (-high if signed else low) - 1e-12
@@ -152,17 +155,21 @@ def test_sizes_are_as_likely_wherever_the_nodes_lie(seed, sizes, signed):
             assert mass[node > 0.0].sum() == pytest.approx(0.5, abs=1e-9)
 
 
-@pytest.mark.parametrize("ranges", [RANGES, ((0.1, 0.3),), ((0.01, 0.02), (0.3, 0.35))])
-def test_errors_are_as_likely_within_each_range(ranges):
-    size, log_weight = offset_nodes(ranges)
-    weights = np.exp(log_weight)
-    np.testing.assert_allclose(weights @ size, 0.0, atol=1e-12)
-    for (low, high), weight in zip(ranges, weights, strict=True):
-        step = np.ptp(np.abs(size)) / 35
-        mean = weight @ np.abs(size)
-        assert mean == pytest.approx(0.5 * (low + high), abs=step)
-        inside = (np.abs(size) > low - step) & (np.abs(size) < high + step)
-        assert weight[inside].sum() == pytest.approx(1.0)
+@pytest.mark.parametrize("least", [1e-4, 1.0])
+@pytest.mark.parametrize(
+    "ranges", [RANGES, ((0.1, 0.3),), ((0.01, 0.02), (0.3, 0.35)), ((5e-4, 0.003), (0.2, 0.9))]
+)
+def test_errors_are_as_likely_within_each_range(ranges, least):
+    best, usable = np.array([[0.15, -0.013]]), np.array([[True, True]])
+    size, log_mass = redrawn_nodes(best, np.full((1, 2), 0.001), usable, ranges, least)
+    for sizes, weights in zip(size[0], np.exp(log_mass[0]), strict=True):
+        np.testing.assert_allclose(weights.sum(axis=1), 1.0)
+        np.testing.assert_allclose(weights[:, sizes > 0.0].sum(axis=1), 0.5)
+        step = np.diff(sizes).max()
+        for (low, high), weight in zip(ranges, weights, strict=True):
+            assert weight @ np.abs(sizes) == pytest.approx(0.5 * (low + high), abs=step)
+            inside = (np.abs(sizes) > low - step) & (np.abs(sizes) < high + step)
+            assert weight[inside].sum() == pytest.approx(1.0)
 
 
 def test_a_motor_that_lost_torque_sags_as_its_stiffness_is_left():
@@ -173,7 +180,7 @@ def test_a_motor_that_lost_torque_sags_as_its_stiffness_is_left():
 
 
 def test_drifts_of_all_rates_and_both_signs_are_as_likely(likelihood):
-    fault_model = growing_offset_model(likelihood, 0, MODES["drift"], 0.6)
+    fault_model = growing_offset_model(likelihood, 0, MODES["drift"], [(0.005, 0.06)], 0.6)
     mass = np.exp(fault_model.log_prior[0]).sum(axis=0)
     low, high = 0.005, 0.06
     size = fault_model.size[0]
@@ -187,9 +194,10 @@ def test_drifts_of_all_rates_and_both_signs_are_as_likely(likelihood):
 def test_offsets_are_those_of_the_simulated_motion(likelihood, mode):
     """What a mode says of its offset is what its stages do to a motor that stands at its target."""
     said, alone = MODES[mode], likelihood[3]
+    sizes = [said.considered]
     found = type("Asked", (type(said),), {"settled_offset": FaultMode.settled_offset})()
     model = growing_offset_model if mode == "drift" else offset_model
-    expected, asked = model(alone, 1, said, 0.3), model(alone, 1, found, 0.3)
+    expected, asked = model(alone, 1, said, sizes, 0.3), model(alone, 1, found, sizes, 0.3)
     np.testing.assert_allclose(asked.angle, expected.angle, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(asked.size, expected.size, rtol=0.0, atol=1e-9)
 
@@ -203,7 +211,7 @@ def test_an_offset_that_bends_with_its_size_is_asked_at_every_node(likelihood):
 
     kind = {"mode": "end_stop", "on_reference": stops, "sizes": (0.3, 0.95)}
     stop = type("EndStop", (type(MODES["slow"]),), {**kind, "on_movements": FaultMode.on_movements})
-    found = offset_model(likelihood, 1, stop(), 0.3)
+    found = offset_model(likelihood, 1, stop(), [stop().considered], 0.3)
     base = likelihood.outcomes.base[..., 1][:, :, None]
     limit = np.deg2rad(80.0) * (1.0 - found.size[:, None, :, None])
     settled = likelihood.profile(1).faulty_baseline[:, :, None]

@@ -44,6 +44,7 @@ def test_a_healthy_slide_has_the_density_of_student(run_on):
 # Off by an amount of its own in each movement.
 
 COUNT_RAD = np.deg2rad(0.24)
+CONSIDERED = {name: [mode.considered] for name, mode in MODES.items()}
 USUAL_RANGES = tuple((k * COUNT_RAD, 5 * k * COUNT_RAD) for k in (4, 7, 10))
 
 
@@ -135,7 +136,10 @@ def test_a_constant_error_has_the_evidence_of_all_sizes(run_on, bias, first):
     likelihood, brute = run_on(TARGETS, stands)
     size, chance = uniform(0.02, 0.85, signed=True)
     found = told(
-        marginal_likelihood(likelihood, offset_model(likelihood, 0, MODES["encoder_bias"], 0.9))
+        marginal_likelihood(
+            likelihood,
+            offset_model(likelihood, 0, MODES["encoder_bias"], CONSIDERED["encoder_bias"], 0.9),
+        )
     )
     expected = lasting_by_force(brute, np.tile(size, (4, 1)), chance)
     assert found == pytest.approx(expected, abs=0.06)
@@ -147,7 +151,10 @@ def test_a_wrong_scale_has_the_evidence_of_all_sizes(run_on, scale):
     likelihood, brute = run_on(TARGETS, np.multiply(TARGETS, 1.0 + scale))
     size, chance = uniform(0.03, 0.75, signed=True)
     found = told(
-        marginal_likelihood(likelihood, offset_model(likelihood, 0, MODES["encoder_scale"], 0.9))
+        marginal_likelihood(
+            likelihood,
+            offset_model(likelihood, 0, MODES["encoder_scale"], CONSIDERED["encoder_scale"], 0.9),
+        )
     )
     assert found == pytest.approx(
         lasting_by_force(brute, np.multiply.outer(TARGETS, size), chance), abs=0.03
@@ -162,7 +169,9 @@ def test_play_has_the_evidence_of_all_sizes(run_on, play):
     size, chance = uniform(0.02, 0.15, signed=False)
     offsets = np.multiply.outer(-0.5 * direction, size)
     found = told(
-        marginal_likelihood(likelihood, offset_model(likelihood, 0, MODES["backlash"], 0.9))
+        marginal_likelihood(
+            likelihood, offset_model(likelihood, 0, MODES["backlash"], CONSIDERED["backlash"], 0.9)
+        )
     )
     assert found == pytest.approx(lasting_by_force(brute, offsets, chance), abs=0.03)
 
@@ -186,14 +195,19 @@ def test_a_drift_has_the_evidence_of_all_rates_and_onsets(run_on, rate, onset_s)
             says = brute.from_on(first, places) @ chance[::20] * 20
             total += weight * brute.before(first) * says
     found = told(
-        marginal_likelihood(likelihood, growing_offset_model(likelihood, 0, MODES["drift"], 0.9))
+        marginal_likelihood(
+            likelihood,
+            growing_offset_model(likelihood, 0, MODES["drift"], CONSIDERED["drift"], 0.9),
+        )
     )
     assert found == pytest.approx(np.log(total), abs=0.1 if onset_s == 0.0 else 0.7)
 
 
 def test_a_drift_may_begin_at_any_time(run_on):
     """One in ten begin in the run, evenly up to where the last movement is seen at rest."""
-    fault_model = growing_offset_model(run_on(TARGETS, TARGETS)[0], 0, MODES["drift"], 0.9)
+    fault_model = growing_offset_model(
+        run_on(TARGETS, TARGETS)[0], 0, MODES["drift"], CONSIDERED["drift"], 0.9
+    )
     onset, part = fault_model.onsets(0)
     share = np.exp(fault_model.log_prior[0])[..., None] * part
     end = settled_middles()[-1]
@@ -214,7 +228,9 @@ def test_a_slow_motor_gets_as_far_as_its_time_goes(run_on, share, done):
         stands.append(here)
     likelihood, brute = run_on(TARGETS, stands)
     size = (
-        marginal_likelihood(likelihood, transient_model(likelihood, 0, MODES["slow"], 0.9))
+        marginal_likelihood(
+            likelihood, transient_model(likelihood, 0, MODES["slow"], CONSIDERED["slow"], 0.9)
+        )
         .estimate(0)
         .size
     )
@@ -229,7 +245,9 @@ def test_a_slow_motor_gets_as_far_as_its_time_goes(run_on, share, done):
         for first, chance in enumerate(first_affected(STARTS_S)):
             expected[k] += chance * brute.before(first) * brute.from_on(first, np.array(places))
     found = told(
-        marginal_likelihood(likelihood, transient_model(likelihood, 0, MODES["slow"], 0.9))
+        marginal_likelihood(
+            likelihood, transient_model(likelihood, 0, MODES["slow"], CONSIDERED["slow"], 0.9)
+        )
     )
     assert found == pytest.approx(np.log(expected.mean()), abs=1e-3)
     np.testing.assert_allclose(

@@ -91,10 +91,8 @@ def test_modes_have_their_own_share_before_the_run():
 
 
 def test_usual_beliefs():
-    """Counts of 0.24 deg: 4 to 20, 7 to 35, 10 to 50."""
-    count = np.deg2rad(0.24)
-    expected = [(4 * count, 20 * count), (7 * count, 35 * count), (10 * count, 50 * count)]
-    np.testing.assert_allclose(Priors().error_ranges, expected)
+    """Sizes of errors come from the robot."""
+    assert Priors().error_ranges is None
     assert (Priors().healthy_odds, MONITORING.healthy_odds) == (1.0, 30.0)
     assert (Priors().onset.free, Priors().onset.known_s) == (0.2, None)
 

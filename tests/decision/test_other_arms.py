@@ -11,11 +11,11 @@ from small_arms import GANTRY, SCARA, small_twin
 from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
 from failuretwin.core.hypothesis import UNKNOWN, paper_hypotheses, single_faults
 from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import (
     NO_IMPERFECTIONS,
     Readings,
-    generic_imperfections,
 )
 from failuretwin.failure_behavior.modes import SteadyStateError
 from failuretwin.failure_behavior.random_movements import RandomMovements
@@ -126,7 +126,7 @@ def test_a_slide_is_where_the_tool_is(gantry, run_of):
 
 def test_reach_is_that_of_links_and_slides(gantry, scara):
     def reach(twin):
-        return HealthyModel(twin, NO_IMPERFECTIONS).reach
+        return twin.robot.reach
 
     assert reach(gantry) == pytest.approx(0.3 + 0.4 + 0.5)
     assert reach(scara) == pytest.approx(0.2 + 0.3 + 0.25 + 0.2)

@@ -30,15 +30,17 @@ from failuretwin.inference.explanation import worded
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.posterior import (
     check_diagnosable,
-    compute_posterior,
     shows_in_transients,
 )
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.shared_posterior import set_up_in_doubt, shared_posterior
 
 if TYPE_CHECKING:
     import xarray as xr
 
+JUDGED_RUNS = 32
+"""So many runs of a set, evenly spread, tell whether its set-up may be off."""
 CHUNK_RUNS = 64
 """Runs of five movements at a time: keeps the work on nodes in about 100 MB."""
 
@@ -154,12 +156,17 @@ class BayesDiagnoser:
         faults = truth_of(runs)
         truth: list[str | None] = [None] * len(names) if faults is None else list(faults)
         results = []
+        some = np.unique(np.linspace(0, len(names) - 1, JUDGED_RUNS).astype(np.int64))
+        sample = RunLikelihood(evidence[some], self.healthy_model)
+        in_doubt = set_up_in_doubt(sample, self.hypothesis_set, self.priors)
         chunk = _runs_at_a_time(evidence.movements.start.shape[1])
         for first in range(0, len(names), chunk):
             rows = slice(first, first + chunk)
             way = None if moving is None else moving[rows]
             likelihood = RunLikelihood(evidence[rows], self.healthy_model, way)
-            posterior_of_runs = compute_posterior(likelihood, self.hypothesis_set, self.priors)
+            posterior_of_runs = shared_posterior(
+                likelihood, self.hypothesis_set, self.priors, in_doubt
+            )
             for at in range(len(names))[rows]:
                 results.append(
                     posterior_of_runs.to_diagnosis(

@@ -6,19 +6,27 @@ Section: docs/diagnosis.md#posterior-estimates-and-abstention
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from failuretwin.core.hypothesis import Diagnosis, Fault, Hypothesis, MovementEvidence
+from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.wrong_setup import NOWHERE
 
 SURE = 0.95
 """Posterior mass that the hypotheses named as possible hold together."""
 TELLING_NATS = 1.0
 """Evidence of a movement worth telling [nats]: it changes the odds by a factor of 2.7."""
+
+WRONG_SETUP_ADVICE = (
+    "Put right what the verdict names, or check that the log is of this robot, and diagnose the "
+    "same log again."
+)
 
 
 def percent(probability: float) -> str:
@@ -43,6 +51,27 @@ def worded(
         verdict=verdict(diagnosis, ranked),
         explanation=explanation(diagnosis, ranked, losses),
     )
+
+
+COUNTED_MOTOR = re.compile(r"motor_\d+")
+COUNTED_JOINT = re.compile(r"(.*_)?(joint|axis|j|a)_?\d+")
+"""Names of motors and joints that only count them."""
+
+
+def with_joint_names(diagnosis: Diagnosis, robot: Robot) -> Diagnosis:
+    """Return a diagnosis whose verdict names the joint of each motor that has but a number.
+
+    Args:
+        diagnosis: With its verdict in words.
+        robot: The robot; joints of it that are only counted say nothing more.
+    """
+    text = diagnosis.verdict
+    for motor in robot.motors:
+        if COUNTED_MOTOR.fullmatch(motor.name) and not COUNTED_JOINT.fullmatch(motor.joint.lower()):
+            plain = motor.joint.removesuffix("_joint").replace("_", " ")
+            name = motor.name.replace("_", " ")
+            text = re.sub(rf"\b{name}\b", f"{name} ({plain})", text, count=1)
+    return replace(diagnosis, verdict=text)
 
 
 def plain_name(hypothesis: Hypothesis) -> str:
@@ -86,6 +115,7 @@ _TOLD_UNITS = {
     "rad": (180.0 / math.pi, "deg"),
     "rad/s": (180.0 / math.pi, "deg/s"),
     "m": (1e3, "mm"),
+    "m/s": (1e3, "mm/s"),
     "ratio": (1e2, "%"),
 }
 """Factor to the unit that people read, and its name, by unit; any other is told as it is."""
@@ -98,19 +128,20 @@ def _size_and_onset(diagnosis: Diagnosis, hypothesis: Hypothesis) -> str:
         return since if onset else ""
     fault, size = hypothesis.faults[0], diagnosis.magnitude
     told = onset or MODES.find(fault.mode).signature is Signature.HELD
-    return size_words(fault, size) + (since if told else "")
+    return size_words(fault, size, diagnosis.magnitude_unit) + (since if told else "")
 
 
-def size_words(fault: Fault, size: float) -> str:
+def size_words(fault: Fault, size: float, unit: str | None = None) -> str:
     """Return the size of a fault as it is told behind its name, such as `` by about 2.4 deg``.
 
     Args:
         fault: Of any known mode.
-        size: Its magnitude, in the unit of its mode.
+        size: Its magnitude.
+        unit: Its unit; None: that of its mode. Of a joint that slides, m where that has rad.
     """
     mode = MODES.find(fault.mode)
-    factor, unit = _TOLD_UNITS.get(mode.unit, (1.0, mode.unit))
-    return mode.size_words.format(size=factor * size, unit=unit)
+    factor, told = _TOLD_UNITS.get(unit or mode.unit, (1.0, unit or mode.unit))
+    return mode.size_words.format(size=factor * size, unit=told)
 
 
 def possible_hypotheses(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> Sequence[Hypothesis]:
@@ -129,6 +160,8 @@ def explanation(
         ranked: Its hypotheses from the most to the least probable.
         losses: Commands that seem not to have arrived.
     """
+    if NOWHERE in diagnosis.undecided:
+        return (WRONG_SETUP_ADVICE,)
     if diagnosis.undecided:
         return ("Log again, for five movements or more, with the tool in view while it rests.",)
     lines = list(_evidence_lines(diagnosis.evidence, ranked))

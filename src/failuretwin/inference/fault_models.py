@@ -3,7 +3,7 @@
 The mode itself says where the motor settles, or how its way changes; what remains is to place
 nodes where the movements point, and to give each its prior.
 
-    phi(z) = where it settles + settled_offset(z)    weights of z: the trapezoidal rule
+    phi(z) = where it settles + settled_offset(z)    weights of z: prior mass nearest to it
 
 Section: docs/diagnosis.md#fault-models-where-each-fault-puts-its-motor
 """
@@ -14,63 +14,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from failuretwin.core.numerics import log_of, log_sum, log_trapezoid_weights, weighted_quantiles
-from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.core.numerics import log_of, log_sum, weighted_quantiles
+from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.settling import sag
 from failuretwin.failure_behavior.fault import Arrival
-from failuretwin.failure_behavior.mode import FaultMode, Range
+from failuretwin.failure_behavior.mode import FaultMode, Range, Signature
+from failuretwin.inference.fault_sizes import redrawn_nodes, size_nodes
 from failuretwin.inference.joint_likelihood import JointLikelihood
 from failuretwin.inference.marginal import FaultModel
 from failuretwin.inference.priors import immediate, next_movement
 from failuretwin.inference.run_likelihood import RunLikelihood
-
-# Nodes of an unknown that holds for the whole run: dense where a movement may point.
-
-LOCAL_STEPS = np.array([-8, -5, -3.5, -2.5, -1.75, -1, -0.5, 0, 0.5, 1, 1.75, 2.5, 3.5, 5, 8.0])
-"""Nodes around the value that a movement points to, in its own standard deviations."""
-COARSE_NODES = 41
-"""Nodes spread evenly over the range of sizes, on each side of zero."""
-
-
-def nodes_around(
-    best: FloatArray, width: FloatArray, usable: BoolArray, otherwise: float
-) -> FloatArray:
-    """Return nodes around the value that each movement points to, (run, node).
-
-    Args:
-        best: That value, (run, movement).
-        width: Its standard deviation, (run, movement).
-        usable: Movements that point anywhere, (run, movement).
-        otherwise: What the others give.
-    """
-    nodes = best[..., None] + width[..., None] * LOCAL_STEPS
-    return np.where(usable[..., None], nodes, otherwise).reshape(len(best), -1)
-
-
-def size_nodes(
-    best: FloatArray, width: FloatArray, usable: BoolArray, sizes: tuple[float, ...], signed: bool
-) -> tuple[FloatArray, FloatArray]:
-    """Return magnitudes of a fault, sorted, and the log of their prior, (run, node) each.
-
-    Args:
-        best: Magnitude that each movement points to, (run, movement).
-        width: Its standard deviation, (run, movement).
-        usable: Movements that point anywhere, (run, movement).
-        sizes: Lowest and highest magnitude, all between as likely.
-        signed: Whether they come with a minus too.
-    """
-    low, high = sizes
-    grid = np.linspace(low, high, COARSE_NODES)
-    if signed:
-        grid = np.concatenate([-grid, grid])
-    local = nodes_around(best, width, usable, low)
-    coarse = np.broadcast_to(grid, (len(best), len(grid)))
-    nodes = np.concatenate([local, coarse], axis=1)
-    side = np.where(signed & (nodes < 0.0), -1.0, 1.0)
-    nodes = np.sort(side * np.clip(side * nodes, low, high), axis=1)
-    # Both sides moved together: what lies between the lowest sizes has no mass.
-    mass = log_trapezoid_weights(nodes - np.sign(nodes) * low)
-    return nodes, mass - log_sum(mass, axis=1)[:, None]
 
 
 def pointed(
@@ -89,7 +42,11 @@ LONG_S = 10.0
 
 
 def offset_model(
-    likelihood: RunLikelihood, motor: int, mode: FaultMode, prior_before_run: float
+    likelihood: RunLikelihood,
+    motor: int,
+    mode: FaultMode,
+    ranges: Sequence[Range],
+    prior_before_run: float,
 ) -> FaultModel:
     """Return the fault model of a fault whose offset is decided by one size, from its onset on.
 
@@ -97,32 +54,43 @@ def offset_model(
         likelihood: The runs.
         motor: Index of the motor.
         mode: Its mode.
+        ranges: Ranges of the size, equally likely.
         prior_before_run: Probability that the fault was there before the run.
     """
     profile = likelihood.profile(motor)
     arrival = _arrival(likelihood, motor, mode, np.array(LONG_S))
     gain = _gain(mode, arrival)
-    settled = profile.faulty_baseline
-    amount, width = pointed(profile, settled[..., 0], gain[..., 0])
-    amount = np.clip(amount, -1e3, 1e3)
-    best = mode.size_of(amount if mode.signed else np.maximum(amount, 0.0))
-    size, log_size = size_nodes(
-        best,
-        width / _slope(mode, best),
-        profile.usable & (np.abs(gain[..., 0]) > 1e-9),
-        mode.considered,
-        mode.signed,
-    )
+    best, width = _best_sizes(mode, profile, gain[..., 0])
+    usable = profile.usable & (np.abs(gain[..., 0]) > 1e-9)
+    size, log_size = size_nodes(best, width, usable, ranges, mode.signed)
+    log_size = log_sum(log_size, axis=1) - np.log(len(ranges))
     stretches = immediate(likelihood.evidence)
     return FaultModel(
         motor=motor,
         held=False,
-        angle=settled[:, :, None] + _offset(mode, size, arrival, gain),
+        angle=profile.faulty_baseline[:, :, None] + _offset(mode, size, arrival, gain),
         log_prior=log_of(stretches.weights(prior_before_run))[..., None] + log_size[:, None],
         size=size,
         onsets=stretches.onsets(prior_before_run),
         gain=gain,
     )
+
+
+def _best_sizes(
+    mode: FaultMode, profile: JointLikelihood, gain: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the size that each movement points to and its deviation, (run, movement).
+
+    Args:
+        mode: The mode.
+        profile: What the movements say of the motor.
+        gain: Offset for each unit of amount, (run, movement) [rad].
+    """
+    amount, width = pointed(profile, profile.faulty_baseline[..., 0], gain)
+    amount = np.clip(amount, -1e3, 1e3)
+    both = mode.signed or mode.signature is Signature.REDRAWN_OFFSET
+    best = mode.size_of(amount if both else np.maximum(amount, 0.0))
+    return best, width / _slope(mode, best)
 
 
 def _arrival(
@@ -200,7 +168,11 @@ WITHIN = np.linspace(-0.4, 0.4, 5) / CELLS
 
 
 def growing_offset_model(
-    likelihood: RunLikelihood, motor: int, mode: FaultMode, prior_before_run: float
+    likelihood: RunLikelihood,
+    motor: int,
+    mode: FaultMode,
+    ranges: Sequence[Range],
+    prior_before_run: float,
 ) -> FaultModel:
     """Return the fault model of a fault whose offset grows from an unknown onset on.
 
@@ -208,11 +180,12 @@ def growing_offset_model(
         likelihood: The runs.
         motor: Index of the motor.
         mode: Its mode.
+        ranges: Ranges of the rate, equally likely.
         prior_before_run: Probability that it grows from the start of the run.
     """
     middle = np.nan_to_num(0.5 * (likelihood.evidence.begin + likelihood.evidence.end))
     settled = likelihood.profile(motor).faulty_baseline
-    rate, log_rate = _rates(likelihood, motor, mode, settled, middle)
+    rate, log_rate = _rates(likelihood, motor, mode, ranges, middle)
     stretches = immediate(likelihood.evidence)
     onset, share = stretches.samples(prior_before_run, ONSETS)  # (run, movement, onset)
     log_onset = log_of(stretches.weights(prior_before_run)[..., None] * share)
@@ -247,7 +220,11 @@ def growing_offset_model(
 
 
 def _rates(
-    likelihood: RunLikelihood, motor: int, mode: FaultMode, settled: FloatArray, since: FloatArray
+    likelihood: RunLikelihood,
+    motor: int,
+    mode: FaultMode,
+    ranges: Sequence[Range],
+    since: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Return rates, sorted, and the log of their prior, (run, rate) each.
 
@@ -257,18 +234,19 @@ def _rates(
         likelihood: The runs.
         motor: Index of the motor.
         mode: Its mode.
-        settled: Where it settles apart from what has grown, (run, movement, outcome) [rad].
+        ranges: Ranges of the rate, equally likely.
         since: For how long it has grown then, (run, movement) [s].
     """
     profile = likelihood.profile(motor)
     gain = _gain(mode, _arrival(likelihood, motor, mode, since[..., None]))[..., 0]
-    best, width = pointed(profile, settled[..., 0], gain)
+    best, width = pointed(profile, profile.faulty_baseline[..., 0], gain)
     weight = np.where(profile.usable & (gain != 0.0), 1.0 / width**2, 0.0)
     total = weight.sum(axis=1, keepdims=True)
     some = np.asarray(total > 0.0)
     together = weighted_quantiles(best, weight, (0.5,))
     spread = 1.0 / np.sqrt(np.where(some, total, 1.0))
-    return size_nodes(together, spread, some, mode.considered, mode.signed)
+    rates, log_rates = size_nodes(together, spread, some, ranges, mode.signed)
+    return rates, log_sum(log_rates, axis=1) - np.log(len(ranges))
 
 
 # Faults that show on the way: a motor that starts late, a motor that is slow.
@@ -278,7 +256,11 @@ TIMED_NODES = 12
 
 
 def transient_model(
-    likelihood: RunLikelihood, motor: int, mode: FaultMode, prior_before_run: float
+    likelihood: RunLikelihood,
+    motor: int,
+    mode: FaultMode,
+    ranges: Sequence[Range],
+    prior_before_run: float,
 ) -> FaultModel:
     """Return the fault model of a motor that starts late or has lost speed.
 
@@ -288,9 +270,11 @@ def transient_model(
         likelihood: The runs.
         motor: Index of the motor.
         mode: Its mode.
+        ranges: Ranges of the size; all between the lowest and the highest is as likely.
         prior_before_run: Probability that the fault was there before the run.
     """
-    size = np.linspace(*mode.considered, TIMED_NODES)
+    lows, highs = zip(*ranges, strict=True)
+    size = np.linspace(min(lows), max(highs), TIMED_NODES)
     factor, delay = mode.ramp_factor(size), mode.dead_time(size)
     angle, begin, way = likelihood.profile(motor).expected[:, :, None], None, None
     if (factor != 1.0).any():
@@ -335,9 +319,6 @@ def _reached(
 
 # An offset that is drawn anew for each movement: a steady-state error.
 
-ERROR_NODES = 36
-"""Sizes to sum over on each side of zero, up to the largest error considered."""
-
 
 def redrawn_offset_model(
     likelihood: RunLikelihood,
@@ -355,33 +336,23 @@ def redrawn_offset_model(
         ranges: Run-level ranges of the size, equally likely.
         prior_before_run: Probability that it was there before the run.
     """
-    size, log_weight = offset_nodes(ranges)
-    arrival = _by_node(_arrival(likelihood, motor, mode, np.array(LONG_S)))
-    offset = mode.settled_offset(size[:, None], arrival)
+    profile = likelihood.profile(motor)
+    arrival = _arrival(likelihood, motor, mode, np.array(LONG_S))
+    gain = _gain(mode, arrival)[..., 0]
+    best, width = _best_sizes(mode, profile, gain)
+    usable = profile.usable & (np.abs(gain) > 1e-9)
+    size, log_mass = redrawn_nodes(
+        best, width, usable, ranges, float(likelihood.model.scatter[motor])
+    )
     stretches = next_movement(likelihood.evidence.movements)
     log_first = log_of(stretches.weights(prior_before_run))
     return FaultModel(
         motor=motor,
         held=False,
-        angle=likelihood.profile(motor).faulty_baseline[:, :, None] + offset,
+        angle=profile.faulty_baseline[:, :, None]
+        + mode.settled_offset(size[..., None], _by_node(arrival)),
         log_prior=np.repeat(log_first[..., None] - np.log(len(ranges)), len(ranges), axis=2),
-        size=size[None],
+        size=size,
         onsets=stretches.onsets(prior_before_run),
-        redrawn=log_weight,
+        redrawn=log_mass,
     )
-
-
-def offset_nodes(ranges: Sequence[Range]) -> tuple[FloatArray, FloatArray]:
-    """Return signed sizes (node,) and their log weights in each range (range, node)."""
-    largest = max(high for _, high in ranges)
-    smallest = min(low for low, _ in ranges)
-    step = (largest - smallest) / (ERROR_NODES - 1) if largest > smallest else 0.0
-    sizes = smallest + step * np.arange(ERROR_NODES if step else 1)
-    edges = np.concatenate([[smallest], 0.5 * (sizes[1:] + sizes[:-1]), [largest]])
-    weights = []
-    for low, high in ranges:
-        overlap = np.clip(np.minimum(edges[1:], high) - np.maximum(edges[:-1], low), 0.0, None)
-        total = overlap.sum()
-        weights.append(overlap / total if total else np.eye(1, len(sizes))[0])
-    half = 0.5 * np.array(weights)
-    return np.concatenate([-sizes, sizes]), log_of(np.concatenate([half, half], axis=1))

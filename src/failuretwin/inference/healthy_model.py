@@ -10,7 +10,7 @@ Section: docs/diagnosis.md#healthy-model-where-a-healthy-arm-settles
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,7 +20,7 @@ from failuretwin.core.numerics import Ellipsoid
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
 from failuretwin.digital_model.nonidealities import Imperfections, Timing
-from failuretwin.digital_model.settling import Settling, loads_in_range
+from failuretwin.digital_model.settling import Settling, loads_in_range, poses_in_range
 from failuretwin.digital_model.twin import SAG_ROUNDS, DigitalTwin
 from failuretwin.inference.command_loss import OUTLIER_RATE, CommandOutcomes, LostCommands
 from failuretwin.inference.evidence import SettledEvidence
@@ -99,8 +99,12 @@ class StartDelay:
 
 PATH_NOISE_M = 0.001
 """Noise assumed of a settled tool position where the sensor is not known [m]."""
-LEAST_NOISE_M = 0.0003
-"""What a calibration leaves unsaid of the tool's path: bending links, bearings [m]; assumed."""
+UNMEASURED_OF_REACH = 0.001
+"""Noise assumed of a settled tool position of an arm that nobody has calibrated, as a share of its
+reach: links that differ from the drawing, and the sensor. Of two industrial arms links alone leave
+0.0008 of it."""
+LEAST_VISIBLE_POSES = 200
+"""Poses at which it is asked how small an angle shows."""
 
 
 @dataclass(frozen=True)
@@ -111,11 +115,13 @@ class HealthyModel:
         twin: Kinematics.
         imperfections: Offsets, scatter and rates of lost commands.
         scatter_factor: Factor on all scatter and noise; 1 for a robot as it is.
+        untold_noise_m: Noise of the sensor beside what is known of it [m].
     """
 
     twin: DigitalTwin
     imperfections: Imperfections
     scatter_factor: float = 1.0
+    untold_noise_m: float = 0.0
 
     @classmethod
     def of(cls, twin: RobotLike, imperfections: HealthyLike = None) -> HealthyModel:
@@ -134,14 +140,18 @@ class HealthyModel:
         return self.twin.robot.motor_names
 
     @cached_property
-    def movement_range(self) -> list[tuple[float, float]]:
-        """Lowest and highest target of each motor, (motor,) [rad]."""
-        return [motor.movement_range for motor in self.twin.robot.motors]
-
-    @cached_property
     def settling(self) -> Settling:
         """Settled offsets; of ideal motors where the imperfections have none."""
         return self.imperfections.settling or Settling.ideal(len(self.twin.robot.motors))
+
+    @cached_property
+    def without_doubt(self) -> HealthyModel:
+        """The same with offsets that are known: what is doubted of them does not scatter."""
+        doubt = self.imperfections.variation
+        if doubt is None:
+            return self
+        sharp = replace(doubt, bias=(), compliance=(), friction=())
+        return replace(self, imperfections=replace(self.imperfections, variation=sharp))
 
     @cached_property
     def scatter(self) -> FloatArray:
@@ -170,11 +180,50 @@ class HealthyModel:
 
     @cached_property
     def path_noise(self) -> float:
-        """Noise of a settled tool position that belongs to no motor [m]."""
-        readings = self.imperfections.readings
-        if readings is None or self.imperfections.settling is None:
-            return self.scatter_factor * PATH_NOISE_M
-        return self.scatter_factor * float(np.hypot(readings.noise_m, LEAST_NOISE_M))
+        """Noise of a settled tool position that belongs to no motor [m].
+
+        Of an arm whose geometry is fitted, what the fit leaves less what the motors scatter.
+        """
+        return float(np.hypot(self.scatter_factor * self._known_noise, self.untold_noise_m))
+
+    @property
+    def _known_noise(self) -> float:
+        readings, fitted = self.imperfections.readings, self.twin.robot.profile.geometry
+        if fitted.sensor_noise_m > 0.0:
+            rest = np.sqrt(max(fitted.sensor_noise_m**2 - self._scatter_of_tool**2, 0.0))
+        elif self.imperfections.settling is None:
+            return PATH_NOISE_M
+        else:  # nobody has measured the sensor, nor the links
+            rest = 0.0 if readings else UNMEASURED_OF_REACH * self.twin.robot.reach
+        told = 0.0 if readings is None else readings.noise_m
+        return max(float(np.hypot(told, self.settings.least_noise_m)), rest)
+
+    @property
+    def _scatter_of_tool(self) -> float:
+        """What the motors' settled scatter moves the tool on each axis, the median [m]."""
+        robot = self.twin.robot
+        _, jacobian = self.twin.path_and_jacobian(poses_in_range(robot) * robot.sense)
+        moved = jacobian * np.asarray(self.settling.scatter)
+        return float(np.sqrt(np.median(np.sum(moved**2, axis=(1, 2))) / 3.0))
+
+    @cached_property
+    def least_visible(self) -> FloatArray:
+        """Smallest angle by which each motor can be seen to be off, (motor,) [rad or m].
+
+        One standard deviation of what a settled position says of it, P^-1/2 with its own scatter,
+        the median over poses spread over the travel.
+        """
+        low, high = self.twin.robot.travel.T
+        poses = np.random.default_rng(0).uniform(low, high, (LEAST_VISIBLE_POSES, len(low)))
+        _, jacobian = self.twin.path_and_jacobian(poses)
+        found = []
+        for motor, own in enumerate(self.scatter):
+            others = np.where(np.arange(len(self.scatter)) == motor, 0.0, self.scatter)
+            spread = Ellipsoid.of(jacobian * others, self.path_noise**2)
+            lever = jacobian[..., motor]
+            precision = np.maximum(spread.product(lever, lever), 1e-12)
+            found.append(float(np.median(np.sqrt(1.0 / precision + own**2))))
+        return np.array(found)
 
     @property
     def knows_timing(self) -> bool:
@@ -210,24 +259,12 @@ class HealthyModel:
     @cached_property
     def anywhere_log_density(self) -> float:
         """Log density of a tool that is anywhere within reach [log 1/m3]."""
-        return -float(np.log(4.0 / 3.0 * np.pi * self.reach**3))
+        return -float(np.log(4.0 / 3.0 * np.pi * self.twin.robot.reach**3))
 
     @cached_property
     def outlier_log_density(self) -> float:
         """Log of the outlier rate times the density of "anywhere within reach" [log 1/m3]."""
         return float(np.log(OUTLIER_RATE) + self.anywhere_log_density)
-
-    @cached_property
-    def reach(self) -> float:
-        """How far the tool can be from the base at most [m]: links and slides laid end to end."""
-        robot, chain = self.twin.robot, self.twin.robot.chain
-        links = sum(float(np.linalg.norm(joint.T_pj[:3, 3])) for joint in chain.joints)
-        slides = sum(
-            max(abs(end) for end in motor.movement_range)
-            for motor, joint in zip(robot.motors, chain.joints, strict=True)
-            if joint.prismatic
-        )
-        return links + slides + float(np.linalg.norm(chain.T_jt[:3, 3]))
 
     @cached_property
     def lost_commands(self) -> LostCommands:

@@ -28,7 +28,6 @@ from failuretwin.core.runs import RunTable
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.digital_model.nonidealities import (
-    GENERIC_SCATTER_RAD,
     Imperfections,
     LostCommand,
 )
@@ -245,7 +244,7 @@ def isolability(
     motions = _motions(model.twin, command, time)
     _check_onset(onset_s, float(motions["time"].values[-1]))
     trials = MonteCarloFaults(judge, motions, onset_s)
-    considered = {h: _sizes(h, judge.priors) for h in judge.hypotheses}
+    considered = {h: _sizes(h, judge) for h in judge.hypotheses}
     nats = trials.log_bayes_factor([(h, _typical(*sizes)) for h, sizes in considered.items()])
     sized = {h: sizes for h, sizes in considered.items() if np.isfinite(sizes).all()}
     smallest = {str(h): minimum_detectable_sizes(trials, h, sizes) for h, sizes in sized.items()}
@@ -296,11 +295,13 @@ def _motions(twin: DigitalTwin, command: ArrayLike, time: ArrayLike) -> xr.Datas
     ).to_dataset()
 
 
-def _sizes(hypothesis: Hypothesis, priors: Priors) -> tuple[float, float]:
+def _sizes(hypothesis: Hypothesis, judge: ExpectedLogBayesFactor) -> tuple[float, float]:
     """Return smallest and largest size that is considered; NaN where there is none."""
     if hypothesis.is_healthy:
         return np.nan, np.nan
-    lows, highs = zip(*priors.ranges_of(MODES[hypothesis.faults[0].mode]), strict=True)
+    fault, model = hypothesis.faults[0], judge.model
+    motor = model.motor_names.index(fault.motor)
+    lows, highs = zip(*judge.priors.ranges_of(MODES[fault.mode], model, motor), strict=True)
     return min(lows), max(highs)
 
 
@@ -349,6 +350,8 @@ def _cliques(
 
 # Which runs had better not teach the twin: they look faulty even to a doubtful eye.
 
+MOST_SCATTER_RAD = 0.01
+"""Scatter of a motor above which what was learned is taken for errors of faulty runs [rad]."""
 MOST_LOST = 0.1
 """A healthy motor loses at most this share of its commands, however often these logs did."""
 
@@ -366,7 +369,7 @@ def fault_probabilities(runs: xr.Dataset, robot: Robot, learned: Imperfections) 
     """
     settling = learned.settling
     if settling is not None:
-        scatter = tuple(min(value, GENERIC_SCATTER_RAD) for value in settling.scatter)
+        scatter = tuple(min(value, MOST_SCATTER_RAD) for value in settling.scatter)
         settling = replace(settling, scatter=scatter)
     bounded = replace(
         learned,

@@ -29,8 +29,8 @@ REFINEMENTS = 2
 """Newton steps from the point of the circle nearest to the tool; more change nothing."""
 LONGEST_STEP_RAD = 0.3
 """Bound on such a step: near a singular pose the parabola promises too much."""
-HELD_BEYOND = 1.1
-"""Share of the range of movements within which a motor may stand, on one side of its target."""
+FURTHEST_OFF = 1.1
+"""Share of its travel within which a motor may stand, on one side of its target."""
 NEGLIGIBLE_NATS = 9.0
 """What lies this far below the tool being anywhere, wherever the motor stands, is left out."""
 LARGEST_OFFSET_RAD = 0.9
@@ -89,7 +89,7 @@ class JointLikelihood(ArrayStruct):
             held: Whether the gear holds it exactly there.
         """
         precision, log_weight = self._with_scatter(held)
-        off = self._turned(angle - self.mode)
+        off = self.turned(angle - self.mode)
         return log_weight + log_fall(self.min_distance2 + precision * off**2, self.dof)
 
     def log_density(self, angle: FloatArray, held: bool) -> FloatArray:
@@ -116,7 +116,7 @@ class JointLikelihood(ArrayStruct):
             if not some.any():
                 continue
             at = angle[some, :, k if angle.shape[-1] > 1 else 0]
-            off = self._turned(at - self.mode[some, k, None])
+            off = self.turned(at - self.mode[some, k, None])
             off *= off
             off *= precision[some, k, None]
             off += self.min_distance2[some, k, None]
@@ -127,7 +127,7 @@ class JointLikelihood(ArrayStruct):
         usable = self.usable.reshape(self.usable.shape + (1,) * (found.ndim - 2))
         return np.where(usable, found, 0.0)
 
-    def _turned(self, off: FloatArray) -> FloatArray:
+    def turned(self, off: FloatArray) -> FloatArray:
         """Return differences of angles, the shorter way around."""
         return off - 2.0 * np.pi * np.rint(off / (2.0 * np.pi)) if self.wraps else off
 
@@ -248,8 +248,8 @@ def _beside(
 
 def _may_turn_around(model: HealthyModel, motor: int) -> bool:
     """Return whether a motor may be half a turn or more from where it should be."""
-    low, high = model.movement_range[motor]
-    return not model.twin.robot.chain.joints[motor].prismatic and HELD_BEYOND * (high - low) > np.pi
+    low, high = model.twin.robot.travel[motor]
+    return not model.twin.robot.slides[motor] and FURTHEST_OFF * (high - low) > np.pi
 
 
 def nearest_on_circle(
@@ -273,7 +273,7 @@ def nearest_on_circle(
     found = np.arctan2(np.sum(toward * sine, axis=-1), np.sum(toward * cosine, axis=-1))
     here = np.sum(pose * own, axis=-1)
     found = found + 2.0 * np.pi * np.rint((here - found) / (2.0 * np.pi))
-    slides = np.array([joint.prismatic for joint in model.twin.robot.chain.joints])
+    slides = model.twin.robot.slides
     if not slides.any():
         return np.asarray(found)
     along = (half - first) / np.pi

@@ -11,13 +11,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from failuretwin.core.movements import Movements
 from failuretwin.core.runs import AXES, measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.readings import MeasuredSamples, measured_samples
 from failuretwin.inference.settings import USUAL, InferenceSettings
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from failuretwin.inference.evidence import SettledEvidence
 
 GAP_S = 0.5
 """A longer silence is a gap [s], whatever the rate."""
@@ -80,6 +84,60 @@ def log_quality(
     command = as_floats(runs["command"].values)
     point, near = (readings or measured_samples(runs)).point, settings.nearly_still_m
     return [_quality(time, c, m, rate, near) for c, m in zip(command, point, strict=True)]
+
+
+SLACK = 0.01
+"""Share of a range by which a command may leave it unremarked: limits are often rounded."""
+
+
+def commands_beyond(robot: Robot, movements: Movements, run: int) -> list[str]:
+    """Return where the commands of a run leave what the profile of the robot says, a line each.
+
+    Args:
+        robot: The robot.
+        movements: The movements.
+        run: Index of the run.
+    """
+    told = movements.target[run][movements.exists[run]]
+    if not len(told):
+        return []
+    lowest, highest = told.min(axis=0), told.max(axis=0)
+    expected = np.array([motor.movement_range for motor in robot.motors])
+    lines, remarked = [], np.zeros(len(expected), dtype=bool)
+    for ranges, name, means in (
+        (robot.limits, "the limits of their joints", "are units, zeros and senses right?"),
+        (expected, "movement_range", "what the profile says of usual loads may not hold there"),
+    ):
+        slack = SLACK * np.where(np.isfinite(ranges).all(axis=1), np.ptp(expected, axis=1), 0.0)
+        beyond = (lowest < ranges[:, 0] - slack) | (highest > ranges[:, 1] + slack)
+        which = np.flatnonzero(beyond & ~remarked)
+        remarked |= beyond
+        if len(which):
+            spans = [_span(robot, int(k), lowest[k], highest[k], ranges[k]) for k in which]
+            lines.append(f"commands go beyond {name}: {', '.join(spans)}; {means}")
+    return lines
+
+
+def _span(robot: Robot, motor: int, low: float, high: float, expected: FloatArray) -> str:
+    """Return how far a motor is told to go, and within what it was expected."""
+    factor, unit = (1e3, "mm") if robot.slides[motor] else (float(np.rad2deg(1.0)), "deg")
+    name, (first, last) = robot.motor_names[motor].replace("_", " "), factor * expected
+    return (
+        f"{name} from {factor * low:.0f} to {factor * high:.0f} {unit} "
+        f"(expected {first:.0f} to {last:.0f})"
+    )
+
+
+def unused_movements(evidence: SettledEvidence, run: int) -> list[str]:
+    """Return why movements of a run are not used, a line each."""
+    lines = []
+    for movement in np.flatnonzero(evidence.movements.exists[run] & ~evidence.usable[run]):
+        if evidence.moving[run, movement]:
+            reason = "the tool does not come to rest"
+        else:
+            reason = "no reading while the tool is at rest"
+        lines.append(f"movement {movement + 1} not used: {reason}")
+    return lines
 
 
 def drop_invalid(runs: xr.Dataset, quality: Sequence[LogQuality]) -> xr.Dataset:

@@ -132,11 +132,12 @@ class FaultModel:
         angle: Where it settles, (run, movement, node, outcome) [rad]; axes may be 1.
         log_prior: Log probability of the first movement spoilt and the node,
             (run, movement, node), or of the group of nodes where nodes are redrawn.
-        size: Magnitude of the fault at each node, (run, node).
+        size: Magnitude of the fault at each node, (run, node), or (run, movement, node) where nodes
+            are redrawn.
         onsets: Onset at each node of a run, by its index, (movement, node, sample) [s], and the
             share of each sample, same axes; axes of nodes and movements may be 1.
-        redrawn: Log weights of the nodes in each group, (group, node), where every movement draws
-            its own node; None: one node holds for the whole run.
+        redrawn: Log weights of the nodes in each group, (run, movement, group, node), where every
+            movement draws its own node; None: one node holds for the whole run.
         log_transient: Log density of the readings on the way at each node, (run, movement, node);
             None: as for any motor that settles off its target.
         gain: By how much the motor is off for each unit of an amount that holds for the run,
@@ -162,7 +163,10 @@ class FaultModel:
         if self.redrawn is None:
             return by_node
         top = by_node.max(axis=-1, keepdims=True)
-        return np.asarray(top + np.log(np.exp(by_node - top) @ np.exp(self.redrawn).T))
+        runs, movements, *sums = self.redrawn.shape
+        between = (1,) * (by_node.ndim - 3)  # axes for the cells of another fault
+        weights = np.exp(self.redrawn).reshape(runs, movements, *between, *sums)
+        return np.asarray(top + np.log((weights @ np.exp(by_node - top)[..., None])[..., 0]))
 
 
 @dataclass(frozen=True)
@@ -215,10 +219,10 @@ def marginal_likelihood(likelihood: RunLikelihood, fault_model: FaultModel) -> M
             size = Weighted(_of_run(fault_model.size, run), cells)
             nodes = np.broadcast_to(cells, by_node[run].shape)
         else:
-            of_node = np.exp(by_node[run][:, None] + fault_model.redrawn - density[run][..., None])
-            size = _rms(
-                likelihood.evidence.movements.exists[run], of_node, share, fault_model.size[0]
-            )
+            of_node = by_node[run][:, None] + fault_model.redrawn[run] - density[run][..., None]
+            of_node = np.exp(of_node)
+            exists = likelihood.evidence.movements.exists[run]
+            size = _rms(exists, of_node, share, fault_model.size[run])
             nodes = np.einsum("fg,mgn->mn", share, of_node)
         outcome_probability = _became(profile, fault_model, run, share, nodes)
         return Estimate(_onset(fault_model, run, share), size, outcome_probability)
@@ -250,10 +254,10 @@ def _rms(exists: BoolArray, nodes: FloatArray, share: FloatArray, offset: FloatA
         exists: Movements that are there, (movement,).
         nodes: Posterior of each node, (movement, group, node).
         share: Posterior of first movement and group, (movement, group).
-        offset: Offsets, (node,).
+        offset: Offsets, (movement, node).
     """
     there = exists[:, None]
-    second, fourth = (np.einsum("mgn,n->mg", nodes, offset**p) * there for p in (2, 4))
+    second, fourth = (np.einsum("mgn,mn->mg", nodes, offset**p) * there for p in (2, 4))
 
     def from_here(values: FloatArray) -> FloatArray:
         return np.cumsum(values[::-1], axis=0)[::-1]

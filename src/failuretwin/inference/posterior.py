@@ -24,19 +24,21 @@ from failuretwin.core.hypothesis import (
 )
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.failure_behavior.mode import FaultMode, Signature
+from failuretwin.digital_model.robot import Robot
+from failuretwin.failure_behavior.mode import FaultMode, Range, Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.double_faults import double_fault_likelihood
 from failuretwin.inference.evidence import SettledEvidence
-from failuretwin.inference.explanation import worded
+from failuretwin.inference.explanation import with_joint_names, worded
 from failuretwin.inference.fault_models import (
-    LOCAL_STEPS,
     growing_offset_model,
     offset_model,
     redrawn_offset_model,
     transient_model,
 )
-from failuretwin.inference.log_quality import LogQuality
+from failuretwin.inference.fault_sizes import LOCAL_STEPS
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.log_quality import LogQuality, commands_beyond, unused_movements
 from failuretwin.inference.marginal import (
     Estimate,
     FaultModel,
@@ -49,6 +51,7 @@ from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.stuck import stuck_model
 from failuretwin.inference.two_joint_likelihood import two_joint_likelihood
 from failuretwin.inference.unknown import unknown_likelihood
+from failuretwin.inference.wrong_setup import NOWHERE, nowhere_near
 
 # From a hypothesis to what runs say of it.
 
@@ -146,12 +149,15 @@ def motor_of(likelihood: RunLikelihood, fault: Fault) -> int:
     return likelihood.model.motor_names.index(fault.motor)
 
 
-MODELS: Mapping[Signature, Callable[[RunLikelihood, int, FaultMode, float], FaultModel]] = {
+MODELS: Mapping[
+    Signature, Callable[[RunLikelihood, int, FaultMode, Sequence[Range], float], FaultModel]
+] = {
     Signature.OFFSET: offset_model,
     Signature.GROWING_OFFSET: growing_offset_model,
+    Signature.REDRAWN_OFFSET: redrawn_offset_model,
     Signature.TRANSIENT: transient_model,
 }
-"""Fault models that need to know nothing but the mode."""
+"""Fault models of faults that have a size."""
 
 
 def fault_model_of(likelihood: RunLikelihood, fault: Fault, priors: Priors) -> FaultModel:
@@ -160,9 +166,8 @@ def fault_model_of(likelihood: RunLikelihood, fault: Fault, priors: Priors) -> F
     early = priors.onset.before_run(fault.mode)
     if mode.signature is Signature.HELD:
         return stuck_model(likelihood, motor, priors.onset)
-    if mode.signature is Signature.REDRAWN_OFFSET:
-        return redrawn_offset_model(likelihood, motor, mode, priors.ranges_of(mode), early)
-    return MODELS[mode.signature](likelihood, motor, mode, early)
+    ranges = priors.ranges_of(mode, likelihood.model, motor)
+    return MODELS[mode.signature](likelihood, motor, mode, ranges, early)
 
 
 def _fault_models_of_two(
@@ -207,25 +212,13 @@ LIKELY = 0.5
 """Probability from which a lost command is told [-]."""
 
 
-def unused_movements(evidence: SettledEvidence, run: int) -> list[str]:
-    """Return why movements of a run are not used, a line each."""
-    lines = []
-    for movement in np.flatnonzero(evidence.movements.exists[run] & ~evidence.usable[run]):
-        if evidence.moving[run, movement]:
-            reason = "the tool does not come to rest"
-        else:
-            reason = "no reading while the tool is at rest"
-        lines.append(f"movement {movement + 1} not used: {reason}")
-    return lines
-
-
 def abstention_reason(
     quality: LogQuality,
     evidence: SettledEvidence,
     run: int,
     probability: float,
     by_movement: FloatArray,
-    outlier_log_density: float,
+    model: HealthyModel,
 ) -> str:
     """Return why a run allows no verdict, empty if it does.
 
@@ -235,7 +228,7 @@ def abstention_reason(
         run: Index of the run.
         probability: Posterior of the best hypothesis.
         by_movement: Log density of each movement under the best hypothesis, (movement,).
-        outlier_log_density: That of a tool anywhere within reach.
+        model: The healthy robot.
     """
     if quality.fatal:
         return quality.fatal
@@ -247,14 +240,12 @@ def abstention_reason(
     if usable.sum() <= FEW_MOVEMENTS and probability < 0.5:
         count = int(usable.sum())
         return f"only {count} movement{'s' * (count != 1)} can be used and no hypothesis stands out"
-    unexplained = usable & (by_movement < outlier_log_density + UNEXPLAINED_NATS)
+    unexplained = usable & (by_movement < model.outlier_log_density + UNEXPLAINED_NATS)
     if 2 * unexplained.sum() <= usable.sum():
         return ""
     which = ", ".join(str(m + 1) for m in np.flatnonzero(unexplained))
-    return (
-        f"after movement {which} the tool is nowhere near where any of the hypotheses puts it: "
-        "wrong units or robot, a spoilt sensor, or a fault of another kind"
-    )
+    target, point = evidence.movements.target[run][usable], evidence.point[run][usable]
+    return f"after movement {which} {NOWHERE}: {nowhere_near(model.twin, target, point)}"
 
 
 def lost_commands(
@@ -318,6 +309,7 @@ class Posterior:
         log_prior: (hypothesis,).
         log_posterior: (run, hypothesis).
         weights: What the runs say of each hypothesis, in their order.
+        set_up: What is to be said of the set-up of each run; empty: nothing of any.
     """
 
     likelihood: RunLikelihood
@@ -325,6 +317,7 @@ class Posterior:
     log_prior: FloatArray
     log_posterior: FloatArray
     weights: Sequence[MarginalLikelihood]
+    set_up: Sequence[str] = ()
 
     def undecided(self, run: int, quality: LogQuality) -> str:
         """Return why a run allows no verdict, empty if it does.
@@ -340,7 +333,7 @@ class Posterior:
             run,
             float(np.exp(self.log_posterior[run, best])),
             self.weights[best].settled(run),
-            self.likelihood.model.outlier_log_density,
+            self.likelihood.model,
         )
 
     def posterior(self, run: int, undecided: str) -> FloatArray:
@@ -369,28 +362,38 @@ class Posterior:
             truth: What was wrong, where known; it is only passed on.
             place: Where it lies in a stream, whose times and movements are told.
         """
-        evidence, imperfections = self.likelihood.evidence, self.likelihood.model.imperfections
+        evidence, model = self.likelihood.evidence, self.likelihood.model
+        robot = model.twin.robot
         order = np.argsort(-self.log_posterior[run], kind="stable")
         ranked = [self.hypotheses[i] for i in order]
         best, undecided = self.weights[order[0]], self.undecided(run, quality)
         posterior = self.posterior(run, undecided)
+        unused = unused_movements(evidence, run)
         used = "settled poses" if self.likelihood.moving is None else "whole run"
         diagnosis = Diagnosis(
             run=name,
             truth=truth,
             posterior={str(h): float(p) for h, p in zip(self.hypotheses, posterior, strict=True)},
-            quality=(*quality.remarks, *unused_movements(evidence, run)),
+            quality=(
+                *quality.remarks,
+                *self._set_up(run),
+                *unused,
+                *commands_beyond(robot, evidence.movements, run),
+            ),
             undecided=undecided,
-            protocol=imperfections.protocol,
-            method=f"bayes, {used}; healthy behaviour: {imperfections.name}",
+            protocol=model.imperfections.protocol,
+            method=f"bayes, {used}; healthy behaviour: {model.imperfections.name}",
         )
         losses: list[str] = []
         if not undecided:
             diagnosis = replace(diagnosis, evidence=self._evidence(run, order, place))
             estimate = best.estimate(run)
             losses = self._losses(estimate, ranked[0])
-            diagnosis = _with_estimate(diagnosis, ranked[0], estimate, place)
-        return worded(diagnosis, ranked, losses)
+            diagnosis = _with_estimate(diagnosis, ranked[0], estimate, place, robot)
+        return with_joint_names(worded(diagnosis, ranked, losses), robot)
+
+    def _set_up(self, run: int) -> tuple[str, ...]:
+        return (self.set_up[run],) if self.set_up and self.set_up[run] else ()
 
     def _evidence(
         self, run: int, order: IntArray, place: StreamPosition
@@ -432,7 +435,11 @@ def compute_posterior(
 
 
 def _with_estimate(
-    diagnosis: Diagnosis, hypothesis: Hypothesis, estimate: Estimate, place: StreamPosition
+    diagnosis: Diagnosis,
+    hypothesis: Hypothesis,
+    estimate: Estimate,
+    place: StreamPosition,
+    robot: Robot,
 ) -> Diagnosis:
     """Return the diagnosis with onset and magnitude of the fault that is most probable."""
     if estimate.onset is not None:
@@ -443,7 +450,8 @@ def _with_estimate(
             diagnosis = replace(diagnosis, onset_s=known.onset_s, onset_90=known.onset_90)
     if estimate.size is not None:
         low, half, high = estimate.size.quantiles(LEVELS).tolist()
-        unit = MODES[hypothesis.faults[0].mode].unit
+        fault = hypothesis.faults[0]
+        unit = robot.own_unit(fault.motor, MODES[fault.mode].unit)
         diagnosis = replace(
             diagnosis, magnitude=half, magnitude_unit=unit, magnitude_90=(low, high)
         )

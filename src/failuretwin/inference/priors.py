@@ -7,20 +7,21 @@ Section: docs/diagnosis.md#priors-odds-onset-sizes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.robot import Robot
-from failuretwin.failure_behavior.mode import FaultMode, Range
-from failuretwin.failure_behavior.modes import SteadyStateError
+from failuretwin.failure_behavior.mode import FaultMode, Range, Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.evidence import SettledEvidence
-from failuretwin.inference.settings import USUAL, InferenceSettings
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.settings import WIDEST_ERROR
+from failuretwin.inference.shared_unknowns import SetupPrior
 
 # When a fault may have begun: which movement it spoils first, and what that says of the onset.
 
@@ -35,7 +36,7 @@ class OnsetPrior:
     Attributes:
         prior_before_run: Probability that the fault was there before the run; of a stuck motor,
             that it was stuck before the run or gets stuck on its first ramp. The rest is spread
-            evenly over the time after that. None: as the mode says.
+            evenly over the time after that. One for all modes, or by mode; None: as the mode says.
         free: Probability that the held angle of a stuck motor is unrelated to the commands,
             anywhere in range.
         known_s: The onset of a stuck motor, where it is known [s].
@@ -44,12 +45,14 @@ class OnsetPrior:
         InputError: If a probability or the onset makes no sense.
     """
 
-    prior_before_run: float | None = None
+    prior_before_run: float | Mapping[str, float] | None = None
     free: float = 0.2
     known_s: float | None = None
 
     def __post_init__(self) -> None:
-        for name, value in (("prior_before_run", self.prior_before_run), ("free", self.free)):
+        early = self.prior_before_run
+        told = list(early.values()) if isinstance(early, Mapping) else [early]
+        for name, value in (*(("prior_before_run", one) for one in told), ("free", self.free)):
             if value is not None and not 0.0 <= value <= 1.0:
                 raise InputError(f"{name} is {value:g}, expected a probability from 0 to 1.")
         if self.known_s is not None and not 0.0 <= self.known_s < np.inf:
@@ -57,7 +60,9 @@ class OnsetPrior:
 
     def before_run(self, mode: str) -> float:
         """Return the probability that a fault of this mode was there before the run."""
-        return MODES[mode].before_run if self.prior_before_run is None else self.prior_before_run
+        early = self.prior_before_run
+        told = early.get(mode) if isinstance(early, Mapping) else early
+        return MODES[mode].before_run if told is None else told
 
 
 @dataclass(frozen=True)
@@ -189,30 +194,92 @@ class Priors:
 
     Attributes:
         onset: When a motor may have got stuck.
-        error_ranges: Run-level ranges of steady-state errors [rad], equally likely.
+        error_ranges: Run-level ranges of steady-state errors [rad, or m of a joint that slides],
+            equally likely; those of some motors by name, or the same for all. None: as the profile
+            says, else from what can be seen of each motor up to `LARGEST_ERROR_RAD`.
         healthy_odds: How many times as probable it is that all is well as its mode
             says, which leaves no more for it than for a stuck motor.
+        setup: How far the set-up of the sensor may be off.
 
     Raises:
         InputError: If there is no range, or one or the odds make no sense.
     """
 
     onset: OnsetPrior = field(default_factory=OnsetPrior)
-    error_ranges: Sequence[Range] = USUAL.error_ranges
+    error_ranges: Sequence[Range] | Mapping[str, Sequence[Range]] | None = None
     healthy_odds: float = 1.0
+    setup: SetupPrior = field(default_factory=SetupPrior)
 
     def __post_init__(self) -> None:
-        sound = all(0.0 <= low < high < np.inf for low, high in self.error_ranges)
-        if not self.error_ranges or not sound:
-            raise InputError(
-                f"error_ranges are {self.error_ranges}, expected pairs 0 <= low < high [rad]."
-            )
+        for ranges in self._stated:
+            if not ranges or not all(0.0 <= low < high < np.inf for low, high in ranges):
+                raise InputError(
+                    f"error_ranges are {ranges}, expected pairs 0 <= low < high [rad]."
+                )
         if not 0.0 < self.healthy_odds < np.inf:
             raise InputError(f"healthy_odds are {self.healthy_odds:g}, expected above 0.")
 
-    def ranges_of(self, mode: FaultMode) -> Sequence[Range]:
-        """Return the ranges of sizes that are considered of a mode, equally likely."""
-        return self.error_ranges if isinstance(mode, SteadyStateError) else (mode.considered,)
+    @property
+    def _stated(self) -> Sequence[Sequence[Range]]:
+        """The ranges of errors that are stated, those of all motors or of each."""
+        if self.error_ranges is None:
+            return ()
+        if isinstance(self.error_ranges, Mapping):
+            return tuple(self.error_ranges.values())
+        return (self.error_ranges,)
+
+    def ranges_of(self, mode: FaultMode, model: HealthyModel, motor: int) -> Sequence[Range]:
+        """Return the ranges of sizes that are considered of a mode, equally likely.
+
+        Args:
+            mode: The mode.
+            model: The healthy robot.
+            motor: Index of the motor.
+        """
+        if not mode.down_to_visible:
+            return (mode.considered,)
+        redrawn, told = mode.signature is Signature.REDRAWN_OFFSET, self.error_ranges
+        if isinstance(told, Mapping):
+            told = told.get(model.motor_names[motor])
+        if redrawn and told is not None:
+            return told
+        if model.settings.least_error_rad:
+            return model.settings.error_ranges if redrawn else (mode.considered,)
+        return visible_ranges(mode, model, motor)
+
+
+LARGEST_ERROR_RAD = 0.9
+"""Largest steady-state error considered where nothing is said of them [rad]."""
+LEAST_ERROR = 0.5
+"""Smallest size considered, in the angle that one settled position shows: a few of them show less,
+and what nothing shows keeps "healthy" from being surer than it can be."""
+LARGER = 2.5
+"""Where each range of sizes begins, in the begin of the one before."""
+GROWN_S = 10.0
+"""Time in which the slowest drift comes to what can be seen [s]: a run."""
+
+
+def visible_ranges(mode: FaultMode, model: HealthyModel, motor: int) -> tuple[Range, ...]:
+    """Return ranges of sizes of a motor, from what can be seen of it to the mode's largest.
+
+    Each is as wide as the paper's, five times its least size, and begins at 2.5 times that of the
+    one before: all orders of magnitude are as likely.
+
+    Args:
+        mode: The mode; its sizes are offsets [rad], or grow with the time [rad/s].
+        model: The healthy robot.
+        motor: Index of the motor.
+    """
+    low, high = model.twin.robot.travel[motor]
+    largest = LARGEST_ERROR_RAD if mode.sizes is None else mode.considered[1]
+    if model.twin.robot.slides[motor]:
+        largest *= (high - low) / np.pi
+    least = LEAST_ERROR * model.least_visible[motor]
+    if mode.signature is Signature.GROWING_OFFSET:
+        least /= GROWN_S
+    count = 1 + max(0, int(np.ceil(np.log(largest / WIDEST_ERROR / least) / np.log(LARGER))))
+    lows = np.geomspace(least, max(least, largest / WIDEST_ERROR), count)
+    return tuple((float(low), float(WIDEST_ERROR * low)) for low in lows)
 
 
 MONITORING = Priors(healthy_odds=30.0)
@@ -221,35 +288,96 @@ more often a lost command. Chosen on emulated robots: about one false alarm an h
 
 
 def priors_of(
-    robot: Robot, error_range_counts: tuple[float, float] | None, onset_s: float | None
+    robot: Robot,
+    error_range_counts: tuple[float, float] | None,
+    onset_s: float | None,
+    error_range: tuple[float, float, str] | None = None,
 ) -> Priors:
     """Return priors with what is known of the faults, the default for what is not.
 
     Args:
-        robot: The robot, for its servo units.
+        robot: The robot, for its servo units and what its motors turn through.
         error_range_counts: Range of steady-state errors [servo units].
         onset_s: Onset of stuck faults [s].
+        error_range: Range of steady-state errors and its unit, one of `ERROR_UNITS`; motors that
+            are not measured in it keep the default.
 
     Raises:
-        InputError: If the range is not 0 <= low < high, no motor can be off by that much, or the
-            onset is negative.
+        InputError: If the range is not 0 <= low < high, no motor can be off by that much, the unit
+            is not known or fits no motor, both ranges are given, or the onset is negative.
     """
-    priors = Priors(error_ranges=InferenceSettings.of(robot).error_ranges)
+    priors = Priors()
     if error_range_counts is not None:
-        low, high = error_range_counts
-        if not 0.0 <= low < high < np.inf:
-            raise InputError(f"--sse-range is {low:g} {high:g}, expected 0 <= LOW < HIGH.")
-        units, count = robot.servo_units, robot.servo_units.rad_per_count
-        most = units.high - units.low
-        if high > most:
-            raise InputError(
-                f"--sse-range is {low:g} {high:g}, but the motors turn through {most:g} servo "
-                f"units ({np.rad2deg(most * count):.0f} deg) and can be off by no more. Expected "
-                f"HIGH up to {most:g}."
-            )
-        priors = replace(priors, error_ranges=((low * count, high * count),))
+        if error_range is not None:
+            raise InputError("--sse-range and --error-range say the same. Give one of them.")
+        ranges = _error_ranges(robot, *error_range_counts, "counts", "--sse-range")
+        priors = replace(priors, error_ranges=ranges)
+    if error_range is not None:
+        priors = replace(priors, error_ranges=_error_ranges(robot, *error_range, "--error-range"))
     if onset_s is not None:
         if not 0.0 <= onset_s < np.inf:
             raise InputError(f"--onset is {onset_s:g} s, expected 0 or more.")
         priors = replace(priors, onset=replace(priors.onset, known_s=onset_s))
     return priors
+
+
+ERROR_UNITS = ("deg", "rad", "mm", "m", "counts", "percent")
+"""Units of `--error-range`; per cent are of what a motor turns through."""
+
+
+def _error_ranges(
+    robot: Robot, low: float, high: float, unit: str, option: str
+) -> dict[str, tuple[Range]]:
+    """Return the range of errors of each motor that is measured in a unit [rad or m], by name.
+
+    Args:
+        robot: The robot.
+        low: The least.
+        high: The largest.
+        unit: One of `ERROR_UNITS`.
+        option: Where they come from, for errors.
+
+    Raises:
+        InputError: See `priors_of`.
+    """
+    if unit not in ERROR_UNITS:
+        raise InputError(f"{option}: {unknown_name('unit', unit, ERROR_UNITS)}")
+    if not 0.0 <= low < high < np.inf:
+        raise InputError(f"{option} is {low:g} {high:g}, expected 0 <= LOW < HIGH.")
+    factors = {
+        motor: _in_si(robot, k, unit)
+        for k, motor in enumerate(robot.motor_names)
+        if unit == "percent" or robot.slides[k] == (unit in ("mm", "m"))
+    }
+    if not factors:
+        kind = "turn. Expected deg, rad" if unit in ("mm", "m") else "slide. Expected mm, m"
+        raise InputError(
+            f"{option} is in {unit}, but all motors of {robot.name!r} {kind} or percent."
+        )
+    most = max(_turns_through(robot, robot.motor_names.index(m), unit) for m in factors)
+    if high > most * (1.0 + 1e-9):
+        span = f"{most:g} {unit}"
+        if unit == "counts":
+            degrees = np.rad2deg(most * robot.servo_units.rad_per_count)
+            span = f"{most:g} servo units ({abs(degrees):.0f} deg)"
+        raise InputError(
+            f"{option} is {low:g} {high:g}, but the motors turn through {span} and can be off by "
+            f"no more. Expected HIGH up to {most:g}."
+        )
+    return {motor: ((low * factor, high * factor),) for motor, factor in factors.items()}
+
+
+def _in_si(robot: Robot, motor: int, unit: str) -> float:
+    """Return how much a unit is of a motor [rad or m]."""
+    if unit == "counts":
+        return abs(robot.servo_units.rad_per_count)
+    if unit == "percent":
+        return 0.01 * float(np.ptp(robot.travel[motor]))
+    return {"deg": float(np.deg2rad(1.0)), "mm": 1e-3}.get(unit, 1.0)
+
+
+def _turns_through(robot: Robot, motor: int, unit: str) -> float:
+    """Return what a motor turns or slides through, in a unit."""
+    if unit == "counts":
+        return robot.servo_units.high - robot.servo_units.low
+    return float(np.ptp(robot.travel[motor])) / _in_si(robot, motor, unit)

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from failuretwin.core.numerics import log_sum
-from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.command_loss import CommandOutcomes
 from failuretwin.inference.evidence import SettledEvidence, TransientSamples
 from failuretwin.inference.healthy_model import HealthyModel
@@ -26,7 +26,11 @@ from failuretwin.inference.joint_likelihood import (
 from failuretwin.inference.transient_likelihood import TransientLikelihood
 
 HELD_ANGLES = 25
-"""Held angles at which the way is judged, over the range of a motor."""
+"""Held angles at which the way is judged, over a range of `USUAL_TRAVEL` or less."""
+USUAL_TRAVEL = 3.4
+"""Range of held angles up to which so few are enough [rad]; over a wider one they are more."""
+HELD_BEYOND = 0.1
+"""Share of its travel by which a motor may be held beyond its ends: limits are not stops."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +61,9 @@ class RunLikelihood:
         default_factory=dict, init=False, compare=False, repr=False
     )
 
-    def __getitem__(self, run: int) -> RunLikelihood:
-        """Return one of the runs alone."""
-        rows = slice(run, run + 1)
+    def __getitem__(self, run: int | IntArray) -> RunLikelihood:
+        """Return one or some of the runs alone."""
+        rows = slice(run, run + 1) if isinstance(run, int | np.integer) else run
         moving = None if self.moving is None else self.moving[rows]
         return replace(
             self, evidence=self.evidence[rows], moving=moving, remembered=self.findings[rows]
@@ -135,10 +139,11 @@ class RunLikelihood:
         low, high = self.held_range(motor)
         known = ("held", motor)
         if known not in self.memo:
-            grid = np.linspace(low, high, HELD_ANGLES)
+            grid = np.linspace(low, high, self.spread_over(motor, HELD_ANGLES), axis=1)
             self.memo[known] = self.transients.stuck(motor, self.profile(motor), grid)
-        place = np.clip((angle - low) / (high - low) * (HELD_ANGLES - 1), 0, HELD_ANGLES - 1)
-        left = np.minimum(place.astype(np.int64), HELD_ANGLES - 2)
+        last = self.memo[known].shape[2] - 1
+        place = np.clip((angle - low[:, None]) / (high - low)[:, None] * last, 0, last)
+        left = np.minimum(place.astype(np.int64), last - 1)
         share = (place - left)[:, None]
         shape = (*self.usable.shape, angle.shape[1])
         at, after = (
@@ -147,11 +152,31 @@ class RunLikelihood:
         )
         return at + share * (after - at)
 
-    def held_range(self, motor: int) -> tuple[float, float]:
-        """Return the range of angles at which a motor may be held [rad]."""
-        low, high = self.model.movement_range[motor]
-        margin = 0.1 * (high - low)
-        return low - margin, high + margin
+    def held_range(self, motor: int) -> tuple[FloatArray, FloatArray]:
+        """Return the lowest and the highest angle at which a motor may be held, (run,) [rad] each.
+
+        Its travel, wider where a run's commands go beyond, and a little more.
+        """
+        low, high = self.model.twin.robot.travel[motor]
+        margin, movements = HELD_BEYOND * (high - low), self.evidence.movements
+        if not self.model.twin.robot.slides[motor]:  # beyond a full turn all angles come again
+            margin = min(margin, max(0.0, np.pi - 0.5 * (high - low)))
+        told = np.column_stack([movements.initial[:, motor], movements.target[..., motor]])
+        lowest, highest = np.nanmin(told, axis=1), np.nanmax(told, axis=1)
+        return np.minimum(low, lowest) - margin, np.maximum(high, highest) + margin
+
+    def spread_over(self, motor: int, usual: int) -> int:
+        """Return how many nodes lie over its range as densely as `usual` ones over `USUAL_TRAVEL`.
+
+        Args:
+            motor: Index of the motor.
+            usual: The fewest; as many as there are over any narrower range.
+        """
+        robot = self.model.twin.robot
+        if robot.slides[motor]:
+            return usual
+        wider = (1.0 + 2.0 * HELD_BEYOND) * float(np.ptp(robot.travel[motor])) / USUAL_TRAVEL
+        return int(np.ceil(usual * max(wider, 1.0)))
 
     @cached_property
     def log_healthy(self) -> FloatArray:

@@ -5,7 +5,7 @@ Section: docs/diagnosis.md#settled-evidence-where-the-tool-rests
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,10 +17,22 @@ from failuretwin.failure_behavior.mode import Range
 NOISE_FACTOR = 3.0
 """Lengths by which rest is told from motion are at least so many times the sensor's noise: the
 distance of a reading from the median of many exceeds that once in 34 times if it is normal."""
+UNKNOWN_NOISE_M = 0.001
+"""What the sensor of an arm is taken to tell apart where nothing is known of it [m]."""
+RESOLUTION = 2.5e-4
+"""What can be told apart at best, in the reach of the arm [-]: 0.3 mm of an arm of 1.3 m."""
+ROUGHNESS = 0.007
+"""What straight lines between the knots of a path leave out, in the reach [-]; ArmPi: 2 mm."""
+NOISE_OF_REACH = 2e-4
+"""Noise of a settled position that no motor makes, in the reach [-]: 0.2 mm of an arm of a metre.
+Industrial arms come back to 0.05 to 0.1 mm, and a nominal geometry leaves more; assumed."""
+NOISE_OF_FIT = 0.5
+"""The same where the geometry is fitted, in what the fit leaves [-]: at least so much belongs to no
+motor, however their scatter was told apart from it; assumed."""
 ERROR_STEPS = (1.0, 1.75, 2.5)
-"""Where ranges of steady-state errors begin, in the least error."""
+"""Where ranges of steady-state errors begin, in the least error that a profile states."""
 WIDEST_ERROR = 5.0
-"""Greatest error of a range, in its least one: the paper's 10 to 50 counts."""
+"""Greatest size of a range, in its least one: the paper's 10 to 50 counts."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +53,10 @@ class InferenceSettings(Bounded):
             [m]; ArmPi: a tenth of what a healthy one scatters.
         path_roughness_m: What straight lines between the knots of a path and bent ramps leave out
             [m]; ArmPi: links of 0.3 m in all.
-        least_error_rad: Least size of a steady-state error [rad]; ArmPi: four counts of 0.24 deg,
-            just above its healthy scatter.
+        least_noise_m: Least noise of a settled tool position, beside that of the readings: bending
+            links, bearings [m]; ArmPi: assumed.
+        least_error_rad: Least size of a steady-state error of any motor [rad]; ArmPi: four counts
+            of 0.24 deg, just above its healthy scatter. 0: what can be seen of each motor.
     """
 
     moving_spread_m: AtLeastZero = 0.004
@@ -51,13 +65,15 @@ class InferenceSettings(Bounded):
     unmoved_m: AtLeastZero = 0.02
     update_m: AtLeastZero = 0.0005
     path_roughness_m: AtLeastZero = 0.002
-    least_error_rad: AtLeastZero = 4 * np.deg2rad(0.24)
+    least_noise_m: AtLeastZero = 0.0003
+    least_error_rad: AtLeastZero = 0.0
 
     @property
     def error_ranges(self) -> tuple[Range, ...]:
-        """Run-level ranges of a steady-state error's size [rad].
+        """Run-level ranges of a steady-state error's size, where the profile states the least.
 
-        From just above the healthy scatter to the paper's own, of the ArmPi FPV 10 to 50 counts.
+        From just above the healthy scatter to the paper's own, of the ArmPi FPV 10 to 50 counts
+        [rad].
         """
         least = np.array(ERROR_STEPS) * self.least_error_rad
         return tuple((float(low), float(WIDEST_ERROR * low)) for low in least)
@@ -66,8 +82,9 @@ class InferenceSettings(Bounded):
     def of(cls, robot: Robot, imperfections: Imperfections | None = None) -> InferenceSettings:
         """Return the settings of a robot.
 
-        What the table `inference` of its profile says; else the defaults, of which those that tell
-        rest from motion are no less than `NOISE_FACTOR` times the noise of its sensor.
+        What the table `inference` of its profile says. Else multiples of what its sensor can tell
+        apart: its noise, where that is known, and no less than a share of the reach. Those that
+        tell rest from motion are no less than `NOISE_FACTOR` times the noise.
 
         Args:
             robot: The robot.
@@ -77,10 +94,19 @@ class InferenceSettings(Bounded):
             InputError: If the table holds anything else, or a negative number.
         """
         readings = None if imperfections is None else imperfections.readings
-        noise = 0.0 if readings is None else NOISE_FACTOR * readings.noise_m
-        table = asdict(cls())
-        for name in ("moving_spread_m", "nearly_still_m", "same_place_m", "unmoved_m"):
-            table[name] = max(table[name], noise)
+        noise = UNKNOWN_NOISE_M if readings is None else readings.noise_m
+        least = 0.0 if readings is None else NOISE_FACTOR * readings.noise_m
+        apart = max(noise, RESOLUTION * robot.reach)
+        fitted = robot.profile.geometry.sensor_noise_m
+        table = {
+            "moving_spread_m": max(4.0 * apart, least),
+            "nearly_still_m": max(3.0 * apart, least),
+            "same_place_m": max(2.0 * apart, least),
+            "unmoved_m": max(20.0 * apart, least),
+            "update_m": 0.5 * apart,
+            "path_roughness_m": ROUGHNESS * robot.reach,
+            "least_noise_m": NOISE_OF_FIT * fitted if fitted else NOISE_OF_REACH * robot.reach,
+        }
         return from_table(cls, table | robot.profile.inference, f"{robot.name}: inference")
 
 

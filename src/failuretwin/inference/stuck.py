@@ -17,13 +17,15 @@ import numpy as np
 
 from failuretwin.core.numerics import log_fall, log_norm, log_of, log_sum, log_trapezoid_weights
 from failuretwin.core.types import FloatArray
-from failuretwin.inference.fault_models import nodes_around
+from failuretwin.inference.fault_sizes import nodes_around
+from failuretwin.inference.joint_likelihood import JointLikelihood
 from failuretwin.inference.marginal import FaultModel
 from failuretwin.inference.priors import OnsetIntervals, OnsetPrior, plateau_or_ramp
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 COARSE_NODES = 49
-"""Nodes spread evenly over the range of the held angle."""
+"""Nodes spread evenly over the range of the held angle, of the usual width; more over a wider."""
+FULL_TURN = 2.0 * np.pi
 PRIOR_STEPS = np.array([-5, -2.5, -1, 0, 1, 2.5, 5.0])
 """Nodes around each angle that the prior favours, in the scale of its peak."""
 SETTLED_SCALE, ON_THE_WAY_SCALE = 2.0, 8.0
@@ -49,7 +51,8 @@ def stuck_model(
     """
     angle = _angle_nodes(likelihood, motor, prior)
     if likely is not None:
-        angle = np.sort(np.concatenate([angle, likely.clip(*likelihood.held_range(motor))], axis=1))
+        low, high = (end[:, None] for end in likelihood.held_range(motor))
+        angle = np.sort(np.concatenate([angle, likely.clip(low, high)], axis=1))
     parts = _log_prior(likelihood, motor, angle, prior)  # (run, movement, plateau | ramp, node)
     log_prior = log_sum(parts, axis=2)
 
@@ -79,12 +82,12 @@ def _angle_nodes(likelihood: RunLikelihood, motor: int, prior: OnsetPrior) -> Fl
 
     They crowd where the likelihood or the prior may have a peak.
     """
-    low, high = likelihood.held_range(motor)
+    low, high = (end[:, None] for end in likelihood.held_range(motor))
     profile = likelihood.profile(motor)
     runs = len(profile.mode)
     width = np.sqrt(1.0 / np.maximum(profile.precision[..., 0], 1.0) + 1e-10)
-    local = nodes_around(profile.mode[..., 0], width, profile.usable, low)
-    coarse = np.broadcast_to(np.linspace(low, high, COARSE_NODES), (runs, COARSE_NODES))
+    local = _around_copies(profile, width, low, high)
+    coarse = np.linspace(low[:, 0], high[:, 0], likelihood.spread_over(motor, COARSE_NODES), axis=1)
     origin, _ = _ends(likelihood, motor)
     scale = max(profile.scatter, 1e-4)
     tied = [origin[..., None] + SETTLED_SCALE * scale * PRIOR_STEPS]
@@ -93,9 +96,32 @@ def _angle_nodes(likelihood: RunLikelihood, motor: int, prior: OnsetPrior) -> Fl
         tied.append(way[..., None] + ON_THE_WAY_SCALE * scale * PRIOR_STEPS)
     # Padded movements favour no angle, so that a run is judged as it is on its own.
     there = likelihood.evidence.movements.exists[..., None]
-    peaks = [np.where(there, angles, low).reshape(runs, -1) for angles in tied]
+    peaks = [np.where(there, angles, low[..., None]).reshape(runs, -1) for angles in tied]
     nodes = [coarse, local, *peaks]
     return np.sort(np.clip(np.concatenate(nodes, axis=1), low, high), axis=1)
+
+
+def _around_copies(
+    profile: JointLikelihood, width: FloatArray, low: FloatArray, high: FloatArray
+) -> FloatArray:
+    """Return nodes around the angle that each movement points to, (run, node) [rad].
+
+    And around its copies full turns away, where they lie within the range.
+
+    Args:
+        profile: What the movements say of the motor.
+        width: Standard deviation of that angle, (run, movement) [rad].
+        low: Lowest held angle, (run, 1) [rad]; what points nowhere gives it.
+        high: The highest.
+    """
+    best = profile.mode[..., 0]
+    found = [nodes_around(best, width, profile.usable, low)]
+    for turns in (-2, -1, 1, 2) if profile.wraps else ():
+        copy = best + turns * FULL_TURN
+        inside = profile.usable & (copy > low) & (copy < high)
+        if inside.any():
+            found.append(nodes_around(copy, width, inside, low))
+    return np.concatenate(found, axis=1)
 
 
 def _log_prior(
@@ -108,7 +134,7 @@ def _log_prior(
     """
     origin, target = _ends(likelihood, motor)
     scale = max(float(likelihood.model.scatter[motor]), 1e-4)
-    low, high = likelihood.held_range(motor)
+    low, high = (end[:, None, None, None] for end in likelihood.held_range(motor))
     plateau = _tied(angle[:, None] - origin[..., None], SETTLED_SCALE * scale)
     if prior.known_s is not None:
         way = _position_at(likelihood, motor, prior.known_s)

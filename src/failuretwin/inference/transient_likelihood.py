@@ -86,7 +86,7 @@ class TransientLikelihood:
         Args:
             motor: Index of the motor.
             profile: What each movement says of it.
-            angle: Where it may be held otherwise, (node,) [rad].
+            angle: Where it may be held otherwise, (run, node) [rad].
 
         Returns:
             (run, movement, node).
@@ -100,10 +100,10 @@ class TransientLikelihood:
         chosen, log_correction = self._fill_in(ends, seen, whatever)
         origin, destination = self._course(ends, chosen, whatever)
         begin, end, duration = (
-            np.repeat(values[:, :, None], len(angle), axis=2)
+            np.repeat(values[:, :, None], angle.shape[1], axis=2)
             for values in (origin, destination, self.settled.movements.ramp_duration)
         )
-        begin[..., motor] = end[..., motor] = np.where(usable, nearest, angle)
+        begin[..., motor] = end[..., motor] = np.where(usable, nearest, angle[:, None])
         stays = self._of_runs(begin, end, duration)
         begin[..., motor] = self._course(ends, chosen, lost)[0][..., None, motor]
         travel = self.settled.movements.target[..., None, motor] - begin[..., motor]
@@ -202,7 +202,7 @@ class TransientLikelihood:
     def _outlier_path(self) -> FloatArray:
         """Log density if the tool strays from its way as no fault explains, (run, movement)."""
         origin, destination, _ = self._healthy
-        spread_m = OUTLIER_PATH * self.model.reach
+        spread_m = OUTLIER_PATH * self.model.twin.robot.reach
         says = self._of_runs(origin[:, :, None], destination[:, :, None], spread_m=spread_m)
         return TEMPERING * says[..., 0]
 

@@ -26,6 +26,8 @@ from failuretwin.inference.joint_likelihood import nearest_on_circle
 
 SCANNED = 16
 """Angles of the first motor from which a way is looked for; more find no other ways."""
+SCANNED_STEP_RAD = 0.19
+"""The furthest apart that they lie, whatever its travel."""
 SOLUTIONS = 2
 """Ways to bring the tool somewhere that are followed."""
 STEPS = 6
@@ -175,9 +177,9 @@ def _starts(
 ) -> FloatArray:
     """Return from where to look for each way, (run, movement, outcome, way, motor) [rad]."""
     first, second = pair
-    low, high = model.twin.robot.motors[first].movement_range
-    grid = np.linspace(low, high, SCANNED)
-    poses = np.repeat(pose[..., None, :], SCANNED, axis=-2)
+    low, high = model.twin.robot.travel[first]
+    grid = np.linspace(low, high, max(SCANNED, int(np.ceil((high - low) / SCANNED_STEP_RAD)) + 1))
+    poses = np.repeat(pose[..., None, :], len(grid), axis=-2)
     poses[..., first] = grid
     point = point[:, :, None, None]
     own = (np.arange(pose.shape[-1]) == second).reshape(1, *(1,) * (poses.ndim - 1), -1)
@@ -197,7 +199,7 @@ def _found(
     """Return whether each way is within the range of both motors and no copy of the first."""
     there = np.ones(angle.shape[:-1], dtype=bool)
     for k, motor in enumerate(pair):
-        low, high = model.twin.robot.motors[motor].movement_range
+        low, high = model.twin.robot.travel[motor]
         margin = 0.2 * (high - low)
         there &= (angle[..., k] > low - margin) & (angle[..., k] < high + margin)
     off = angle[..., 1:, :] - angle[..., :1, :]

@@ -130,8 +130,7 @@ def _of_pair(
 def _offsets(likelihood: RunLikelihood, seen: TwoJointLikelihood) -> LinearOffsets:
     """Return where two motors may stand, for each of `KINDS`."""
     pair = list(seen.pair)
-    motors = [likelihood.model.twin.robot.motors[motor] for motor in pair]
-    ends = np.array([motor.movement_range for motor in motors])
+    ends = likelihood.model.twin.robot.travel[pair]
     middle, length = ends.mean(axis=1), ends[:, 1] - ends[:, 0]
     target = np.nan_to_num(likelihood.evidence.movements.target[..., pair])
     scatter = likelihood.model.scatter[pair] ** 2

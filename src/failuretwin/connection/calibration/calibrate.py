@@ -280,7 +280,7 @@ def _held_out_runs(runs: xr.Dataset, hold_out: str | None) -> np.ndarray:
 def _refuse_scatter(first: Calibration, robot: Robot) -> None:
     for parameter in first.parameters:
         if parameter.name == "scatter" and parameter.low > MOST_SCATTER_RAD:
-            scale, unit = shown_unit("rad", robot)
+            scale, unit = shown_unit("rad", robot, parameter.motor)
             raise InputError(
                 f"{parameter.motor} settles anew with every movement, with a scatter of "
                 f"{scale * parameter.value:.1f} {unit}; expected {scale * MOST_SCATTER_RAD:.1f} at "

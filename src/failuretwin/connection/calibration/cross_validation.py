@@ -25,7 +25,8 @@ from failuretwin.connection.calibration.timing_fit import (
 from failuretwin.core.errors import InputError
 from failuretwin.core.numerics import log_student
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
-from failuretwin.digital_model.nonidealities import Timing, generic_imperfections
+from failuretwin.digital_model.arm_classes import generic_imperfections
+from failuretwin.digital_model.nonidealities import Timing
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling
 from failuretwin.digital_model.twin import DigitalTwin

@@ -1,0 +1,368 @@
+"""From healthy logs to a profile that knows its frames: search, fit, see what poses cannot tell.
+
+Section: docs/registration.md
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from failuretwin.connection.calibration.result import Parameter
+from failuretwin.connection.registration.arm import (
+    AXIS_SPREADS,
+    BASE_RAD,
+    Arm,
+    Fitted,
+    rotation,
+)
+from failuretwin.connection.registration.poses import Poses, settled_poses
+from failuretwin.connection.registration.robust import Posterior, fit
+from failuretwin.connection.registration.search import Registered, search
+from failuretwin.core.errors import InputError
+from failuretwin.core.runs import check_motors
+from failuretwin.core.types import FloatArray
+from failuretwin.data_knowledge.read import RunsLike, as_runs
+from failuretwin.digital_model.geometry import roll_pitch_yaw
+from failuretwin.digital_model.robot import Profile, Robot, load_robot
+from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.registration import align
+from failuretwin.inference.wrong_setup import NEAR, extent, wrong_setup
+
+Z_95 = 1.959963984540054
+LEARNED = 0.5
+"""A number is identified if poses bring its deviation below this share of the prior's."""
+NOT_TOLD = 0.7
+"""A direction is not told by the poses where its deviation stays above this share of before."""
+MAIN_PART = 0.35
+"""Share of a direction from which a number is named as part of it."""
+FOLDS = 5
+"""Every fifth pose is predicted by a fit to the others."""
+
+
+@dataclass(frozen=True)
+class Registration:
+    """What settled poses say of frames, senses, zeros and geometry.
+
+    Attributes:
+        profile: The profile with all of it.
+        parameters: Every number with its 95 % interval.
+        poses: Number of settled poses.
+        before_mm: How far the tool was from where the profile had put it, median over poses [mm].
+        frames_mm: The same with frame, tool point, senses and zeros fitted alone.
+        after_mm: The same with the geometry fitted too, of poses that the fit had not seen.
+        noise_m: Standard deviation that is left on each axis [m].
+        not_told: What the poses cannot tell, in sentences.
+        remarks: What else the user should know, in sentences.
+    """
+
+    profile: Profile
+    parameters: tuple[Parameter, ...]
+    poses: int
+    before_mm: float
+    frames_mm: float
+    after_mm: float
+    noise_m: float
+    not_told: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+
+def fit_registration(
+    runs: RunsLike, robot: Robot | str | Path, source: str = "", date: str = ""
+) -> Registration:
+    """Fit frames, tool point, senses, zeros and geometry to healthy logs.
+
+    Args:
+        runs: The logs as a run set, or where they are.
+        robot: The robot, its name or its profile.
+        source: Which logs these are.
+        date: When it is done, as the profile will say.
+
+    Raises:
+        InputError: If there are too few poses, or no frame, sense or zero explains them; it says
+            which simple mistake does.
+    """
+    robot = load_robot(robot)
+    runs = as_runs(runs, robot)
+    check_motors(runs, robot.name, robot.motor_names)
+    poses = settled_poses(runs, robot)
+    return register(poses, robot, source, date)
+
+
+def register(poses: Poses, robot: Robot, source: str = "", date: str = "") -> Registration:
+    """Fit frames, tool point, senses, zeros and geometry to settled poses.
+
+    Args:
+        poses: The poses.
+        robot: The robot.
+        source: Where they come from.
+        date: When it is done.
+
+    Raises:
+        InputError: As `fit_registration`.
+    """
+    arm = Arm.of(robot)
+    _refuse_units(poses, robot)
+    found = search(arm, poses)
+    _refuse_misfit(found.best, poses, robot)
+    whole = _with_details(arm, found.best, poses)
+    fitted = whole.fitted
+    when = f" on {date}" if date else ""
+    told = f"failuretwin robot fit{when}: {len(poses)} settled poses"
+    told += f" of {source}" if source else ""
+    return Registration(
+        profile=_profile(robot, fitted, whole.noise, told),
+        parameters=_parameters(whole),
+        poses=len(poses),
+        before_mm=_middle_mm(poses.point - DigitalTwin(robot).path(poses.target)),
+        frames_mm=_middle_mm(_error(found.best, poses)),
+        after_mm=_unseen_mm(arm, whole, poses),
+        noise_m=whole.noise,
+        not_told=tuple(_not_told(whole)),
+        remarks=tuple(_remarks(robot, found, whole, poses)),
+    )
+
+
+def _with_details(arm: Arm, found: Posterior, poses: Poses) -> Posterior:
+    unknowns = arm.details()
+    begin = np.zeros(len(unknowns))
+    begin[: len(found.fitted.values)] = found.fitted.values
+    return fit(arm, found.fitted.start, unknowns, poses, begin)
+
+
+def _error(found: Posterior, poses: Poses) -> FloatArray:
+    fitted = found.fitted
+    torque = fitted.arm.torque(poses.target, fitted.start)
+    return poses.point - fitted.expected(poses.target, torque)
+
+
+def _unseen_mm(arm: Arm, whole: Posterior, poses: Poses) -> float:
+    """Return the error of every fifth pose by a fit to the others, which begins at `whole` [mm]."""
+    fold = np.arange(len(poses)) % FOLDS == FOLDS - 1
+    fitted = whole.fitted
+    others = fit(arm, fitted.start, fitted.unknowns, poses[np.flatnonzero(~fold)], fitted.values)
+    return _middle_mm(_error(others, poses[np.flatnonzero(fold)]))
+
+
+def _middle_mm(error: FloatArray) -> float:
+    """Return the median distance; poses that lost a command would make the rms [mm]."""
+    return 1e3 * float(np.median(np.linalg.norm(error, axis=1)))
+
+
+# Set-ups that no frame can mend.
+
+FACTOR = 8.0
+"""Extents that differ by so much are no matter of senses: the unit of lengths is another [-]."""
+MOST_RAD = 20.0
+"""Commands beyond three turns are no angles in rad."""
+
+
+def _refuse_units(poses: Poses, robot: Robot) -> None:
+    expected = DigitalTwin(robot).path(poses.target)
+    ratio = extent(poses.point) / max(extent(expected), 1e-9)
+    farthest = float(np.abs(poses.target).max())
+    if farthest > MOST_RAD:
+        raise InputError(
+            f"commands reach {farthest:.0f} rad, so they look like degrees. Say "
+            'unit = "deg" under [command] in the column map.'
+        )
+    if ratio > FACTOR:
+        unit = "millimetres (mm)" if ratio > 30 * FACTOR else "centimetres (cm)"
+        raise InputError(
+            f"tool positions spread over {extent(poses.point):.0f} m, expected about "
+            f"{extent(expected):.2g} m: they look like {unit}. Say so as the unit under [tool] in "
+            "the column map."
+        )
+
+
+def _refuse_misfit(found: Posterior, poses: Poses, robot: Robot) -> None:
+    away = float(np.median(np.linalg.norm(_error(found, poses), axis=1)))
+    if away <= NEAR * extent(poses.point):
+        return
+    setup = wrong_setup(DigitalTwin(robot), poses.target, poses.point)
+    told = setup.told if setup is not None else _swapped(robot, poses, away)
+    raise InputError(
+        f"with the best frame, senses and zeros the tool is still {1e3 * away:.0f} mm off at "
+        f"the median, so nothing is written. "
+        + (told or "Check that the logs are of this robot, and the units of the column map.")
+    )
+
+
+def _swapped(robot: Robot, poses: Poses, away: float) -> str:
+    """Return which two columns of commands are swapped, a sentence; empty if none are."""
+    twin, names = DigitalTwin(robot), robot.motor_names
+    best, told = 0.25 * away, ""
+    for a, b in combinations(range(len(names)), 2):
+        order = np.arange(len(names))
+        order[[a, b]] = b, a
+        off = align(twin.path(poses.target[:, order]), poses.point).away
+        if off < best:
+            best = off
+            told = f"The commands of {names[a]} and {names[b]} seem to be swapped: exchange their "
+            told += "columns in the map."
+    return told
+
+
+# What was found, as a profile and in words.
+
+
+def _profile(robot: Robot, fitted: Fitted, noise: float, source: str) -> Profile:
+    """Return the profile with what was fitted; the pose that is seen changes with senses alone."""
+    profile, sense = robot.profile, fitted.start.sense
+    if not np.array_equal(sense, robot.sensor_sense):
+        motors = tuple(
+            replace(m, sense=float(s)) for m, s in zip(profile.motors, sense, strict=True)
+        )
+        profile = replace(profile, motors=motors, sensor_pose="physical")
+    return replace(
+        profile,
+        tool_xyz=fitted.tool_xyz,
+        base_xyz_rpy=fitted.base_xyz_rpy,
+        geometry=fitted.geometry(noise, source),
+        imperfections=None,
+    )
+
+
+def _parameters(found: Posterior) -> tuple[Parameter, ...]:
+    fitted, names = found.fitted, found.fitted.arm.robot.motor_names
+    values = _stated(fitted)
+    rows = []
+    deviations = found.deviation
+    deviations[ANGLES] = _angle_deviation(found)
+    for unknown, value, deviation in zip(fitted.unknowns, values, deviations, strict=True):
+        if unknown.name.startswith("axis "):
+            continue
+        half = Z_95 * float(deviation)
+        motor = "" if unknown.motor is None else names[unknown.motor]
+        learned = bool(deviation < LEARNED * unknown.spread)
+        note = "" if learned else "the poses do not say; it stays where the URDF puts it"
+        rows.append(
+            Parameter(
+                unknown.name, motor, unknown.unit, value, value - half, value + half, learned, note
+            )
+        )
+    return (*rows, *_axis_parameters(found))
+
+
+ANGLES = slice(3, 6)
+"""Where the turn of the base stands among the unknowns."""
+TURN_RAD = 1e-5
+
+
+def _angle_deviation(found: Posterior) -> FloatArray:
+    """Return the standard deviation of the base's roll, pitch and yaw, (3,) [rad]."""
+    R = found.fitted.turn
+    here = np.array(roll_pitch_yaw(R))
+    turned = [np.array(roll_pitch_yaw(rotation(TURN_RAD * way) @ R)) for way in np.eye(3)]
+    slope = np.stack([(one - here + np.pi) % (2.0 * np.pi) - np.pi for one in turned], axis=1)
+    slope /= TURN_RAD
+    covariance = found.covariance[ANGLES, ANGLES] * BASE_RAD**2
+    return np.asarray(np.sqrt(np.diag(slope @ covariance @ slope.T)))
+
+
+def _stated(fitted: Fitted) -> list[float]:
+    """Return the numbers as people read them: places rather than changes."""
+    places = [*fitted.base_xyz_rpy, *fitted.tool_xyz]
+    found = places[:]
+    rest = zip(fitted.unknowns[len(places) :], fitted.values[len(places) :], strict=True)
+    for unknown, value in rest:
+        if unknown.name == "zero" and unknown.motor is not None:
+            found.append(fitted.zero(unknown.motor))
+        else:
+            found.append(fitted.scale if unknown.name == "sensor scale" else float(value))
+    return found
+
+
+AXIS_NUMBERS = (
+    ("axis shift x", "m"),
+    ("axis shift y", "m"),
+    ("axis tilt x", "rad"),
+    ("axis tilt y", "rad"),
+)
+
+
+def _axis_parameters(found: Posterior) -> list[Parameter]:
+    """Return how each axis is moved across itself, in its own frame."""
+    fitted, rows = found.fitted, []
+    for j, motor in enumerate(fitted.arm.robot.motor_names):
+        at = fitted.unknowns.of_axis(j)
+        if not at:
+            continue
+        ways = fitted.arm.lines[j]
+        spread = np.array(AXIS_SPREADS)
+        deviation = spread * np.sqrt(np.diag(ways @ found.covariance[np.ix_(at, at)] @ ways.T))
+        prior = spread * np.linalg.norm(ways, axis=1)
+        for (name, unit), value, half, believed in zip(
+            AXIS_NUMBERS, fitted.moved(j), Z_95 * deviation, prior, strict=True
+        ):
+            if believed < 1e-9:
+                continue
+            learned = bool(half < Z_95 * LEARNED * believed)
+            note = "" if learned else "the poses do not say; it stays where the URDF puts it"
+            rows.append(
+                Parameter(
+                    name,
+                    motor,
+                    unit,
+                    float(value),
+                    float(value - half),
+                    float(value + half),
+                    learned,
+                    note,
+                )
+            )
+    return rows
+
+
+def _not_told(found: Posterior) -> list[str]:
+    """Return the directions whose posterior is as wide as the prior, widest first."""
+    size, ways = np.linalg.eigh(found.covariance)
+    sentences = []
+    for deviation, way in sorted(zip(np.sqrt(size), ways.T, strict=True), key=lambda p: -p[0]):
+        if deviation < NOT_TOLD:
+            break
+        parts = np.flatnonzero(np.abs(way) > MAIN_PART)
+        names = dict.fromkeys(_spoken(found.fitted, int(i)) for i in parts)
+        sentences.append(" against ".join(names) if len(names) > 1 else "".join(names))
+    return sentences
+
+
+def _spoken(fitted: Fitted, index: int) -> str:
+    unknown = fitted.unknowns[index]
+    if unknown.motor is None:
+        return unknown.name
+    what = "place of the axis" if unknown.name.startswith("axis ") else unknown.name
+    return f"{what} of {fitted.arm.robot.motors[unknown.motor].joint}"
+
+
+def _remarks(robot: Robot, found: Registered, whole: Posterior, poses: Poses) -> list[str]:
+    names, sense = robot.motor_names, whole.fitted.start.sense
+    turned = [n for n, now, was in zip(names, sense, robot.sensor_sense, strict=True) if now != was]
+    remarks = [f"{name} turns the other way than the profile said" for name in turned]
+    remarks += [_either(names, sense, other) for other in found.others]
+    unknowns = len(whole.fitted.unknowns)
+    if 3 * len(poses) < 6 * unknowns:
+        remarks.append(
+            f"{len(poses)} poses for {unknowns} unknowns: {2 * unknowns} poses all over the range "
+            "would make the geometry sure"
+        )
+    if robot.profile.imperfections is not None:
+        remarks.append(
+            f"{robot.profile.imperfections} was learned with the geometry as it was before, so the "
+            "new profile does not name it; run `failuretwin calibrate` with the new profile"
+        )
+    return remarks
+
+
+def _either(names: list[str], sense: FloatArray, other: Posterior) -> str:
+    """Return a sentence on another way to see the arm, and on what decides."""
+    differ = [n for n, a, b in zip(names, sense, other.fitted.start.sense, strict=True) if a != b]
+    up = "up" if other.fitted.turn[2, 2] > 0.0 else "down"
+    return (
+        f"either as fitted, or with {', '.join(differ)} turning the other way and the base's z "
+        f"pointing {up} for the sensor: the poses cannot tell. Move {differ[0]} by hand or alone "
+        "and see whether it turns as the URDF says; tool positions are the same either way"
+    )

@@ -1,0 +1,242 @@
+"""Diagnosis of a folder that calibrates itself: no healthy logs, no labels.
+
+What a kind of arm is like is the prior; the runs say together how this robot differs from it, each
+weighed by how surely it is known what is wrong in it. What is learned is an ordinary calibration.
+
+Section: docs/self_calibration.md
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import xarray as xr
+
+from failuretwin.connection.calibration.observations import session_names
+from failuretwin.connection.calibration.parameters import readings_of, schedule_of, timing_of
+from failuretwin.connection.calibration.result import Calibration, Parameter
+from failuretwin.connection.calibration.timing_fit import gap_starts, lateness
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis
+from failuretwin.core.runs import truth_of
+from failuretwin.core.types import FloatArray
+from failuretwin.data_knowledge.read import RunsLike, as_runs
+from failuretwin.digital_model.arm_classes import generic_imperfections
+from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
+from failuretwin.digital_model.nonidealities import Imperfections, LostCommand, Variation
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.evidence import Evidence
+from failuretwin.inference.folder_posterior import Advance, FolderPosterior, folder_posterior
+from failuretwin.inference.priors import Priors
+from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.shared_unknowns import REGISTRATION
+
+LATE_LOSSES = 4.0
+"""How many times as often a movement that starts late loses its command, where nobody has counted:
+a stalled bus does both; assumed."""
+FAR = 3.0
+"""Offsets so many deviations off what such robots do are told."""
+IDENTIFIED = 0.7
+"""An offset is learned where the runs narrow it to this share of the prior's deviation."""
+UNITS = {"bias": "rad", "compliance": "rad/(N m)", "friction": "rad"}
+
+
+@dataclass(frozen=True)
+class SelfCalibration:
+    """What some runs say together.
+
+    Attributes:
+        diagnoses: Of each run.
+        calibration: What they teach of the robot.
+        taught: By how much each run has narrowed that, in the runs' order [nats].
+    """
+
+    diagnoses: Sequence[Diagnosis]
+    calibration: Calibration
+    taught: FloatArray
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What is to be known of what was learned, in sentences."""
+        return self.calibration.remarks
+
+
+@dataclass(frozen=True)
+class SelfCalibratingDiagnoser:
+    """Diagnoses the runs of one robot together, and learns from them how it differs from its kind.
+
+    ``SelfCalibratingDiagnoser("armpi_fpv").diagnose("logs/")`` is enough. Results are protocol P1:
+    runs inform each other, though none its own prior.
+
+    Attributes:
+        robot: The robot, its name or its profile.
+        population: What such robots are like: figures, the name or path of a calibration whose
+            variation says how far this robot may differ; None: what arms of its class are like.
+        hypotheses: What may be the case; None: the paper's classes.
+        priors: Beliefs about faults and set-ups; None: the usual ones.
+    """
+
+    robot: RobotLike
+    population: HealthyLike = None
+    hypotheses: Sequence[Hypothesis | str] | None = None
+    priors: Priors | None = None
+
+    @cached_property
+    def twin(self) -> DigitalTwin:
+        """Digital twin of the robot."""
+        if self.population is None:
+            return calibrated(self.robot, "none").twin
+        return calibrated(self.robot, self.population).twin
+
+    def diagnose(self, runs: RunsLike) -> list[Diagnosis]:
+        """Return the diagnosis of each run, judged with what all the others teach.
+
+        Raises:
+            InputError: If the runs cannot be read or are of another robot.
+        """
+        return list(self.learn(runs).diagnoses)
+
+    def learn(self, runs: RunsLike, advance: Advance = lambda passes: None) -> SelfCalibration:
+        """Return the diagnoses, and what the runs teach of the robot.
+
+        Args:
+            runs: A run set, or any logs by their path.
+            advance: Told of progress.
+
+        Raises:
+            InputError: If the runs cannot be read or are of another robot.
+        """
+        robot = self.twin.robot
+        runs = as_runs(runs, robot)
+        believed = self._population(runs)
+        bayes = BayesDiagnoser(self.twin, believed, self.hypotheses, self.priors)
+        model = bayes.healthy_model
+        seen = Evidence(runs, model.settings)
+        evidence = seen.sound.settled
+        if evidence.movements.start.shape[1] == 0:
+            raise InputError(
+                "no run holds a movement: `command` never leaves its first value. Expected runs "
+                "of one movement at least."
+            )
+        likelihood = RunLikelihood(evidence, model)
+        found = folder_posterior(likelihood, bayes.hypothesis_set, bayes.priors, advance)
+        names = [str(name) for name in runs["run"].values]
+        truth = truth_of(runs)
+        truths = [None] * len(names) if truth is None else list(truth)
+        diagnoses: list[Diagnosis] = []
+        for posterior in found.posteriors:
+            first = len(diagnoses)
+            for at in range(len(posterior.log_posterior)):
+                run = first + at
+                told = posterior.to_diagnosis(at, names[run], seen.quality[run], truths[run])
+                diagnoses.append(replace(told, protocol="P1"))
+        return SelfCalibration(diagnoses, _calibration(found, believed, robot, runs), found.taught)
+
+    def _population(self, runs: xr.Dataset) -> Imperfections:
+        """Return what such robots are like, with what the commands alone say of their timing."""
+        robot = self.twin.robot
+        believed = calibrated(self.robot, self.population or generic_imperfections(robot))
+        if self.population is not None:
+            return believed.imperfections
+        movements = Evidence(runs).settled.movements
+        late = lateness(movements)
+        timing = timing_of(None, late, gap_starts(runs, movements, late.late))
+        losses = believed.imperfections.lost_commands
+        if timing.late_rate > 0.0:
+            losses = tuple(_more_when_late(entry) for entry in losses)
+        return replace(
+            believed.imperfections,
+            timing=timing,
+            schedule=schedule_of(movements, late, robot),
+            lost_commands=losses,
+        )
+
+
+def _more_when_late(entry: LostCommand) -> LostCommand:
+    return replace(entry, rate_when_late=min(LATE_LOSSES * entry.rate, 0.2))
+
+
+def _calibration(
+    found: FolderPosterior, believed: Imperfections, robot: Robot, runs: xr.Dataset
+) -> Calibration:
+    """Return what was learned as a calibration, which anybody may use."""
+    learned, name = found.model.imperfections, f"{robot.name}, self-calibrated"
+    source = f"{runs.sizes['run']} runs without labels; {believed.name}"
+    parameters = _parameters(found, believed, robot)
+    return Calibration(
+        imperfections=replace(
+            learned,
+            name=name,
+            source=source,
+            protocol="P1",
+            readings=readings_of(runs, robot, None),
+            variation=_variation(found),
+        ),
+        parameters=tuple(parameters),
+        sessions=tuple(dict.fromkeys(session_names(runs))),
+        runs=runs.sizes["run"],
+        movements=int(sum(p.likelihood.evidence.usable.sum() for p in found.posteriors)),
+        used_readings=False,
+        remarks=tuple(_remarks(parameters, found, runs)),
+    )
+
+
+def _variation(found: FolderPosterior) -> Variation:
+    """Return the deviations of what was learned, as a calibration states them."""
+    motors = len(found.model.scatter)
+    if len(found.mean) == REGISTRATION:
+        return found.model.imperfections.variation or Variation()
+    bias, compliance, friction = found.deviation[REGISTRATION:].reshape(3, motors)
+    mean = np.abs(np.asarray(found.model.settling.compliance))
+    relative = np.divide(compliance, mean, out=np.zeros(motors), where=mean > 1e-9)
+    return Variation(
+        bias=tuple(bias.tolist()),
+        compliance=tuple(np.minimum(relative, 1.0).tolist()),
+        friction=tuple(friction.tolist()),
+    )
+
+
+def _parameters(found: FolderPosterior, believed: Imperfections, robot: Robot) -> list[Parameter]:
+    """Return every offset with its 95 % interval, and how far it lies from what such robots do."""
+    if len(found.mean) == REGISTRATION:
+        return []
+    motors, told = robot.motor_names, []
+    for k, name in enumerate(UNITS):
+        values = np.asarray(getattr(found.model.settling, name))
+        expected = np.asarray(getattr(believed.settling, name))
+        for i, motor in enumerate(motors):
+            at = REGISTRATION + k * len(motors) + i
+            spread, prior = found.deviation[at], found.prior_deviation[at]
+            off = (values[i] - expected[i]) / prior
+            note = f"{off:+.1f} deviations off what such robots do" if abs(off) > FAR else ""
+            known = bool(spread < IDENTIFIED * prior)
+            if not known:
+                note = "the runs do not tell it from what such robots differ by"
+            low, high = values[i] - 1.96 * spread, values[i] + 1.96 * spread
+            value = float(values[i])
+            told.append(Parameter(name, motor, UNITS[name], value, low, high, known, note))
+    return told
+
+
+def _remarks(
+    parameters: Sequence[Parameter], found: FolderPosterior, runs: xr.Dataset
+) -> list[str]:
+    """Return what else is to be known of what was learned."""
+    lines = [
+        f"{p.name} of {p.motor}: {p.note}; a fault that is there in every run looks like this"
+        for p in parameters
+        if p.identified and p.note
+    ]
+    names = runs["run"].values
+    most = [f"{names[i]} ({found.taught[i]:.1f} nats)" for i in np.argsort(-found.taught)[:3]]
+    lines.append(f"most was learned from {', '.join(most)}")
+    lines.append(
+        "a constant error that is there in every run cannot be told from the robot's own, up to "
+        "what such robots differ by"
+    )
+    return lines

@@ -1,0 +1,403 @@
+"""What runs say of a hypothesis, as a function of the shared unknowns near their best values.
+
+    log p(run | h, theta + d) ~ L + b^T d - 1/2 d^T A d
+
+By Fisher's identity the score b is the mean of the complete score over all that is unknown; by
+Louis's identity the information A is the complete information less what the unknown angle of the
+faulty motor takes away. With weights w of outcomes and states, u = (nu + 3)/(nu + D^2),
+
+    b = sum w u Gamma^T rho,    A = sum w (nu + 3)/(nu + 5) Gamma^T Gamma - missing
+
+A motor with an active fault says nothing of its own offsets. An angle that holds for the run is
+common to its movements; an offset that is drawn anew takes away all along its lever.
+
+Section: docs/diagnosis.md#shared-unknowns-registration-and-offsets
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.numerics import log_sum
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.failure_behavior.mode import Signature
+from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.joint_likelihood import LEAST_PRECISION
+from failuretwin.inference.linear_response import LinearResponse, MotorResponse, Whitened
+from failuretwin.inference.marginal import (
+    ChangePointPosterior,
+    FaultModel,
+    change_points,
+    movement_log_likelihoods,
+)
+from failuretwin.inference.posterior import fault_model_of
+from failuretwin.inference.priors import Priors
+from failuretwin.inference.run_likelihood import RunLikelihood, share_of
+
+
+@dataclass(frozen=True)
+class LocalLikelihood:
+    """The log likelihood of some runs near one theta of each.
+
+    Attributes:
+        theta: Where it is expanded, (run, theta).
+        log_likelihood: L, (run,).
+        score: b, (run, theta).
+        information: A, (run, theta, theta).
+        misfit: Mean D^2 of what is explained, (run,); 3 if all is well.
+        scattered: Expected sum of squares of how far each healthy motor has scattered, and of how
+            many times it has, (run, 2, motor) [rad2, -].
+        outcomes: Expected share of each outcome of each movement, (run, movement, outcome).
+    """
+
+    theta: FloatArray
+    log_likelihood: FloatArray
+    score: FloatArray
+    information: FloatArray
+    misfit: FloatArray
+    scattered: FloatArray
+    outcomes: FloatArray
+
+
+def local_likelihood(
+    response: LinearResponse, hypothesis: Hypothesis, priors: Priors, theta: FloatArray
+) -> LocalLikelihood:
+    """Return what settled positions say of a hypothesis near theta.
+
+    Args:
+        response: The runs.
+        hypothesis: What may be the case; one that `has_score`.
+        priors: Beliefs about onset and size.
+        theta: Beside the theta of the response, (run, theta).
+    """
+    if hypothesis.is_healthy:
+        likelihood = response.at(theta, ())
+        sums = _healthy_sums(response, likelihood, theta, np.ones(likelihood.usable.shape))
+        return sums.local(theta, likelihood.log_healthy.sum(axis=1), likelihood.usable)
+    motor = response.model.motor_names.index(hypothesis.faults[0].motor)
+    likelihood = response.at(theta, (motor,))
+    fault_model = fault_model_of(likelihood, hypothesis.faults[0], priors)
+    says = movement_log_likelihoods(likelihood, fault_model)
+    joint = change_points(likelihood.log_healthy, says.by_cell, fault_model.log_prior)
+    found = ChangePointPosterior.of(joint)
+    active = np.cumsum(np.exp(found.log_responsibility), axis=1)  # (run, movement, cell)
+    faulty = np.clip(active.sum(axis=-1), 0.0, 1.0)
+    sums = _healthy_sums(response, likelihood, theta, 1.0 - faulty)
+    sums += _faulty_sums(response, likelihood, fault_model, theta, active, says.by_node)
+    return sums.local(theta, found.log_evidence, likelihood.usable)
+
+
+OUTLYING = 100.0
+"""Squared distance that stands for "nowhere near" when the fit of a run is judged."""
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """Sums over the movements of each run: b, A, D^2 and scatter; and the weights of outcomes."""
+
+    score: FloatArray
+    information: FloatArray
+    square: FloatArray
+    scattered: FloatArray
+    weight: FloatArray
+
+    def __add__(self, other: _Sums) -> _Sums:
+        both = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        return _Sums(*(one + two for one, two in both))
+
+    def local(
+        self, theta: FloatArray, log_likelihood: FloatArray, usable: BoolArray
+    ) -> LocalLikelihood:
+        """Return the local likelihood that has these sums."""
+        count = np.maximum(usable.sum(axis=1), 1)
+        explained = self.weight.sum(axis=(1, 2))
+        misfit = (self.square + OUTLYING * (count - explained)) / count
+        told = (self.score, self.information, misfit, self.scattered, self.weight)
+        return LocalLikelihood(theta, log_likelihood, *told)
+
+
+def has_score(hypothesis: Hypothesis) -> bool:
+    """Return whether settled positions have a score under it: healthy, or one motor settles off.
+
+    For the rest, which settle as healthy ones or hold two faults or any, the best theta of these
+    has to do.
+    """
+    if not hypothesis.known or len(hypothesis.faults) > 1:
+        return False
+    signatures = [MODES[fault.mode].signature for fault in hypothesis.faults]
+    return not set(signatures) & {Signature.TRANSIENT, Signature.MISSED}
+
+
+def _healthy_sums(
+    response: LinearResponse, likelihood: RunLikelihood, theta: FloatArray, share: FloatArray
+) -> _Sums:
+    """Return the sums of movements that are healthy with some probability, (run, movement)."""
+    seen, model = response.healthy, response.model
+    off = seen.off(theta)
+    square = np.einsum("...k,...k->...", off, off)
+    weight = likelihood.outcome_probability * share[..., None]
+    return _sums(seen, off, square, weight, model.scatter, model.settling.tail_dof)
+
+
+def _sums(
+    seen: Whitened,
+    off: FloatArray,
+    square: FloatArray,
+    weight: FloatArray,
+    scatter: FloatArray,
+    nu: float,
+) -> _Sums:
+    """Return the sums of some movements.
+
+    Motors scatter by s^2 lambda^T rho at the most probable, with s^2 - s^4 lambda^T lambda left.
+
+    Args:
+        seen: Residuals, columns and levers.
+        off: Residuals at theta, (..., 3).
+        square: D^2, (...).
+        weight: How much each counts, (...).
+        scatter: Scale of each motor's scatter, (motor,) [rad]; 0: it tells nothing.
+        nu: Degrees of freedom of the scatter.
+    """
+    runs, size = len(off), seen.gamma.shape[-1]
+    u = _pull(square, nu)
+    score = np.matmul(
+        np.reshape((u * weight)[..., None] * off, (runs, 1, -1)),
+        np.reshape(seen.gamma, (runs, -1, size)),
+    )
+    scaled = seen.gamma * np.sqrt(_mean_pull(nu) * weight)[..., None, None]
+    scaled = np.reshape(scaled, (runs, -1, size))
+    lead = tuple(range(1, weight.ndim))
+    moved = np.einsum("...k,...kn->...n", off, seen.levers) ** 2 * u[..., None]
+    moved = moved - np.einsum("...kn,...kn->...n", seen.levers, seen.levers)
+    second = scatter**4 * np.einsum("rman,rma->rn", moved, weight)
+    times = weight.sum(lead)[:, None] * (scatter > 0.0)
+    return _Sums(
+        score[:, 0],
+        np.matmul(np.swapaxes(scaled, 1, 2), scaled),
+        (square * weight).sum(lead),
+        np.stack([second + scatter**2 * times, times], axis=1),
+        weight,
+    )
+
+
+def _faulty_sums(
+    response: LinearResponse,
+    likelihood: RunLikelihood,
+    fault_model: FaultModel,
+    theta: FloatArray,
+    active: FloatArray,
+    by_node: FloatArray,
+) -> _Sums:
+    """Return the sums of movements that are faulty with some probability.
+
+    Args:
+        response: The runs.
+        likelihood: The same at theta.
+        fault_model: The fault.
+        theta: Beside the theta of the response, (run, theta).
+        active: Probability that each movement is faulty, by cell of what is unknown,
+            (run, movement, cell).
+        by_node: Log density of each settled position at each node, (run, movement, node).
+    """
+    motor, nu = response.motors[fault_model.motor], response.model.settling.tail_dof
+    profile = likelihood.profile(fault_model.motor)
+    if fault_model.redrawn is not None:
+        log_share = by_node[:, :, None] + fault_model.redrawn
+        angle, spread = _redrawn_angle(fault_model, log_share, active, profile.mode.shape)
+    else:
+        angle, spread = _common_angle(fault_model, active, profile.mode.shape)
+    precision = np.maximum(profile.precision, LEAST_PRECISION)
+    loose = 1.0 if fault_model.held else 1.0 / (1.0 + profile.scatter**2 * precision)
+    terms = profile.log_terms(angle, fault_model.held)
+    weight = share_of(terms, profile.outlier, profile.usable)
+    weight = weight * np.clip(active.sum(axis=-1), 0.0, 1.0)[..., None]
+    beyond, off = profile.turned(angle - profile.mode), motor.seen.off(theta)
+    square = np.einsum("...k,...k->...", off, off) + loose * precision * beyond**2
+    others = np.where(
+        np.arange(response.layout.motors) == fault_model.motor, 0.0, response.model.scatter
+    )
+    sums = _sums(motor.seen, off, square, weight, others, nu)
+    pull, mean = _pull(square, nu) * weight * loose, _mean_pull(nu) * weight * loose
+    score = sums.score - np.einsum("rma,rmat->rt", pull * beyond, motor.lever)
+    if fault_model.redrawn is None:
+        along = _along_lever(motor, mean, precision, spread)
+    else:
+        known = np.clip(1.0 - loose * precision * spread, 0.0, 1.0)
+        scaled = motor.lever * np.sqrt(mean * known / precision)[..., None]
+        along = np.einsum("rmat,rmau->rtu", scaled, scaled, optimize=True)
+    return replace(sums, score=score, information=sums.information + along)
+
+
+def _along_lever(
+    motor: MotorResponse, weight: FloatArray, precision: FloatArray, gain: FloatArray
+) -> FloatArray:
+    """Return the information along the lever of a motor that one common amount puts off.
+
+    With c = lambda^T Gamma and slopes s of the angle by the amount,
+
+        A = sum w c c^T / P - (sum w s c)(sum w s c)^T / sum w P s^2
+
+    Args:
+        motor: The motor.
+        weight: w, (run, movement, outcome).
+        precision: P, same axes [1/rad2].
+        gain: s, same axes.
+
+    Returns:
+        (run, theta, theta).
+    """
+    scaled = motor.lever * np.sqrt(weight / precision)[..., None]
+    along = np.einsum("rmat,rmau->rtu", scaled, scaled, optimize=True)
+    common = np.einsum("rma,rmat->rt", weight * gain, motor.lever)
+    total = np.einsum("rma,rma->r", weight * precision, gain**2)
+    missing = common[:, :, None] * common[:, None, :] / np.maximum(total, 1e-12)[:, None, None]
+    return np.asarray(along - missing)
+
+
+def _common_angle(
+    fault_model: FaultModel, active: FloatArray, shape: tuple[int, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the mean angle of each movement and its slope by what is common, (..., outcome).
+
+    The slope is that of the regression of the angle on the size over the nodes.
+
+    Args:
+        fault_model: The fault.
+        active: Probability that each movement is faulty with each node, (run, movement, node).
+        shape: Runs, movements and outcomes.
+    """
+    total = active.sum(axis=-1, keepdims=True)
+    even = np.full_like(active, 1.0 / active.shape[-1])
+    share = np.where(total > 1e-9, active / np.maximum(total, 1e-9), even)
+    size = np.broadcast_to(fault_model.size, (len(active), active.shape[-1]))
+    angle = np.broadcast_to(fault_model.angle, (*shape[:2], active.shape[-1], shape[2]))
+    mean = np.einsum("rmn,rmna->rma", share, angle)
+    if fault_model.held:
+        return mean, np.ones_like(mean)
+    centre = np.einsum("rmn,rn->rm", share, size)
+    away = size[:, None] - centre[..., None]
+    covariance = np.einsum("rmn,rmna->rma", share * away, angle)
+    variance = np.maximum(np.einsum("rmn,rmn->rm", share, away**2), 1e-18)
+    return mean, covariance / variance[..., None]
+
+
+def _redrawn_angle(
+    fault_model: FaultModel, joint: FloatArray, active: FloatArray, shape: tuple[int, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean and variance of an angle that each movement draws anew, (..., outcome).
+
+    Args:
+        fault_model: The fault.
+        joint: Log weight times density of each settled position at each node of each group,
+            (run, movement, group, node).
+        active: Probability that each movement is faulty with each group, (run, movement, group).
+        shape: Runs, movements and outcomes.
+    """
+    share = np.exp(joint - log_sum(joint, axis=-1)[..., None])
+    share = np.einsum("rmg,rmgn->rmn", active + 1e-12, share)
+    share /= share.sum(axis=-1, keepdims=True)
+    angle = np.broadcast_to(fault_model.angle, (*shape[:2], share.shape[-1], shape[2]))
+    mean = np.einsum("rmn,rmna->rma", share, angle)
+    return mean, np.einsum("rmn,rmna->rma", share, (angle - mean[:, :, None]) ** 2)
+
+
+def _pull(square: FloatArray, nu: float) -> FloatArray:
+    """Return u, the weight that a Student t gives a deviation of squared distance D^2."""
+    return np.ones_like(square) if np.isinf(nu) else (nu + 3.0) / (nu + square)
+
+
+def _mean_pull(nu: float) -> float:
+    """Return what the information of a Student t is of that of a normal with its scale."""
+    return 1.0 if np.isinf(nu) else (nu + 3.0) / (nu + 5.0)
+
+
+# A normal distribution of theta times a local likelihood: its integral and what is left of it.
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal distributions of theta, one a run, by precision and precision times mean.
+
+    Attributes:
+        precision: (run, theta, theta).
+        shift: Precision times mean, (run, theta).
+    """
+
+    precision: FloatArray
+    shift: FloatArray
+
+    @property
+    def mean(self) -> FloatArray:
+        """(run, theta)."""
+        return np.asarray(np.linalg.solve(self.precision, self.shift[..., None])[..., 0])
+
+    def times(self, says: LocalLikelihood) -> Normal:
+        """Return the distribution given what runs say, to second order."""
+        turn = np.einsum("rtu,ru->rt", says.information, says.theta)
+        return Normal(self.precision + says.information, self.shift + says.score + turn)
+
+    def log_density(self, theta: FloatArray) -> FloatArray:
+        """Return the log density, but for the constant of pi, (run,)."""
+        away = theta - self.mean
+        square = np.einsum("rt,rtu,ru->r", away, self.precision, away)
+        return 0.5 * (np.linalg.slogdet(self.precision)[1] - square)
+
+
+def integrated(prior: Normal, says: LocalLikelihood) -> FloatArray:
+    """Return log of the integral of prior times likelihood over theta, by Laplace's method, (run,).
+
+    L + log N(theta; prior) - 1/2 log |P^-1 + A| + 1/2 log |P^-1|, with `says` at the best theta
+    """
+    posterior = np.linalg.slogdet(prior.precision + says.information)[1]
+    return says.log_likelihood + prior.log_density(says.theta) - 0.5 * posterior
+
+
+NEWTON_STEPS = 2
+"""Steps towards the best theta; more change nothing in the mean."""
+
+
+def search(
+    response: LinearResponse,
+    hypothesis: Hypothesis,
+    priors: Priors,
+    prior: Normal,
+    start: FloatArray,
+    known: LocalLikelihood | None = None,
+) -> LocalLikelihood:
+    """Return what runs say of a hypothesis near its most probable theta: Newton, halved if worse.
+
+    Args:
+        response: The runs.
+        hypothesis: What may be the case.
+        priors: Beliefs about onset and size.
+        prior: Of theta, beside that of the response.
+        start: Where to start, (run, theta).
+        known: What they say there, where that is known.
+    """
+    best = known or local_likelihood(response, hypothesis, priors, start)
+    start = best.theta
+    height = best.log_likelihood + prior.log_density(start)
+    theta = prior.times(best).mean
+    for step in range(NEWTON_STEPS):
+        here = local_likelihood(response, hypothesis, priors, theta)
+        high = here.log_likelihood + prior.log_density(theta)
+        better = high > height
+        best, height = _where(better, here, best), np.where(better, high, height)
+        if step < NEWTON_STEPS - 1:
+            newton = prior.times(best).mean
+            theta = np.where(better[:, None], newton, 0.5 * (theta + best.theta))
+    return best
+
+
+def _where(better: BoolArray, one: LocalLikelihood, other: LocalLikelihood) -> LocalLikelihood:
+    """Return one local likelihood for some runs and the other for the rest."""
+
+    def either(name: str) -> FloatArray:
+        first, second = getattr(one, name), getattr(other, name)
+        return np.where(better.reshape(-1, *(1,) * (first.ndim - 1)), first, second)
+
+    return LocalLikelihood(*(either(field.name) for field in fields(one)))
