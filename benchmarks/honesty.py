@@ -37,9 +37,11 @@ from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.posterior import marginal_likelihood_of
 from failuretwin.inference.priors import OnsetPrior, Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.settings import InferenceSettings
 
 EARLY = 0.5
-PRIORS = Priors(onset=OnsetPrior(prior_before_run=EARLY, free=0.01))
+ERROR_RANGES = InferenceSettings.of(ft.load_robot("armpi_fpv")).error_ranges
+PRIORS = Priors(OnsetPrior(prior_before_run=EARLY, free=0.01), ERROR_RANGES)
 """Half of the faults were there before the run; held angles come from where the motor was."""
 CHUNK = 500
 DRAWS = 199
@@ -73,7 +75,7 @@ class PriorError(SteadyStateError):
         self, motor: str, movements: int, duration: float, rng: np.random.Generator
     ) -> FaultValue:
         """Return the fault as it strikes one run."""
-        low, high = PRIORS.error_ranges[int(rng.integers(len(PRIORS.error_ranges)))]
+        low, high = ERROR_RANGES[int(rng.integers(len(ERROR_RANGES)))]
         value = super().draw(motor, movements, duration, rng)
         sizes = rng.uniform(low, high, movements) * rng.choice([-1.0, 1.0], movements)
         onset = 0.0 if rng.random() < EARLY_DRAWN else float(rng.uniform(0.0, LATEST_S))

@@ -4,9 +4,9 @@
 
 FOLDER is the campaign of `killian_truth.py`, whose list says what is true of which run. Each run
 is diagnosed from commands and tool path alone; the readings of the motors are deleted first.
-Healthy behaviour is that of each bundled calibration, and one learned from the healthy runs of the
-campaign, the judged run left out (P0c). Accuracy is that of the judged runs of the list; the
-healthy runs are shown beside it, as false alarms.
+Healthy behaviour is the generic one, that of each bundled calibration, and one learned from the
+healthy runs of the campaign, the judged run left out (P0c). Accuracy is that of the judged runs of
+the list; the healthy runs are shown beside it, as false alarms.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from failuretwin.core.hypothesis import Diagnosis, Hypothesis, single_faults
 from failuretwin.decision.evaluation import Judged, score_line
 from failuretwin.decision.proportions import wilson_interval
 from failuretwin.decision.results import write_json_lines
+from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
@@ -48,6 +49,8 @@ def main() -> None:
     listed = read_list()
     runs = read_campaign(options.folder, listed, robot)
     known = runs.drop_vars("position")
+    generic = generic_imperfections(robot)
+    report(generic.name, listed, diagnose(known, robot, generic, hypotheses))
     for name in bundled():
         imperfections = load_calibration(name, robot).imperfections
         report(name, listed, diagnose(known, robot, imperfections, hypotheses))

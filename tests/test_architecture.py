@@ -24,7 +24,17 @@ ROOMS = (
 """From left to right; a room may import itself and those to its left."""
 
 EXTRAS = {
-    *("dask", "distributed", "matplotlib", "mcap", "mujoco", "rosbags", "roslibpy", "rospy"),
+    *(
+        "dask",
+        "distributed",
+        "matplotlib",
+        "mcap",
+        "mujoco",
+        "pyarrow",
+        "rosbags",
+        "roslibpy",
+        "rospy",
+    ),
     *("sklearn", "torch"),
 }
 

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from failuretwin.inference.diagnoser import BayesDiagnoser, Diagnoser, diagnose
     from failuretwin.inference.isolability import IsolabilityReport, isolability
     from failuretwin.inference.priors import OnsetPrior, Priors
+    from failuretwin.inference.shared_unknowns import SetupPrior
 
 __version__ = "0.1.0"
 
@@ -54,6 +55,7 @@ _HOME = {
     "Priors": "inference.priors",
     "ReadOptions": "data_knowledge.read",
     "Robot": "digital_model.robot",
+    "SetupPrior": "inference.shared_unknowns",
     "Sink": "connection.links.base",
     "SizedMode": "failure_behavior.mode",
     "Source": "connection.links.base",
@@ -96,6 +98,7 @@ __all__ = [
     "Priors",
     "ReadOptions",
     "Robot",
+    "SetupPrior",
     "Sink",
     "SizedMode",
     "Source",

@@ -30,8 +30,8 @@ from failuretwin.connection.calibration.result import (
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.data_knowledge.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import save_run_set
+from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import load_calibration
-from failuretwin.digital_model.nonidealities import generic_imperfections
 
 COUNT = np.deg2rad(0.24)
 REPORT = "report"

@@ -133,3 +133,18 @@ def test_paths_that_no_whole_counts_make_need_approximate(tmp_path):
     assert exact.returncode == 2
     assert "--approximate" in exact.stderr
     assert fitted.returncode == 0, fitted.stderr
+
+
+def test_columns_whose_names_tell_all_need_no_map(log):
+    table = pd.read_csv(log / "log.csv")
+    refused = failuretwin("diagnose", "log.csv", cwd=log)
+    table.rename(columns=lambda name: name + "_mm" * name.startswith("tcp")).to_csv(
+        log / "told.csv", index=False
+    )
+
+    result = failuretwin("diagnose", "told.csv", cwd=log)
+
+    assert refused.returncode == 2
+    assert "the unit of tcp_x" in refused.stderr
+    assert result.returncode == 0, result.stderr
+    assert "healthy" in result.stdout

@@ -196,3 +196,24 @@ def test_a_made_profile_can_be_simulated(arm, run, tmp_path):
     code, out, _ = run("simulate", "--robot", tmp_path / "mine.toml", *words)
     assert code == 0
     assert "6 runs written" in out
+
+
+def test_init_centres_random_movements_on_the_pose_at_rest(arm, run, tmp_path):
+    out = tmp_path / "mine.toml"
+    wide = arm('lower="-1" upper="1"', 'lower="-6" upper="6"')
+    code, _, _ = run("robot", "init", wide, "--home", "-90", "--out", out)
+
+    motor = load_robot(out).motors[0]
+    assert code == 0
+    assert motor.home == pytest.approx(-np.pi / 2)
+    assert np.mean(motor.movement_range) == pytest.approx(-np.pi / 2)
+
+
+@pytest.mark.parametrize(
+    ("home", "message"),
+    [("1,2", "home has 2 values, expected 1"), ("a", "expected numbers separated by commas")],
+)
+def test_init_refuses_a_pose_at_rest_of_another_arm(arm, run, tmp_path, home, message):
+    code, _, err = run("robot", "init", arm(), "--home", home, "--out", tmp_path / "mine.toml")
+    assert code == 2
+    assert message in err

@@ -209,3 +209,40 @@ def test_a_command_that_is_not_finite_is_refused(value):
     command[0, 5] = value
     with pytest.raises(InputError, match=r"not finite.*hold the last command"):
         find_movements(command, np.arange(10) * 0.1)
+
+
+# References that a hand guides.
+
+
+def guided(stops, seed=0):
+    """Return a wandering reference of two motors at 30 Hz with stops, and its times [s].
+
+    It wanders for 2 s before each stop; stops are their lengths [s].
+    """
+    rng, parts, here = np.random.default_rng(seed), [np.zeros((15, 2))], np.zeros(2)
+    for stop in stops:
+        steps = rng.normal(0.0, 0.03, (60, 2))
+        way = here + np.cumsum(steps, axis=0)
+        here = way[-1]
+        parts += [way, np.repeat(here[None], round(30 * stop), axis=0)]
+    command = np.concatenate(parts)
+    return command, np.arange(len(command)) / 30.0
+
+
+def test_what_a_hand_guides_is_one_movement_from_rest_to_rest():
+    command, time = guided([1.0, 0.6, 1.0])
+
+    found = find_movements(command[None], time)
+
+    np.testing.assert_allclose(found.start[0], [0.467, 3.467, 6.067], atol=0.04)
+    np.testing.assert_allclose(found.target[0], command[[80, 170, -1]], atol=1e-3)
+    np.testing.assert_allclose(found.ramp_duration[0].max(axis=1), 2.0, atol=0.1)
+
+
+def test_a_hand_that_halts_for_a_moment_is_not_at_rest():
+    command, time = guided([0.15, 1.0])
+
+    found = find_movements(command[None], time)
+
+    assert found.start.shape == (1, 1)
+    np.testing.assert_allclose(found.target[0, 0], command[-1], atol=1e-3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -73,7 +73,10 @@ def said(diagnosis):
 def diagnosed(runs, change=lambda runs: runs, arm="armpi_fpv", known="own", **options):
     """Return what a diagnoser says of a stored run set; options are its own."""
     robot = twin(arm).robot
-    return told(ft.BayesDiagnoser(twin(arm), healthy(known, robot), **options), change(load(runs)))
+    given = options.pop("priors", None) or ft.Priors()
+    priors = replace(given, setup=ft.SetupPrior.known())
+    known_robot = ft.BayesDiagnoser(twin(arm), healthy(known, robot), priors=priors, **options)
+    return told(known_robot, change(load(runs)))
 
 
 def some(*rows):
@@ -348,7 +351,7 @@ CASES = {
     "bias and error": Case(partial(pair, 2)),
     "pairs, unknown": Case(partial(diagnosed, "pairs", **_in_unknown())),
     "ur5e": Case(partial(diagnosed, "ur5e", arm="ur5e")),
-    "so101": Case(partial(diagnosed, "so101", arm="so101")),
+    "so101": Case(partial(diagnosed, "so101", arm="so101", known="generic")),
     "evidence, nine": Case(partial(evidence, "nine", one_of_each)),
     "evidence, rough": Case(partial(evidence, "rough")),
     "evidence, drawn": Case(partial(evidence, "drawn")),

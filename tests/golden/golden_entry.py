@@ -24,11 +24,12 @@ from failuretwin.decision.learned.feature_encoder import (
 )
 from failuretwin.decision.streaming.diagnoser import monitor
 from failuretwin.decision.streaming.fleet import StreamingFleet
+from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import load_calibration
-from failuretwin.digital_model.nonidealities import LostCommand, Readings, generic_imperfections
+from failuretwin.digital_model.nonidealities import LostCommand, Readings
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference import diagnoser as bayes
-from failuretwin.inference import posterior as posterior
+from failuretwin.inference import shared_posterior
 from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.expected_bayes_factors import expected_log_bayes_factors
 from failuretwin.inference.log_quality import log_quality
@@ -91,11 +92,11 @@ def with_log_evidence(diagnoser, runs):
     """Return the diagnoses, and the log evidence before the prior, (run, hypothesis)."""
     kept = []
 
-    def compute_posterior(*arguments):
-        kept.append(posterior.compute_posterior(*arguments))
+    def weighed(*arguments):
+        kept.append(shared_posterior.shared_posterior(*arguments))
         return kept[-1]
 
-    with mock.patch.object(bayes, "compute_posterior", compute_posterior):
+    with mock.patch.object(bayes, "shared_posterior", weighed):
         diagnoses = diagnoser.diagnose(runs)
     says = [np.stack([weight.log_evidence for weight in j.weights], axis=1) for j in kept]
     return diagnoses, np.concatenate(says)

@@ -122,7 +122,7 @@ def pairs():
 
 def other_arm(name):
     robot = twin(name).robot
-    known = replace(healthy("own", robot), readings=READ)
+    known = replace(healthy("generic", robot), readings=READ)
     first, second = robot.motor_names[1:3]
     names = ["healthy", f"{first}:stuck", f"{second}:steady_state_error"]
     return small(simulated(names, known, 29, arm=name))

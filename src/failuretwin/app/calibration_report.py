@@ -54,7 +54,7 @@ def print_calibration(found: Calibration, robot: Robot) -> None:
 def _parameter_table(parameters: tuple[Parameter, ...], robot: Robot) -> Table:
     rows = []
     for p in parameters:
-        scale, unit = shown_unit(p.unit, robot)
+        scale, unit = shown_unit(p.unit, robot, p.motor)
         value, low, high = (f"{scale * x:.4g}" for x in (p.value, p.low, p.high))
         known = "" if p.identified else "not identified"
         rows.append((_title(p), value, f"{low} to {high}", unit, known))

@@ -17,12 +17,13 @@ from failuretwin.core.hypothesis import Hypothesis, parse_hypotheses
 from failuretwin.data_knowledge.bags import BagTopics
 from failuretwin.data_knowledge.column_guess import column_map_text, guess_columns
 from failuretwin.data_knowledge.csv_log import read_column_map
+from failuretwin.data_knowledge.lerobot import LeRobotAngles, is_lerobot, lerobot_map_text
 from failuretwin.data_knowledge.matlab import RECOVERY_ERROR, RECOVERY_WORST
 from failuretwin.data_knowledge.raw_sessions import As
 from failuretwin.data_knowledge.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
-from failuretwin.digital_model.nonidealities import GENERIC_NAME
+from failuretwin.digital_model.arm_classes import GENERIC_NAME
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser, Diagnoser, diagnoser_from_text
@@ -72,7 +73,7 @@ def warn_mismatch(runs: xr.Dataset, expected: str) -> None:
 def _with_map(
     options: ReadOptions, path: Path, sources: Sequence[Path], robot: Robot
 ) -> ReadOptions:
-    """Return the options with a map of columns or topics.
+    """Return the options with a map of columns, topics or the angles of a LeRobot data set.
 
     Where there is no such file yet, a guess is written and shown, and the work stops.
     """
@@ -81,11 +82,20 @@ def _with_map(
         if "topics" in table:
             topics = from_table(BagTopics, table["topics"], f"{path}: topics")
             return replace(options, topics=topics)
+        if "lerobot" in table:
+            angles = from_table(LeRobotAngles, table["lerobot"], f"{path}: lerobot")
+            return replace(options, lerobot=angles)
         return replace(options, columns=read_column_map(path, robot))
-    log = next((s for s in sources if s.is_file() and s.suffix == ".csv"), None)
+    log = next((s for s in sources if is_lerobot(s) or (s.suffix == ".csv" and s.is_file())), None)
     if log is None:
-        raise InputError(f"{path}: does not exist, and no CSV file is given to guess it from.")
-    text = column_map_text(guess_columns(log, robot), log.name, robot)
+        raise InputError(
+            f"{path}: does not exist, and no CSV file or LeRobot data set is given to guess it "
+            "from."
+        )
+    if is_lerobot(log):
+        text = lerobot_map_text(log, robot)
+    else:
+        text = column_map_text(guess_columns(log, robot), log.name, robot)
     with replacing(path) as partial:
         partial.write_text(text, encoding="utf-8")
     click.echo(text)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from itertools import zip_longest
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -15,6 +18,9 @@ from failuretwin.app.commands.options import (
     plugin_option,
     reading_options,
 )
+
+if TYPE_CHECKING:
+    from failuretwin.digital_model.urdf_check import UrdfReport
 
 
 @click.command("import")
@@ -38,7 +44,8 @@ def import_(
     """Read logs and write them as one run set.
 
     SRC is a run set (.nc, .zarr), a folder with raw sessions or published MATLAB files (searched
-    downwards), such a file (.mat), a bag (.bag, .mcap), or a CSV file with --columns.
+    downwards), such a file (.mat), a bag (.bag, .mcap), a LeRobot data set (a folder), an RTDE
+    recording, or a CSV file, with --columns where its column names do not tell enough.
     """
     del seed  # nothing here is drawn by chance
     from failuretwin.app.inputs import read_inputs
@@ -164,28 +171,40 @@ def link_options(command: F) -> F:
     command = click.option(
         "--tool",
         metavar="LINK",
-        help="Link whose origin is the tool point. Default: the end of the branch with the most "
-        "moving joints.",
+        help="Link whose origin is the tool point. Default: by name (tool0, tcp, end_effector, "
+        "...), else the end of the branch with the most moving joints.",
+    )(command)
+    command = click.option(
+        "--sensor-noise",
+        type=click.FloatRange(min=0.0),
+        default=0.5,
+        show_default=True,
+        metavar="MM",
+        help="Noise of the tool sensor on each axis [mm]; joints that move the tool by less for "
+        "each radian are left out.",
     )(command)
     return click.option(
-        "--base", metavar="LINK", help="Link that carries the base frame. Default: the root."
+        "--base",
+        metavar="LINK",
+        help="Link that carries the base frame, any that is fixed to the arm's foot. Default: the "
+        "root.",
     )(command)
 
 
 @click.group()
 def robot() -> None:
-    """Look a URDF over and make a robot profile of it."""
+    """Look a URDF over, make a robot profile of it, and fit it to healthy logs."""
 
 
 @robot.command()
 @click.argument("urdf", type=PATH)
 @link_options
-def check(urdf: Path, base: str | None, tool: str | None) -> None:
+def check(urdf: Path, base: str | None, tool: str | None, sensor_noise: float) -> None:
     """Say whether a URDF can be used, which motors move the tool, and what is missing."""
     from failuretwin.app.reports import print_report
     from failuretwin.digital_model.urdf_check import check_urdf
 
-    report = check_urdf(urdf, base, tool)
+    report = check_urdf(urdf, base, tool, 1e-3 * sensor_noise)
     print_report(report)
     report.raise_errors()
 
@@ -193,20 +212,34 @@ def check(urdf: Path, base: str | None, tool: str | None) -> None:
 @robot.command()
 @click.argument("urdf", type=PATH)
 @click.option("--out", required=True, type=PATH, metavar="PROFILE", help="Profile to write: .toml.")
+@click.option(
+    "--home",
+    metavar="ANGLE,...",
+    help="Angle of each motor at rest [deg, mm for one that slides], base to tool; random "
+    "movements keep round it. Default: the middle of the limits.",
+)
 @link_options
-def init(urdf: Path, out: Path, base: str | None, tool: str | None) -> None:
+def init(
+    urdf: Path,
+    out: Path,
+    home: str | None,
+    base: str | None,
+    tool: str | None,
+    sensor_noise: float,
+) -> None:
     """Write a commented profile for the robot of a URDF, ready for --robot PROFILE."""
     from failuretwin.core.errors import InputError
     from failuretwin.data_knowledge.store import replacing
-    from failuretwin.digital_model.robot import load_robot, profile_text
+    from failuretwin.digital_model.profile_text import profile_text
+    from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.urdf_check import check_urdf
 
     if out.suffix != ".toml":
         raise InputError(f"{out}: a profile ends in .toml. Give such a name.")
     if out.exists():
         raise InputError(f"{out}: exists already. Choose another name, or remove it first.")
-    report = check_urdf(urdf, base, tool)
-    text = profile_text(report, out)
+    report = check_urdf(urdf, base, tool, 1e-3 * sensor_noise)
+    text = profile_text(report, out, _home(home, report))
     with replacing(out) as partial:
         partial.write_text(text, encoding="utf-8")
         load_robot(partial)
@@ -217,3 +250,55 @@ def init(urdf: Path, out: Path, base: str | None, tool: str | None) -> None:
         f"profile with {count} motor{'s' * (count != 1)} written to {out}; go through the "
         "lines that say 'assumed'"
     )
+
+
+def _home(text: str | None, report: UrdfReport) -> list[float]:
+    """Return the angles at rest that the user gives [rad or m]; empty where none are given."""
+    from failuretwin.core.errors import InputError
+
+    if text is None:
+        return []
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"--home {text}: expected numbers separated by commas.") from None
+    units = [1e-3 if m.joint.type == "prismatic" else math.pi / 180.0 for m in report.motors]
+    return [value * unit for value, unit in zip_longest(values, units, fillvalue=1.0)]
+
+
+@robot.command("fit")
+@click.argument("logs", nargs=-1, required=True, type=PATH, metavar="LOG...")
+@click.option("--out", required=True, type=PATH, metavar="PROFILE", help="Profile to write: .toml.")
+@reading_options
+@common_options
+def fit_(logs: tuple[Path, ...], out: Path, reading: LogOptions, robot: str, seed: int) -> None:
+    """Find frames, tool point, senses, zeros and geometry from poses in which a healthy arm rests.
+
+    LOG is whatever `diagnose` reads. Writes the profile of --robot with what was found, its remarks
+    kept. Forty poses all over the range tell the frames, hundreds the geometry.
+    """
+    del seed  # nothing here depends on chance
+    from datetime import UTC, datetime
+
+    from failuretwin.app.inputs import read_inputs
+    from failuretwin.app.registration_report import print_registration
+    from failuretwin.connection.registration.fit import fit_registration
+    from failuretwin.core.errors import InputError
+    from failuretwin.data_knowledge.store import replacing
+    from failuretwin.digital_model.profile_text import fitted_text
+    from failuretwin.digital_model.robot import load_robot
+
+    if out.suffix != ".toml":
+        raise InputError(f"{out}: a profile ends in .toml. Give such a name.")
+    model = load_robot(robot)
+    if out.exists() and out.resolve() != model.source.resolve():
+        raise InputError(f"{out}: exists already. Choose another name, or remove it first.")
+    runs = read_inputs(logs, model, reading)
+    names = ", ".join(log.name for log in logs)
+    found = fit_registration(runs, model, names, datetime.now(UTC).date().isoformat())
+    text = fitted_text(model.source.read_text(encoding="utf-8"), model.source, out, found.profile)
+    with replacing(out) as partial:
+        partial.write_text(text, encoding="utf-8")
+        load_robot(partial)
+    print_registration(found)
+    click.echo(f"written to {out}; use it with --robot {out}")

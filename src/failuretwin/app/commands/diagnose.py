@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -15,6 +16,14 @@ from failuretwin.app.commands.options import (
     plugin_option,
     reading_options,
 )
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from failuretwin.connection.self_calibration import SelfCalibration
+    from failuretwin.core.hypothesis import Diagnosis
+    from failuretwin.digital_model.twin import DigitalTwin
+    from failuretwin.inference.diagnoser import BayesDiagnoser
 
 
 @click.command()
@@ -34,6 +43,18 @@ from failuretwin.app.commands.options import (
     "calibration (FILE.history.jsonl). Give runs in their order, the oldest first.",
 )
 @click.option(
+    "--self-calibrate",
+    is_flag=True,
+    help="Let the runs, all of one robot, say together how it differs from others of its kind: no "
+    "healthy logs are needed. With --calibration FILE, how it differs from that.",
+)
+@click.option(
+    "--out",
+    type=PATH,
+    metavar="FILE",
+    help="Where to write the calibration that --self-calibrate learns.",
+)
+@click.option(
     "--hypotheses",
     cls=HypothesesOption,
     metavar="H,...",
@@ -46,6 +67,13 @@ from failuretwin.app.commands.options import (
     type=float,
     metavar="LOW HIGH",
     help="Known range of steady-state errors [servo units]. Default: several, weighed.",
+)
+@click.option(
+    "--error-range",
+    type=(float, float, str),
+    metavar="LOW HIGH UNIT",
+    help="The same in deg, rad, mm, m, counts or percent of what each motor turns through, such as "
+    "0.1 2 deg.",
 )
 @click.option("--onset", type=float, metavar="SECONDS", help="Onset of stuck faults, where known.")
 @click.option("--json", "json_file", type=PATH, help="Write an object a line, a line a run.")
@@ -64,8 +92,11 @@ def diagnose(
     calibration: Path | None,
     method: str,
     track: bool,
+    self_calibrate: bool,
+    out: Path | None,
     hypotheses: str | None,
     sse_range: tuple[float, float] | None,
+    error_range: tuple[float, float, str] | None,
     onset: float | None,
     json_file: Path | None,
     csv_file: Path | None,
@@ -77,7 +108,8 @@ def diagnose(
     """Diagnose runs from commands and tool path alone.
 
     INPUT is a run set (.nc, .zarr), a folder with raw sessions or published MATLAB files (searched
-    downwards), such a file (.mat), a bag (.bag, .mcap), or a CSV file with --columns.
+    downwards), such a file (.mat), a bag (.bag, .mcap), a LeRobot data set (a folder), an RTDE
+    recording, or a CSV file, with --columns where its column names do not tell enough.
     """
     del seed  # nothing here is drawn by chance
     from failuretwin.app import reports
@@ -90,9 +122,7 @@ def diagnose(
     )
     from failuretwin.app.tables import progress_bar, show
     from failuretwin.connection import tracked_diagnosis as tracking
-    from failuretwin.core.errors import InputError
     from failuretwin.decision.evaluation import Judged
-    from failuretwin.decision.results import write_csv, write_json_lines
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.inference.diagnoser import BayesDiagnoser
@@ -104,31 +134,77 @@ def diagnose(
         known.twin,
         imperfections=known.imperfections,
         hypotheses=parse_cli_hypotheses(hypotheses, model),
-        priors=priors_of(model, sse_range, onset),
+        priors=priors_of(model, sse_range, onset, error_range),
     )
     settings = {
         "--calibration": calibration,
         "--track": track or None,
+        "--self-calibrate": self_calibrate or None,
         "--hypotheses": hypotheses,
         "--sse-range": sse_range,
+        "--error-range": error_range,
         "--onset": onset,
     }
     diagnoser = chosen_diagnoser(method, bayes, settings)
-    history = None
-    if track:
-        if calibration is None:
-            raise InputError(
-                "--track keeps its history beside the calibration: name one (--calibration FILE; "
-                "`failuretwin calibrate` makes it)."
-            )
-        history = tracking.open_history(bayes, calibration)
+    _check_together(calibration, track, self_calibrate, out)
+    history = tracking.open_history(bayes, calibration) if track and calibration else None
     runs = read_inputs(inputs, model, reading)
     warn_mismatch(runs, expected_name(diagnoser, bayes))
-    tracked = None
+    tracked = learned = None
     if history is not None:
         with progress_bar("diagnosing", runs.sizes["run"]) as advance:
             tracked = tracking.diagnose_tracked(runs, bayes, history, advance)
-    diagnoses = diagnoser.diagnose(runs) if tracked is None else tracked.diagnoses
+        diagnoses = tracked.diagnoses
+    elif self_calibrate:
+        learned, bayes = _learn_together(runs, bayes, calibration, out)
+        diagnoses = list(learned.diagnoses)
+    else:
+        diagnoses = diagnoser.diagnose(runs)
+    _write(runs, diagnoses, known.twin, json_file, csv_file, plot)
+    if tracked is not None:
+        tracking.keep_history(tracked)
+    reports.print_diagnoses(diagnoses)
+    if method == "bayes":
+        show(*reports.isolability_summary(runs, bayes))
+    reports.print_scores(Judged.of(diagnoses))
+    if tracked is not None:
+        click.echo(f"\n{reports.tracking_line(tracked)}")
+    if learned is not None:
+        click.echo("\n" + "\n".join(f"self-calibrated: {line}" for line in learned.remarks))
+
+
+def _check_together(
+    calibration: Path | None, track: bool, self_calibrate: bool, out: Path | None
+) -> None:
+    """Refuse ways of weighing runs together that contradict each other.
+
+    Raises:
+        InputError: If they do.
+    """
+    from failuretwin.core.errors import InputError
+
+    if out is not None and not self_calibrate:
+        raise InputError("--out is for what --self-calibrate learns. Add --self-calibrate.")
+    if track and self_calibrate:
+        raise InputError("--track follows a calibration, --self-calibrate makes one. Choose one.")
+    if track and calibration is None:
+        raise InputError(
+            "--track keeps its history beside the calibration: name one (--calibration FILE; "
+            "`failuretwin calibrate` makes it)."
+        )
+
+
+def _write(
+    runs: xr.Dataset,
+    diagnoses: list[Diagnosis],
+    twin: DigitalTwin,
+    json_file: Path | None,
+    csv_file: Path | None,
+    plot: Path | None,
+) -> None:
+    """Write results to the files that were asked for."""
+    from failuretwin.decision.results import write_csv, write_json_lines
+
     if json_file is not None:
         write_json_lines(diagnoses, json_file)
     if csv_file is not None:
@@ -138,16 +214,36 @@ def diagnose(
         from failuretwin.data_knowledge.store import filling
 
         with filling(plot) as folder:
-            pictures = plot_runs(runs, diagnoses, known.twin, folder)
-            write_page(diagnoses, pictures, model.name, folder / "index.html")
-    if tracked is not None:
-        tracking.keep_history(tracked)
-    reports.print_diagnoses(diagnoses)
-    if method == "bayes":
-        show(*reports.isolability_summary(runs, bayes))
-    reports.print_scores(Judged.of(diagnoses))
-    if tracked is not None:
-        click.echo(f"\n{reports.tracking_line(tracked)}")
+            pictures = plot_runs(runs, diagnoses, twin, folder)
+            write_page(diagnoses, pictures, twin.robot.name, folder / "index.html")
+
+
+def _learn_together(
+    runs: xr.Dataset, bayes: BayesDiagnoser, calibration: Path | None, out: Path | None
+) -> tuple[SelfCalibration, BayesDiagnoser]:
+    """Return what runs say together, and a diagnoser that knows what they teach.
+
+    Args:
+        runs: The runs.
+        bayes: What would diagnose them one by one.
+        calibration: What the robot is taken to be like; None: what its kind is like.
+        out: Where the calibration goes; None: nowhere.
+    """
+    from failuretwin.app.tables import progress_bar
+    from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
+    from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
+    from failuretwin.inference.folder_posterior import PASSES
+
+    robot = bayes.twin.robot
+    if out is not None:
+        check_calibration_file(out)
+    together = SelfCalibratingDiagnoser(robot, calibration, bayes.hypotheses, bayes.priors)
+    with progress_bar("self-calibrating", PASSES) as advance:
+        learned = together.learn(runs, advance)
+    if out is not None:
+        save_calibration(learned.calibration, robot, out)
+    known = learned.calibration.imperfections
+    return learned, type(bayes)(together.twin, known, bayes.hypotheses, bayes.priors)
 
 
 @click.command()

@@ -120,8 +120,8 @@ reading_options = _gathered(
         "--columns",
         type=PATH,
         metavar="MAP.toml",
-        help="What the columns of a CSV file (or the topics of a bag) are. If MAP.toml does not "
-        "exist, a guess is written there for you to check.",
+        help="What the columns of a CSV file (or the topics of a bag, or the angles of a LeRobot "
+        "data set) are. If MAP.toml does not exist, a guess is written there for you to check.",
     ),
     click.option(
         "--approximate",

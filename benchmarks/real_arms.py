@@ -1,0 +1,208 @@
+"""Diagnosis of real arms that nobody has tuned anything for: relabelled runs of UR10 and UR5.
+
+    FAILURETWIN_DATA=DATA python benchmarks/real_arms.py [--arms ur10 ur5] [--seeds 0]
+        [--per-cell 6] [--healthy 60]
+
+DATA/real_arms holds measured poses of healthy arms, DATA/../real_arms/relabel.py makes runs with
+known faults of them ("relabelled real": the measurements stay, the claimed commands change). Each
+arm has the profile that `failuretwin robot init` writes, untouched. Its runs are judged without a
+calibration, with the one that `failuretwin calibrate` learns from other poses, and with the one
+that it learns with the geometry that `failuretwin robot fit` finds from those poses; the UR10 also
+judges healthy runs of the same robot four months before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import failuretwin as ft
+from failuretwin.connection.registration.fit import fit_registration
+from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.data_knowledge.csv_log import read_column_map
+from failuretwin.digital_model.nonidealities import Imperfections
+from failuretwin.digital_model.profile_text import fitted_text, profile_text
+from failuretwin.digital_model.robot import Robot, load_robot
+from failuretwin.digital_model.urdf_check import check_urdf
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+POSES = {"ur10": "ur10_series_c.csv", "ur5": "ur5.csv"}
+EARLIER = {"ur10": "ur10_series_a.csv"}
+"""Poses of the same robot at another time and place."""
+SURE = 0.99
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A run that was judged.
+
+    Attributes:
+        group: Healthy, stuck, or the size of its errors [deg].
+        diagnosis: What was said of it.
+        truth: What was true.
+    """
+
+    group: str
+    diagnosis: Diagnosis
+    truth: str
+
+    @property
+    def right(self) -> bool:
+        """Whether the verdict is the truth."""
+        return not self.diagnosis.undecided and self.diagnosis.diagnosis == self.truth
+
+    @property
+    def surely_wrong(self) -> bool:
+        """Whether the verdict is wrong and claims to be sure."""
+        most = max(self.diagnosis.posterior.values())
+        return not self.right and not self.diagnosis.undecided and most > SURE
+
+
+def main() -> None:
+    """Print a table for each arm and seed."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--arms", nargs="+", choices=POSES, default=list(POSES))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--per-cell", type=int, default=6, help="runs a motor and size")
+    parser.add_argument("--healthy", type=int, default=60, help="healthy runs")
+    options = parser.parse_args()
+    script, poses = _data()
+    for arm in options.arms:
+        for seed in options.seeds:
+            with tempfile.TemporaryDirectory() as folder:
+                counts = (options.per_cell, options.healthy)
+                _arm(script, poses, arm, seed, counts, Path(folder))
+
+
+def _data() -> tuple[Path, Path]:
+    """Return the script that makes runs, and the folder with measured poses."""
+    data = Path(os.environ.get("FAILURETWIN_DATA", "data"))
+    script, poses = data.resolve().parent / "real_arms" / "relabel.py", data / "real_arms"
+    for path in (script, poses):
+        if not path.exists():
+            sys.exit(
+                f"{path} is not there. Set FAILURETWIN_DATA to the folder that holds real_arms "
+                "with measured poses, beside which real_arms/relabel.py lies."
+            )
+    return script, poses
+
+
+def _arm(
+    script: Path, poses: Path, arm: str, seed: int, counts: tuple[int, int], folder: Path
+) -> None:
+    """Judge the runs of one arm and print the tables."""
+    runs = _relabelled(script, poses / POSES[arm], arm, seed, counts, folder / "runs")
+    profile = runs / "arm.toml"
+    profile.write_text(profile_text(check_urdf(runs / "arm.urdf"), profile), encoding="utf-8")
+    robot = load_robot(profile)
+    _table(f"{arm}, seed {seed}, plain", _judged(runs, robot, None))
+    known = _calibrated(runs, robot)
+    fitted = _fitted(runs, robot, "fitted.toml")
+    exact = _calibrated(runs, fitted)
+    _table(f"{arm}, seed {seed}, calibrated", _judged(runs, robot, known))
+    _table(f"{arm}, seed {seed}, calibrated with geometry", _judged(runs, fitted, exact))
+    if arm in EARLIER:
+        months = (script, poses / EARLIER[arm], arm, seed, (0, counts[1]), folder / "earlier")
+        older = _relabelled(*months)
+        _table(f"{arm}, seed {seed}, months before", _judged(older, robot, known))
+        _table(f"{arm}, seed {seed}, months before, geometry of now", _judged(older, fitted, exact))
+        placed = _fitted(older, robot, "then.toml")
+        title = f"{arm}, seed {seed}, months before, geometry of then, calibration of now"
+        _table(title, _judged(older, placed, exact))
+
+
+def _calibrated(runs: Path, robot: Robot) -> Imperfections:
+    return ft.calibrate(_healthy_logs(runs, robot), robot).imperfections
+
+
+def _fitted(runs: Path, robot: Robot, name: str) -> Robot:
+    """Return the robot by the profile that `failuretwin robot fit` writes from healthy logs."""
+    found = fit_registration(_healthy_logs(runs, robot), robot).profile
+    text = robot.source.read_text(encoding="utf-8")
+    profile = robot.folder / name
+    profile.write_text(fitted_text(text, robot.source, profile, found), encoding="utf-8")
+    return load_robot(profile)
+
+
+def _healthy_logs(runs: Path, robot: Robot) -> xr.Dataset:
+    return ft.read_runs([*sorted(runs.glob("calibration_*.csv"))], robot, _reading(runs, robot))
+
+
+def _reading(runs: Path, robot: Robot) -> ft.ReadOptions:
+    return ft.ReadOptions(columns=read_column_map(runs / "map.toml", robot))
+
+
+def _judged(runs: Path, robot: Robot, known: Imperfections | None) -> list[Scored]:
+    """Return the runs of a folder judged by a robot and its calibration; None: by generic ones."""
+    test = ft.read_runs(runs / "test.csv", robot, _reading(runs, robot))
+    return _scored(ft.BayesDiagnoser(robot, known).diagnose(test), runs / "truth.csv")
+
+
+def _relabelled(
+    script: Path, poses: Path, arm: str, seed: int, counts: tuple[int, int], out: Path
+) -> Path:
+    """Return the folder of runs made of measured poses.
+
+    Args:
+        script: What makes them.
+        poses: The measured poses.
+        arm: Name of the arm.
+        seed: Seed of what is drawn.
+        counts: Runs of each motor and size, healthy runs.
+        out: That folder.
+    """
+    per_cell, healthy = (str(count) for count in counts)
+    options = ["--seed", str(seed), "--per-cell", per_cell, "--healthy", healthy]
+    command = [sys.executable, str(script), str(poses), arm, str(out), *options]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    return out
+
+
+def _scored(found: Sequence[Diagnosis], truths: Path) -> list[Scored]:
+    with truths.open(encoding="utf-8") as file:
+        rows = {row["run"]: row for row in csv.DictReader(file)}
+    scored = []
+    for diagnosis in found:
+        row = rows[diagnosis.run.rpartition("/")[2]]
+        mode = row["truth"].partition(":")[2]
+        group = f"error {float(row['size_deg']):g} deg" if row["size_deg"] else mode or "healthy"
+        scored.append(Scored(group, diagnosis, row["truth"]))
+    return scored
+
+
+def _table(title: str, scored: Sequence[Scored]) -> None:
+    """Print how many of each group are right, by joint where that matters."""
+    print(f"\n{title}")
+    print(f"{'':16s}    right  wrong, above {SURE:.0%} sure   right of each motor")
+    for group in dict.fromkeys(one.group for one in scored):
+        some = [one for one in scored if one.group == group]
+        right, sure = sum(one.right for one in some), sum(one.surely_wrong for one in some)
+        line = f"{group:16s} {right:4d} /{len(some):4d} {sure:4d}"
+        print(f"{line:50s} {_by_motor(some)}".rstrip())
+    right, sure = sum(one.right for one in scored), sum(one.surely_wrong for one in scored)
+    print(f"{'all':16s} {right:4d} /{len(scored):4d} {sure:4d}", flush=True)
+
+
+def _by_motor(some: Sequence[Scored]) -> str:
+    motors = sorted({one.truth.partition(":")[0] for one in some})
+    if motors == ["healthy"]:
+        return ""
+    return " ".join(
+        str(sum(one.right for one in some if one.truth.startswith(motor + ":"))) for motor in motors
+    )
+
+
+if __name__ == "__main__":
+    main()
