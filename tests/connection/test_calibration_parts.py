@@ -31,8 +31,10 @@ from failuretwin.connection.calibration.timing_fit import (
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
+from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.disturbances import lagged
 from failuretwin.digital_model.settling import Settling
+from failuretwin.inference.healthy_model import HealthyModel
 
 COUNT = np.deg2rad(0.24)
 NAMES = ["motor_1", "motor_2", "motor_3", "motor_4"]
@@ -449,7 +451,8 @@ def test_gain_is_the_mean_difference_of_log_densities(settle, armpi, twin):
     part = sort_and_fit(settle(TYPICAL, seed=12), armpi)
     seen = settle(TYPICAL, seed=13, movements=40)
     entry = judge(seen, part, armpi, "other day")
-    generic = Settling((0.0,) * 4, (0.0,) * 4, (0.0,) * 4, (0.01,) * 4, 4.0, "")
+    kind = HealthyModel.of(twin, generic_imperfections(armpi))
+    generic = replace(kind.settling, scatter=tuple(kind.scatter))
     gain = log_densities(seen, part.settling, armpi, twin) - log_densities(
         seen, generic, armpi, twin
     )

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from failuretwin.digital_model.nonidealities import Imperfections
+from failuretwin.digital_model.nonidealities import Imperfections, Readings
 from failuretwin.digital_model.settling import Settling
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.healthy_model import HealthyModel
@@ -24,8 +24,12 @@ LAG_S, RAMP_S, PERIOD_S = 0.025, 0.8, 2.0
 TARGETS = [0.2, -0.15, 0.1, -0.25]
 STARTS_S = PERIOD_S * np.arange(4)
 PLAIN = Imperfections(
-    "slide", "test", settling=Settling((0.0,), (0.0,), (0.0,), (SCATTER_M,), DOF, "made up")
+    "slide",
+    "test",
+    settling=Settling((0.0,), (0.0,), (0.0,), (SCATTER_M,), DOF, "made up"),
+    readings=Readings(10.0, noise_m=float(np.sqrt(NOISE_M**2 - 0.00006**2))),
 )
+"""A five-thousandth of the reach, 0.06 mm, belongs to no motor and to no sensor."""
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 TRUST = 0.1
-ROUGHNESS_M, JITTER_S = 0.002, 0.012
+ROUGHNESS_M, JITTER_S = 0.0021, 0.012
 
 
 def way_by_force(origin, target, moving, movement, spread_m=0.0, doubt=0.3):

@@ -5,7 +5,12 @@ import pytest
 from scipy import optimize, stats
 from small_arms import SCARA, small_twin
 
-from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfections, LostCommand
+from failuretwin.digital_model.nonidealities import (
+    NO_IMPERFECTIONS,
+    Imperfections,
+    LostCommand,
+    Readings,
+)
 from failuretwin.digital_model.settling import Settling
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.healthy_model import HealthyModel
@@ -25,7 +30,10 @@ SETTLING = Settling(
     source="made up",
 )
 LOSSES = (LostCommand(("motor_1",), 0.1, 0.1), LostCommand(("motor_2", "motor_3"), 0.05, 0.05))
-IMPERFECT = Imperfections("made up", "test", settling=SETTLING, lost_commands=LOSSES)
+READINGS = Readings(10.0, noise_m=float(np.sqrt(PATH_NOISE_M**2 - 0.0003**2)))
+IMPERFECT = Imperfections(
+    "made up", "test", settling=SETTLING, readings=READINGS, lost_commands=LOSSES
+)
 REACH_M = 0.028505 + 0.0361 + 0.10048 + 0.094714 + 0.05071
 ANYWHERE = OUTLIER_RATE / (4 / 3 * np.pi * REACH_M**3)
 

@@ -34,7 +34,7 @@ from golden_runs import PAPER, load
 import failuretwin as ft
 
 EXACT = Tolerance(1e-9)
-FITTED = Tolerance(1e-6, floor=0.01)
+FITTED = Tolerance(1e-4, floor=0.01)
 """What an iterative fit gives [mostly rad or s]."""
 EVERY = ("healthy", *(f"motor_{k}:{mode}" for mode in MODES for k in range(1, 5)))
 PAIRS = (

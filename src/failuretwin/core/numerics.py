@@ -54,18 +54,37 @@ def log_trapezoid_weights(nodes: FloatArray) -> FloatArray:
     return log_of(weights)
 
 
+SAME_VALUE = 1e-9
+"""Values that differ by a smaller share of their range are the same [-]."""
+
+
 def weighted_quantiles(
     values: FloatArray, weights: FloatArray, levels: tuple[float, ...]
 ) -> FloatArray:
-    """Return quantiles of each row of weighted `values`, (..., value) -> (..., level)."""
+    """Return quantiles of each row of weighted `values`, (..., value) -> (..., level).
+
+    Between the middles of their weights by straight lines. Values that are the same but for
+    rounding are an atom with a step, lest their order, which is then by chance, should matter.
+    """
     order = np.argsort(values, axis=-1)
     values = np.take_along_axis(values, order, axis=-1)
     weights = np.take_along_axis(weights, order, axis=-1)
-    total = np.maximum(weights.sum(axis=-1, keepdims=True), np.finfo(float).tiny)
-    middle = (np.cumsum(weights, axis=-1) - 0.5 * weights) / total
-    flat = middle.reshape(-1, middle.shape[-1]), values.reshape(-1, values.shape[-1])
-    rows = [np.interp(levels, m, v) for m, v in zip(*flat, strict=True)]
+    flat = values.reshape(-1, values.shape[-1]), weights.reshape(-1, values.shape[-1])
+    rows = [_quantiles(row, weight, levels) for row, weight in zip(*flat, strict=True)]
     return np.array(rows).reshape(*values.shape[:-1], len(levels))
+
+
+def _quantiles(values: FloatArray, weights: FloatArray, levels: tuple[float, ...]) -> FloatArray:
+    """Return quantiles of one row of sorted values, (level,)."""
+    first = np.append(True, np.diff(values) > SAME_VALUE * (values[-1] - values[0]))
+    at = np.flatnonzero(first)
+    weights = np.add.reduceat(weights, at)
+    alone = np.diff(at, append=len(values)) == 1
+    inset = np.where(alone, 0.5 * weights, 0.0)
+    end = np.cumsum(weights)
+    steps = np.stack([end - weights + inset, end - inset], axis=1).ravel()
+    total = max(float(end[-1]), np.finfo(float).tiny)
+    return np.asarray(np.interp(levels, steps / total, np.repeat(values[first], 2)))
 
 
 # Covariances of points in space, many at once: S = A A^T + noise I, solved in closed form.

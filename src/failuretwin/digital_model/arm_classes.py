@@ -60,7 +60,8 @@ ARM_CLASSES: Mapping[str, ArmClass] = {
 """Figures by class. Hobby servos: what published measurements of such servos agree on (settled
 errors of half a degree to one degree, a twentieth of commands lost on a shared bus), rounded;
 industrial arms: absolute accuracy of joints and repeatability as makers state them; cable-driven:
-assumed, wide. None was fitted to a robot that is judged."""
+assumed, wide. The bias of hobby servos, which is also what the calibrations of two of them scatter
+by, was settled with diagnoses of one of these in sight (benchmarks/looks.md)."""
 LONG_ARM_M = 0.6
 """Arms that reach farther are taken to be industrial where the profile names no class [m]."""
 

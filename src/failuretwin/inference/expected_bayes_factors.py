@@ -144,6 +144,7 @@ def _expected(profile: JointLikelihood, log_weight: FloatArray) -> JointLikeliho
         min_distance2=profile.min_distance2 * factor,
         log_weight=log_weight,
         scatter=0.0,
+        held_scatter=0.0,
         outlier=-MOST_NATS,
     )
 

@@ -103,6 +103,9 @@ UNMEASURED_OF_REACH = 0.001
 """Noise assumed of a settled tool position of an arm that nobody has calibrated, as a share of its
 reach: links that differ from the drawing, and the sensor. Of two industrial arms links alone leave
 0.0008 of it."""
+HELD_PLAY_RAD = 0.003
+"""What the gear of a held motor gives by under changing loads, 0.17 deg: it is not held better than
+its healthy neighbours scatter, however exact these are; assumed."""
 LEAST_VISIBLE_POSES = 200
 """Poses at which it is asked how small an angle shows."""
 
@@ -157,6 +160,17 @@ class HealthyModel:
     def scatter(self) -> FloatArray:
         """Scale of the settled scatter and of what is not known of the robot, (motor,) [rad]."""
         return self.scatter_factor * self._sharp_scatter
+
+    @cached_property
+    def held_scatter(self) -> FloatArray:
+        """Scale by which a held motor gives, where healthy ones scatter less, (motor,) [rad].
+
+        h^2 = max(0, play^2 - s^2); none of a robot that is said to be ideal, nor of a slide.
+        """
+        if self.imperfections.settling is None:
+            return np.zeros(len(self.scatter))
+        more = np.sqrt(np.maximum(HELD_PLAY_RAD**2 - self.scatter**2, 0.0))
+        return np.where(self.twin.robot.slides, 0.0, more)
 
     @property
     def _sharp_scatter(self) -> FloatArray:

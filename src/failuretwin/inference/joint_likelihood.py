@@ -57,6 +57,7 @@ class JointLikelihood(ArrayStruct):
         log_weight: Log of the outcome's weight times the density's norm.
         expected: Angle at which the motor settles if it is healthy [rad].
         scatter: Scale of its own settled scatter [rad].
+        held_scatter: The same if it is held.
         dof: Degrees of freedom of the scatter.
         outlier: Log density of the tool being anywhere, times its rate.
         usable: Movements with evidence, (run, movement).
@@ -74,6 +75,7 @@ class JointLikelihood(ArrayStruct):
     log_weight: PerOutcome
     expected: PerOutcome
     scatter: float
+    held_scatter: float
     dof: float
     outlier: float
     usable: Annotated[BoolArray, Axes("run", "movement", empty=False)]
@@ -86,7 +88,7 @@ class JointLikelihood(ArrayStruct):
 
         Args:
             angle: Where the motor settles, scatter aside, (..., outcome) [rad].
-            held: Whether the gear holds it exactly there.
+            held: Whether the gear holds it there.
         """
         precision, log_weight = self._with_scatter(held)
         off = self.turned(angle - self.mode)
@@ -98,7 +100,7 @@ class JointLikelihood(ArrayStruct):
         Args:
             angle: Where the motor settles, scatter aside, (..., node, outcome) [rad], or with
                 a last axis of 1 if it is the same whatever became of the commands.
-            held: Whether the gear holds it exactly there.
+            held: Whether the gear holds it there.
 
         Returns:
             (..., node) [log 1/m3]; 0 for movements that are not usable.
@@ -131,11 +133,14 @@ class JointLikelihood(ArrayStruct):
         """Return differences of angles, the shorter way around."""
         return off - 2.0 * np.pi * np.rint(off / (2.0 * np.pi)) if self.wraps else off
 
+    def inflation(self, held: bool) -> FloatArray:
+        """Return 1 + s^2 P, with s the scatter of the motor itself, (..., outcome)."""
+        own = self.held_scatter if held else self.scatter
+        return np.asarray(1.0 + own**2 * self.precision)
+
     def _with_scatter(self, held: bool) -> tuple[FloatArray, FloatArray]:
         """Return precision and log weight once the motor's own scatter counts."""
-        if held:
-            return self.precision, self.log_weight
-        inflation = 1.0 + self.scatter**2 * self.precision
+        inflation = self.inflation(held)
         return self.precision / inflation, self.log_weight - 0.5 * np.log(inflation)
 
 
@@ -158,7 +163,7 @@ def joint_likelihoods(
         motors: Indices of the motors.
         other: Index of another motor that has a fault of its own, if any.
         other_angle: Where it settles, (run, movement, node, outcome) [rad].
-        other_held: Whether the gear holds it exactly there.
+        other_held: Whether the gear holds it there.
     """
     base, direction = outcomes.base, outcomes.direction
     log_weight, point = outcomes.log_weight, evidence.point[:, :, None]
@@ -179,7 +184,8 @@ def joint_likelihoods(
     expected = model.settle(base, direction, another)
     # A leading axis for the motors: own marks each of them among all, (own, 1, motor).
     own = np.eye(len(model.scatter), dtype=bool)[list(motors)][:, None]
-    scale = np.where(own | (another & other_held), 0.0, model.scatter)
+    rest = np.where(another & other_held, model.held_scatter, model.scatter)
+    scale = np.where(own, 0.0, rest)
     angle = nearest_on_circle(model, expected, own, point)
     for _ in range(REFINEMENTS):
         pose = np.where(own, angle[..., None], base)
@@ -211,6 +217,7 @@ def joint_likelihoods(
             log_weight=everywhere(weighed[i], -np.inf),
             expected=everywhere(expected[..., motor]),
             scatter=float(model.scatter[motor]),
+            held_scatter=float(model.held_scatter[motor]),
             dof=dof,
             outlier=model.outlier_log_density,
             usable=evidence.usable,

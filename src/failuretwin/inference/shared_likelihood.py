@@ -211,7 +211,7 @@ def _faulty_sums(
     else:
         angle, spread = _common_angle(fault_model, active, profile.mode.shape)
     precision = np.maximum(profile.precision, LEAST_PRECISION)
-    loose = 1.0 if fault_model.held else 1.0 / (1.0 + profile.scatter**2 * precision)
+    loose = 1.0 / profile.inflation(fault_model.held)
     terms = profile.log_terms(angle, fault_model.held)
     weight = share_of(terms, profile.outlier, profile.usable)
     weight = weight * np.clip(active.sum(axis=-1), 0.0, 1.0)[..., None]

@@ -144,7 +144,7 @@ def _offsets(likelihood: RunLikelihood, seen: TwoJointLikelihood) -> LinearOffse
     return LinearOffsets(
         centre=np.where(held, 0.0, seen.expected[:, :, None]),
         slope=np.where(amount, slope, 0.0),
-        noise=np.where(held, 0.0, scatter) + np.where(redrawn, spread**2, 0.0),
+        noise=np.where(held, likelihood.model.held_scatter[pair] ** 2, scatter) + np.where(redrawn, spread**2, 0.0),
         mean=np.where(held, middle, 0.0),
         variance=deviation**2,
         well=seen.expected,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,7 +30,7 @@ from failuretwin.digital_model.nonidealities import Timing
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.inference.healthy_model import PATH_NOISE_M
+from failuretwin.inference.healthy_model import PATH_NOISE_M, HealthyModel
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -71,8 +71,8 @@ def judge(
         session: Name of the session.
     """
     settling = others.settling
-    generic = generic_imperfections(robot).settling
-    assert generic is not None
+    kind = HealthyModel.of(robot, generic_imperfections(robot))
+    generic = replace(kind.settling, scatter=tuple(kind.scatter.tolist()))
     plain = settled_errors(observations, robot, None)
     told = settled_errors(observations, robot, settling)
     kept = _healthy(plain, observations)

@@ -75,8 +75,8 @@ class HeldOut:
         before: Robust size of the settled error of each motor without calibration, 1.48 times its
             median size [rad]; of the three axes of the tool [m] where the log has no readings.
         after: The same about what the fit to the others predicts.
-        gain: Mean log density of a movement under the fit, minus that with the generic figures of
-            an uncalibrated robot [nats].
+        gain: Mean log density of a movement under the fit, minus that with the figures of its
+            class, what its arms differ by counted as scatter [nats].
         gain_error: Standard error of `gain`.
     """
 
