@@ -33,6 +33,7 @@ class ArmClass(Bounded):
 
     Attributes:
         bias_rad: Deviation of a motor's constant error [rad].
+        session_rad: Deviation of that error of one arm from one day to another [rad].
         sag_rad: Yielding under the rms load of a motor, mean and deviation alike [rad].
         friction_rad: How far a motor stops short, mean [rad].
         friction_spread_rad: Deviation of that [rad].
@@ -43,6 +44,7 @@ class ArmClass(Bounded):
     """
 
     bias_rad: AtLeastZero
+    session_rad: AtLeastZero
     sag_rad: AtLeastZero
     friction_rad: AtLeastZero
     friction_spread_rad: AtLeastZero
@@ -53,9 +55,9 @@ class ArmClass(Bounded):
 
 
 ARM_CLASSES: Mapping[str, ArmClass] = {
-    "hobby servo": ArmClass(0.0065, 0.015, 0.007, 0.005, 0.006, 5.0, 0.03, 0.005),
-    "industrial": ArmClass(0.003, 0.001, 0.0003, 0.0003, 0.0004, 4.0, 0.003, 0.0003),
-    "cable-driven": ArmClass(0.02, 0.02, 0.015, 0.01, 0.01, 4.0, 0.01, 0.001),
+    "hobby servo": ArmClass(0.0065, 0.001, 0.015, 0.007, 0.005, 0.006, 5.0, 0.03, 0.005),
+    "industrial": ArmClass(0.003, 0.001, 0.001, 0.0003, 0.0003, 0.0004, 4.0, 0.003, 0.0003),
+    "cable-driven": ArmClass(0.02, 0.005, 0.02, 0.015, 0.01, 0.01, 4.0, 0.01, 0.001),
 }
 """Figures by class. Hobby servos: what published measurements of such servos agree on (settled
 errors of half a degree to one degree, a twentieth of commands lost on a shared bus), rounded;
@@ -64,6 +66,15 @@ assumed, wide. The bias of hobby servos, which is also what the calibrations of 
 by, was settled with diagnoses of one of these in sight (benchmarks/looks.md)."""
 LONG_ARM_M = 0.6
 """Arms that reach farther are taken to be industrial where the profile names no class [m]."""
+
+
+def class_of(robot: Robot) -> ArmClass:
+    """Return the figures of the class of an arm.
+
+    Raises:
+        InputError: If the profile names a class that is not known.
+    """
+    return ARM_CLASSES[class_name(robot)]
 
 
 def class_name(robot: Robot) -> str:
@@ -86,8 +97,7 @@ def generic_imperfections(robot: Robot) -> Imperfections:
     Raises:
         InputError: If the profile names a class of arms that is not known.
     """
-    name = class_name(robot)
-    kind, motors = ARM_CLASSES[name], len(robot.motors)
+    name, kind, motors = class_name(robot), class_of(robot), len(robot.motors)
     load = np.sqrt(np.mean(loads_in_range(robot, 0.0) ** 2, axis=0))
     loaded = load > LEAST_LOAD * max(float(load.max()), LEAST_LOAD)
     compliance = np.where(loaded, kind.sag_rad / np.where(loaded, load, 1.0), 0.0)

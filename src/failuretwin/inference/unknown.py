@@ -134,6 +134,7 @@ def _offsets(likelihood: RunLikelihood, seen: TwoJointLikelihood) -> LinearOffse
     middle, length = ends.mean(axis=1), ends[:, 1] - ends[:, 0]
     target = np.nan_to_num(likelihood.evidence.movements.target[..., pair])
     scatter = likelihood.model.scatter[pair] ** 2
+    gives = likelihood.model.held_scatter[pair] ** 2
     held, by_angle, redrawn, amount = (
         np.array([[bool(getattr(kind, name)) for kind in kinds] for kinds in KINDS])
         for name in ("held", "by_angle", "redrawn", "amount")
@@ -144,7 +145,7 @@ def _offsets(likelihood: RunLikelihood, seen: TwoJointLikelihood) -> LinearOffse
     return LinearOffsets(
         centre=np.where(held, 0.0, seen.expected[:, :, None]),
         slope=np.where(amount, slope, 0.0),
-        noise=np.where(held, likelihood.model.held_scatter[pair] ** 2, scatter) + np.where(redrawn, spread**2, 0.0),
+        noise=np.where(held, gives, scatter) + np.where(redrawn, spread**2, 0.0),
         mean=np.where(held, middle, 0.0),
         variance=deviation**2,
         well=seen.expected,

@@ -45,6 +45,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.read import RunsLike, as_runs
+from failuretwin.digital_model.arm_classes import class_of
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.digital_model.robot import Robot, load_robot, shown_unit
 from failuretwin.inference.isolability import fault_probabilities
@@ -146,7 +147,7 @@ def fit_calibration(
         lost_commands=tuple(loss.entry() for loss in losses),
         schedule=schedule_of(movements, late, robot),
         readings=readings_of(kept, robot, glitches),
-        variation=_variation(part, losses),
+        variation=_variation(part, losses, robot),
     )
     settling = settling_parameters(part.fit, robot, payload)
     return Calibration(
@@ -180,10 +181,14 @@ def _held_out(part: SettlingFit, robot: Robot, judged: xr.Dataset | None) -> tup
     return tuple(entry for entry in entries if entry is not None)
 
 
-def _variation(part: SettlingFit, losses: Sequence[LossRates]) -> Variation:
-    """Return the doubt about the figures: what a robot of these logs may be like."""
+def _variation(part: SettlingFit, losses: Sequence[LossRates], robot: Robot) -> Variation:
+    """Return the doubt about the figures: what a robot of these logs may be like.
+
+    Logs do not tell what will change until they are used: what arms of the class do is added.
+    """
     deviation = part.fit.deviation[:-1].reshape(4, -1)
     bias, compliance, friction, log_scatter = deviation
+    bias = np.hypot(bias, class_of(robot).session_rad)
     size = np.abs(part.fit.mode[:-1].reshape(4, -1)[1])
     share = np.divide(compliance, size, out=np.zeros_like(size), where=size > compliance)
     hits = sum(loss.punctual.hits + loss.late.hits for loss in losses)
