@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from failuretwin.connection.calibration.calibrate import calibrate
     from failuretwin.connection.calibration.result import Calibration, save_calibration
     from failuretwin.connection.links.base import Sink, Source
+    from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
     from failuretwin.core.errors import InputError
     from failuretwin.core.hypothesis import Diagnosis, Fault, Hypothesis
     from failuretwin.core.runs import run_set
@@ -55,6 +56,7 @@ _HOME = {
     "Priors": "inference.priors",
     "ReadOptions": "data_knowledge.read",
     "Robot": "digital_model.robot",
+    "SelfCalibratingDiagnoser": "connection.self_calibration",
     "SetupPrior": "inference.shared_unknowns",
     "Sink": "connection.links.base",
     "SizedMode": "failure_behavior.mode",
@@ -98,6 +100,7 @@ __all__ = [
     "Priors",
     "ReadOptions",
     "Robot",
+    "SelfCalibratingDiagnoser",
     "SetupPrior",
     "Sink",
     "SizedMode",

@@ -34,7 +34,7 @@ from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.folder_posterior import Advance, FolderPosterior, folder_posterior
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.shared_unknowns import REGISTRATION
+from failuretwin.inference.shared_unknowns import ORIGIN, REGISTRATION, SCALE, TURN
 
 LATE_LOSSES = 4.0
 """How many times as often a movement that starts late loses its command, where nobody has counted:
@@ -134,7 +134,7 @@ class SelfCalibratingDiagnoser:
             for at in range(len(posterior.log_posterior)):
                 run = first + at
                 told = posterior.to_diagnosis(at, names[run], seen.quality[run], truths[run])
-                diagnoses.append(replace(told, protocol="P1"))
+                diagnoses.append(replace(told, protocol="P1", method=_method(robot)))
         return SelfCalibration(diagnoses, _calibration(found, believed, robot, runs), found.taught)
 
     def _population(self, runs: xr.Dataset) -> Imperfections:
@@ -157,6 +157,14 @@ class SelfCalibratingDiagnoser:
         )
 
 
+def _name(robot: Robot) -> str:
+    return f"{robot.name}, self-calibrated"
+
+
+def _method(robot: Robot) -> str:
+    return f"bayes, settled poses; healthy behaviour: {_name(robot)}"
+
+
 def _more_when_late(entry: LostCommand) -> LostCommand:
     return replace(entry, rate_when_late=min(LATE_LOSSES * entry.rate, 0.2))
 
@@ -165,13 +173,13 @@ def _calibration(
     found: FolderPosterior, believed: Imperfections, robot: Robot, runs: xr.Dataset
 ) -> Calibration:
     """Return what was learned as a calibration, which anybody may use."""
-    learned, name = found.model.imperfections, f"{robot.name}, self-calibrated"
+    learned = found.model.imperfections
     source = f"{runs.sizes['run']} runs without labels; {believed.name}"
     parameters = _parameters(found, believed, robot)
     return Calibration(
         imperfections=replace(
             learned,
-            name=name,
+            name=_name(robot),
             source=source,
             protocol="P1",
             readings=readings_of(runs, robot, None),
@@ -232,6 +240,8 @@ def _remarks(
         for p in parameters
         if p.identified and p.note
     ]
+    if found.registered:
+        lines.append(_where_it_stands(found.place))
     names = runs["run"].values
     most = [f"{names[i]} ({found.taught[i]:.1f} nats)" for i in np.argsort(-found.taught)[:3]]
     lines.append(f"most was learned from {', '.join(most)}")
@@ -240,3 +250,18 @@ def _remarks(
         "what such robots differ by"
     )
     return lines
+
+
+def _where_it_stands(place: FloatArray) -> str:
+    """Return what is to be known of a sensor that the runs put elsewhere, (theta,)."""
+
+    def axes(values: FloatArray) -> str:
+        return ", ".join(f"{value:.1f}" for value in values)
+
+    origin, turn = axes(1e3 * place[ORIGIN]), axes(np.rad2deg(place[TURN]))
+    return (
+        f"the sensor may not stand where the profile says: origin off by ({origin}) mm, turned by "
+        f"({turn}) deg, scale {1e2 * place[SCALE][0]:+.1f} %. "
+        "Offsets were learned beside that, and a calibration does not hold it: `failuretwin robot "
+        "fit` on healthy runs finds the frame, so do that first"
+    )

@@ -5,7 +5,7 @@
 
 with movements m, the first one m0 that a fault affects, its size z, and L_m the log density of
 what was seen of a movement. Read the modules in this order; each states its term, and links its
-section of docs/diagnosis.md (words and symbols: docs/glossary.md):
+section of docs/diagnosis.md or docs/shared_unknowns.md (words and symbols: docs/glossary.md):
 
     readings, log_quality    which samples were measured, and what is wrong with them
     evidence, settings       e_m, where the tool settled; transient samples on the way
@@ -16,10 +16,15 @@ section of docs/diagnosis.md (words and symbols: docs/glossary.md):
     run_likelihood           all of it for some runs: what every hypothesis draws from
     marginal                 the sum over change point m0 and nodes z
     priors                   p(m0), ranges of sizes, odds
+    fault_sizes              nodes over sizes, each with its share of the prior
     fault_models, stuck      nodes z, and the angle phi at which each puts the motor
     missed_movements         faults that leave a motor where it was: a chain of places
     double_faults, two_joint_likelihood, unknown    two motors; what no hypothesis explains
+    registration, wrong_setup    the simple mistake that explains a log which fits nothing
     posterior                evidence times prior; the diagnosis of each run
+    shared_unknowns, linear_response    theta: where the sensor stands and motors rest
+    shared_likelihood, shared_posterior    theta integrated out under each hypothesis
+    folder_posterior         runs that say together what theta is
     diagnoser                BayesDiagnoser, and what any method must offer
     explanation              the verdict in words
     isolability, expected_bayes_factors    which faults a motion can tell apart

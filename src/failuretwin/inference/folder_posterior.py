@@ -36,7 +36,7 @@ from failuretwin.inference.shared_posterior import (
     Weighed,
     set_up_in_doubt,
 )
-from failuretwin.inference.shared_unknowns import REGISTRATION, offsets_of
+from failuretwin.inference.shared_unknowns import KNOWN, REGISTRATION, TURN, offsets_of
 
 PASSES = 4
 """Times that every run is judged; later ones change nothing that matters."""
@@ -97,6 +97,11 @@ class FolderPosterior:
     def deviation(self) -> FloatArray:
         """Standard deviation of theta, (theta,)."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def registered(self) -> bool:
+        """Whether the set-up was in doubt, so that the runs say where the sensor stands."""
+        return bool((self.prior_deviation[TURN] > KNOWN).any())
 
 
 def folder_posterior(

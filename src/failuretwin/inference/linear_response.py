@@ -7,7 +7,7 @@
 
 Nothing of the arm is computed anew for another theta, so that many can be tried.
 
-Section: docs/diagnosis.md#shared-unknowns-registration-and-offsets
+Section: docs/shared_unknowns.md
 """
 
 from __future__ import annotations

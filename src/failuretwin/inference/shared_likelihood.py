@@ -11,7 +11,7 @@ faulty motor takes away. With weights w of outcomes and states, u = (nu + 3)/(nu
 A motor with an active fault says nothing of its own offsets. An angle that holds for the run is
 common to its movements; an offset that is drawn anew takes away all along its lever.
 
-Section: docs/diagnosis.md#shared-unknowns-registration-and-offsets
+Section: docs/shared_unknowns.md
 """
 
 from __future__ import annotations
