@@ -21,6 +21,7 @@ from failuretwin.connection.calibration.result import Calibration, Parameter
 from failuretwin.connection.calibration.timing_fit import gap_starts, lateness
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
+from failuretwin.core.movements import Movements
 from failuretwin.core.runs import truth_of
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.read import RunsLike, as_runs
@@ -117,16 +118,17 @@ class SelfCalibratingDiagnoser:
         """
         robot = self.twin.robot
         runs = as_runs(runs, robot)
-        believed = self._population(runs)
-        bayes = BayesDiagnoser(self.twin, believed, self.hypotheses, self.priors)
-        model = bayes.healthy_model
-        seen = Evidence(runs, model.settings)
-        evidence = seen.sound.settled
-        if evidence.movements.start.shape[1] == 0:
+        movements = Evidence(runs).settled.movements
+        if movements.start.shape[1] == 0:
             raise InputError(
                 "no run holds a movement: `command` never leaves its first value. Expected runs "
                 "of one movement at least."
             )
+        believed = self._population(runs, movements)
+        bayes = BayesDiagnoser(self.twin, believed, self.hypotheses, self.priors)
+        model = bayes.healthy_model
+        seen = Evidence(runs, model.settings)
+        evidence = seen.sound.settled
         likelihood = RunLikelihood(evidence, model)
         found = folder_posterior(likelihood, bayes.hypothesis_set, bayes.priors, advance)
         names = [str(name) for name in runs["run"].values]
@@ -141,13 +143,12 @@ class SelfCalibratingDiagnoser:
                 diagnoses.append(replace(told, protocol="P1"))
         return SelfCalibration(diagnoses, _calibration(found, believed, robot, runs), found.taught)
 
-    def _population(self, runs: xr.Dataset) -> Imperfections:
+    def _population(self, runs: xr.Dataset, movements: Movements) -> Imperfections:
         """Return what such robots are like, with what the commands alone say of their timing."""
         robot = self.twin.robot
         believed = calibrated(self.robot, self.population or generic_imperfections(robot))
         if self.population is not None:
             return believed.imperfections
-        movements = Evidence(runs).settled.movements
         late = lateness(movements)
         timing = timing_of(None, late, gap_starts(runs, movements, late.late))
         losses = believed.imperfections.lost_commands
