@@ -78,3 +78,29 @@ def test_many_degrees_of_freedom_are_normal():
     square = np.linspace(0.0, 30.0, 7)
     np.testing.assert_allclose(log_fall(square, 1e9), log_fall(square, np.inf), rtol=1e-6)
     assert log_norm(1e9) == pytest.approx(log_norm(np.inf), abs=1e-6)
+
+
+@given(
+    seed=st.integers(0, 1000),
+    columns=st.integers(1, 7),
+    size=st.sampled_from([0.0, 1e-3, 0.05]),
+)
+def test_the_inverse_root_is_the_cholesky_factor_of_the_inverse(seed, columns, size):
+    """A with A^T A = S^-1 is unique once it is upper triangular with a positive diagonal."""
+    root, shape, a, _ = drawn(seed, columns, size, 1e-3)
+    spread = Ellipsoid.of(root, 1e-3)
+    found, lower = spread.inverse_root, np.linalg.cholesky(np.linalg.inv(shape))
+    top = np.abs(lower).max()
+    np.testing.assert_allclose(found, np.swapaxes(lower, -1, -2), rtol=1e-6, atol=1e-6 * top)
+    white = np.matmul(found, a[..., None])[..., 0]
+    np.testing.assert_allclose(np.sum(white**2, axis=-1), spread.product(a, a), rtol=1e-6)
+
+
+def test_the_inverse_root_by_hand():
+    """S = diag(1, 1/4, 1/9) turned by nothing, and one with a single pair that belongs together."""
+    root = np.diag([1.0, 0.5, 1.0 / 3.0])
+    np.testing.assert_allclose(Ellipsoid.of(root, 0.0).inverse_root, np.diag([1.0, 2.0, 3.0]))
+    # S^-1 = [[4, 2, 0], [2, 5, 4], [0, 4, 13]] = A^T A with A = [[2, 1, 0], [0, 2, 2], [0, 0, 3]].
+    factor = np.array([[2.0, 1.0, 0.0], [0.0, 2.0, 2.0], [0.0, 0.0, 3.0]])
+    found = Ellipsoid.of(np.linalg.inv(factor), 0.0).inverse_root
+    np.testing.assert_allclose(found, factor, atol=1e-9)

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from failuretwin.core.hypothesis import Diagnosis, Fault, Hypothesis, MovementEvidence
+from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
@@ -199,4 +200,29 @@ def _evidence_lines(
             lines.append(
                 f"movement {item.movement}: {-item.nats:.1f} nats for {second} over {best}"
             )
+    return lines
+
+
+LIKELY = 0.5
+"""Probability from which a lost command is told [-]."""
+
+
+def lost_command_lines(
+    outcome_probability: FloatArray, lost: BoolArray, motors: Sequence[str], faulty: Sequence[str]
+) -> list[str]:
+    """Return the commands of a run that seem not to have arrived, a line each.
+
+    Args:
+        outcome_probability: Probability of each outcome, (movement, outcome).
+        lost: Motors that lose their command in it, (outcome, motor).
+        motors: Names of the motors.
+        faulty: Motors whose fault is told anyway.
+    """
+    lines = []
+    for movement, share in enumerate(outcome_probability):
+        missing = share @ lost > LIKELY
+        told = [m for m, gone in zip(motors, missing, strict=True) if gone and m not in faulty]
+        if told:
+            names = " and ".join(motor.replace("_", " ") for motor in told)
+            lines.append(f"movement {movement + 1}: {names} did not get the command")
     return lines

@@ -28,15 +28,14 @@ from failuretwin.inference.posterior import Posterior
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.shared_likelihood import Normal
-from failuretwin.inference.shared_posterior import (
+from failuretwin.inference.shared_posterior import Mixture, set_up_in_doubt
+from failuretwin.inference.shared_unknowns import REGISTRATION, offsets_of
+from failuretwin.inference.shared_weighing import (
     COARSE_TO_FINE,
     Candidate,
-    Mixture,
     SharedWeighing,
     Weighed,
-    set_up_in_doubt,
 )
-from failuretwin.inference.shared_unknowns import KNOWN, REGISTRATION, TURN, offsets_of
 
 PASSES = 4
 """Times that every run is judged; later ones change nothing that matters."""
@@ -79,7 +78,9 @@ class FolderPosterior:
         place: Where the sensor stands, (theta,).
         mean: Posterior mean of theta about the model that was given, (theta,).
         covariance: Posterior covariance, (theta, theta).
-        prior_deviation: What theta was believed to differ by, (theta,).
+        prior_deviation: What theta was believed to differ by, (theta,): more than that of others of
+            the kind where the set-up is in doubt.
+        usual_deviation: What theta of others of the kind differs by, (theta,).
         taught: By how much each run has narrowed theta, 1/2 log det (I + Lambda_i V),
             (run,) [nats].
         posteriors: Of some of the runs each, in their order.
@@ -90,6 +91,7 @@ class FolderPosterior:
     mean: FloatArray
     covariance: FloatArray
     prior_deviation: FloatArray
+    usual_deviation: FloatArray
     taught: FloatArray
     posteriors: Sequence[Posterior]
 
@@ -97,11 +99,6 @@ class FolderPosterior:
     def deviation(self) -> FloatArray:
         """Standard deviation of theta, (theta,)."""
         return np.sqrt(np.diag(self.covariance))
-
-    @property
-    def registered(self) -> bool:
-        """Whether the set-up was in doubt, so that the runs say where the sensor stands."""
-        return bool((self.prior_deviation[TURN] > KNOWN).any())
 
 
 def folder_posterior(
@@ -129,6 +126,7 @@ class _Folder:
     model: HealthyModel
     hypotheses: Sequence[Hypothesis]
     priors: Priors
+    usual: FloatArray
     unit: FloatArray
     here: FloatArray
     sites: Sites
@@ -139,7 +137,7 @@ class _Folder:
         cls, likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
     ) -> _Folder:
         weighing = SharedWeighing(likelihood, hypotheses, priors)
-        deviation = weighing.parts[0].deviation
+        usual = deviation = weighing.parts[0].deviation
         here = np.zeros(len(deviation))
         runs = len(likelihood.usable)
         some = np.unique(np.linspace(0, runs - 1, CHUNK_RUNS // 2).astype(np.int64))
@@ -147,7 +145,8 @@ class _Folder:
             deviation = weighing.broad
             here = weighing.register_together()[0]
         sites = Sites.none(runs, len(here))
-        return cls(likelihood, likelihood.model, hypotheses, priors, deviation, here, sites)
+        model = likelihood.model
+        return cls(likelihood, model, hypotheses, priors, usual, deviation, here, sites)
 
     def run(self, advance: Advance) -> FolderPosterior:
         """Pass over the runs until nothing changes."""
@@ -167,8 +166,9 @@ class _Folder:
         mean = belief.mean[0] * self.unit
         place = mean.copy()
         place[REGISTRATION:] = 0.0
+        at = self._at(mean)
         return FolderPosterior(
-            self._at(mean), place, mean, covariance, self.unit, taught, posteriors
+            at, place, mean, covariance, self.unit, self.usual, taught, posteriors
         )
 
     @property

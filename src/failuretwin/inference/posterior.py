@@ -23,13 +23,13 @@ from failuretwin.core.hypothesis import (
     single_faults,
 )
 from failuretwin.core.numerics import log_sum
-from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import FaultMode, Range, Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.double_faults import double_fault_likelihood
 from failuretwin.inference.evidence import SettledEvidence
-from failuretwin.inference.explanation import with_joint_names, worded
+from failuretwin.inference.explanation import lost_command_lines, with_joint_names, worded
 from failuretwin.inference.fault_models import (
     growing_offset_model,
     offset_model,
@@ -208,8 +208,6 @@ UNEXPLAINED_NATS = 1.0
 """A movement whose density is within this of "anywhere within reach" is not explained [nats]."""
 FEW_MOVEMENTS = 2
 """So few usable movements carry a verdict only if one hypothesis holds half of the probability."""
-LIKELY = 0.5
-"""Probability from which a lost command is told [-]."""
 
 
 def abstention_reason(
@@ -246,27 +244,6 @@ def abstention_reason(
     which = ", ".join(str(m + 1) for m in np.flatnonzero(unexplained))
     target, point = evidence.movements.target[run][usable], evidence.point[run][usable]
     return f"after movement {which} {NOWHERE}: {nowhere_near(model.twin, target, point)}"
-
-
-def lost_commands(
-    outcome_probability: FloatArray, lost: BoolArray, motors: Sequence[str], faulty: Sequence[str]
-) -> list[str]:
-    """Return the commands of a run that seem not to have arrived, a line each.
-
-    Args:
-        outcome_probability: Probability of each outcome, (movement, outcome).
-        lost: Motors that lose their command in it, (outcome, motor).
-        motors: Names of the motors.
-        faulty: Motors whose fault is told anyway.
-    """
-    lines = []
-    for movement, share in enumerate(outcome_probability):
-        missing = share @ lost > LIKELY
-        told = [m for m, gone in zip(motors, missing, strict=True) if gone and m not in faulty]
-        if told:
-            names = " and ".join(motor.replace("_", " ") for motor in told)
-            lines.append(f"movement {movement + 1}: {names} did not get the command")
-    return lines
 
 
 LEVELS = (0.05, 0.5, 0.95)
@@ -412,7 +389,7 @@ class Posterior:
         """Return the commands that seem not to have arrived if `hypothesis` is true."""
         motors = self.likelihood.model.twin.robot.motor_names
         faulty = [fault.motor for fault in hypothesis.faults]
-        return lost_commands(
+        return lost_command_lines(
             estimate.outcome_probability, self.likelihood.outcomes.lost, motors, faulty
         )
 

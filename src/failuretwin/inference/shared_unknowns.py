@@ -20,6 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from failuretwin.core.config import AtLeastZero, Bounded, Share
+from failuretwin.core.numerics import log_of
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.settling import Settling, loads_in_range
 from failuretwin.inference.evidence import SettledEvidence, TransientSamples
@@ -218,6 +219,8 @@ def components(
 ) -> list[SharedComponent]:
     """Return what is believed of theta beside the healthy model; the first is that all is well.
 
+    What is impossible is left out.
+
     Args:
         model: The healthy robot; its doubt is that of the offsets in every component.
         prior: How far set-ups may be off.
@@ -233,7 +236,7 @@ def components(
         deviation = known.copy()
         for place, value in ((ORIGIN, origin * reach), (TURN, turn), (SCALE, scale)):
             deviation[place] = np.maximum(deviation[place], value)
-        return SharedComponent(name, float(np.log(rate)), deviation)
+        return SharedComponent(name, float(log_of(rate)), deviation)
 
     near, far = prior.origin
     little, much = prior.turn_rad
@@ -244,15 +247,13 @@ def components(
         usual = found[0].log_weight + float(np.log1p(-ODD_RATE))
         found = [replace(found[0], log_weight=usual)]
         found.append(SharedComponent("", usual + float(np.log(ODD_RATE / (1 - ODD_RATE))), odd))
-    if prior.doubt == 0.0:
-        return found
     found += [off("origin", prior.origin_rate / 2, o, 0.0, 0.0) for o in (near, far)]
     found += [off("turn", prior.turn_rate / 2, 0.0, w, 0.0) for w in (little, much)]
     found.append(off("scale", prior.scale_rate, 0.0, 0.0, prior.scale))
     found.append(off("frame", prior.all_rate, (near + far) / 2, (little + much) / 2, prior.scale))
-    noise = float(np.log(prior.noise_rate / 2))
+    noise = float(log_of(prior.noise_rate / 2))
     found += [SharedComponent("noise", noise, known, share * reach) for share in prior.noise]
-    return found
+    return [part for part in found if np.isfinite(part.log_weight)]
 
 
 def offsets_of(theta: FloatArray, settling: Settling) -> Settling:

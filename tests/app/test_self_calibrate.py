@@ -1,0 +1,94 @@
+"""`failuretwin diagnose --self-calibrate`: runs that are judged together."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from click.testing import CliRunner
+
+from failuretwin.app.cli import cli
+from failuretwin.connection.calibration.result import read_calibration
+from failuretwin.core.errors import InputError
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.data_knowledge.store import save_run_set
+from failuretwin.digital_model.nonidealities import Imperfections
+from failuretwin.digital_model.settling import Settling
+
+TRUTHS = ["healthy", "motor_2:stuck", "motor_3:steady_state_error"]
+ROBOT = Settling(
+    (0.0, 0.02, 0.0, 0.0), (0.0, 0.09, 0.14, 0.35), (0.007,) * 4, (0.006,) * 4, 5.0, "made up"
+)
+
+
+def diagnose(*arguments):
+    given = ["diagnose", *(str(argument) for argument in arguments)]
+    return CliRunner().invoke(cli, given, catch_exceptions=False, standalone_mode=False)
+
+
+@pytest.fixture(scope="module")
+def runs(armpi, tmp_path_factory):
+    """Runs of a robot whose motor 2 is 0.02 rad off for good."""
+    path = tmp_path_factory.mktemp("runs") / "runs.nc"
+    known = Imperfections("made up", "test", settling=ROBOT)
+    save_run_set(simulate(Plan(armpi, TRUTHS, 2, 4, known)), path)
+    return path
+
+
+def records(path):
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_runs_are_judged_together_and_the_robot_is_kept(runs, armpi, tmp_path):
+    out, file = tmp_path / "own.toml", tmp_path / "out.jsonl"
+    answer = diagnose(runs, "--self-calibrate", "--out", out, "--json", file)
+    found = records(file)
+    assert [r["diagnosis"] for r in found] == [name for name in TRUTHS for _ in range(2)]
+    assert {r["protocol"] for r in found} == {"P1"}
+    learned = read_calibration(out, armpi)
+    assert learned.imperfections.settling.bias[1] == pytest.approx(0.02, abs=0.005)
+    told = [line for line in answer.output.splitlines() if line.startswith("self-calibrated: ")]
+    assert [line.removeprefix("self-calibrated: ") for line in told] == list(learned.remarks)
+    assert "6 of 6 runs right" in answer.output
+    # The file is a calibration like any other, and may be learned from again.
+    diagnose(runs, "--self-calibrate", "--calibration", out, "--json", file)
+    assert {r["protocol"] for r in records(file)} == {"P1"}
+
+
+def test_hypotheses_count(runs, tmp_path):
+    file = tmp_path / "out.jsonl"
+    names = ",".join(TRUTHS)
+    diagnose(runs, "--self-calibrate", "--hypotheses", names, "--json", file)
+    assert all(list(r["posterior"]) == TRUTHS for r in records(file))
+
+
+def test_without_it_nothing_is_learned(runs, tmp_path):
+    file = tmp_path / "out.jsonl"
+    answer = diagnose(runs, "--json", file)
+    assert "self-calibrated" not in answer.output
+    assert "P1" not in {r["protocol"] for r in records(file)}
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--out", "own.toml"], "--out is for what --self-calibrate learns. Add --self-calibrate"),
+        (["--track", "--self-calibrate"], "--track follows a calibration, --self-calibrate makes"),
+        (["--track"], "--track keeps its history beside the calibration: name one"),
+        (["--self-calibrate", "--out", "own.json"], "own.json: a calibration ends in .toml"),
+        (["--self-calibrate", "--out", "no/own.toml"], "does not exist. Make it first"),
+    ],
+)
+def test_what_contradicts_itself_is_refused(runs, tmp_path, monkeypatch, options, words):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((InputError, OSError)) as refusal:
+        diagnose(runs, *options)
+    assert words in str(refusal.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_network_cannot_be_told_to(runs, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "network.npz").write_bytes(b"")
+    with pytest.raises(InputError, match="--self-calibrate: only the Bayesian diagnosis"):
+        diagnose(runs, "--method", "network.npz", "--self-calibrate")

@@ -1,0 +1,241 @@
+"""What the runs of a folder say together, against one posterior of all runs at once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from shared_runs import (
+    DOUBT,
+    SETTLING,
+    WIDTH,
+    drawn_from_its_model,
+    scene,
+    whole,
+)
+
+from failuretwin import BayesDiagnoser, SetupPrior
+from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.nonidealities import Imperfections, LostCommand
+from failuretwin.failure_behavior.random_movements import RandomMovements
+from failuretwin.inference import folder_posterior as folder
+from failuretwin.inference.evidence import Evidence
+from failuretwin.inference.folder_posterior import folder_posterior
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.priors import Priors
+from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.shared_likelihood import Normal, search
+
+SURE = Priors(setup=SetupPrior.known())
+USUAL = Priors()
+KNOWN = Imperfections("made up", "test", settling=replace(SETTLING, tail_dof=5.0))
+HEALTHY = [Hypothesis.parse("healthy")]
+OFF = {"bias": (0.018, -0.03, 0.038, -0.004), "friction": (0.002, 0.009, 0.008, 0.006)}
+"""A robot about a deviation off what it is taken to be."""
+
+
+def runs_of(robot, truths, each=1, seed=2, known=KNOWN, **off):
+    imperfections = replace(known, settling=replace(known.settling, **off))
+    return simulate(Plan(robot, truths, each, seed, imperfections, RandomMovements(count=6)))
+
+
+def judged(twin, runs, hypotheses=None, priors=USUAL, known=KNOWN):
+    """Return the folder posterior of runs, and the log posterior of each, (run, hypothesis)."""
+    model = HealthyModel(twin, replace(known, variation=DOUBT))
+    likelihood = RunLikelihood(Evidence(runs, model.settings).settled, model)
+    names = paper_hypotheses(twin.robot.motor_names) if hypotheses is None else hypotheses
+    found = folder_posterior(likelihood, names, priors)
+    return found, np.concatenate([part.log_posterior for part in found.posteriors]), names
+
+
+def verdicts(log_posterior, names):
+    return [str(names[i]) for i in log_posterior.argmax(axis=1)]
+
+
+TRUTHS = ["healthy", "motor_2:stuck", "motor_3:steady_state_error", "motor_4:stuck"]
+
+
+@pytest.fixture(scope="module")
+def mixed(armpi):
+    return runs_of(armpi, TRUTHS, 2, **OFF)
+
+
+@pytest.fixture(scope="module")
+def found(twin, mixed):
+    return judged(twin, mixed)
+
+
+def test_each_run_is_judged_with_what_the_others_teach(found, mixed):
+    """The truth is one of four in turn, and what is off is found."""
+    theta, log_posterior, names = found
+    assert verdicts(log_posterior, names) == [name for name in TRUTHS for _ in range(2)]
+    settling = theta.model.settling
+    np.testing.assert_allclose(settling.bias, OFF["bias"], atol=0.009)
+    np.testing.assert_allclose(settling.friction, OFF["friction"], atol=0.004)
+    assert settling.bias[1] == pytest.approx(-0.02 + theta.mean[8])
+    assert theta.place[7:].tolist() == [0.0] * 12
+
+
+def test_order_does_not_matter(twin, mixed, found):
+    order = np.random.default_rng(0).permutation(8)
+    theta, log_posterior, _ = judged(twin, mixed.isel(run=order))
+    known, expected, _ = found
+    np.testing.assert_allclose(np.exp(log_posterior), np.exp(expected[order]), atol=1e-6)
+    np.testing.assert_allclose(theta.mean / WIDTH, known.mean / WIDTH, atol=1e-6)
+    np.testing.assert_allclose(theta.taught, known.taught[order], atol=1e-6)
+
+
+def test_nor_does_how_many_are_weighed_at_a_time(twin, mixed, found, monkeypatch):
+    monkeypatch.setattr(folder, "CHUNK_RUNS", 3)
+    theta, log_posterior, _ = judged(twin, mixed, priors=SURE)
+    monkeypatch.undo()
+    whole_set, expected, _ = judged(twin, mixed, priors=SURE)
+    assert len(theta.posteriors) == 3
+    np.testing.assert_allclose(np.exp(log_posterior), np.exp(expected), atol=1e-6)
+    np.testing.assert_allclose(theta.mean / WIDTH, whole_set.mean / WIDTH, atol=1e-6)
+
+
+def test_later_passes_change_nothing_that_matters(twin, mixed, monkeypatch):
+    _, log_posterior, _ = judged(twin, mixed)
+    monkeypatch.setattr(folder, "PASSES", 8)
+    _, later, _ = judged(twin, mixed)
+    np.testing.assert_allclose(np.exp(log_posterior), np.exp(later), atol=0.02)
+
+
+def test_one_run_alone_is_judged_nearly_as_by_itself(twin, mixed):
+    """By itself it also counts robots that differ three times as far, one in ten."""
+    diagnoser = BayesDiagnoser(twin, replace(KNOWN, variation=DOUBT), priors=SURE)
+    for run in (0, 2, 5):
+        alone = mixed.isel(run=[run])
+        (diagnosis,) = diagnoser.diagnose(alone)
+        _, log_posterior, names = judged(twin, alone, priors=SURE)
+        shares = [diagnosis.posterior[str(h)] for h in names]
+        np.testing.assert_allclose(np.exp(log_posterior[0]), shares, atol=0.1)
+
+
+def test_no_healthy_run_is_needed(twin, armpi):
+    truths = ["motor_2:stuck", "motor_3:steady_state_error", "motor_1:steady_state_error"]
+    runs = runs_of(armpi, truths, 3, **OFF)
+    theta, log_posterior, names = judged(twin, runs)
+    assert verdicts(log_posterior, names) == [name for name in truths for _ in range(3)]
+    np.testing.assert_allclose(theta.model.settling.bias, OFF["bias"], atol=0.01)
+
+
+def test_a_run_that_is_faulty_teaches_less(twin, armpi):
+    """Its motor says nothing; the motor that is stuck in all of them keeps its prior."""
+    theta, *_ = judged(twin, runs_of(armpi, ["healthy", "motor_2:stuck"], 4, **OFF), priors=SURE)
+    assert theta.taught[:4].mean() > theta.taught[4:].mean() > 0.1
+    theta, *_ = judged(twin, runs_of(armpi, ["motor_3:stuck"], 4, **OFF), priors=SURE)
+    narrowed = theta.deviation / theta.prior_deviation
+    assert narrowed[[7, 8]].max() < 0.6
+    assert narrowed[9] > 0.7
+
+
+# Against one posterior of all runs at once.
+
+
+@pytest.fixture(scope="module")
+def gaussian(twin):
+    """Healthy runs of normal scatter, and what they say together; scatter is not learned."""
+    one = drawn_from_its_model(scene(twin, "healthy", runs=5, seed=4))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(folder, "SCATTER_COUNT", 1e12)
+        found = folder_posterior(RunLikelihood(one.evidence, one.model), HEALTHY, SURE)
+    return one, found
+
+
+def height(one, theta):
+    """Return log of likelihood times prior of all runs at once, but for a constant."""
+    prior = np.array([*[0.01] * 4, *[0.0, 0.03, 0.045, 0.06], *[0.004] * 4])
+    some = prior > 0.0
+    square = np.sum((theta[7:][some] / prior[some]) ** 2)
+    return whole(one, theta).log_healthy.sum() - 0.5 * square
+
+
+def directions():
+    """Return changes of theta within what is in doubt: of the offsets, the frame is known."""
+    rng = np.random.default_rng(1)
+    step = np.zeros((12, 19))
+    step[:, 7:] = rng.normal(size=(12, 12)) * WIDTH[7:] * 0.05
+    step[:, 11] = 0.0
+    return step
+
+
+def test_of_healthy_runs_the_mean_is_the_top_of_the_joint_posterior(gaussian):
+    one, found = gaussian
+    for step in directions():
+        slope = height(one, found.mean + step) - height(one, found.mean - step)
+        unit = step @ np.linalg.inv(found.covariance) @ step
+        assert abs(slope) / 2.0 < 0.06 * np.sqrt(unit)  # some hundredths of a deviation
+
+
+def test_and_the_covariance_is_its_width(gaussian):
+    one, found = gaussian
+    top = height(one, found.mean)
+    for step in directions():
+        bend = height(one, found.mean + step) + height(one, found.mean - step) - 2.0 * top
+        assert -bend == pytest.approx(step @ np.linalg.inv(found.covariance) @ step, rel=0.06)
+
+
+def test_what_a_run_has_taught_is_by_how_much_it_narrows_theta(twin):
+    """Of one run alone: 1/2 log det (I + Lambda V), Lambda all that is not of the prior."""
+    one = scene(twin, "healthy", runs=1)
+    found = folder_posterior(RunLikelihood(one.evidence, one.model), HEALTHY, SURE)
+    said = np.linalg.inv(found.covariance) - np.diag(found.prior_deviation**-2.0)
+    expected = 0.5 * np.linalg.slogdet(np.eye(19) + said @ found.covariance)[1]
+    assert found.taught[0] == pytest.approx(expected, rel=0.01)
+    assert expected > 0.5
+
+
+# Scatter and losses.
+
+
+def test_scatter_is_learned_with_twelve_movements_of_prior(twin, monkeypatch):
+    """After the first pass: squares and their number as each run tells them at its best theta."""
+    one = drawn_from_its_model(scene(twin, "healthy", runs=6, seed=4))
+    wide = replace(one.evidence, point=one.evidence.point + 0.002 * np.eye(6, 3))
+    one = replace(one, evidence=wide)
+    monkeypatch.setattr(folder, "PASSES", 2)
+    found = folder_posterior(RunLikelihood(one.evidence, one.model), HEALTHY, SURE)
+    prior = Normal(np.tile(np.diag(found.prior_deviation**-2.0), (6, 1, 1)), np.zeros((6, 19)))
+    best = search(one.response(), HEALTHY[0], SURE, prior, np.zeros((6, 19)))
+    squares, times = best.scattered.sum(axis=0)
+    before = np.array([0.004, 0.005, 0.006, 0.007])
+    expected = np.sqrt((12.0 * before**2 + squares) / (12.0 + times))
+    np.testing.assert_allclose(found.model.settling.scatter, expected, rtol=0.01)
+    assert (np.abs(expected / before - 1.0) > 0.05).any()
+
+
+def test_runs_that_scatter_more_say_so(twin, armpi):
+    wide = tuple(2.5 * np.array(SETTLING.scatter))
+    known = replace(KNOWN, settling=replace(SETTLING, tail_dof=np.inf))
+    runs = runs_of(armpi, ["healthy"], 8, known=known, scatter=wide)
+    theta, *_ = judged(twin, runs, HEALTHY, SURE, known)
+    ratio = np.array(theta.model.settling.scatter) / wide
+    assert (ratio[:3] > 0.6).all()
+    assert (ratio < 1.1).all()
+
+
+def test_a_rate_of_losses_is_learned_with_thirty_movements_of_prior(twin, armpi):
+    """Of motor 1, that stays where it was in about a third; nothing is known of late movements."""
+    often, seldom = LostCommand(("motor_1",), 0.35, 0.35), LostCommand(("motor_1",), 0.03, 0.06)
+    runs = runs_of(armpi, ["healthy"], 8, known=replace(KNOWN, lost_commands=(often,)))
+    known = replace(KNOWN, lost_commands=(seldom,))
+    names = [Hypothesis.parse(name) for name in ("healthy", "motor_3:stuck")]
+    theta, *_ = judged(twin, runs, names, SURE, known)
+    (entry,) = theta.model.imperfections.lost_commands
+    settled = runs["position"].values[:, 190::200, 0][:, :6]
+    told = runs["command"].values[:, 190::200, 0][:, :6]
+    lost = (np.abs(settled - told) > 0.08).sum()
+    assert lost >= 8
+    assert entry.rate == pytest.approx((30 * 0.03 + lost) / (30 + 48), rel=0.12)
+    assert entry.rate_when_late == pytest.approx(0.06)
+
+
+def test_eigenvalues_below_the_least_are_raised():
+    root, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
+    matrix = root @ np.diag([-2.0, 0.5, 3.0]) @ root.T
+    found = folder._positive(matrix[None], 0.1)[0]
+    np.testing.assert_allclose(found, root @ np.diag([0.1, 0.5, 3.0]) @ root.T, atol=1e-12)
