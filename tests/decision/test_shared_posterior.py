@@ -198,7 +198,7 @@ def test_a_frame_is_found_from_coarse_to_fine(twin, armpi, runs):
     there = registered_evidence(
         replace(many.likelihood.evidence[slice(0, 1)], point=seen[None]), place[:1]
     )
-    assert np.linalg.norm(there.point[0] - point, axis=1).mean() < 0.0025
+    assert np.linalg.norm(there.point[0] - point, axis=1).mean() < 0.0008
 
 
 def test_a_search_from_several_starts_finds_the_higher_top(twin, runs):
@@ -227,11 +227,11 @@ def test_a_search_from_several_starts_finds_the_higher_top(twin, runs):
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_posterior_is_that_of_quadrature_over_the_scale(twin, seed):
-    """Half of the belief: a scale that is off by 1.5 %. All else is known."""
+    """A tenth of the belief: a scale that is off by 1.5 %. All else is known."""
     one = scene(twin, TRUTHS[seed], runs=1, seed=seed, doubt=None)
     theta = np.linspace(-0.075, 0.075, 121)
     belief = SetupPrior(
-        origin_rate=0.0, turn_rate=0.0, scale_rate=0.5, all_rate=0.0, noise_rate=0.0
+        origin_rate=0.0, turn_rate=0.0, scale_rate=0.1, all_rate=0.0, noise_rate=0.0
     )
     seen = replace(one.evidence, point=1.01 * one.evidence.point)
     hypotheses = [Hypothesis.parse(name) for name in TRUTHS]
@@ -241,12 +241,13 @@ def test_posterior_is_that_of_quadrature_over_the_scale(twin, seed):
         likelihood = RunLikelihood(place, one.model)
         return marginal_likelihood_of(likelihood, hypothesis, Priors()).log_evidence[0]
 
-    log_joint = log_prior(hypotheses, Priors())
+    evidence = np.zeros(3)
     for i, hypothesis in enumerate(hypotheses):
         heights = np.array([says(k, hypothesis) for k in theta])
         values = np.exp(heights - heights.max()) * stats.norm.pdf(theta, 0.0, 0.015)
         slab = np.log(integrate.trapezoid(values, theta)) + heights.max()
-        log_joint[i] += np.logaddexp(np.log(0.5) + says(0.0, hypothesis), np.log(0.5) + slab)
+        evidence[i] = np.logaddexp(np.log(0.9) + says(0.0, hypothesis), np.log(0.1) + slab)
+    log_joint = log_prior(hypotheses, Priors()) + evidence
     expected = log_joint - log_sum(log_joint, axis=0)
     likelihood = RunLikelihood(seen, one.model)
     found = shared_posterior(likelihood, hypotheses, Priors(setup=belief), in_doubt=True)
@@ -254,6 +255,7 @@ def test_posterior_is_that_of_quadrature_over_the_scale(twin, seed):
     np.testing.assert_allclose(
         np.maximum(found.log_posterior[0], least), np.maximum(expected, least), atol=0.1
     )
+    assert found.weights[seed].log_evidence[0] == pytest.approx(evidence[seed], abs=0.15)
 
 
 def test_what_is_impossible_is_not_weighed(twin, runs):
