@@ -33,7 +33,9 @@ from failuretwin.digital_model.settling import poses_in_range
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.evidence import Evidence
+from failuretwin.inference.fault_course import FaultCourse
 from failuretwin.inference.folder_posterior import Advance, FolderPosterior, folder_posterior
+from failuretwin.inference.posterior import log_prior
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.shared_unknowns import ORIGIN, REGISTRATION, SCALE, TURN, registered
@@ -58,12 +60,19 @@ class SelfCalibration:
     Attributes:
         diagnoses: Of each run.
         calibration: What they teach of the robot.
+        prior: Probability of each hypothesis before any run, (hypothesis,).
         taught: By how much each run has narrowed that, in the runs' order [nats].
     """
 
     diagnoses: Sequence[Diagnosis]
     calibration: Calibration
+    prior: FloatArray
     taught: FloatArray
+
+    @property
+    def course(self) -> FaultCourse:
+        """What became of the robot over the runs, if they are in their order."""
+        return FaultCourse.of(self.diagnoses, self.prior)
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -141,7 +150,9 @@ class SelfCalibratingDiagnoser:
                 run = first + at
                 told = posterior.to_diagnosis(at, names[run], seen.quality[run], truths[run])
                 diagnoses.append(replace(told, protocol="P1", method=_method(robot)))
-        return SelfCalibration(diagnoses, _calibration(found, believed, robot, runs), found.taught)
+        learned = _calibration(found, believed, robot, runs)
+        prior = np.exp(log_prior(bayes.hypothesis_set, bayes.priors))
+        return SelfCalibration(diagnoses, learned, prior, found.taught)
 
     def _population(self, runs: xr.Dataset, movements: Movements) -> Imperfections:
         """Return what such robots are like, with what the commands alone say of their timing."""

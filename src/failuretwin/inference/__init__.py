@@ -25,6 +25,7 @@ section of docs/diagnosis.md or docs/shared_unknowns.md (words and symbols: docs
     shared_unknowns, linear_response    theta: where the sensor stands and motors rest
     shared_likelihood, shared_posterior    theta integrated out under each hypothesis
     folder_posterior         runs that say together what theta is
+    fault_course             faults that stay from run to run until they are repaired
     diagnoser                BayesDiagnoser, and what any method must offer
     explanation              the verdict in words
     isolability, expected_bayes_factors    which faults a motion can tell apart

@@ -49,6 +49,13 @@ if TYPE_CHECKING:
     "healthy logs are needed. With --calibration FILE, how it differs from that.",
 )
 @click.option(
+    "--independent",
+    is_flag=True,
+    help="With --track or --self-calibrate: what was wrong in one run says nothing of the next, as "
+    "in a set of experiments. Default: faults stay until repaired, and the runs, in their order, "
+    "get one verdict beside their own.",
+)
+@click.option(
     "--out",
     type=PATH,
     metavar="FILE",
@@ -93,6 +100,7 @@ def diagnose(
     method: str,
     track: bool,
     self_calibrate: bool,
+    independent: bool,
     out: Path | None,
     hypotheses: str | None,
     sse_range: tuple[float, float] | None,
@@ -112,6 +120,8 @@ def diagnose(
     recording, or a CSV file, with --columns where its column names do not tell enough.
     """
     del seed  # nothing here is drawn by chance
+    import numpy as np
+
     from failuretwin.app import reports
     from failuretwin.app.inputs import (
         chosen_diagnoser,
@@ -126,6 +136,8 @@ def diagnose(
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.inference.diagnoser import BayesDiagnoser
+    from failuretwin.inference.fault_course import FaultCourse
+    from failuretwin.inference.posterior import log_prior
     from failuretwin.inference.priors import priors_of
 
     model = load_robot(robot)
@@ -146,7 +158,7 @@ def diagnose(
         "--onset": onset,
     }
     diagnoser = chosen_diagnoser(method, bayes, settings)
-    _check_together(calibration, track, self_calibrate, out)
+    _check_together(calibration, track, self_calibrate, out, independent)
     history = tracking.open_history(bayes, calibration) if track and calibration else None
     runs = read_inputs(inputs, model, reading)
     warn_mismatch(runs, expected_name(diagnoser, bayes))
@@ -167,14 +179,21 @@ def diagnose(
     if method == "bayes":
         show(*reports.isolability_summary(runs, bayes))
     reports.print_scores(Judged.of(diagnoses))
-    if tracked is not None:
-        click.echo(f"\n{reports.tracking_line(tracked)}")
+    prior = np.exp(log_prior(bayes.hypothesis_set, bayes.priors))
+    lines = [] if tracked is None else [reports.tracking_line(tracked)]
     if learned is not None:
-        click.echo("\n" + "\n".join(f"self-calibrated: {line}" for line in learned.remarks))
+        lines = [f"self-calibrated: {line}" for line in learned.remarks]
+    if lines and not independent:
+        lines += [f"over all runs: {line}" for line in FaultCourse.of(diagnoses, prior).verdict]
+    show(*(["", *lines] if lines else []))
 
 
 def _check_together(
-    calibration: Path | None, track: bool, self_calibrate: bool, out: Path | None
+    calibration: Path | None,
+    track: bool,
+    self_calibrate: bool,
+    out: Path | None,
+    independent: bool,
 ) -> None:
     """Refuse ways of weighing runs together that contradict each other.
 
@@ -185,6 +204,8 @@ def _check_together(
 
     if out is not None and not self_calibrate:
         raise InputError("--out is for what --self-calibrate learns. Add --self-calibrate.")
+    if independent and not (track or self_calibrate):
+        raise InputError("--independent is for runs weighed together: --track or --self-calibrate.")
     if track and self_calibrate:
         raise InputError("--track follows a calibration, --self-calibrate makes one. Choose one.")
     if track and calibration is None:
