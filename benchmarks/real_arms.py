@@ -6,9 +6,10 @@
 DATA/real_arms holds measured poses of healthy arms, DATA/../real_arms/relabel.py makes runs with
 known faults of them ("relabelled real": the measurements stay, the claimed commands change). Each
 arm has the profile that `failuretwin robot init` writes, untouched. Its runs are judged without a
-calibration, with the one that `failuretwin calibrate` learns from other poses, and with the one
-that it learns with the geometry that `failuretwin robot fit` finds from those poses; the UR10 also
-judges healthy runs of the same robot four months before.
+calibration, in folders of fifty that calibrate themselves, with the calibration that `failuretwin
+calibrate` learns from other poses, and with the one that it learns with the geometry that
+`failuretwin robot fit` finds from those poses; the UR10 also judges healthy runs of the same robot
+four months before.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 import failuretwin as ft
 from failuretwin.connection.registration.fit import fit_registration
@@ -40,6 +43,7 @@ POSES = {"ur10": "ur10_series_c.csv", "ur5": "ur5.csv"}
 EARLIER = {"ur10": "ur10_series_a.csv"}
 """Poses of the same robot at another time and place."""
 SURE = 0.99
+FOLDER_RUNS = 50
 
 
 @dataclass(frozen=True)
@@ -108,6 +112,7 @@ def _arm(
     profile.write_text(profile_text(check_urdf(runs / "arm.urdf"), profile), encoding="utf-8")
     robot = load_robot(profile)
     _table(f"{arm}, seed {seed}, plain", _judged(runs, robot, None))
+    _table(f"{arm}, seed {seed}, self-calibrated by {FOLDER_RUNS} runs", _together(runs, robot))
     known = _calibrated(runs, robot)
     fitted = _fitted(runs, robot, "fitted.toml")
     exact = _calibrated(runs, fitted)
@@ -148,6 +153,16 @@ def _judged(runs: Path, robot: Robot, known: Imperfections | None) -> list[Score
     """Return the runs of a folder judged by a robot and its calibration; None: by generic ones."""
     test = ft.read_runs(runs / "test.csv", robot, _reading(runs, robot))
     return _scored(ft.BayesDiagnoser(robot, known).diagnose(test), runs / "truth.csv")
+
+
+def _together(runs: Path, robot: Robot) -> list[Scored]:
+    """Return the runs of a folder judged in folders of their own, which calibrate themselves."""
+    test = ft.read_runs(runs / "test.csv", robot, _reading(runs, robot))
+    order, found = np.random.default_rng(0).permutation(test.sizes["run"]), []
+    for first in range(0, len(order), FOLDER_RUNS):
+        some = test.isel(run=order[first : first + FOLDER_RUNS])
+        found += ft.SelfCalibratingDiagnoser(robot).diagnose(some)
+    return _scored(found, runs / "truth.csv")
 
 
 def _relabelled(
