@@ -199,7 +199,7 @@ def test_a_sensor_that_stands_elsewhere_is_told(armpi, shift, turn_deg, away):
 
 # What is believed before.
 
-TIGHT = Variation(bias=(0.004,) * 4, friction=(0.001,) * 4)
+TIGHT = Variation(bias=(0.004,) * 4, friction=(0.002,) * 4)
 
 
 def test_a_population_of_ones_own_counts(armpi, own):
