@@ -80,6 +80,17 @@ AREAS: dict[str, tuple[str, ...]] = {
         "tests/decision/test_isolability.py",
     ),
     "inference/explanation.py": ("tests/decision/test_wording.py",),
+    "inference/shared_unknowns.py": ("tests/decision/test_shared_unknowns.py",),
+    "inference/linear_response.py": (
+        "tests/decision/test_linear_response.py",
+        "tests/decision/test_shared_likelihood.py",
+    ),
+    "inference/shared_likelihood.py": (
+        "tests/decision/test_shared_likelihood.py",
+        "tests/decision/test_folder_posterior.py",
+    ),
+    "inference/shared_posterior.py": ("tests/decision/test_shared_posterior.py",),
+    "inference/folder_posterior.py": ("tests/decision/test_folder_posterior.py",),
     "inference": (
         "tests/decision/test_start_delay.py",
         "tests/decision/test_inference_settings.py",
@@ -93,6 +104,8 @@ AREAS: dict[str, tuple[str, ...]] = {
         "tests/decision/test_pairs.py",
         "tests/decision/test_bayes.py",
     ),
+    "connection/self_calibration.py": ("tests/connection/test_self_calibration.py",),
+    "digital_model/arm_classes.py": ("tests/digital_model/test_arm_classes.py",),
     "connection/wear*.py": (
         "tests/connection/test_tracker_history.py",
         "tests/connection/test_tracker.py",

@@ -127,7 +127,11 @@ def test_one_run_alone_is_judged_with_the_prior(twin, mixed, monkeypatch):
         model = HealthyModel(twin, replace(KNOWN, variation=DOUBT))
         seen = replace(weighing.likelihood, model=model, remembered=None)
         known = replace(weighing, likelihood=seen).as_told[:2]  # from two starts
-        height = np.maximum(*(each.found.log_evidence[0] for each in known)) + weighing.log_odds
+        evidence = np.maximum(*(each.found.log_evidence[0] for each in known))
+        best = int(log_posterior[0].argmax())
+        told = theta.posteriors[0].weights[best].log_evidence[0]
+        assert told == pytest.approx(evidence[best] + np.log(0.9), abs=0.45)
+        height = evidence + weighing.log_odds
         expected = height - np.logaddexp.reduce(height)
         near = expected > -6.0
         np.testing.assert_allclose(log_posterior[0][near], expected[near], atol=0.5)

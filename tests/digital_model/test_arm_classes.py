@@ -35,7 +35,7 @@ loop = {{ P = 0.3, I = 40.0, filter_s = 0.01 }}
 speed_limit = 5.0
 movement_range = [{low}, {high}]
 """
-RANGES = ((-1.0, 0.6), (-0.5, 1.2))
+RANGES = ((-1.0, 1.9), (-0.5, 1.2))
 
 
 def two_links(folder, kind="", upper=0.8, lower=0.3, tip=0.15):
@@ -77,7 +77,7 @@ def test_figures_of_a_class(tmp_path, kind):
     assert settling.friction == (friction, friction)
     assert settling.scatter == (scatter, scatter)
     assert (settling.tail_dof, settling.payload) == (tail, 0.0)
-    np.testing.assert_allclose(settling.compliance, sag / rms_moment(), rtol=0.03)
+    np.testing.assert_allclose(settling.compliance, sag / rms_moment(), rtol=0.05)
     assert variation.bias == (bias, bias)
     assert variation.friction == (spread, spread)
     assert variation.compliance == (1.0, 1.0)
@@ -112,7 +112,7 @@ def test_a_motor_that_bears_next_to_nothing_does_not_give_way(tmp_path, lower, l
     settling = generic_imperfections(two_links(tmp_path, lower=lower)).settling
     assert (settling.compliance[1] > 0.0) is loaded
     if loaded:
-        assert settling.compliance[1] == pytest.approx(0.015 / rms_moment(lower=lower)[1], rel=0.03)
+        assert settling.compliance[1] == pytest.approx(0.015 / rms_moment(lower=lower)[1], rel=0.05)
 
 
 def test_an_arm_without_masses_does_not_give_way(tmp_path):
