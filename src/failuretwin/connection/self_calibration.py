@@ -35,6 +35,7 @@ from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.fault_course import FaultCourse
 from failuretwin.inference.folder_posterior import Advance, FolderPosterior, folder_posterior
+from failuretwin.inference.mixed_runs import of_second_robot, two_robots
 from failuretwin.inference.posterior import log_prior
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
@@ -257,7 +258,10 @@ def _remarks(
         if p.identified and p.note
     ]
     lines += _set_up(found)
-    names = runs["run"].values
+    names = [str(name) for name in runs["run"].values]
+    second = of_second_robot(found.sites)
+    if second is not None:
+        lines.append(two_robots(second, names))
     most = [f"{names[i]} ({found.taught[i]:.1f} nats)" for i in np.argsort(-found.taught)[:3]]
     lines.append(f"most was learned from {', '.join(most)}")
     lines.append(

@@ -81,6 +81,7 @@ class FolderPosterior:
         prior_deviation: What theta was believed to differ by, (theta,): more than that of others of
             the kind where the set-up is in doubt.
         usual_deviation: What theta of others of the kind differs by, (theta,).
+        sites: What each run says of theta, in units of `prior_deviation`.
         taught: By how much each run has narrowed theta, 1/2 log det (I + Lambda_i V),
             (run,) [nats].
         posteriors: Of some of the runs each, in their order.
@@ -92,6 +93,7 @@ class FolderPosterior:
     covariance: FloatArray
     prior_deviation: FloatArray
     usual_deviation: FloatArray
+    sites: Sites
     taught: FloatArray
     posteriors: Sequence[Posterior]
 
@@ -168,7 +170,7 @@ class _Folder:
         place[REGISTRATION:] = 0.0
         at = self._at(mean)
         return FolderPosterior(
-            at, place, mean, covariance, self.unit, self.usual, taught, posteriors
+            at, place, mean, covariance, self.unit, self.usual, self.sites, taught, posteriors
         )
 
     @property
