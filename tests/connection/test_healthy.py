@@ -38,6 +38,8 @@ SETTLING = Settling(
     tail_dof=4.0,
     source="made up",
 )
+READINGS = Readings(10.0, noise_m=float(np.sqrt(PATH_NOISE_M**2 - 0.0003**2)))
+"""With what belongs to no sensor, 1 mm."""
 
 
 @given(
@@ -91,7 +93,7 @@ def test_posterior_of_an_error_is_that_of_brute_force(twin, run_of, motor, off):
     fault = Hypothesis.parse(f"motor_{motor + 1}:steady_state_error", MOTORS)
     priors = priors_of(twin.robot, (10.0, 50.0), None)
     priors = replace(priors, onset=OnsetPrior(prior_before_run=1.0))
-    imperfections = Imperfections("made up", "test", settling=SETTLING)
+    imperfections = Imperfections("made up", "test", settling=SETTLING, readings=READINGS)
 
     (diagnosis,) = BayesDiagnoser(twin, imperfections, (Hypothesis(), fault), priors).diagnose(runs)
 
@@ -188,7 +190,9 @@ def test_evidence_of_a_run_is_where_it_was_put(twin, run_of):
 def test_doubt_about_the_robot_widens_the_scatter(armpi, twin):
     """A motor of unknown bias scatters by both: the variances add up."""
     doubt = Variation(bias=(0.003, 0.0, 0.0, 0.0), friction=(0.0, 0.004, 0.0, 0.0))
-    sure = HealthyModel(twin, Imperfections("made up", "test", settling=SETTLING))
+    sure = HealthyModel(
+        twin, Imperfections("made up", "test", settling=SETTLING, readings=READINGS)
+    )
     unsure = HealthyModel(
         twin, Imperfections("made up", "test", settling=SETTLING, variation=doubt)
     )

@@ -23,9 +23,9 @@ from failuretwin.inference.priors import OnsetPrior
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.stuck import stuck_model
 
-LOW, HIGH = -0.36, 0.36
-"""Where the motor may be held: its range and a tenth of it on either side [m]."""
-ANGLES = np.linspace(LOW, HIGH, 36001)
+LOW, HIGH = -0.552, 0.552
+"""Where the motor may be held: its travel, 0.46 m either way, and a tenth of that length [m]."""
+ANGLES = np.linspace(LOW, HIGH, 55201)
 
 
 def student(off, scale):

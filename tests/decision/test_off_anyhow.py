@@ -10,7 +10,7 @@ from scipy import integrate, stats
 from small_arms import GANTRY, small_twin
 
 from failuretwin.core.movements import Movements
-from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfections
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfections, Readings
 from failuretwin.digital_model.settling import Settling
 from failuretwin.inference.evidence import SettledEvidence, settled_evidence
 from failuretwin.inference.healthy_model import HealthyModel
@@ -22,7 +22,9 @@ MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 SCATTER = np.array([0.005, 0.006, 0.005, 0.004])
 DOF = 6.0
 SETTLING = Settling((0.0,) * 4, (0.0,) * 4, (0.0,) * 4, tuple(SCATTER), DOF, "made up")
-PLAIN = Imperfections("made up", "test", settling=SETTLING)
+READINGS = Readings(10.0, noise_m=float(np.sqrt(0.001**2 - 0.0003**2)))
+"""With what belongs to no sensor, 1 mm."""
+PLAIN = Imperfections("made up", "test", settling=SETTLING, readings=READINGS)
 PAIRS = [(0, 1), (0, 3), (1, 2), (2, 3)]
 POSE = dict(zip(PAIRS, [2, 4, 4, 2], strict=True))
 """Seeds of poses that are not near singular ones."""

@@ -47,6 +47,8 @@ def set_up_in_doubt(
 ) -> bool:
     """Return whether runs that share a set-up say that it may be off.
 
+    Those that two faults explain best say nothing of it.
+
     Args:
         likelihood: Some of the runs, as they were seen.
         hypotheses: What may be the case.
@@ -56,8 +58,12 @@ def set_up_in_doubt(
     if priors.setup.doubt == 0.0 or not scored:
         return False
     settled = replace(likelihood, moving=None)
-    best = np.argmax(compute_posterior(settled, scored, priors).log_posterior, axis=1)
-    return SharedWeighing(settled, scored, priors).suspect(best)
+    told = [*scored, *(h for h in hypotheses if len(h.faults) > 1)]
+    best = np.argmax(compute_posterior(settled, told, priors).log_posterior, axis=1)
+    single = best < len(scored)
+    if not single.any():
+        return False
+    return SharedWeighing(settled[np.flatnonzero(single)], scored, priors).suspect(best[single])
 
 
 def shared_posterior(

@@ -180,11 +180,13 @@ def diagnose(
         show(*reports.isolability_summary(runs, bayes))
     reports.print_scores(Judged.of(diagnoses))
     prior = np.exp(log_prior(bayes.hypothesis_set, bayes.priors))
-    lines = [] if tracked is None else [reports.tracking_line(tracked)]
+    lines = []
+    if (tracked or learned) is not None and not independent:
+        lines = [f"over all runs: {line}" for line in FaultCourse.of(diagnoses, prior).verdict]
     if learned is not None:
-        lines = [f"self-calibrated: {line}" for line in learned.remarks]
-    if lines and not independent:
-        lines += [f"over all runs: {line}" for line in FaultCourse.of(diagnoses, prior).verdict]
+        lines += [f"self-calibrated: {line}" for line in learned.remarks]
+    if tracked is not None:
+        lines.append(reports.tracking_line(tracked))
     show(*(["", *lines] if lines else []))
 
 
