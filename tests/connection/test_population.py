@@ -332,20 +332,21 @@ FLEET = Imperfections(
     ),
     variation=Variation((0.002,) * 4, (0.0, 0.1, 0.1, 0.1), (0.002,) * 4, (0.1,) * 4),
 )
-TRUTHS = ["healthy", "motor_2:steady_state_error", "motor_3:stuck", "motor_4:steady_state_error"]
+TRUTHS = ["motor_3:steady_state_error", "motor_4:steady_state_error"]
 
 
-def test_a_stranger_of_the_fleet_is_judged_better_than_by_its_class(armpi):
-    """Twelve calibrations of one fleet, and few runs of a thirteenth robot of it."""
-    rng = np.random.default_rng(5)
+def test_strangers_of_a_fleet_are_judged_better_than_by_their_class(armpi):
+    """Six robots of a fleet, of each two runs of two movements; twelve others are calibrated."""
+    rng = np.random.default_rng(0)
     known = [replace(vary(FLEET, rng), name=f"robot {i}") for i in range(12)]
     population = ft.Population.fit(known, armpi)
-    runs = simulate(Plan(armpi, TRUTHS, 2, 6, vary(FLEET, rng), RandomMovements(count=4)))
-    scores = {}
-    for name, prior in (("fleet", population), ("class", None)):
-        found = SelfCalibratingDiagnoser(armpi, prior).diagnose(runs)
-        scores[name] = evaluate(found, runs).judged.scores.log_score
-    assert scores["fleet"] < 0.7 * scores["class"]
+    scores = {"fleet": [], "class": []}
+    for seed in range(6, 12):
+        runs = simulate(Plan(armpi, TRUTHS, 1, seed, vary(FLEET, rng), RandomMovements(count=2)))
+        for name, prior in (("fleet", population), ("class", None)):
+            found = SelfCalibratingDiagnoser(armpi, prior).diagnose(runs)
+            scores[name].append(evaluate(found, runs).judged.scores.log_score)
+    assert np.mean(scores["fleet"]) < 0.3 < 0.6 < np.mean(scores["class"])
     one = ft.BayesDiagnoser(armpi, population.imperfections).diagnose(runs.isel(run=[0]))
     assert (one[0].protocol, "population of 12 robots" in one[0].method) == ("P0", True)
 
