@@ -159,6 +159,30 @@ def test_robots_that_differ_by_less_than_their_doubt():
     assert expected < 0.5 * 0.0065
 
 
+def test_few_robots_that_doubt_alike():
+    """Then tau_y^2 = S^2 - s^2 with S^2 the sample variance, whatever the weights."""
+    seen, doubt2 = np.array([0.0, 0.01, 0.035]), 0.006**2
+    doubt = {"friction": np.full(4, 0.006)}
+    figures = [{**MEAN, "friction": np.full(4, value)} for value in seen]
+    _, deviation = fitted([robot_of(f, i, doubt) for i, f in enumerate(figures)])
+    excess = seen.var(ddof=1) - doubt2
+
+    def off(t2):
+        freedom = 2.0 * (t2 / (t2 + doubt2)) ** 2
+        return t2 * (3.0 + freedom) - 3.0 * 0.005**2 - freedom * excess
+
+    between2 = brentq(off, 0.0, excess)
+    variance = 1.0 / (1.0 / 0.005**2 + 3.0 / (between2 + doubt2))
+    np.testing.assert_allclose(deviation["friction"], np.sqrt(between2 + variance), rtol=1e-6)
+
+
+def test_compliances_differ_by_no_more_than_their_mean():
+    """As files state it of what is self-calibrated."""
+    figures = [{**MEAN, "compliance": np.full(4, value)} for value in (-0.5, 0.8)]
+    found = ft.Population.fit([robot_of(f, i) for i, f in enumerate(figures)]).imperfections
+    assert found.variation.compliance == (0.0, 1.0, 1.0, 1.0)
+
+
 def test_surer_calibrations_count_for_more():
     figures = [{**MEAN, "friction": np.full(4, value)} for value in (0.01, 0.01, 0.03)]
     doubts = [{"friction": np.full(4, value)} for value in (0.0003, 0.0003, 0.02)]
