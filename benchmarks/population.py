@@ -65,8 +65,8 @@ def judge(fleet: Imperfections, robot: ft.Robot, count: int) -> None:
             alone[place] += ft.BayesDiagnoser(robot, figures).diagnose(runs)
     print(f"fleet: {fleet.name}; {2 * count} runs of {count} robots")
     for size, both, each in zip(SIZES, together, alone, strict=True):
-        prior = f"population of {size}" if size else "class"
-        print(f"  {prior:16}  together {told(both)}   alone {told(each)}", flush=True)
+        label = f"population of {size}" if size else "class"
+        print(f"  {label:16}  together {told(both)}   alone {told(each)}", flush=True)
 
 
 def calibrated(fleet: Imperfections, number: int, rng: np.random.Generator) -> Imperfections:
