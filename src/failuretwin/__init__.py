@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from failuretwin.connection.calibration.calibrate import calibrate
     from failuretwin.connection.calibration.result import Calibration, save_calibration
     from failuretwin.connection.links.base import Sink, Source
+    from failuretwin.connection.population import Population
     from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
     from failuretwin.core.errors import InputError
     from failuretwin.core.hypothesis import Diagnosis, Fault, Hypothesis
@@ -53,6 +54,7 @@ _HOME = {
     "IsolabilityReport": "inference.isolability",
     "OnsetPrior": "inference.priors",
     "Plan": "data_knowledge.generate",
+    "Population": "connection.population",
     "Priors": "inference.priors",
     "ReadOptions": "data_knowledge.read",
     "Robot": "digital_model.robot",
@@ -97,6 +99,7 @@ __all__ = [
     "IsolabilityReport",
     "OnsetPrior",
     "Plan",
+    "Population",
     "Priors",
     "ReadOptions",
     "Robot",

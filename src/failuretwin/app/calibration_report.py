@@ -51,14 +51,23 @@ def print_calibration(found: Calibration, robot: Robot) -> None:
     show(f"\n{verdict_line(found)}")
 
 
-def _parameter_table(parameters: tuple[Parameter, ...], robot: Robot) -> Table:
+def print_population(found: Calibration, robot: Robot) -> None:
+    """Print what the robots of a fleet are like and what they differ by."""
+    show(f"{robot.name}: {found.imperfections.name}: {', '.join(found.sessions)}\n")
+    show(_parameter_table(found.parameters, robot, "95 % of such robots"))
+    show(*(f"  {_title(p)}: {p.note}" for p in found.parameters if not p.identified))
+
+
+def _parameter_table(
+    parameters: tuple[Parameter, ...], robot: Robot, interval: str = "95 % interval"
+) -> Table:
     rows = []
     for p in parameters:
         scale, unit = shown_unit(p.unit, robot, p.motor)
         value, low, high = (f"{scale * x:.4g}" for x in (p.value, p.low, p.high))
         known = "" if p.identified else "not identified"
         rows.append((_title(p), value, f"{low} to {high}", unit, known))
-    return Table(("parameter", "value", "95 % interval", "unit", ""), rows)
+    return Table(("parameter", "value", interval, "unit", ""), rows)
 
 
 def _title(parameter: Parameter) -> str:

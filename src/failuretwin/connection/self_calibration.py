@@ -19,6 +19,7 @@ from failuretwin.connection.calibration.observations import session_names
 from failuretwin.connection.calibration.parameters import readings_of, schedule_of, timing_of
 from failuretwin.connection.calibration.result import Calibration, Parameter
 from failuretwin.connection.calibration.timing_fit import gap_starts, lateness
+from failuretwin.connection.population import Population
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.movements import Movements
@@ -90,23 +91,27 @@ class SelfCalibratingDiagnoser:
 
     Attributes:
         robot: The robot, its name or its profile.
-        population: What such robots are like: figures, the name or path of a calibration whose
-            variation says how far this robot may differ; None: what arms of its class are like.
+        population: What such robots are like: a population fitted to others of them; figures, the
+            name or path of a calibration whose variation says how far this robot may differ; None:
+            what arms of its class are like.
         hypotheses: What may be the case; None: the paper's classes.
         priors: Beliefs about faults and set-ups; None: the usual ones.
     """
 
     robot: RobotLike
-    population: HealthyLike = None
+    population: Population | HealthyLike = None
     hypotheses: Sequence[Hypothesis | str] | None = None
     priors: Priors | None = None
 
     @cached_property
     def twin(self) -> DigitalTwin:
         """Digital twin of the robot."""
-        if self.population is None:
-            return calibrated(self.robot, "none").twin
-        return calibrated(self.robot, self.population).twin
+        return calibrated(self.robot, self._figures or "none").twin
+
+    @property
+    def _figures(self) -> HealthyLike:
+        of = self.population
+        return of.imperfections if isinstance(of, Population) else of
 
     def diagnose(self, runs: RunsLike) -> list[Diagnosis]:
         """Return the diagnosis of each run, judged with what all the others teach.
@@ -158,8 +163,8 @@ class SelfCalibratingDiagnoser:
     def _population(self, runs: xr.Dataset, movements: Movements) -> Imperfections:
         """Return what such robots are like, with what the commands alone say of their timing."""
         robot = self.twin.robot
-        believed = calibrated(self.robot, self.population or generic_imperfections(robot))
-        if self.population is not None:
+        believed = calibrated(self.robot, self._figures or generic_imperfections(robot))
+        if self._figures is not None:
             return believed.imperfections
         late = lateness(movements)
         timing = timing_of(None, late, gap_starts(runs, movements, late.late))

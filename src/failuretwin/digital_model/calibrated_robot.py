@@ -143,7 +143,7 @@ def load_calibration(
             "right robot (--robot) or calibrate this one."
         )
     imperfections = _completed(from_table(Imperfections, table, str(path)), len(robot.motors))
-    _check_fit(imperfections, robot, path)
+    check_fit(imperfections, robot, path)
     return CalibratedRobot(with_loops(robot, record.loops), imperfections)
 
 
@@ -190,18 +190,25 @@ def _record(table: object, path: Path) -> _Record:
     return from_table(_Record, known, f"{path}: {CALIBRATION_TABLE}")
 
 
-def _check_fit(imperfections: Imperfections, robot: Robot, path: Path) -> None:
+def check_fit(imperfections: Imperfections, robot: Robot, where: Path | str) -> None:
+    """Raise InputError unless figures are those of a robot with these motors.
+
+    Args:
+        imperfections: What it does that its twin does not.
+        robot: The robot.
+        where: Their file or name, for error texts.
+    """
     count = len(robot.motors)
     lists = [(t, name) for t in ("settling", "variation") for name in SETTLING_LISTS]
     for table, name in [*lists, ("readings", "glitch_rate")]:
         values = getattr(getattr(imperfections, table), name, ())
         if len(values) not in (0, count):
             raise InputError(
-                f"{path}: {table}: {name} has {len(values)} values, expected {count}, one for each "
-                f"motor of {robot.name!r}."
+                f"{where}: {table}: {name} has {len(values)} values, expected {count}, one for "
+                f"each motor of {robot.name!r}."
             )
     for motor in (motor for lost in imperfections.lost_commands for motor in lost.motors):
         if motor not in robot.motor_names:
             raise InputError(
-                f"{path}: lost_commands: {unknown_name('motor', motor, robot.motor_names)}"
+                f"{where}: lost_commands: {unknown_name('motor', motor, robot.motor_names)}"
             )

@@ -24,7 +24,7 @@ ODDS_NATS = 7.0
 DIRECTIONS, ROUNDS = 6, 20
 """Directions of theta along which runs are parted to begin with, and times they are parted anew."""
 FEWEST = 2
-"""Runs that one robot has at least: a single odd run is a fault."""
+"""Runs that one robot has at least, and one more in all that is told of it."""
 
 
 def of_second_robot(sites: Sites) -> BoolArray | None:
@@ -39,10 +39,11 @@ def of_second_robot(sites: Sites) -> BoolArray | None:
     blocks = [np.arange(count) >= k for k in range(FEWEST, count - FEWEST + 1)]
     cases = [(block, np.log(count)) for block in blocks]
     cases += [(part, count * np.log(2.0)) for part in _parted(sites)]
-    one = float(_log_evidence(*_sums(sites, np.ones(count, dtype=bool))))
-    gains = [_of_two(sites, part) - one - cost for part, cost in cases]
+    gains = [_gain(sites, part) - cost for part, cost in cases]
     best = int(np.argmax(gains))
-    return cases[best][0] if gains[best] > ODDS_NATS else None
+    part, cost = cases[best]
+    sure = gains[best] > ODDS_NATS and _least_gain(sites, part) - cost > ODDS_NATS
+    return part if sure else None
 
 
 def _sums(sites: Sites, part: BoolArray) -> tuple[FloatArray, FloatArray]:
@@ -57,11 +58,21 @@ def _log_evidence(precision: FloatArray, shift: FloatArray) -> FloatArray:
     return np.asarray(0.5 * np.sum(shift * mean, axis=-1) - 0.5 * np.linalg.slogdet(whole)[1])
 
 
-def _of_two(sites: Sites, part: BoolArray) -> float:
-    """Return log Z of the two robots; nothing where one has too few runs."""
+def _gain(sites: Sites, part: BoolArray) -> float:
+    """Return the gain of two robots over one; none where one has too few runs."""
     if min(part.sum(), (~part).sum()) < FEWEST:
         return -np.inf
-    return float(sum(_log_evidence(*_sums(sites, some)) for some in (part, ~part)))
+    first, second, both = (
+        float(_log_evidence(*_sums(sites, some))) for some in (part, ~part, part | True)
+    )
+    return first + second - both
+
+
+def _least_gain(sites: Sites, part: BoolArray) -> float:
+    """Return the gain without the run that makes most of it: one odd run is no robot."""
+    rows = [np.delete(np.arange(len(part)), run) for run in range(len(part))]
+    some = [(Sites(sites.precision[kept], sites.shift[kept]), part[kept]) for kept in rows]
+    return min(_gain(*case) for case in some)
 
 
 def _parted(sites: Sites) -> list[BoolArray]:

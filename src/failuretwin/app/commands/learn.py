@@ -28,6 +28,12 @@ from failuretwin.app.commands.options import (
 )
 @click.option("--name", help="What results call the calibration. Default: the file's name.")
 @click.option("--report", type=PATH, metavar="DIR", help="Write a page with tables and pictures.")
+@click.option(
+    "--pool",
+    is_flag=True,
+    help="Each LOG is a calibration of another robot of the kind: write what they have in common "
+    "and differ by, the prior of a robot that nobody has calibrated.",
+)
 @reading_options
 @common_options
 def calibrate(
@@ -36,6 +42,7 @@ def calibrate(
     hold_out: str | None,
     name: str | None,
     report: Path | None,
+    pool: bool,
     reading: LogOptions,
     robot: str,
     seed: int,
@@ -55,6 +62,11 @@ def calibrate(
     from failuretwin.digital_model.robot import load_robot
 
     check_calibration_file(out)
+    if pool:
+        if hold_out is not None or report is not None:
+            raise click.UsageError("--pool reads no logs. Leave out --hold-out and --report.")
+        _pool(logs, out, name, robot)
+        return
     tests, others = step_parameters.split_step_tests(logs, reading.columns)
     steps = step_parameters.learn_loops(tests, load_robot(robot))
     model = steps.robot
@@ -73,6 +85,28 @@ def calibrate(
     click.echo(f"written to {out}")
     if found.beats_uncalibrated is not False:
         click.echo(f"use it with `failuretwin diagnose --calibration {out}`")
+
+
+def _pool(calibrations: tuple[Path, ...], out: Path, name: str | None, robot: str) -> None:
+    """Write the population that some calibrated robots come from."""
+    from dataclasses import replace
+
+    from failuretwin.app.calibration_report import print_population
+    from failuretwin.connection.calibration.result import save_calibration
+    from failuretwin.connection.population import Population
+    from failuretwin.digital_model.robot import load_robot
+
+    model = load_robot(robot)
+    population = Population.fit(calibrations, model)
+    figures = population.imperfections
+    found = replace(population, imperfections=replace(figures, name=name or figures.name))
+    save_calibration(found.calibration, model, out)
+    print_population(found.calibration, model)
+    click.echo(f"written to {out}")
+    click.echo(
+        "use it for another robot of the kind with `failuretwin diagnose LOGS --self-calibrate "
+        f"--calibration {out} --out MINE.toml`, or without --self-calibrate for a single run"
+    )
 
 
 @click.command()
