@@ -77,6 +77,7 @@ def foreign(twin, armpi):
     return runs.isel(run=np.flatnonzero(nearest >= 8.0))
 
 
+@pytest.mark.slow
 def test_modes_that_are_not_offered_are_unknown(diagnoser, foreign):
     found = diagnoser.diagnose(foreign)
     assert {d.truth.split(":")[1] for d in found} == set(FOREIGN)
