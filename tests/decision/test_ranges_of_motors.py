@@ -187,6 +187,8 @@ def test_slides_are_told_in_millimetres(gantry, armpi):
     assert size_words(fault, 0.022, unit) == " by about 22.0 mm"
     assert size_words(fault, 0.022, armpi.own_unit("motor_1", "rad")) == " by about 1.3 deg"
     assert shown_unit("rad", gantry.robot, "motor_1") == (1000.0, "mm")
+    assert gantry.robot.own_unit("motor_1+motor_2", "share") == "share"
+    assert shown_unit("share", gantry.robot, "motor_1+motor_2") == (1.0, "share")
     assert shown_unit("rad/s", gantry.robot, "motor_1") == (1000.0, "mm/s")
 
 
