@@ -107,7 +107,7 @@ def test_later_passes_change_nothing_that_matters(twin, mixed, monkeypatch):
 
 
 def test_early_ones_do(twin, mixed, monkeypatch):
-    """Sites are wide until it is known which motor is faulty; a second look narrows them."""
+    """Normal are wide until it is known which motor is faulty; a second look narrows them."""
     found = {}
     for passes in (2, 4, 10):
         monkeypatch.setattr(folder, "PASSES", passes)

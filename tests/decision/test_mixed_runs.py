@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from failuretwin.inference.folder_posterior import Sites
 from failuretwin.inference.mixed_runs import of_second_robot, two_robots
+from failuretwin.inference.shared_likelihood import Normal
 
 NOISE = 0.3
 
@@ -18,7 +18,7 @@ def measured(places):
     """Return sites of runs that each measure theta with `NOISE`, at places (run, theta)."""
     count, size = places.shape
     precision = np.tile(np.eye(size) / NOISE**2, (count, 1, 1))
-    return Sites(precision, places / NOISE**2)
+    return Normal(precision, places / NOISE**2)
 
 
 def log_density(places):

@@ -52,24 +52,6 @@ Advance = Callable[[int], None]
 
 
 @dataclass(frozen=True)
-class Sites:
-    """Normal factors of theta, one a run, in units of `unit`.
-
-    Attributes:
-        precision: (run, theta, theta).
-        shift: Precision times mean, (run, theta).
-    """
-
-    precision: FloatArray
-    shift: FloatArray
-
-    @classmethod
-    def none(cls, runs: int, size: int) -> Sites:
-        """Return sites that say nothing."""
-        return cls(np.zeros((runs, size, size)), np.zeros((runs, size)))
-
-
-@dataclass(frozen=True)
 class FolderPosterior:
     """What some runs say together.
 
@@ -93,7 +75,7 @@ class FolderPosterior:
     covariance: FloatArray
     prior_deviation: FloatArray
     usual_deviation: FloatArray
-    sites: Sites
+    sites: Normal
     taught: FloatArray
     posteriors: Sequence[Posterior]
 
@@ -131,7 +113,7 @@ class _Folder:
     usual: FloatArray
     unit: FloatArray
     here: FloatArray
-    sites: Sites
+    sites: Normal
     start: FloatArray | None = None
 
     @classmethod
@@ -146,7 +128,7 @@ class _Folder:
         if set_up_in_doubt(likelihood[some], hypotheses, priors):
             deviation = weighing.broad
             here = weighing.register_together()[0]
-        sites = Sites.none(runs, len(here))
+        sites = Normal(np.zeros((runs, len(here), len(here))), np.zeros((runs, len(here))))
         model = likelihood.model
         return cls(likelihood, model, hypotheses, priors, usual, deviation, here, sites)
 
@@ -240,7 +222,7 @@ class _Folder:
             shifts.append(whole[..., 0] - cavity.shift)
         self.start = np.concatenate(means)
         old = self.sites
-        self.sites = Sites(
+        self.sites = Normal(
             old.precision + damping * (np.concatenate(precisions) - old.precision),
             old.shift + damping * (np.concatenate(shifts) - old.shift),
         )

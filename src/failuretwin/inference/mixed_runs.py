@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.inference.folder_posterior import Sites
+from failuretwin.inference.shared_likelihood import Normal
 
 ODDS_NATS = 7.0
 """Log odds of one robot against two before any run is seen, and how sure it must be; assumed."""
@@ -27,7 +27,7 @@ FEWEST = 2
 """Runs that one robot has at least, and one more in all that is told of it."""
 
 
-def of_second_robot(sites: Sites) -> BoolArray | None:
+def of_second_robot(sites: Normal) -> BoolArray | None:
     """Return which runs seem to be of a second robot, (run,); None: all are of one.
 
     Args:
@@ -46,7 +46,7 @@ def of_second_robot(sites: Sites) -> BoolArray | None:
     return part if sure else None
 
 
-def _sums(sites: Sites, part: BoolArray) -> tuple[FloatArray, FloatArray]:
+def _sums(sites: Normal, part: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Return Lambda (theta, theta) and eta (theta,) of some runs together."""
     return sites.precision[part].sum(axis=0), sites.shift[part].sum(axis=0)
 
@@ -58,7 +58,7 @@ def _log_evidence(precision: FloatArray, shift: FloatArray) -> FloatArray:
     return np.asarray(0.5 * np.sum(shift * mean, axis=-1) - 0.5 * np.linalg.slogdet(whole)[1])
 
 
-def _gain(sites: Sites, part: BoolArray) -> float:
+def _gain(sites: Normal, part: BoolArray) -> float:
     """Return the gain of two robots over one; none where one has too few runs."""
     if min(part.sum(), (~part).sum()) < FEWEST:
         return -np.inf
@@ -68,14 +68,14 @@ def _gain(sites: Sites, part: BoolArray) -> float:
     return first + second - both
 
 
-def _least_gain(sites: Sites, part: BoolArray) -> float:
+def _least_gain(sites: Normal, part: BoolArray) -> float:
     """Return the gain without the run that makes most of it: one odd run is no robot."""
     rows = [np.delete(np.arange(len(part)), run) for run in range(len(part))]
-    some = [(Sites(sites.precision[kept], sites.shift[kept]), part[kept]) for kept in rows]
+    some = [(Normal(sites.precision[kept], sites.shift[kept]), part[kept]) for kept in rows]
     return min(_gain(*case) for case in some)
 
 
-def _parted(sites: Sites) -> list[BoolArray]:
+def _parted(sites: Normal) -> list[BoolArray]:
     """Return ways to part the runs that no change of one run improves, whatever their order."""
     precision, shift = _sums(sites, np.ones(len(sites.shift), dtype=bool))
     mean = np.linalg.solve(np.eye(len(shift)) + precision, shift)
@@ -84,7 +84,7 @@ def _parted(sites: Sites) -> list[BoolArray]:
     return [_settled(sites, along > np.median(along)) for along in off.T]
 
 
-def _settled(sites: Sites, part: BoolArray) -> BoolArray:
+def _settled(sites: Normal, part: BoolArray) -> BoolArray:
     """Return the runs parted anew, each to the robot that foretells it better, until all stay."""
     for _ in range(ROUNDS):
         first, second = (_foretold(sites, own) for own in (~part, part))
@@ -94,7 +94,7 @@ def _settled(sites: Sites, part: BoolArray) -> BoolArray:
     return part
 
 
-def _foretold(sites: Sites, part: BoolArray) -> FloatArray:
+def _foretold(sites: Normal, part: BoolArray) -> FloatArray:
     """Return log p(run | the other runs of a robot), (run,)."""
     precision, shift = _sums(sites, part)
     others = (
