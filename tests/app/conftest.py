@@ -1,14 +1,11 @@
 from __future__ import annotations
 
-import os
-import resource
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+from warm_command import WarmCommand
 
 FILES = (
     "trajectory_monitoring_cmd.csv",
@@ -17,31 +14,12 @@ FILES = (
 )
 
 
-def full_disk():
-    """Let no file grow beyond a few bytes, as on a disk without space."""
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (500, 500))
-
-
 @pytest.fixture(scope="session")
 def failuretwin():
     """Run the command line as a user does, without a terminal."""
-
-    def run(*arguments, folder=None, disk_full=False):
-        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-        environment.pop("COLUMNS", None)
-        return subprocess.run(
-            [sys.executable, "-m", "failuretwin", *map(str, arguments)],
-            capture_output=True,
-            text=True,
-            cwd=folder,
-            env=environment,
-            timeout=120,
-            check=False,
-            preexec_fn=full_disk if disk_full else None,
-        )
-
-    return run
+    command = WarmCommand()
+    yield command.run
+    command.close()
 
 
 @pytest.fixture(scope="session")

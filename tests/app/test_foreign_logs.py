@@ -12,11 +12,6 @@ import xarray as xr
 from waiting import WAIT_S
 
 
-def failuretwin(*arguments, cwd):
-    command = [sys.executable, "-m", "failuretwin", *map(str, arguments)]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
-
-
 @pytest.fixture
 def log(tmp_path, twin):
     """A folder with a CSV log of one healthy run, in units of its own."""
@@ -31,8 +26,8 @@ def log(tmp_path, twin):
     return tmp_path
 
 
-def test_a_guess_is_written_and_shown_and_nothing_is_read(log):
-    result = failuretwin("import", "log.csv", "--columns", "map.toml", "--out", "r.nc", cwd=log)
+def test_a_guess_is_written_and_shown_and_nothing_is_read(failuretwin, log):
+    result = failuretwin("import", "log.csv", "--columns", "map.toml", "--out", "r.nc", folder=log)
 
     assert result.returncode == 2
     assert "A GUESS: check every line" in result.stdout
@@ -41,11 +36,11 @@ def test_a_guess_is_written_and_shown_and_nothing_is_read(log):
     assert not (log / "r.nc").exists()
 
 
-def test_the_checked_guess_leads_to_a_verdict_and_a_page(log):
-    failuretwin("diagnose", "log.csv", "--columns", "map.toml", cwd=log)
+def test_the_checked_guess_leads_to_a_verdict_and_a_page(failuretwin, log):
+    failuretwin("diagnose", "log.csv", "--columns", "map.toml", folder=log)
 
     result = failuretwin(
-        "diagnose", "log.csv", "--columns", "map.toml", "--plot", "report", cwd=log
+        "diagnose", "log.csv", "--columns", "map.toml", "--plot", "report", folder=log
     )
 
     assert result.returncode == 0, result.stderr
@@ -55,23 +50,25 @@ def test_the_checked_guess_leads_to_a_verdict_and_a_page(log):
     assert "healthy" in result.stdout
 
 
-def test_a_log_is_never_overwritten_by_what_is_made_of_it(log):
+def test_a_log_is_never_overwritten_by_what_is_made_of_it(failuretwin, log):
     before = (log / "log.csv").read_bytes()
-    failuretwin("diagnose", "log.csv", "--columns", "map.toml", cwd=log)
+    failuretwin("diagnose", "log.csv", "--columns", "map.toml", folder=log)
 
-    result = failuretwin("import", "log.csv", "--columns", "map.toml", "--out", "log.csv", cwd=log)
+    result = failuretwin(
+        "import", "log.csv", "--columns", "map.toml", "--out", "log.csv", folder=log
+    )
 
     assert result.returncode == 2
     assert "is what is to be read" in result.stderr
     assert (log / "log.csv").read_bytes() == before
 
 
-def test_exported_csv_is_read_back(log):
-    failuretwin("diagnose", "log.csv", "--columns", "map.toml", cwd=log)
-    failuretwin("import", "log.csv", "--columns", "map.toml", "--out", "again.csv", cwd=log)
+def test_exported_csv_is_read_back(failuretwin, log):
+    failuretwin("diagnose", "log.csv", "--columns", "map.toml", folder=log)
+    failuretwin("import", "log.csv", "--columns", "map.toml", "--out", "again.csv", folder=log)
 
-    guess = failuretwin("diagnose", "again.csv", "--columns", "again.toml", cwd=log)
-    result = failuretwin("diagnose", "again.csv", "--columns", "again.toml", cwd=log)
+    guess = failuretwin("diagnose", "again.csv", "--columns", "again.toml", folder=log)
+    result = failuretwin("diagnose", "again.csv", "--columns", "again.toml", folder=log)
 
     assert guess.returncode == 2
     assert result.returncode == 0, result.stderr
@@ -108,41 +105,41 @@ def test_an_interrupt_ends_the_workers_and_leaves_no_netcdf(tmp_path):
 
 
 @pytest.mark.parametrize("said", ["not JSON", "[1, 2]", '{"imperfections": 3}'])
-def test_a_configuration_of_other_people_does_no_harm(tmp_path, said):
+def test_a_configuration_of_other_people_does_no_harm(failuretwin, tmp_path, said):
     run = ["--hypotheses", "healthy", "--runs-per-class", "1", "--out", "runs.nc"]
-    failuretwin("simulate", *run, cwd=tmp_path)
+    failuretwin("simulate", *run, folder=tmp_path)
     with xr.open_dataset(tmp_path / "runs.nc", engine="h5netcdf") as stored:
         runs = stored.load()
     runs.attrs["configuration"] = said
     runs.to_netcdf(tmp_path / "theirs.nc", engine="h5netcdf")
 
-    result = failuretwin("diagnose", "theirs.nc", cwd=tmp_path)
+    result = failuretwin("diagnose", "theirs.nc", folder=tmp_path)
 
     assert result.returncode == 0, result.stderr
     assert result.stderr == ""
 
 
-def test_paths_that_no_whole_counts_make_need_approximate(tmp_path):
+def test_paths_that_no_whole_counts_make_need_approximate(failuretwin, tmp_path):
     run = ["--hypotheses", "healthy", "--runs-per-class", "1", "--seed", "3", "--out"]
-    failuretwin("simulate", *run, "runs.nc", cwd=tmp_path)
-    failuretwin("import", "runs.nc", "--out", "runs.mat", cwd=tmp_path)
+    failuretwin("simulate", *run, "runs.nc", folder=tmp_path)
+    failuretwin("import", "runs.nc", "--out", "runs.mat", folder=tmp_path)
 
-    exact = failuretwin("diagnose", "runs.mat", cwd=tmp_path)
-    fitted = failuretwin("diagnose", "runs.mat", "--approximate", cwd=tmp_path)
+    exact = failuretwin("diagnose", "runs.mat", folder=tmp_path)
+    fitted = failuretwin("diagnose", "runs.mat", "--approximate", folder=tmp_path)
 
     assert exact.returncode == 2
     assert "--approximate" in exact.stderr
     assert fitted.returncode == 0, fitted.stderr
 
 
-def test_columns_whose_names_tell_all_need_no_map(log):
+def test_columns_whose_names_tell_all_need_no_map(failuretwin, log):
     table = pd.read_csv(log / "log.csv")
-    refused = failuretwin("diagnose", "log.csv", cwd=log)
+    refused = failuretwin("diagnose", "log.csv", folder=log)
     table.rename(columns=lambda name: name + "_mm" * name.startswith("tcp")).to_csv(
         log / "told.csv", index=False
     )
 
-    result = failuretwin("diagnose", "told.csv", cwd=log)
+    result = failuretwin("diagnose", "told.csv", folder=log)
 
     assert refused.returncode == 2
     assert "the unit of tcp_x" in refused.stderr
