@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 
 from failuretwin.core.movements import Movements
 from failuretwin.digital_model.nonidealities import Imperfections, LostCommand, Timing
+from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
 
 OUTLIER_RATE = 0.01
@@ -78,7 +80,7 @@ def test_motors_that_miss_commands_in_a_row_stand_where_they_went_last(twin, mot
 
 def test_a_motor_that_missed_two_travelled_last_in_the_movement_before_both(twin):
     commanded = movements([False, False, False])
-    found = model(twin, [(("motor_2",), 0.03, 0.03)], 0.0).outcomes(commanded)
+    found = model(twin, [(("motor_2",), 0.005, 0.005)], 0.0).outcomes(commanded)
     travel = np.sign(commanded.target - commanded.origin())[0, :, 1]
     assert len(found.lost) == 3
     np.testing.assert_array_equal(found.direction[0, 2, :, 1], travel[[2, 1, 0]])
@@ -95,7 +97,7 @@ def test_motors_may_lose_every_command(twin, share, count):
 
 
 def test_rare_losses_in_a_row_are_left_out(twin):
-    rate = 0.9 * np.sqrt(1e-4)
+    rate = 0.9 * np.sqrt(1e-6)
     found = model(twin, [(("motor_1",), rate, rate)], 0.0).outcomes(movements([False] * 3))
     assert found.lost.tolist() == [[False] * 4, [True, False, False, False]]
 
@@ -122,3 +124,50 @@ def test_a_run_has_the_alternatives_that_it_has_among_others(twin):
     alone, both = healthy.outcomes(short), healthy.outcomes(padded)
     for name in ("base", "direction", "log_weight"):
         np.testing.assert_array_equal(getattr(both, name)[:1, :2], getattr(alone, name))
+
+
+def test_the_next_travel_begins_where_the_motor_stood(twin):
+    """A motor that missed its command travels from the target before that, on any later way."""
+    commanded = movements([False] * 4)
+    healthy = model(twin, [(("motor_2",), 0.1, 0.1)], 0.0)
+    usual = healthy.outcomes(commanded)
+    pose = healthy.settle(usual.base, usual.direction, healthy.none_held)
+    was = (np.arange(4), [0, 1, 0, 0])  # the second command is lost
+    seen = seen_at(commanded, twin.path(pose[0][was]))
+    found = healthy.outcomes_as_seen(seen)
+    initial, target = commanded.initial[0, 1], commanded.target[0, :, 1]
+    stood = np.array([initial, target[0], target[0], target[2]])
+    np.testing.assert_array_equal(found.direction[0, :, 0, 1], np.sign(target - stood))
+    others = [0, 2, 3]
+    np.testing.assert_array_equal(found.direction[..., others], usual.direction[..., others])
+
+
+def test_a_motor_that_misses_its_command_keeps_its_angle(twin, measured_armpi):
+    """Also what it had settled off its target: by Gauss, of a movement that is surely healthy."""
+    commanded = movements([False] * 3)
+    losses = (LostCommand(("motor_2",), 0.1, 0.1),)
+    healthy = HealthyModel(twin, replace(measured_armpi, lost_commands=losses))
+    usual = healthy.outcomes(commanded)
+    pose = healthy.settle(usual.base, usual.direction, healthy.none_held)[0, :, 0]
+    off = np.array([0.3, -1.0, 0.5, 0.2]) * healthy.scatter
+    seen = seen_at(commanded, twin.path(pose + off))
+    found = healthy.outcomes_as_seen(seen)
+
+    _, jacobian = twin.path_and_jacobian(pose)
+    spread = healthy.scatter**2
+    for m in (1, 2):
+        J, r = jacobian[m - 1], seen.point[0, m - 1] - twin.path(pose[m - 1])
+        cov = J @ np.diag(spread) @ J.T + healthy.path_noise**2 * np.eye(3)
+        expected = spread * (J.T @ np.linalg.solve(cov, r))
+        kept = found.base[0, m, 1] - usual.base[0, m, 1]
+        np.testing.assert_allclose(kept[1], expected[1], rtol=1e-3)
+        np.testing.assert_array_equal(found.base[0, m, 0], commanded.target[0, m])
+
+
+def seen_at(commanded, point):
+    """Return the evidence of tools that settle at some points, (movement, 3) [m]."""
+    count = len(point)
+    seen = SettledEvidence.empty(run=1, movement=count, motor=4, axis=3)
+    return replace(
+        seen, movements=commanded, point=point[None], usable=np.ones((1, count), dtype=bool)
+    )

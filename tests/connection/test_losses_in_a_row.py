@@ -100,7 +100,7 @@ def test_one_motor_misses_as_many_in_a_row_as_are_not_too_rare():
 
 def test_chains_end_although_losses_are_certain():
     chain = ConsecutiveLossHmm.of(losses_of([(0,), (1,)]), np.array([0.0, 1.0, 1.0]), 1e-4)
-    assert len(chain.missed) == 24
+    assert len(chain.missed) == 48
 
 
 def test_what_is_impossible_is_not_made_probable_by_what_was_seen():

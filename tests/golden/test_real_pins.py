@@ -65,8 +65,8 @@ def surprise(posteriors, truths):
     [
         ("measured", True, 89, 0.030427),
         ("measured", False, 89, 0.034234),
-        ("published", True, 86, 0.139188),
-        ("published", False, 85, 0.151442),
+        ("published", True, 87, 0.129976),
+        ("published", False, 86, 0.142107),
     ],
 )
 def test_ninety_runs_with_the_bundled_calibration(told, how, whole, right, score):
@@ -93,7 +93,7 @@ def test_intervals_of_stuck_motors_hold_as_many_as_they_did(real, told, how, ang
 
 @pytest.mark.parametrize(
     ("more", "right", "score"),
-    [((), 71, 0.019802), (("steady_state_error",), 71, 0.023269)],
+    [((), 71, 0.024713), (("steady_state_error",), 71, 0.027115)],
 )
 def test_older_campaign_with_the_bundled_calibration(campaign, twin, more, right, score):
     listed, runs = campaign

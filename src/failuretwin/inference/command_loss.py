@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import numpy as np
 
@@ -23,9 +23,11 @@ from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
 
+Values = TypeVar("Values", FloatArray, BoolArray)
+
 # How many commands in a row each motor has missed: a chain from movement to movement.
 
-MOST_STATES = 24
+MOST_STATES = 48
 """States of a chain beyond which no more are added; what is left out is the rarest."""
 
 
@@ -114,9 +116,10 @@ def _known(missed: tuple[int, ...], states: list[tuple[int, ...]]) -> tuple[int,
 
 OUTLIER_RATE = 0.01
 """Share of movements after which the tool may be anywhere in its workspace [-]."""
-RARE = 1e-4
-"""Losses in a row that are less probable than this, even if all are late, are left out [-]."""
-NEGLIGIBLE = 1e-5
+RARE = 1e-6
+"""Losses in a row that are less probable than this, even if all are late, are left out [-]: less
+than one movement in twenty days of work. One left out looks like a fault."""
+NEGLIGIBLE = 1e-7
 """What is less probable than this given the movements before is left to the outliers [-]."""
 LATE_MARGIN_S = 0.15
 """A movement that lasts this much longer than the schedule allows started late [s]."""
@@ -129,6 +132,8 @@ class CommandOutcomes(ArrayStruct):
     Attributes:
         lost: Motors that lose their command, (outcome, motor).
         base: Angles that the motors then go for, (run, movement, outcome, motor) [rad].
+        kept: What of them is scatter of the movement before a loss, which a motor that does not
+            move keeps, (run, movement, outcome, motor) [rad].
         direction: Sign of their last travel, (run, movement, outcome, motor).
         log_weight: Log probability of each and of no outlier, log w_a (1 - eps),
             (run, movement, outcome).
@@ -136,8 +141,24 @@ class CommandOutcomes(ArrayStruct):
 
     lost: BoolArray
     base: Annotated[FloatArray, Axes("run", "movement", "outcome", "motor")]
+    kept: Annotated[FloatArray, Axes("run", "movement", "outcome", "motor")]
     direction: Annotated[FloatArray, Axes("run", "movement", "outcome", "motor")]
     log_weight: Annotated[FloatArray, Axes("run", "movement", "outcome")]
+
+
+@dataclass(frozen=True)
+class Standing(ArrayStruct):
+    """How motors stood after each movement, by what was seen until then.
+
+    Attributes:
+        lost: Motors that most probably missed its command, (run, movement, motor).
+        base: Angle that each of them went for last, (run, movement, motor) [rad].
+        off: By how much each settled off what is expected there, (run, movement, motor) [rad].
+    """
+
+    lost: Annotated[BoolArray, Axes("run", "movement", "motor", empty=False)]
+    base: Annotated[FloatArray, Axes("run", "movement", "motor")]
+    off: Annotated[FloatArray, Axes("run", "movement", "motor")]
 
 
 @dataclass(frozen=True)
@@ -152,18 +173,28 @@ class LostCommands:
     robot: Robot
     imperfections: Imperfections
 
-    def outcomes(self, movements: Movements) -> CommandOutcomes:
+    def outcomes(self, movements: Movements, standing: Standing | None = None) -> CommandOutcomes:
         """Return what may become of each movement; the first is that every command arrives.
 
-        A motor that misses a command stays where it went last: at the target before, or, if it
-        had missed that one too, at the target before that, and so on. Padding is filled with
-        zeros; no evidence belongs to it.
+        A motor that misses a command keeps its angle: the target before, or, if it had missed that
+        one too, the target before that, and so on, each with what it had settled off it. Its next
+        travel begins there. Padding is filled with zeros; no evidence belongs to it.
+
+        Args:
+            movements: The movements.
+            standing: How the motors stood after each; None: as commanded, without scatter.
         """
         origin, target = np.nan_to_num(movements.origin()), np.nan_to_num(movements.target)
-        travel, rows = np.sign(target - origin), self._in_a_row
+        stood, off, rows = origin, np.zeros_like(origin), self._in_a_row
+        if standing is not None:
+            stood = np.where(_before(standing.lost), _before(standing.base), origin)
+            off = _before(standing.off)
+        travel = np.sign(target - stood)
+        kept = _of_last_made(np.zeros_like(off), off, rows.missed)
         return CommandOutcomes(
             lost=rows.missed > 0,
-            base=_of_last_made(target, origin, rows.missed),
+            base=_of_last_made(target, origin, rows.missed) + kept,
+            kept=kept,
             direction=_of_last_made(travel, _before(travel), rows.missed),
             log_weight=self._log_weight(rows.forward(self._rates(self.late(movements)))),
         )
@@ -257,6 +288,6 @@ def _of_last_made(values: FloatArray, after: FloatArray, missed: IntArray) -> Fl
     return np.moveaxis(chosen, (0, 1), (2, 3)).copy()
 
 
-def _before(values: FloatArray) -> FloatArray:
+def _before(values: Values) -> Values:
     """Return the values of the movement before, (run, movement, ...); zero before the first."""
     return np.concatenate([np.zeros_like(values[:, :1]), values[:, :-1]], axis=1)

@@ -12,17 +12,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 
+from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.movements import Movements
-from failuretwin.core.numerics import Ellipsoid
+from failuretwin.core.numerics import Ellipsoid, log_sum
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
 from failuretwin.digital_model.nonidealities import Imperfections, Timing
 from failuretwin.digital_model.settling import Settling, loads_in_range, poses_in_range
 from failuretwin.digital_model.twin import SAG_ROUNDS, DigitalTwin
-from failuretwin.inference.command_loss import OUTLIER_RATE, CommandOutcomes, LostCommands
+from failuretwin.inference.command_loss import (
+    OUTLIER_RATE,
+    CommandOutcomes,
+    LostCommands,
+    Standing,
+)
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.settings import InferenceSettings
 
@@ -108,6 +115,21 @@ HELD_PLAY_RAD = 0.003
 its healthy neighbours scatter, however exact these are; assumed."""
 LEAST_VISIBLE_POSES = 200
 """Poses at which it is asked how small an angle shows."""
+
+
+@dataclass(frozen=True)
+class Explanation(ArrayStruct):
+    """How well each outcome explains settled positions, and with which pose.
+
+    Attributes:
+        density: Log density of each position if no motor is faulty, (run, movement, outcome)
+            [log 1/m3].
+        poses: The pose, scattered so as to meet the position, (run, movement, outcome, motor)
+            [rad].
+    """
+
+    density: Annotated[FloatArray, Axes("run", "movement", "outcome")]
+    poses: Annotated[FloatArray, Axes("run", "movement", "outcome", "motor")]
 
 
 @dataclass(frozen=True)
@@ -285,9 +307,9 @@ class HealthyModel:
         """Which commands get lost, and how often."""
         return LostCommands(self.twin.robot, self.imperfections)
 
-    def outcomes(self, movements: Movements) -> CommandOutcomes:
-        """Return what may become of each movement; the first is that every command arrives."""
-        return self.lost_commands.outcomes(movements)
+    def outcomes(self, movements: Movements, standing: Standing | None = None) -> CommandOutcomes:
+        """Return what may become of each movement; see `LostCommands.outcomes`."""
+        return self.lost_commands.outcomes(movements, standing)
 
     def filtered_outcomes(
         self, evidence: SettledEvidence, outcomes: CommandOutcomes, density: FloatArray
@@ -345,24 +367,55 @@ class HealthyModel:
         spread = Ellipsoid.of(jacobian * scale[..., None, :], self.path_noise**2)
         return point - predicted, jacobian, spread
 
-    def explain(
-        self, evidence: SettledEvidence, outcomes: CommandOutcomes
-    ) -> tuple[FloatArray, FloatArray]:
+    def outcomes_as_seen(
+        self, evidence: SettledEvidence, first: Explanation | None = None
+    ) -> CommandOutcomes:
+        """Return what may become of each movement, by where the motors stood before it.
+
+        Where that was is judged by a first explanation that takes them to stand as commanded.
+
+        Args:
+            evidence: Settled positions.
+            first: That explanation, where it was computed before.
+        """
+        usual = self.outcomes(evidence.movements)
+        if first is None:
+            first = self.explain(evidence, usual)
+        found = self.filtered_outcomes(evidence, usual, first.density)
+        return self.outcomes(evidence.movements, self._standing(evidence, found, first))
+
+    def _standing(
+        self, evidence: SettledEvidence, outcomes: CommandOutcomes, found: Explanation
+    ) -> Standing:
+        """Return how motors stood after each movement, at its most probable outcome.
+
+        What they settled off is their most probable scatter times the probability that the outcome
+        is what happened.
+        """
+        usable = evidence.usable
+        terms = outcomes.log_weight + np.where(usable[..., None], found.density, 0.0)
+        best = np.argmax(terms, axis=-1)
+
+        def at_best(values: FloatArray) -> FloatArray:
+            return np.take_along_axis(values, best[..., None, None], axis=2)[:, :, 0]
+
+        base, direction = at_best(outcomes.base), at_best(outcomes.direction)
+        total = np.logaddexp(log_sum(terms, axis=-1), self.outlier_log_density)
+        trust = np.where(usable, np.exp(terms.max(axis=-1) - total), 0.0)
+        scatter = at_best(found.poses) - self.settle(base, direction, self.none_held)
+        return Standing(outcomes.lost[best], base, trust[..., None] * scatter)
+
+    def explain(self, evidence: SettledEvidence, outcomes: CommandOutcomes) -> Explanation:
         """Return how well each outcome explains the settled positions, and with which pose.
 
         Args:
             evidence: Settled positions.
             outcomes: What may have become of each movement.
-
-        Returns:
-            Log density of each position under each outcome if no motor is faulty,
-            (run, movement, outcome) [log 1/m3], and the pose, scattered so as to meet the
-            position, (run, movement, outcome, motor) [rad].
         """
         pose = self.settle(outcomes.base, outcomes.direction, self.none_held)
         error, jacobian, spread = self.residual(evidence.point[:, :, None], pose, self.scatter)
         density = spread.log_student(error, self.settling.tail_dof)
-        return density, pose + scattered(spread, jacobian, self.scatter, error)
+        return Explanation(density, pose + scattered(spread, jacobian, self.scatter, error))
 
 
 def scattered(

@@ -23,7 +23,7 @@ from failuretwin.core.numerics import log_fall
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.inference.command_loss import CommandOutcomes
 from failuretwin.inference.evidence import SettledEvidence
-from failuretwin.inference.healthy_model import HealthyModel, scattered
+from failuretwin.inference.healthy_model import Explanation, HealthyModel, scattered
 
 REFINEMENTS = 2
 """Newton steps from the point of the circle nearest to the tool; more change nothing."""
@@ -165,11 +165,11 @@ def joint_likelihoods(
         other_angle: Where it settles, (run, movement, node, outcome) [rad].
         other_held: Whether the gear holds it there.
     """
-    base, direction = outcomes.base, outcomes.direction
+    base, kept, direction = outcomes.base, outcomes.kept, outcomes.direction
     log_weight, point = outcomes.log_weight, evidence.point[:, :, None]
     another = model.none_held.copy()
     if other is not None and other_angle is not None:
-        base, direction = base[:, :, None], direction[:, :, None]
+        base, kept, direction = (part[:, :, None] for part in (base, kept, direction))
         log_weight, point = log_weight[:, :, None], point[:, :, None]
         base = np.repeat(base, other_angle.shape[2], axis=2)
         base[..., other] = other_angle
@@ -200,7 +200,8 @@ def joint_likelihoods(
     square = spread.product(error, error) - taken * (2.0 * slope - precision * taken)
     settled = settled + scattered(spread, jacobian, scale, error - lever * taken[..., None])
     settled = np.where(own, angle[..., None], settled)
-    beside = _beside(model, expected, direction, base, own, angle)
+    commanded = base - np.broadcast_to(kept, (*lead, kept.shape[-1]))[possible]
+    beside = _beside(model, expected, direction, commanded, own, angle)
     dof = model.settling.tail_dof
     weighed = log_weight + spread.log_norm(dof)
 
@@ -243,7 +244,8 @@ def _beside(
         model: The healthy robot.
         expected: Angles at which the motors settle if healthy, (..., motor) [rad].
         direction: Sign of their last travel, (..., motor).
-        base: Angles that they go for, (..., motor) [rad].
+        base: Angles that they are commanded to, (..., motor) [rad]: an error is added to these, and
+            not to the scatter that a motor keeps.
         own: Which motor is meant, (own, ..., motor).
         angle: Where the fault takes it, (own, ...) [rad].
     """
@@ -299,23 +301,19 @@ class MovementLikelihoods(ArrayStruct):
     Attributes:
         model: The healthy robot.
         outcomes: What may have become of each movement, given the movements before.
-        density: Log density of its settled position under each outcome if no motor is faulty,
-            (run, movement, outcome) [log 1/m3].
-        poses: Pose that explains the settled position then, (run, movement, outcome, motor)
-            [rad].
+        explanation: How well each of them explains its settled position if no motor is faulty.
         profiles: What each movement says of each motor.
     """
 
     model: HealthyModel
     outcomes: CommandOutcomes
-    density: PerOutcome
-    poses: Annotated[FloatArray, Axes("run", "movement", "outcome", "motor")]
+    explanation: Explanation
     profiles: tuple[JointLikelihood, ...]
 
     @property
     def terms(self) -> FloatArray:
         """Log weight times density of each outcome, (run, movement, outcome)."""
-        return self.outcomes.log_weight + self.density
+        return self.outcomes.log_weight + self.explanation.density
 
     @property
     def expected(self) -> FloatArray:
@@ -325,8 +323,8 @@ class MovementLikelihoods(ArrayStruct):
 
 def movement_likelihoods(evidence: SettledEvidence, model: HealthyModel) -> MovementLikelihoods:
     """Return what every movement says by itself."""
-    usual = model.outcomes(evidence.movements)
-    density, poses = model.explain(evidence, usual)
-    found = model.filtered_outcomes(evidence, usual, density)
+    usual = model.outcomes_as_seen(evidence)
+    explanation = model.explain(evidence, usual)
+    found = model.filtered_outcomes(evidence, usual, explanation.density)
     profiles = joint_likelihoods(evidence, model, found, range(len(model.scatter)))
-    return MovementLikelihoods(model, found, density, poses, tuple(profiles))
+    return MovementLikelihoods(model, found, explanation, tuple(profiles))

@@ -153,12 +153,12 @@ class LinearResponse:
             layout: What stands in theta.
             moving: Readings on the way, registered; None: they are left aside.
         """
-        usual, sharp = model.outcomes(evidence.movements), model
-        density, poses = model.explain(evidence, usual)
-        outcomes = model.filtered_outcomes(evidence, usual, density)
+        usual, sharp = model.outcomes_as_seen(evidence), model
+        explanation = model.explain(evidence, usual)
+        outcomes = model.filtered_outcomes(evidence, usual, explanation.density)
         if layout.offsets:
             sharp = model.without_doubt
-            density, poses = sharp.explain(evidence, usual)
+            explanation = sharp.explain(evidence, usual)
         profiles = joint_likelihoods(evidence, sharp, outcomes, range(layout.motors))
         pose = sharp.settle(usual.base, usual.direction, sharp.none_held)
         place = _Place(evidence, sharp, layout)
@@ -167,7 +167,7 @@ class LinearResponse:
             sharp,
             layout,
             usual,
-            MovementLikelihoods(sharp, outcomes, density, poses, tuple(profiles)),
+            MovementLikelihoods(sharp, outcomes, explanation, tuple(profiles)),
             place.whitened(pose, usual.direction, sharp.scatter),
             tuple(place.motor(k, profile, outcomes) for k, profile in enumerate(profiles)),
             moving,
@@ -198,7 +198,10 @@ class LinearResponse:
         profiles = list(self.findings.profiles)
         for k in motors:
             profiles[k] = self.motors[k].at(delta, outcomes, self.layout.own(k))
-        found = replace(self.findings, outcomes=outcomes, density=density, profiles=tuple(profiles))
+        explanation = replace(self.findings.explanation, density=density)
+        found = replace(
+            self.findings, outcomes=outcomes, explanation=explanation, profiles=tuple(profiles)
+        )
         return RunLikelihood(self.evidence, self.model, remembered=found)
 
     def whole_at(self, delta: FloatArray) -> RunLikelihood:

@@ -183,7 +183,7 @@ class TransientLikelihood:
     def _healthy(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Where each movement of a healthy arm began and ended, and what else became of it."""
         lost, seen = self.findings.outcomes.lost, self.settled.usable[..., None, None]
-        ends = np.where(seen, self.findings.poses, self.findings.expected)
+        ends = np.where(seen, self.findings.explanation.poses, self.findings.expected)
         chosen, log_correction = self._fill_in(ends, np.argmax(self.findings.terms, axis=-1), lost)
         return *self._course(ends, chosen, lost), log_correction
 

@@ -81,12 +81,13 @@ def two_joint_likelihood(
             their commands, the usual ones are followed.
         pair: Indices of the motors.
     """
-    kept = _kept(outcomes, pair)
+    followed = _followed(outcomes, pair)
     chosen = replace(
         outcomes,
-        base=outcomes.base[:, :, kept],
-        direction=outcomes.direction[:, :, kept],
-        log_weight=outcomes.log_weight[:, :, kept],
+        base=outcomes.base[:, :, followed],
+        kept=outcomes.kept[:, :, followed],
+        direction=outcomes.direction[:, :, followed],
+        log_weight=outcomes.log_weight[:, :, followed],
     )
     expected = model.settle(chosen.base, chosen.direction, model.none_held)
     angle = _starts(model, expected, pair, evidence.point)
@@ -96,14 +97,14 @@ def two_joint_likelihood(
     dof = model.settling.tail_dof
     log_weight = chosen.log_weight[..., None] + near.log_norm + log_fall(near.square, dof, dims=1)
     log_weight = np.where(_found(model, pair, angle, near.covariance), log_weight, -np.inf)
-    shape = (*evidence.usable.shape, len(kept) * SOLUTIONS)
+    shape = (*evidence.usable.shape, len(followed) * SOLUTIONS)
     return TwoJointLikelihood(
         pair,
         angle.reshape(*shape, 2),
         near.covariance.reshape(*shape, 2, 2),
         log_weight.reshape(shape),
         expected[:, :, 0][..., list(pair)],
-        np.repeat(kept, SOLUTIONS),
+        np.repeat(followed, SOLUTIONS),
     )
 
 
@@ -163,7 +164,7 @@ def _laplace(
     )
 
 
-def _kept(outcomes: CommandOutcomes, pair: tuple[int, int]) -> IntArray:
+def _followed(outcomes: CommandOutcomes, pair: tuple[int, int]) -> IntArray:
     """Return the outcomes in which other motors alone lose commands, and not too rarely."""
     most = np.exp(outcomes.log_weight.max(axis=(0, 1)))
     others = ~outcomes.lost[:, list(pair)].any(axis=1)

@@ -26,7 +26,7 @@ from failuretwin.inference.priors import MONITORING
 
 # The state of a stream in a file: plain arrays, read without running anything.
 
-FORMAT = 2
+FORMAT = 3
 SUFFIX = ".npz"
 HEADER = "header"
 

@@ -12,7 +12,7 @@ from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.evidence import MOST_READINGS, SettledEvidence, TransientSamples
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.healthy_model import Explanation, HealthyModel
 from failuretwin.inference.joint_likelihood import (
     MovementLikelihoods,
     joint_likelihoods,
@@ -40,7 +40,8 @@ class MovementWindow(ArrayStruct):
         read_s: When the tool was last read, (robot,) [s].
         settled: Where the tools settled.
         transient: What was read on the way.
-        judged: Movements of which `likelihoods` are up to date, (robot, movement).
+        first: How well outcomes explain each movement if motors stood as commanded before it.
+        judged: Movements of which `first` and `likelihoods` are up to date, (robot, movement).
         likelihoods: What every movement says by itself.
     """
 
@@ -50,6 +51,7 @@ class MovementWindow(ArrayStruct):
     read_s: Annotated[FloatArray, Axes("run", empty=-np.inf)]
     settled: SettledEvidence
     transient: TransientSamples
+    first: Explanation
     judged: Annotated[BoolArray, Axes("run", "movement", empty=False)]
     likelihoods: MovementLikelihoods
 
@@ -58,6 +60,7 @@ class MovementWindow(ArrayStruct):
         """Return windows of so many movements at most, without any yet."""
         sizes = {"motor": len(model.scatter), "axis": 3, "reading": MOST_READINGS}
         settled = SettledEvidence.empty(run=0, movement=movements, **sizes)
+        likelihoods = movement_likelihoods(settled, model)
         none = cls(
             count=np.zeros(0, dtype=np.int64),
             forgotten=np.zeros(0, dtype=np.int64),
@@ -66,7 +69,8 @@ class MovementWindow(ArrayStruct):
             settled=settled,
             transient=TransientSamples.empty(run=0, movement=movements, **sizes),
             judged=np.zeros((0, movements), dtype=bool),
-            likelihoods=movement_likelihoods(settled, model),
+            first=likelihoods.explanation,
+            likelihoods=likelihoods,
         )
         return none.blank(robots, movements)
 
@@ -120,11 +124,14 @@ class MovementWindow(ArrayStruct):
         if len(run):
             item, at = (run[:, None], movement[:, None]), (robots[run][:, None], movement[:, None])
             single, known = evidence[item], self.likelihoods
-            density, poses = model.explain(single, usual[item])
-            known.density[at] = density
-            alone = model.filtered_outcomes(evidence, usual, known.density[some])[item]
+            self.first.put(at, model.explain(single, usual[item]))
+            seen = model.outcomes_as_seen(evidence, self.first[some])
+            explanation = model.explain(single, seen[item])
+            known.explanation.put(at, explanation)
+            density = known.explanation.density[some]
+            alone = model.filtered_outcomes(evidence, seen, density)[item]
             profiles = joint_likelihoods(single, model, alone, range(len(model.scatter)))
-            known.put(at, MovementLikelihoods(model, alone, density, poses, tuple(profiles)))
+            known.put(at, MovementLikelihoods(model, alone, explanation, tuple(profiles)))
             self.judged[at] = True
         return self.likelihoods[some]
 
