@@ -9,7 +9,9 @@ import pytest
 
 from failuretwin import load_robot
 from failuretwin.app.cli import main
+from failuretwin.core.errors import InputError
 from failuretwin.digital_model.robot import bundled_folder, bundled_robots
+from failuretwin.digital_model.urdf import read_root
 
 ARM = """<robot name="arm">
   <link name="base"/>
@@ -217,3 +219,10 @@ def test_init_refuses_a_pose_at_rest_of_another_arm(arm, run, tmp_path, home, me
     code, _, err = run("robot", "init", arm(), "--home", home, "--out", tmp_path / "mine.toml")
     assert code == 2
     assert message in err
+
+
+def test_urdf_and_profile_are_not_mixed_up(tmp_path):
+    with pytest.raises(InputError, match=r"failuretwin robot init arm\.urdf --out arm\.toml"):
+        load_robot("arm.urdf")
+    with pytest.raises(InputError, match="is the profile of a robot, expected its URDF"):
+        read_root(tmp_path / "arm.toml")

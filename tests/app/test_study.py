@@ -21,12 +21,15 @@ from failuretwin.app.study import (
     StudyPlan,
     Training,
     check_folder,
+    given_test_set,
     quick_plan,
     run_study,
     stand_in_test_set,
 )
 from failuretwin.app.study_page import TABLE_2, TABLE_3, mean_confusion, ratio_spreads, spread_of
 from failuretwin.core.errors import InputError
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.data_knowledge.store import save_run_set
 from waiting import WAIT_S, wait_for, workers_of
 
 TINY = StudyPlan(0, 3, (2, 4), 1, 1)
@@ -44,6 +47,15 @@ def studied(armpi, exam, tmp_path_factory):
     told = []
     run_study(TINY, armpi, exam, folder, told.append)
     return folder, sum(told)
+
+
+def test_simulated_runs_are_not_taken_for_real_ones(armpi, tmp_path):
+    save_run_set(simulate(Plan(armpi, ["healthy"], 1)), tmp_path / "runs.nc")
+    exam = given_test_set(tmp_path / "runs.nc", armpi, False)
+    assert not exam.real
+    assert exam.source == f"1 simulated run of {tmp_path / 'runs.nc'}"
+    with pytest.raises(InputError, match="--published-labels is for raw sessions"):
+        given_test_set(tmp_path / "runs.nc", armpi, True)
 
 
 def result(confusion):

@@ -259,7 +259,7 @@ def test_all_modes_can_be_simulated_with_all_imperfections(plan_of, armpi):
 
 
 def test_no_workers_are_refused(plan_of):
-    with pytest.raises(InputError, match="workers is 0, expected 1 or more"):
+    with pytest.raises(InputError, match="workers is 0, expected 1 to"):
         simulate(plan_of(), workers=0)
 
 

@@ -203,7 +203,8 @@ def test_scheduler_without_workers(monkeypatch):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"workers": 0}, "workers is 0, expected 1 or more"),
+        ({"workers": 0}, "workers is 0, expected 1 to"),
+        ({"workers": 10_000}, "workers is 10000, expected 1 to"),
         ({"workers": 2, "scheduler": NOBODY}, "Give one or the other"),
     ],
 )

@@ -13,6 +13,7 @@ import numpy as np
 
 from failuretwin.app.tables import Table, figures_table, latex, show
 from failuretwin.connection.tracked_diagnosis import Tracked
+from failuretwin.core.errors import counted
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.store import replacing
@@ -52,7 +53,7 @@ def print_diagnoses(diagnoses: Sequence[Diagnosis]) -> None:
 
 def _diagnosis_row(d: Diagnosis, known: bool) -> list[str]:
     count = len(d.quality)
-    quality = f"{count} remark{'s' * (count > 1)}" if count else ""
+    quality = counted(count, "remark") if count else ""
     return [d.run, *([d.truth or "", _mark(d)] if known else []), d.verdict, quality]
 
 
@@ -187,7 +188,7 @@ def coverage_table(coverage: Sequence[proportions.Coverage]) -> Table:
 
 def print_comparison(comparison: Comparison) -> None:
     """Print how two methods differ on the same runs."""
-    show(f"\n{comparison.runs} runs, each by A and by B")
+    show(f"\n{counted(comparison.runs, 'run')}, each by A and by B")
     show(*(f"{name}: {value}" for name, value in comparison_rows(comparison)))
 
 
@@ -279,7 +280,7 @@ def isolability_summary(runs: xr.Dataset, diagnoser: BayesDiagnoser) -> list[str
 def _left_out_lines(others: Sequence[Hypothesis]) -> list[str]:
     """Return the hypotheses that nothing is said of here: pairs of faults, and `unknown`."""
     pairs = sum(len(h.faults) > 1 for h in others)
-    names = [f"{pairs} pair{'s' * (pairs > 1)} of faults"] * (pairs > 0)
+    names = [f"{counted(pairs, 'pair')} of faults"] * (pairs > 0)
     names += [str(h) for h in others if not h.known]
     said = "what motions tell apart is said of single faults only, not of "
     return [said + " and ".join(names)] * bool(names)
@@ -336,7 +337,7 @@ def _summary(report: UrdfReport) -> str:
     count = len(report.motors)
     return (
         f"{report.name or report.source.name}: from {report.base_link} to {report.tool_link}, "
-        f"{count} motor{'s' * (count != 1)} can move the tool point\n"
+        f"{counted(count, 'motor')} can move the tool point\n"
         f"the tool gets {report.reach:.3f} m away from the base's origin; "
         f"what moves weighs {report.moving_mass:.3f} kg\n"
     )

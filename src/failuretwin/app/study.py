@@ -23,12 +23,12 @@ import numpy as np
 
 from failuretwin import __version__
 from failuretwin.core.config import fingerprint, from_table
-from failuretwin.core.errors import FailureTwinError, InputError, OutputError
+from failuretwin.core.errors import FailureTwinError, InputError, OutputError, counted
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.read import ReadOptions, read_runs
-from failuretwin.data_knowledge.store import reason, replacing
+from failuretwin.data_knowledge.store import SUFFIXES, reason, replacing
 from failuretwin.decision.evaluation import Truths
 from failuretwin.decision.learned.feature_encoder import FeatureEncoder, signals_of
 from failuretwin.digital_model.robot import Robot
@@ -116,12 +116,18 @@ def class_names(robot: Robot) -> list[str]:
     return [str(hypothesis) for hypothesis in paper_hypotheses(robot.motor_names)]
 
 
-def real_test_set(path: Path, robot: Robot, published_labels: bool) -> Exam:
+def given_test_set(path: Path, robot: Robot, published_labels: bool) -> Exam:
     """Read a test set as the authors processed theirs: readings drawn out by straight lines.
 
     Raises:
-        InputError: If it cannot be read or its truth is not known or not one of the classes.
+        InputError: If it cannot be read or its truth is not known or not one of the classes, or if
+            a stored run set, which has its labels, is to be labelled anew.
     """
+    if published_labels and path.suffix in SUFFIXES:
+        raise InputError(
+            f"{path}: is a run set, which has its labels already; --published-labels is for raw "
+            "sessions. Leave it out, or `failuretwin import` the sessions with it."
+        )
     runs = read_runs(path, robot, ReadOptions("published", published_labels))
     check_motors(runs, robot.name, robot.motor_names)
     truth = {known.fault for known in Truths.of(runs, str(path)).by_run.values()}
@@ -131,7 +137,10 @@ def real_test_set(path: Path, robot: Robot, published_labels: bool) -> Exam:
             f"{path}: runs of {', '.join(strange)} are no class of the study. Expected "
             f"{', '.join(class_names(robot))}."
         )
-    return Exam(runs, real=True, source=f"{runs.sizes['run']} runs of {path}")
+    simulated = str(runs.attrs.get("source", "")).startswith("simulated")
+    made = "simulated " if simulated else ""
+    source = f"{counted(runs.sizes['run'], made + 'run')} of {path}"
+    return Exam(runs, real=not simulated, source=source)
 
 
 def stand_in_test_set(plan: StudyPlan, robot: Robot) -> Exam:

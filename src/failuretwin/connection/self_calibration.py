@@ -20,7 +20,7 @@ from failuretwin.connection.calibration.parameters import readings_of, schedule_
 from failuretwin.connection.calibration.result import Calibration, Parameter
 from failuretwin.connection.calibration.timing_fit import gap_starts, lateness
 from failuretwin.connection.population import Population
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import truth_of
@@ -196,7 +196,7 @@ def _calibration(
 ) -> Calibration:
     """Return what was learned as a calibration, which anybody may use."""
     learned = found.model.imperfections
-    source = f"{runs.sizes['run']} runs without labels; {believed.name}"
+    source = f"{counted(runs.sizes['run'], 'run')} without labels; {believed.name}"
     parameters = _parameters(found, believed, robot)
     return Calibration(
         imperfections=replace(

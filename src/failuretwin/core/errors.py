@@ -51,3 +51,8 @@ def needs_extra(who: str, extra: str) -> Iterator[None]:
         raise InputError(
             f"{who} ({error}). Install {them}: pip install 'failuretwin[{extra}]'."
         ) from error
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a number of things in words: "1 run", "2 runs"."""
+    return f"{count} {noun}{'s' * (count != 1)}"

@@ -6,6 +6,7 @@ Needs the extra `cluster`, except for one process.
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -126,6 +127,10 @@ LONGEST_WAIT_S = 1800.0
 """Longest wait for the next result [s]: many times what a piece takes on a slow machine."""
 
 
+WORKERS_PER_CORE = 4
+"""Most processes of our own for each processor."""
+
+
 @dataclass(frozen=True)
 class Workforce:
     """Who does the work.
@@ -140,8 +145,12 @@ class Workforce:
     scheduler: str | None = None
 
     def __post_init__(self) -> None:
-        if self.workers < 1:
-            raise InputError(f"workers is {self.workers}, expected 1 or more.")
+        most = WORKERS_PER_CORE * (os.cpu_count() or 1)
+        if not 1 <= self.workers <= most:
+            raise InputError(
+                f"workers is {self.workers}, expected 1 to {most}: more than {WORKERS_PER_CORE} to "
+                "each of this machine's processors only get in each other's way."
+            )
         if self.scheduler is not None and self.workers > 1:
             raise InputError(
                 f"{self.workers} workers here and those of scheduler {self.scheduler} at once "

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import truth_of
 from failuretwin.core.types import BoolArray, FloatArray
@@ -162,9 +162,9 @@ def score_line(judged: Judged) -> str:
     scores = judged.scores
     low, high = scores.interval
     return (
-        f"{scores.right} of {scores.runs} runs right: accuracy {100 * scores.accuracy:.1f} % "
-        f"(95 % interval {100 * low:.1f} to {100 * high:.1f} %), protocol {judged.protocol}, "
-        f"log score {_log_score_text(scores.log_scores)}"
+        f"{scores.right} of {counted(scores.runs, 'run')} right: accuracy "
+        f"{100 * scores.accuracy:.1f} % (95 % interval {100 * low:.1f} to {100 * high:.1f} %), "
+        f"protocol {judged.protocol}, log score {_log_score_text(scores.log_scores)}"
     )
 
 
@@ -187,7 +187,7 @@ def as_unknown_line(judged: Judged) -> str:
     found = judged.as_unknown
     if not found:
         return ""
-    truths = [f"{truth} ({count} run{'s' * (count > 1)})" for truth, count in found.items()]
+    truths = [f"{truth} ({counted(count, 'run')})" for truth, count in found.items()]
     return f"judged as unknown, since not among the hypotheses: {', '.join(truths)}"
 
 
@@ -232,7 +232,7 @@ class Evaluation:
     @property
     def runs_and_protocol(self) -> str:
         """What was judged, in words."""
-        return f"{self.scores.runs} runs, protocol {self.judged.protocol}"
+        return f"{counted(self.scores.runs, 'run')}, protocol {self.judged.protocol}"
 
 
 def evaluate(

@@ -287,6 +287,12 @@ def load_robot(name_or_path: str | Path | Robot) -> Robot:
     path = Path(name_or_path)
     if path.suffix != ".toml":
         if str(name_or_path) not in bundled_robots():
+            if path.suffix == ".urdf":
+                raise InputError(
+                    f"{path}: is a URDF; a robot is named by its profile. Make one: "
+                    f"failuretwin robot init {path} --out {path.stem}.toml, then --robot "
+                    f"{path.stem}.toml."
+                )
             error = unknown_name("robot", str(name_or_path), bundled_robots())
             raise InputError(f"{error} Or give the path of a profile that ends in .toml.")
         path = bundled_folder() / f"{name_or_path}.toml"

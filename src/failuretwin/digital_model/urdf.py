@@ -249,8 +249,13 @@ def read_root(path: Path) -> ElementTree.Element:
     """Return the <robot> element of a URDF file.
 
     Raises:
-        InputError: If the file is missing, not XML, a xacro template or not a URDF.
+        InputError: If the file is missing, a profile, not XML, a xacro template or not a URDF.
     """
+    if path.suffix == ".toml":
+        raise InputError(
+            f"{path}: is the profile of a robot, expected its URDF. A profile is checked wherever "
+            "it is used as --robot; make one of a URDF by: failuretwin robot init URDF --out FILE."
+        )
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -20,7 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import FloatArray, IntArray
@@ -178,12 +178,12 @@ class FaultCourse:
             return tuple(self._sentence(episode) for episode in faulty)
         healthy = self.path[0]
         sure = percent(float(self.posterior[:, healthy].min()))
-        return (f"healthy in all {len(self.runs)} runs, {sure} sure",)
+        return (f"healthy in all {counted(len(self.runs), 'run')}, {sure} sure",)
 
     def _sentence(self, episode: Episode) -> str:
         count, first, last = len(self.runs), episode.first + 1, episode.last + 1
         low, high = (end + 1 for end in episode.first_90)
-        when = f"in all {count} runs"
+        when = f"in all {counted(count, 'run')}"
         if first > 1 or last < count:
             when = f"in runs {first} to {last} of {count}" if last > first else f"in run {first}"
         if first > 1:

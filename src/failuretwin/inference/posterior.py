@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import (
     UNKNOWN,
     Diagnosis,
@@ -237,7 +237,7 @@ def abstention_reason(
         return "the tool is not seen at rest after any movement"
     if usable.sum() <= FEW_MOVEMENTS and probability < 0.5:
         count = int(usable.sum())
-        return f"only {count} movement{'s' * (count != 1)} can be used and no hypothesis stands out"
+        return f"only {counted(count, 'movement')} can be used and no hypothesis stands out"
     unexplained = usable & (by_movement < model.outlier_log_density + UNEXPLAINED_NATS)
     if 2 * unexplained.sum() <= usable.sum():
         return ""

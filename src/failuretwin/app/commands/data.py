@@ -18,6 +18,7 @@ from failuretwin.app.commands.options import (
     plugin_option,
     reading_options,
 )
+from failuretwin.core.errors import counted
 
 if TYPE_CHECKING:
     from failuretwin.digital_model.urdf_check import UrdfReport
@@ -60,7 +61,7 @@ def import_(
     model = load_robot(robot)
     runs = read_inputs(sources, model, reading)
     export_runs(runs, out, DigitalTwin(model))
-    click.echo(f"{runs.sizes['run']} runs written to {out}")
+    click.echo(f"{counted(runs.sizes['run'], 'run')} written to {out}")
 
 
 # `failuretwin simulate`: runs made by the twin.
@@ -160,7 +161,7 @@ def simulate(
     workforce = Workforce(workers, scheduler)
     with progress_bar("simulating", plan.size) as advance:
         produce(plan, out, workforce, advance, tell=lambda text: click.echo(text, err=True))
-    click.echo(f"{plan.size} runs written to {out}")
+    click.echo(f"{counted(plan.size, 'run')} written to {out}")
 
 
 # `failuretwin robot`: bring a robot of your own, from its URDF.
@@ -245,9 +246,8 @@ def init(
         load_robot(partial)
     for message in report.having("warning"):
         click.echo(f"warning: {message}", err=True)
-    count = len(report.motors)
     click.echo(
-        f"profile with {count} motor{'s' * (count != 1)} written to {out}; go through the "
+        f"profile with {counted(len(report.motors), 'motor')} written to {out}; go through the "
         "lines that say 'assumed'"
     )
 

@@ -227,10 +227,12 @@ def study(
     test = (
         paper.stand_in_test_set(plan, model)
         if test_path is None
-        else paper.real_test_set(test_path, model, published_labels)
+        else paper.given_test_set(test_path, model, published_labels)
     )
     check_learning()
-    total = len(list(plan.jobs())) * plan.iterations
+    trainings = len(list(plan.jobs()))
+    click.echo(f"{trainings} trainings of {plan.iterations} iterations each")
+    total = trainings * plan.iterations
     with progress_bar("training", total) as advance:
         page = paper.run_study(plan, model, test, out, advance)
     click.echo(f"written to {page}")
