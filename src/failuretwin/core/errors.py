@@ -51,3 +51,16 @@ def needs_extra(who: str, extra: str) -> Iterator[None]:
         raise InputError(
             f"{who} ({error}). Install {them}: pip install 'failuretwin[{extra}]'."
         ) from error
+
+
+def reason(error: BaseException) -> str:
+    """Return what the system or a library says of an error, on one line."""
+    if isinstance(error, MemoryError):
+        return "not enough memory"
+    text = getattr(error, "strerror", None) or str(error)
+    return one_line(str(text)) or type(error).__name__
+
+
+def one_line(text: str) -> str:
+    """Return the text of another library's error on one line, without its inner details."""
+    return " ".join(text.partition("(")[0].split())

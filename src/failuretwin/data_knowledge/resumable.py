@@ -20,13 +20,12 @@ from typing import TYPE_CHECKING, Any
 
 from failuretwin import __version__
 from failuretwin.core.config import fingerprint
-from failuretwin.core.errors import FailureTwinError, InputError, OutputError
+from failuretwin.core.errors import FailureTwinError, InputError, OutputError, reason
 from failuretwin.data_knowledge.generate import CHUNK_RUNS, Plan, simulate, simulate_runs
 from failuretwin.data_knowledge.store import (
     atomic_replace,
     check_destination,
     quiet_zarr,
-    reason,
     save_run_set,
     sole_writer,
     write_files,
@@ -35,12 +34,15 @@ from failuretwin.data_knowledge.workers import ONE_PROCESS, Workforce
 
 if TYPE_CHECKING:
     import xarray as xr
+    from zarr.core.array_spec import ArrayConfigLike
     from zarr.core.buffer import Buffer
 
 MANIFEST = "manifest.json"
 GROUP = "zarr.json"
 """File that makes a folder a Zarr group: the last one to be written."""
 COMPRESSION_LEVEL = 5
+EVERY_CHUNK: ArrayConfigLike = {"write_empty_chunks": True}
+"""How arrays are written: a chunk without a file is then one that was lost."""
 DECISIVE = ("numpy", "scipy", "zarr", "numcodecs")
 """Packages, beside ourselves, whose versions may change bytes of a run set."""
 LARGEST_NETCDF_BYTES = 600_000_000
@@ -109,7 +111,7 @@ class Generation:
         """Return the hash of a chunk: SHA-256 over name, NUL, size, NUL, bytes of its files."""
         total = hashlib.sha256()
         for name in sorted(f.replace("/c.0", f"/c.{chunk}") for f in self.chunk_files.values()):
-            if (self.store / name).is_file():  # what is all missing has no file
+            if (self.store / name).is_file():  # one that was lost gives another hash
                 data = (self.store / name).read_bytes()
                 total.update(f"{name}\0{len(data)}\0".encode() + data)
         return total.hexdigest()
@@ -169,7 +171,7 @@ def make_chunk(generation: Generation, chunk: int) -> str:
     part = simulate_runs(generation.plan, runs).to_dataset()
     with quiet_zarr():
         for name in generation.chunk_files:
-            array = zarr.open_array(generation.store / name, mode="r+")
+            array = zarr.open_array(generation.store / name, mode="r+", config=EVERY_CHUNK)
             array[runs.start : runs.stop] = part[name].values
     digest = generation.digest(chunk)
     generation.mark(chunk).write_text(digest)

@@ -18,6 +18,7 @@ from failuretwin.app.commands.options import (
     plugin_option,
     reading_options,
 )
+from failuretwin.app.terminal import tell
 
 if TYPE_CHECKING:
     from failuretwin.digital_model.urdf_check import UrdfReport
@@ -60,7 +61,7 @@ def import_(
     model = load_robot(robot)
     runs = read_inputs(sources, model, reading)
     export_runs(runs, out, DigitalTwin(model))
-    click.echo(f"{runs.sizes['run']} runs written to {out}")
+    tell(f"{runs.sizes['run']} runs written to {out}")
 
 
 # `failuretwin simulate`: runs made by the twin.
@@ -159,8 +160,8 @@ def simulate(
     )
     workforce = Workforce(workers, scheduler)
     with progress_bar("simulating", plan.size) as advance:
-        produce(plan, out, workforce, advance, tell=lambda text: click.echo(text, err=True))
-    click.echo(f"{plan.size} runs written to {out}")
+        produce(plan, out, workforce, advance, tell=lambda text: tell(text, err=True))
+    tell(f"{plan.size} runs written to {out}")
 
 
 # `failuretwin robot`: bring a robot of your own, from its URDF.
@@ -244,9 +245,9 @@ def init(
         partial.write_text(text, encoding="utf-8")
         load_robot(partial)
     for message in report.having("warning"):
-        click.echo(f"warning: {message}", err=True)
+        tell(f"warning: {message}", err=True)
     count = len(report.motors)
-    click.echo(
+    tell(
         f"profile with {count} motor{'s' * (count != 1)} written to {out}; go through the "
         "lines that say 'assumed'"
     )
@@ -301,4 +302,4 @@ def fit_(logs: tuple[Path, ...], out: Path, reading: LogOptions, robot: str, see
         partial.write_text(text, encoding="utf-8")
         load_robot(partial)
     print_registration(found)
-    click.echo(f"written to {out}; use it with --robot {out}")
+    tell(f"written to {out}; use it with --robot {out}")
