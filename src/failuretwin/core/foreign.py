@@ -49,7 +49,8 @@ def reading(path: Path | str, kind: str, fix: str = "") -> Iterator[None]:
     # Broken bytes lead libraries anywhere: IndexError, AssertionError, MemoryError, struct.error.
     except Exception as error:
         why = reason(error).rstrip(".")
-        raise InputError(f"{path}: cannot be read as {kind} ({why}). {fix}".rstrip()) from error
+        read = "read" if getattr(error, "strerror", None) else f"read as {kind}"
+        raise InputError(f"{path}: cannot be {read} ({why}). {fix}".rstrip()) from error
 
 
 def read_text(path: Path, kind: str, fix: str = "") -> str:

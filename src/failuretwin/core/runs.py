@@ -198,7 +198,7 @@ def check_runs(runs: xr.Dataset, where: str) -> xr.Dataset:
             raise InputError(
                 f"{where}: {coordinate} names are not unique. Rename those that repeat."
             )
-    _check_duration(runs, where)
+    check_duration(runs, where)
     rate = runs.attrs.get("measured_rate_hz", 1.0)
     if not (isinstance(rate, int | float | np.number) and 0.0 < rate < np.inf):
         raise InputError(f"{where}: `measured_rate_hz` is {rate!r}, expected a rate above 0 [Hz].")
@@ -256,17 +256,18 @@ def _check_time(time: FloatArray, where: str) -> None:
         )
 
 
-def _check_duration(runs: xr.Dataset, where: str) -> None:
+def check_duration(runs: xr.Dataset, where: str, last: float = np.inf) -> None:
+    """Raise InputError unless every run is longer than nothing and ends by the time `last` [s]."""
     if "duration" not in runs:
         return
-    last, kind = float(runs["time"].values[-1]), runs["duration"].dtype
-    length = as_floats(runs["duration"].values) if kind.kind in "fiu" else np.array([np.nan])
-    wrong = ~((length > 0.0) & (length <= last * (1.0 + UNIFORM)))
+    numbers = runs["duration"].dtype.kind in "fiu"
+    length = as_floats(runs["duration"].values) if numbers else np.array([np.nan])
+    wrong = ~((length > 0.0) & (length < np.inf) & (length <= last * (1.0 + UNIFORM)))
     if wrong.any():
         run = runs["run"].values[int(np.argmax(wrong))]
         raise InputError(
             f"{where}: `duration` of run {str(run)!r} is {length[wrong][0]:g}, expected a time "
-            f"above 0 and no later than the end of `time`, {last:g} s."
+            f"above 0 up to the end of `time`, {runs['time'].values[-1]:g} s."
         )
 
 

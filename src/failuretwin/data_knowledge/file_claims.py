@@ -67,6 +67,8 @@ CELL_BYTES = {"string": TEXT_CELL_BYTES, "bool": 1} | {
     if (kind, bits) != ("float", 8)
 }
 """Types of elements that are let in, and what one takes in memory [bytes]."""
+FIXED_TEXT = "fixed_length_utf32"
+"""Type of text that is equally long throughout; its metadata say how long."""
 MAY_BE_EMPTY = ("onset", "magnitude", "position", "temperature", "voltage")
 """Variables that may be unknown throughout; other writers leave out chunks that are all unknown."""
 
@@ -114,14 +116,21 @@ def _check_codecs(node: Any, file: Path) -> None:
 
 def _array_bytes(node: Mapping[str, Any], file: Path) -> float:
     """Return what an array of a Zarr store takes, or one of its chunks if that is more [bytes]."""
-    kind = node["data_type"]
-    if not isinstance(kind, str) or kind not in CELL_BYTES:
-        raise InputError(f"{file}: has the type {kind!r}, expected {', '.join(CELL_BYTES)}.")
+    cell = _cell_bytes(node["data_type"], file)
     grid = [int(n) for n in node["chunk_grid"]["configuration"]["chunk_shape"]]
     shape = [int(n) for n in node["shape"]]
     if len(grid) != len(shape) or min([*shape, *grid], default=0) < 0 or 0 in grid:
         raise InputError(f"{file}: has the shape {shape} and chunks of {grid}, which do not fit.")
-    return float(max(math.prod(shape), math.prod(grid))) * CELL_BYTES[kind]
+    return float(max(math.prod(shape), math.prod(grid))) * cell
+
+
+def _cell_bytes(kind: Any, file: Path) -> float:
+    if isinstance(kind, Mapping) and kind.get("name") == FIXED_TEXT:
+        return float(kind["configuration"]["length_bytes"])
+    if not isinstance(kind, str) or kind not in CELL_BYTES:
+        expected = ", ".join((*CELL_BYTES, FIXED_TEXT))
+        raise InputError(f"{file}: has the type {kind!r}, expected {expected}.")
+    return CELL_BYTES[kind]
 
 
 def _check_chunks(node: Mapping[str, Any], folder: Path) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from failuretwin.core.errors import InputError, OutputError, reason
 from failuretwin.core.foreign import reading
-from failuretwin.core.runs import check_runs
+from failuretwin.core.runs import check_duration, check_runs
 from failuretwin.data_knowledge.file_claims import check_netcdf, check_zarr
 
 if TYPE_CHECKING:
@@ -45,7 +45,9 @@ def load_run_set(path: Path) -> xr.Dataset:
             check_zarr(path)
             opened = _open_zarr(path)
         with opened as stored:
-            return check_runs(stored.load(), str(path))
+            runs = check_runs(stored.load(), str(path))
+            check_duration(runs, str(path), float(runs["time"].values[-1]))
+            return runs
 
 
 def _open_netcdf(path: Path) -> xr.Dataset:

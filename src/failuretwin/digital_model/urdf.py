@@ -348,7 +348,7 @@ def _triple(
     values = _three_numbers(text)
     if values is None:
         raise InputError(
-            f"{where}: {key}={text[:40]!r}, expected three numbers within +-{FARTHEST:g}."
+            f"{where}: {key}={text[:40]!r}, expected three finite numbers within +-{FARTHEST:g}."
         )
     return values
 
