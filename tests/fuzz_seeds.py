@@ -254,10 +254,16 @@ RESULT = {
     "verdict": "motor 1 stuck",
 }
 RESULTS = "".join(json.dumps(RESULT | {"run": f"run_{k}"}) + "\n" for k in range(5))
-MODES = "[drift]\nmagnitude = [0.01, 0.05]\nonset_s = [0.0, 5.0]\nprofiles = ['step']\n"
-LEROBOT_MAP = (
-    "unit = 'normalised'\nlow = [-90, -90, -90, -90, -90]\nhigh = [90, 90, 90, 90, 90]\n"
-)
+MODES = """\
+# How faults come about, for the fuzzer.
+[stuck]
+onset_s = [0.5, 2.0]
+[drift]
+magnitude = [0.01, 0.05]
+onset_s = [0.0, 5.0]
+profiles = ['step']
+"""
+LEROBOT_MAP = "unit = 'normalised'\nlow = [-90, -90, -90, -90, -90]\nhigh = [90, 90, 90, 90, 90]\n"
 ROS_TOPICS = 'command = "/arm"\ncommand_type = "trajectory_msgs/JointTrajectory"\n'
 
 
@@ -276,9 +282,10 @@ def network(folder):
     from failuretwin.decision.learned.storage import save_network
 
     encoder = FeatureEncoder("robust", ARMPI, None)
+    hypotheses = parse_hypotheses(["healthy", "motor_1:stuck"], ARMPI.motor_names)
     diagnoser = LearnedDiagnoser("lstm", encoder, iterations=1, random_state=1)
-    save_network(diagnoser.fit(simulate(Plan(ARMPI, parse_hypotheses(
-        ["healthy", "motor_1:stuck"], ARMPI.motor_names), 4, 2))), folder / "network.npz")  # fmt: skip
+    diagnoser.fit(simulate(Plan(ARMPI, hypotheses, 4, 2)))
+    save_network(diagnoser, folder / "network.npz")
     return folder / "network.npz"
 
 

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
+from bag_writers import write_bag
 from failuretwin.core.errors import FailureTwinError
 from fuzz_changes import bytes_changed, entries_changed, file_changed
 from fuzz_seeds import SEEDS, bag_entries, trajectory_entries
-from bag_writers import write_bag
 
 LIMIT_BYTES = 2 * 10**9
 SECONDS = 20
@@ -145,6 +145,8 @@ def _outcome(case: Case, sound: Path, folder: Path) -> str:
         SEEDS[case.kind].read(path)
     except FailureTwinError as error:
         said = str(error).replace(str(folder), "")
+        if isinstance(error.__cause__, MemoryError):  # said in one line, but found out too late
+            said += " [MemoryError]"
         return f"refused: {said}"
     except KeyboardInterrupt:
         return f"TOO LONG: {traceback.format_exc()}"

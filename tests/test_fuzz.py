@@ -24,7 +24,7 @@ def sound(tmp_path_factory):
 
 
 def judge(chosen, sound, scratch):
-    """Run cases; none may end otherwise than by being read or refused, in every kind some do both."""
+    """Run cases; none may end otherwise than by being read or refused."""
     found = run_cases(chosen, sound, scratch)
     wrong = {c: t for c, t in found.items() if t != "read" and not t.startswith("refused: ")}
     told = "\n\n".join(f"{case}\n{text[-1500:]}" for case, text in list(wrong.items())[:5])

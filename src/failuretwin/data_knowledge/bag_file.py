@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import reading
+from failuretwin.data_knowledge.bag_claims import check_chunks
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -83,6 +84,9 @@ def read_topics(path: Path) -> list[BagTopic]:
         InputError: If it cannot be read or rosbags is not installed.
     """
     _check_installed(path)
+    with _guarded(path):
+        for file in [path] if path.is_file() else sorted(path.glob("*.mcap")):
+            check_chunks(file)
     with _guarded(path), _reader(path) as reader:
         connections = sorted(reader.connections, key=lambda c: c.topic)
         names = dict.fromkeys(c.topic for c in connections)

@@ -219,8 +219,9 @@ def _hidden(path: Path, motors: int) -> tuple[FloatArray, FloatArray, FloatArray
         )
     found = []
     for half in halves:
-        series = [_series(item, path) for item in np.ravel(half)[:motors]]
-        found += [series[0][0], np.stack([values for _, values in series], axis=1)]
+        with reading(path, "commands and responses", "Expected a timeseries for each motor."):
+            series = [_series(item, path) for item in np.ravel(half)[:motors]]
+            found += [series[0][0], np.stack([values for _, values in series], axis=1)]
     return found[0], found[1], found[2], found[3]
 
 

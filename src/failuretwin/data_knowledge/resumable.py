@@ -25,24 +25,21 @@ from failuretwin.data_knowledge.generate import CHUNK_RUNS, Plan, simulate, simu
 from failuretwin.data_knowledge.store import (
     atomic_replace,
     check_destination,
-    quiet_zarr,
     save_run_set,
     sole_writer,
     write_files,
+    writing_zarr,
 )
 from failuretwin.data_knowledge.workers import ONE_PROCESS, Workforce
 
 if TYPE_CHECKING:
     import xarray as xr
-    from zarr.core.array_spec import ArrayConfigLike
     from zarr.core.buffer import Buffer
 
 MANIFEST = "manifest.json"
 GROUP = "zarr.json"
 """File that makes a folder a Zarr group: the last one to be written."""
 COMPRESSION_LEVEL = 5
-EVERY_CHUNK: ArrayConfigLike = {"write_empty_chunks": True}
-"""How arrays are written: a chunk without a file is then one that was lost."""
 DECISIVE = ("numpy", "scipy", "zarr", "numcodecs")
 """Packages, beside ourselves, whose versions may change bytes of a run set."""
 LARGEST_NETCDF_BYTES = 600_000_000
@@ -169,9 +166,9 @@ def make_chunk(generation: Generation, chunk: int) -> str:
         )
     runs = generation.runs_of(chunk)
     part = simulate_runs(generation.plan, runs).to_dataset()
-    with quiet_zarr():
+    with writing_zarr():
         for name in generation.chunk_files:
-            array = zarr.open_array(generation.store / name, mode="r+", config=EVERY_CHUNK)
+            array = zarr.open_array(generation.store / name, mode="r+")
             array[runs.start : runs.stop] = part[name].values
     digest = generation.digest(chunk)
     generation.mark(chunk).write_text(digest)
@@ -217,7 +214,7 @@ def _template(
 
     content: dict[str, Buffer] = {}
     store = MemoryStore(content)
-    with quiet_zarr():
+    with writing_zarr():
         example.to_zarr(store, mode="w", consolidated=False, encoding=encoding)
         for name in encoding:
             array = zarr.open_array(store, path=name, mode="r+")

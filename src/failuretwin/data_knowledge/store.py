@@ -87,8 +87,8 @@ def _zarr_files(runs: xr.Dataset) -> dict[str, Buffer]:
     from zarr.storage import MemoryStore
 
     content: dict[str, Buffer] = {}
-    with quiet_zarr():
-        runs.to_zarr(MemoryStore(content), mode="w", consolidated=True, write_empty_chunks=True)
+    with writing_zarr():
+        runs.to_zarr(MemoryStore(content), mode="w", consolidated=True)
     return content
 
 
@@ -105,9 +105,14 @@ def write_files(content: Mapping[str, Buffer], folder: Path) -> None:
 
 
 @contextmanager
-def quiet_zarr() -> Iterator[None]:
-    """Keep to ourselves that text and consolidated metadata are not in Zarr's final text yet."""
-    with warnings.catch_warnings():
+def writing_zarr() -> Iterator[None]:
+    """Write every chunk, so that one without a file is one that was lost.
+
+    That text and consolidated metadata are not in Zarr's final text yet, we keep to ourselves.
+    """
+    import zarr
+
+    with warnings.catch_warnings(), zarr.config.set({"array.write_empty_chunks": True}):
         warnings.filterwarnings("ignore", message=".*Zarr (V3|format 3).*")
         yield
 
