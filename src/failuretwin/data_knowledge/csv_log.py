@@ -205,6 +205,11 @@ def load_csv(path: Path, separator: str = ",") -> pd.DataFrame:
         raise InputError(f"{path}: is empty. Expected a header and rows of numbers.")
     with reading(path, "CSV", "Expected a header and rows of numbers."):
         table = pd.read_csv(path, dtype=str, sep=separator, skipinitialspace=True)
+    if not isinstance(table.index, pd.RangeIndex):
+        raise InputError(
+            f"{path}: its rows have more cells than its header has names. Check the separator, or "
+            "add the missing names."
+        )
     if table.empty:
         raise InputError(f"{path}: has a header but no rows.")
     return table

@@ -184,8 +184,8 @@ def _completed(imperfections: Imperfections, motors: int) -> Imperfections:
 
 
 LARGEST_ERROR = 1.0 / 8.0
-"""Largest error of a healthy motor as a share of where it may stand, such as 30 of 240 deg.
-Random movements go half as far from the middle; more would look like a motor that stands still."""
+"""Largest error of a healthy motor as a share of where it may stand, such as 20 of 160 deg: a
+guess, ten times what hobby servos do. Far beyond it a healthy motor looks like a stuck one."""
 
 
 def _check_sane(settling: Settling | None, robot: Robot, path: Path) -> None:
