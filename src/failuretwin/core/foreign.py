@@ -49,7 +49,8 @@ def reading(path: Path | str, kind: str, fix: str = "") -> Iterator[None]:
     # Broken bytes lead libraries anywhere: IndexError, AssertionError, MemoryError, struct.error.
     except Exception as error:
         why = reason(error).rstrip(".")
-        read = "read" if getattr(error, "strerror", None) else f"read as {kind}"
+        there = not isinstance(error, FileNotFoundError | PermissionError)
+        read = f"read as {kind}" if there else "read"
         raise InputError(f"{path}: cannot be {read} ({why}). {fix}".rstrip()) from error
 
 

@@ -63,7 +63,9 @@ def _open_zarr(path: Path) -> xr.Dataset:
     """
     import xarray as xr
 
-    return xr.open_zarr(path, chunks=None, consolidated=False, decode_times=False)
+    with warnings.catch_warnings():  # our manifest lies beside the arrays
+        warnings.filterwarnings("ignore", message="Object at .* is not recognized")
+        return xr.open_zarr(path, chunks=None, consolidated=False, decode_times=False)
 
 
 def save_run_set(runs: xr.Dataset, path: Path) -> None:
