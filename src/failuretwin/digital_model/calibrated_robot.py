@@ -139,7 +139,7 @@ def load_calibration(
     robot = load_robot(robot)
     if str(name_or_path) == GENERIC or (name_or_path is None and robot.imperfections_file is None):
         return CalibratedRobot(robot, generic_imperfections(robot))
-    if name_or_path == "none":
+    if str(name_or_path) == "none":
         return CalibratedRobot(robot, NO_IMPERFECTIONS)
     path = _file_of(str(name_or_path or robot.name), robot)
     table = read_toml(path)
