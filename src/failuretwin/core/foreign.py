@@ -8,6 +8,7 @@ text only (`printable`, `as_cell`).
 
 from __future__ import annotations
 
+import errno
 import os
 import unicodedata
 from collections.abc import Iterator
@@ -49,7 +50,7 @@ def reading(path: Path | str, kind: str, fix: str = "") -> Iterator[None]:
     # Broken bytes lead libraries anywhere: IndexError, AssertionError, MemoryError, struct.error.
     except Exception as error:
         why = reason(error).rstrip(".")
-        there = not isinstance(error, FileNotFoundError | PermissionError)
+        there = getattr(error, "errno", None) not in (errno.ENOENT, errno.EACCES)
         read = f"read as {kind}" if there else "read"
         raise InputError(f"{path}: cannot be {read} ({why}). {fix}".rstrip()) from error
 
