@@ -4,6 +4,7 @@ import pytest
 
 from failuretwin.app import tables
 from failuretwin.app.tables import Table, figures_table, progress_bar, show
+from failuretwin.app.terminal import tell
 
 COUNTS = figures_table(("motor [counts]", "n"), [("a:smile: [b]", "1"), ("c", "20")], "counted")
 
@@ -64,3 +65,14 @@ def test_short_work_says_nothing(clock, capsys):
             clock[0] += 0.4
             advance(1)
     assert capsys.readouterr().err == ""
+
+
+def test_text_of_files_does_not_act_on_the_terminal(capsys):
+    name = "run \x1b[31m[red]x\x9b2J"
+    show(f"a {name}", Table(("run", name), [[name, "1"]], title=name))
+    tell(name)
+    tell(name, err=True)
+    out, err = capsys.readouterr()
+    assert "\x1b" not in out + err
+    assert "\x9b" not in out + err
+    assert out.count("run \\x1b[31m[red]x\\x9b2J") == 5

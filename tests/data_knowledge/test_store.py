@@ -227,3 +227,12 @@ def test_file_cut_short_is_refused(tmp_path, published):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(InputError, match="cannot be read as a run set"):
         load_run_set(path)
+
+
+def test_a_set_whose_grid_was_thinned_is_read_and_one_that_was_cut_is_not(tmp_path):
+    runs = small(samples=12)
+    save_run_set(runs.isel(time=slice(None, None, 2)), tmp_path / "thin.nc")
+    np.testing.assert_allclose(load_run_set(tmp_path / "thin.nc")["duration"], 1.1)
+    save_run_set(runs.isel(time=slice(0, 6)), tmp_path / "cut.nc")
+    with pytest.raises(InputError, match=r"`duration` of run 'a' is 1\.1, .* `time`, 0\.5 s"):
+        load_run_set(tmp_path / "cut.nc")

@@ -5,7 +5,7 @@ import pytest
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import find_movements, resolution, simplify
-from failuretwin.data_knowledge.timed_log import Samples, Targets, TimedLog, timed_run
+from failuretwin.data_knowledge.timed_log import STEP_S, Samples, Targets, TimedLog, timed_run
 
 AT = np.arange(0.0, 6.0, 0.1)
 
@@ -109,4 +109,18 @@ def test_of_rows_with_the_same_time_the_last_one_counts(armpi, twin):
 )
 def test_a_log_that_says_too_little_is_refused(armpi, log, words):
     with pytest.raises(InputError, match=words):
+        timed_run(log, armpi)
+
+
+@pytest.mark.parametrize(("step_s", "fits"), [(1.9, True), (10.0, False)])
+def test_milliseconds_taken_for_seconds_make_no_grid_of_a_million_samples(
+    armpi, twin, step_s, fits
+):
+    time = step_s * np.arange(1100)  # 10 ms a row; as seconds, three hours
+    angles = 0.1 * np.sin(0.01 * time)[:, None] * np.ones(4)
+    log = log_of(twin, angles, time)
+    if fits:
+        assert len(timed_run(log, armpi).time) == pytest.approx(1.9 * 1099 / STEP_S, abs=2)
+        return
+    with pytest.raises(InputError, match=r"milliseconds may have been taken for seconds"):
         timed_run(log, armpi)

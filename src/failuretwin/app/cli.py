@@ -17,6 +17,7 @@ from failuretwin.app.commands.data import import_, robot, simulate
 from failuretwin.app.commands.diagnose import diagnose, evaluate
 from failuretwin.app.commands.learn import calibrate, study, train
 from failuretwin.app.commands.live import emulate, watch
+from failuretwin.app.terminal import tell
 from failuretwin.core.errors import FailureTwinError
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100, "show_default": True}
@@ -47,10 +48,10 @@ def main() -> None:
         error.show()
         sys.exit(2)
     except FailureTwinError as error:
-        click.echo(f"error: {error}", err=True)
+        tell(f"error: {error}", err=True)
         sys.exit(2)
     except OSError as error:  # the output itself: a full disk, or a reader that has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not isinstance(error, BrokenPipeError):
-            click.echo(f"error: output could not be written ({error.strerror}).", err=True)
+            tell(f"error: output could not be written ({error.strerror}).", err=True)
         sys.exit(2)

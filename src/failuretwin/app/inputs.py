@@ -8,9 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-import click
-
 from failuretwin.app.commands.options import LogOptions
+from failuretwin.app.terminal import tell
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.core.hypothesis import Hypothesis, parse_hypotheses
@@ -48,7 +47,7 @@ def read_inputs(sources: Sequence[Path], robot: Robot, reading: LogOptions) -> x
     runs = read_runs(list(sources), robot, options)
     error = float(runs.attrs.get(RECOVERY_ERROR, 0.0))
     if error > REPORTED_ERROR_M:
-        click.echo(
+        tell(
             f"note: approximate commands miss the desired path by up to {1000 * error:.1f} mm "
             f"(worst: {runs.attrs[RECOVERY_WORST]}); a diagnosis can be no better than that",
             err=True,
@@ -63,7 +62,7 @@ def warn_mismatch(runs: xr.Dataset, expected: str) -> None:
     except (KeyError, TypeError, ValueError):  # a run set of other people may say anything there
         return
     if isinstance(made_with, str) and expected not in (made_with, GENERIC_NAME):
-        click.echo(
+        tell(
             f"note: the runs were simulated with imperfections '{made_with}', the diagnosis "
             f"expects '{expected}'; there will be false alarms",
             err=True,
@@ -98,7 +97,7 @@ def _with_map(
         text = column_map_text(guess_columns(log, robot), log.name, robot)
     with replacing(path) as partial:
         partial.write_text(text, encoding="utf-8")
-    click.echo(text)
+    tell(text)
     raise InputError(
         f"{path} did not exist. The guess above has been written there and nothing was read: check "
         "every line, correct it, and run the same command again."

@@ -12,7 +12,6 @@ from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from urllib.parse import urlsplit
 
-import click
 import numpy as np
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -22,10 +21,12 @@ from rich.text import Text
 
 from failuretwin.app.commands.options import LiveOptions
 from failuretwin.app.shadow import SILENCE_S, Change, Changes, Shadow, Snapshot
+from failuretwin.app.terminal import tell
 from failuretwin.connection.links import ros_messages
 from failuretwin.connection.links.base import LinkCounts, Pace, Sink, Source, source_from_text
 from failuretwin.connection.links.ros_messages import LEVEL_NAMES, RosTopics, load_topics, statuses
 from failuretwin.core.errors import InputError
+from failuretwin.core.foreign import printable
 from failuretwin.data_knowledge.bag_messages import BagTopics
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
@@ -178,7 +179,7 @@ class View:
         self, snapshot: Snapshot, counts: LinkCounts, changes: Sequence[Change]
     ) -> RenderableType:
         """Return the view of what is known now; of the changes the newest is the last."""
-        lines = [Text(str(change)) for change in list(changes)[-SHOWN_CHANGES:]]
+        lines = [Text(printable(str(change))) for change in list(changes)[-SHOWN_CHANGES:]]
         return Group(
             self._head(snapshot, counts),
             self._motor_table(snapshot),
@@ -189,12 +190,12 @@ class View:
     def _head(self, snapshot: Snapshot, counts: LinkCounts) -> Text:
         arm = statuses(snapshot.answer, self._motors)[0]
         head = Text(f"{LEVEL_NAMES[arm.level]:6s}", STYLES[arm.level])
-        head.append(f" {arm.message}\n", "default")
+        head.append(f" {printable(arm.message)}\n", "default")
         off = float(np.linalg.norm(snapshot.residual)) * 1000.0
         share = 0.0 if np.isnan(off) else min(1.0, off / RESIDUAL_MM)
         said = "no reading" if np.isnan(off) else f"{off:5.1f} mm off the reference"
         head.append(
-            f"{self._source}  {snapshot.stream_time:.1f} s  {counts.received} events, "
+            f"{printable(self._source)}  {snapshot.stream_time:.1f} s  {counts.received} events, "
             f"{counts.garbage} garbage, {counts.dropped} dropped, {counts.reconnects} reconnects, "
             f"{1000 * snapshot.seconds:.1f} ms a sample\n",
             "dim",
@@ -209,11 +210,11 @@ class View:
         for status in statuses(snapshot.answer, self._motors)[1:]:
             probability = float(status.values.get("probability", 0.0))
             table.add_row(
-                status.name,
+                printable(status.name),
                 Text(LEVEL_NAMES[status.level], STYLES[status.level]),
                 f"{100 * probability:5.1f} %" if status.values else "",
                 _bar(probability),
-                status.message,
+                printable(status.message),
             )
         return table
 
@@ -226,7 +227,7 @@ class View:
         for name, _ in weight.most_common(SHOWN_HYPOTHESES):
             blocks = "".join(_block(column.get(name)) for column in self._history)
             last = self._history[-1].get(name)
-            table.add_row(name, blocks, "" if last is None else f"{100 * last:5.1f} %")
+            table.add_row(printable(name), blocks, "" if last is None else f"{100 * last:5.1f} %")
         return table
 
 
@@ -274,7 +275,7 @@ def watch_until_end(
             found = changes.notice(shadow.snapshot, source.counts, shadow.clock_jumps, troubles)
             if shown is None:
                 for change in found:
-                    click.echo(str(change))
+                    tell(str(change))
                 continue
             view.remember(shadow.snapshot)
             if not going or time.monotonic() >= drawn_s + REFRESH_S:

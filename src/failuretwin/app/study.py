@@ -23,12 +23,12 @@ import numpy as np
 
 from failuretwin import __version__
 from failuretwin.core.config import fingerprint, from_table
-from failuretwin.core.errors import FailureTwinError, InputError, OutputError, counted
+from failuretwin.core.errors import FailureTwinError, InputError, OutputError, counted, reason
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.read import ReadOptions, read_runs
-from failuretwin.data_knowledge.store import SUFFIXES, reason, replacing
+from failuretwin.data_knowledge.store import SUFFIXES, replacing
 from failuretwin.decision.evaluation import Truths
 from failuretwin.decision.learned.feature_encoder import FeatureEncoder, signals_of
 from failuretwin.digital_model.robot import Robot

@@ -12,9 +12,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-import click
 from rich.console import Console
 from rich.table import Table as TerminalTable
+
+from failuretwin.app.terminal import tell
+from failuretwin.core.foreign import printable
 
 PIPE_WIDTH = 160
 """Columns when the output is not a terminal, so that sentences stay whole."""
@@ -59,23 +61,23 @@ def console() -> Console:
 
 
 def show(*parts: str | Table) -> None:
-    """Print sentences, which no width cuts, and tables."""
+    """Print sentences, which no width cuts, and tables; text of files only as text."""
     out = console()
     for part in parts:
         if isinstance(part, str):
-            out.print(part, soft_wrap=True)
+            out.print(printable(part), soft_wrap=True)
             continue
         if part.title:
-            out.print(part.title, soft_wrap=True)
+            out.print(printable(part.title), soft_wrap=True)
         out.print(_on_terminal(part))
 
 
 def _on_terminal(table: Table) -> TerminalTable:
     drawn = TerminalTable(box=None, pad_edge=False, show_header=table.header)
     for heading, right in table.columns:
-        drawn.add_column(heading, overflow="fold", justify="right" if right else "left")
+        drawn.add_column(printable(heading), overflow="fold", justify="right" if right else "left")
     for row in table.rows:
-        drawn.add_row(*row)
+        drawn.add_row(*map(printable, row))
     return drawn
 
 
@@ -145,6 +147,6 @@ def _progress_lines(what: str, total: int) -> Callable[[int], None]:
         if 0 < done < total and now_s - reported_s >= REPORT_EVERY_S:
             reported_s = now_s
             left_s = (now_s - begun_s) * (total - done) / done
-            click.echo(f"{what}: {done} of {total}, about {left_s:.0f} s left", err=True)
+            tell(f"{what}: {done} of {total}, about {left_s:.0f} s left", err=True)
 
     return advance

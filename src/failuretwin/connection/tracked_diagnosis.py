@@ -17,6 +17,7 @@ from failuretwin.connection.wear import RunEvidence, WearState, run_evidence
 from failuretwin.connection.wear_tracker import DELAY, PendingRun, Step, Tracker
 from failuretwin.core.config import fingerprint
 from failuretwin.core.errors import InputError, OutputError
+from failuretwin.core.foreign import reading
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.store import check_writable
@@ -208,16 +209,15 @@ def parse_line(line: str, where: str) -> dict[str, Any]:
     Raises:
         InputError: If it is none.
     """
-    try:
+    with reading(where, "JSON", DAMAGED):
         value = json.loads(line)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{where}: is damaged ({error}). Move the file away.") from error
     if not isinstance(value, dict):
         raise InputError(f"{where}: is damaged (no object). Move the file away.")
     return value
 
 
 SUFFIX = ".history.jsonl"
+DAMAGED = "It is damaged: move the file away."
 
 
 @dataclass(frozen=True)
@@ -257,17 +257,15 @@ def read_history(path: Path, start: Tracker) -> History:
     Raises:
         InputError: If the file cannot be read, is damaged, or belongs to another calibration.
     """
-    try:
+    with reading(path, "a history", DAMAGED):
         content = path.read_bytes() if path.exists() else b""
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error}).") from error
-    size = content.rfind(b"\n") + 1
-    head, *lines = content[:size].decode("utf-8", errors="replace").splitlines() or [""]
-    if not head:
-        return History(path, 0, (), start)
-    _check_head(head, path, start)
-    steps = tuple(step_of(line, f"{path}: line {n}") for n, line in enumerate(lines, start=2))
-    return History(path, size, steps, _resumed(start, steps))
+        size = content.rfind(b"\n") + 1
+        head, *lines = content[:size].decode("utf-8", errors="replace").splitlines() or [""]
+        if not head:
+            return History(path, 0, (), start)
+        _check_head(head, path, start)
+        steps = tuple(step_of(line, f"{path}: line {n}") for n, line in enumerate(lines, start=2))
+        return History(path, size, steps, _resumed(start, steps))
 
 
 def append_history(history: History, steps: Sequence[Step]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import textwrap
 import tomllib
 import types
 from collections.abc import Mapping
@@ -15,9 +16,12 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_typ
 
 import numpy as np
 
-from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.errors import InputError, reason, unknown_name
+from failuretwin.core.foreign import read_text
 
 T = TypeVar("T")
+SHOWN = 200
+"""Letters of a wrong value that an error shows."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +74,13 @@ def read_toml(path: Path) -> dict[str, Any]:
     Raises:
         InputError: If the file cannot be read or is not TOML.
     """
+    text = read_text(path, "text")
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}).") from error
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path}: not a TOML file: {error}.") from error
+    except (ValueError, RecursionError) as error:  # a number of 5000 digits, lists in lists
+        raise InputError(f"{path}: not a TOML file: {reason(error)}.") from error
 
 
 def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
@@ -140,7 +145,10 @@ def _convert_tuple(args: tuple[Any, ...], value: Any, where: str) -> tuple[Any, 
 def _convert_plain(hint: Any, value: Any, where: str) -> Any:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if hint is float and is_number:
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            raise InputError(f"{where} is a whole number of more than 300 digits.") from None
     if hint in (str, bool, int) and type(value) is hint:
         return value
     names = {float: "a number", str: "text", bool: "true or false", int: "a whole number"}
@@ -148,7 +156,7 @@ def _convert_plain(hint: Any, value: Any, where: str) -> Any:
 
 
 def _wrong(where: str, value: Any, expected: str) -> InputError:
-    return InputError(f"{where} is {value!r}, expected {expected}.")
+    return InputError(f"{where} is {textwrap.shorten(repr(value), SHOWN)}, expected {expected}.")
 
 
 # Values as canonical JSON: equal values give equal text, whatever process writes it.

@@ -56,3 +56,16 @@ def needs_extra(who: str, extra: str) -> Iterator[None]:
 def counted(count: int, noun: str) -> str:
     """Return a number of things in words: "1 run", "2 runs"."""
     return f"{count} {noun}{'s' * (count != 1)}"
+
+
+def reason(error: BaseException) -> str:
+    """Return what the system or a library says of an error, on one line."""
+    if isinstance(error, MemoryError):
+        return "not enough memory"
+    text = getattr(error, "strerror", None) or str(error)
+    return one_line(str(text)) or type(error).__name__
+
+
+def one_line(text: str) -> str:
+    """Return the text of another library's error on one line, without its inner details."""
+    return " ".join(text.partition("(")[0].split())

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from failuretwin.core.errors import InputError
+from failuretwin.core.foreign import check_memory
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray, as_floats
 
@@ -197,6 +198,7 @@ def check_runs(runs: xr.Dataset, where: str) -> xr.Dataset:
             raise InputError(
                 f"{where}: {coordinate} names are not unique. Rename those that repeat."
             )
+    check_duration(runs, where)
     rate = runs.attrs.get("measured_rate_hz", 1.0)
     if not (isinstance(rate, int | float | np.number) and 0.0 < rate < np.inf):
         raise InputError(f"{where}: `measured_rate_hz` is {rate!r}, expected a rate above 0 [Hz].")
@@ -254,6 +256,21 @@ def _check_time(time: FloatArray, where: str) -> None:
         )
 
 
+def check_duration(runs: xr.Dataset, where: str, last: float = np.inf) -> None:
+    """Raise InputError unless every run is longer than nothing and ends by the time `last` [s]."""
+    if "duration" not in runs:
+        return
+    numbers = runs["duration"].dtype.kind in "fiu"
+    length = as_floats(runs["duration"].values) if numbers else np.array([np.nan])
+    wrong = ~((length > 0.0) & (length < np.inf) & (length <= last * (1.0 + UNIFORM)))
+    if wrong.any():
+        run = runs["run"].values[int(np.argmax(wrong))]
+        raise InputError(
+            f"{where}: `duration` of run {str(run)!r} is {length[wrong][0]:g}, expected a time "
+            f"above 0 up to the end of `time`, {runs['time'].values[-1]:g} s."
+        )
+
+
 def time_step(runs: xr.Dataset) -> float:
     """Return the step of the time grid [s]."""
     time = runs["time"].values
@@ -286,6 +303,9 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     length = max(part.sizes["time"] for part in parts)
     longest = next(part for part in parts if part.sizes["time"] == length)
     shared = [n for n in first.data_vars if all(n in part for part in parts)]
+    count = sum(part.sizes["run"] for part in parts)
+    size = padded_bytes(count, length, first.sizes["motor"])
+    check_memory(size, "the runs", f"{count} runs, padded to {length} samples,")
     movements = max((part.sizes.get("movement", 0) for part in parts), default=0)
     padded = [_pad(part[shared], longest["time"].values, movements) for part in parts]
     whole = xr.concat(
@@ -301,6 +321,11 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     return whole.assign_coords(
         run=np.asarray(unique_names([str(name) for name in whole["run"].values]), dtype=object)
     )
+
+
+def padded_bytes(runs: int, samples: int, motors: int) -> float:
+    """Return what runs take that are padded to one length: commands, tool path, readings."""
+    return 8.0 * runs * samples * (2 * motors + len(AXES))
 
 
 def _check_same_kind(first: xr.Dataset, other: xr.Dataset) -> None:

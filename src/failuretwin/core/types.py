@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from failuretwin.core.errors import InputError
+
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
@@ -28,6 +30,8 @@ def as_floats(values: Any) -> FloatArray:
 # Conversion at the border: servo units, degrees and milliseconds to SI and radians.
 
 MS_PER_S = 1000.0
+LARGEST_SCALE = 2e7
+"""Largest figure of a count scale: encoders of 24 bits count to 1.7e7."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,16 @@ class ServoUnits:
     deg_per_count: float
     low: float
     high: float
+
+    def __post_init__(self) -> None:
+        values = (self.zero_deg, self.deg_per_count, self.low, self.high)
+        sane = all(abs(value) <= LARGEST_SCALE for value in values)  # which NaN is not
+        if not sane or self.deg_per_count == 0.0 or not self.low < self.high:
+            raise InputError(
+                f"servo_units are zero_deg {values[0]:g}, deg_per_count {values[1]:g}, low "
+                f"{values[2]:g}, high {values[3]:g}. Expected low below high, a count that is not "
+                f"0 deg, and nothing beyond {LARGEST_SCALE:g}."
+            )
 
     @property
     def rad_per_count(self) -> float:

@@ -6,13 +6,15 @@ strange topic spoils no other.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from failuretwin.core.errors import InputError
+from failuretwin.core.foreign import reading
+from failuretwin.data_knowledge.bag_claims import check_chunks
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -82,7 +84,10 @@ def read_topics(path: Path) -> list[BagTopic]:
         InputError: If it cannot be read or rosbags is not installed.
     """
     _check_installed(path)
-    with _blame(path), _reader(path) as reader:
+    with _guarded(path):
+        for file in [path] if path.is_file() else sorted(path.glob("*.mcap")):
+            check_chunks(file)
+    with _guarded(path), _reader(path) as reader:
         connections = sorted(reader.connections, key=lambda c: c.topic)
         names = dict.fromkeys(c.topic for c in connections)
         return [_topic([c for c in connections if c.topic == name]) for name in names]
@@ -95,7 +100,7 @@ def read_messages(path: Path, names: Sequence[str]) -> dict[str, list[BagMessage
         InputError: If the recording or a message cannot be read.
     """
     messages: dict[str, list[BagMessage]] = {name: [] for name in names}
-    with _blame(path), _reader(path) as reader:
+    with _guarded(path), _reader(path) as reader:
         wanted = [c for c in reader.connections if c.topic in messages]
         stores = {c.id: _typestore(c) for c in wanted}
         # An empty selection would mean all topics to rosbags.
@@ -118,19 +123,11 @@ def _check_installed(path: Path) -> None:
         ) from error
 
 
-@contextmanager
-def _blame(path: Path) -> Iterator[None]:
-    """Turn what goes wrong in reading a recording into an error that names it."""
-    try:
-        yield
-    # In damaged files rosbags falls over in many ways: wrong bytes reach struct, zstd, SQLite,
-    # YAML or an assertion. Only its own work runs under this guard.
-    except Exception as error:
-        repair = REPAIR.get(path.suffix, REPAIR[".db3"])
-        raise InputError(
-            f"{path}: cannot be read as a ROS recording ({type(error).__name__}: {error}). If the "
-            f"recorder was cut off, repair it with `{repair}`; else record or copy it again."
-        ) from error
+def _guarded(path: Path) -> AbstractContextManager[None]:
+    """Return what turns an error in reading a recording into one that says how to repair it."""
+    repair = REPAIR.get(path.suffix, REPAIR[".db3"])
+    fix = f"If the recorder was cut off, repair it with `{repair}`; else record or copy it again."
+    return reading(path, "a ROS recording", fix)
 
 
 def _is_ros1(path: Path) -> bool:

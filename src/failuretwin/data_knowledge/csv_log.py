@@ -11,6 +11,7 @@ import numpy as np
 
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.foreign import check_memory, reading, stored_bytes
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.data_knowledge.timed_log import Samples, Targets, TimedLog
 from failuretwin.digital_model.robot import Robot
@@ -23,6 +24,8 @@ LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 ANGLE_UNITS = {"rad": 1.0, "deg": np.pi / 180.0}
 SERVO = "servo"
 ISO = "iso"
+CSV_EXPANSION = 30
+"""What a byte of a CSV file takes while its cells are text: a cell of two bytes takes sixty."""
 BLANKS = r"\s+"
 """Separator of columns with any number of blanks between them."""
 
@@ -196,12 +199,17 @@ def load_csv(path: Path, separator: str = ",") -> pd.DataFrame:
     """
     import pandas as pd
 
-    try:
+    size = stored_bytes(path)
+    check_memory(CSV_EXPANSION * size, str(path), "its cells")
+    if size == 0:
+        raise InputError(f"{path}: is empty. Expected a header and rows of numbers.")
+    with reading(path, "CSV", "Expected a header and rows of numbers."):
         table = pd.read_csv(path, dtype=str, sep=separator, skipinitialspace=True)
-    except pd.errors.EmptyDataError:
-        raise InputError(f"{path}: is empty. Expected a header and rows of numbers.") from None
-    except (OSError, UnicodeDecodeError, pd.errors.ParserError) as error:
-        raise InputError(f"{path}: cannot be read as CSV ({error}).") from error
+    if not isinstance(table.index, pd.RangeIndex):
+        raise InputError(
+            f"{path}: its rows have more cells than its header has names. Check the separator, or "
+            "add the missing names."
+        )
     if table.empty:
         raise InputError(f"{path}: has a header but no rows.")
     return table

@@ -17,16 +17,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from failuretwin.core.errors import InputError, needs_extra, unknown_name
+from failuretwin.core.foreign import check_size, read_text, reading
 from failuretwin.core.types import FloatArray, IntArray, as_floats
 from failuretwin.data_knowledge.timed_log import Samples, TimedLog
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    import pyarrow.parquet as pq
 
 INFO_FILE = Path("meta") / "info.json"
 ACTION, STATE, EPISODE, FRAME = "action", "observation.state", "episode_index", "frame_index"
 DEG, RAD, NORMALISED = "deg", "rad", "normalised"
+NUMBER_BYTES = 40
+"""What a number of a list takes while it is read [bytes]."""
 FULL_SCALE = 100.0
 """Ends of a normalised joint's range: -100 and 100."""
 NAME_PREFIX, NAME_SUFFIX = "main_", ".pos"
@@ -118,10 +122,8 @@ class _Frames:
 
 
 def _info(path: Path) -> dict[str, Any]:
-    try:
-        info = json.loads((path / INFO_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path / INFO_FILE}: cannot be read ({error}).") from error
+    with reading(path / INFO_FILE, "JSON"):
+        info = json.loads(read_text(path / INFO_FILE, "JSON"))
     if not isinstance(info, dict) or not isinstance(info.get("features"), dict):
         raise InputError(f"{path / INFO_FILE}: has no features. Expected a LeRobot data set.")
     return info
@@ -202,21 +204,27 @@ def _frames(
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
     """Return number of episode and frame (frame,), action and state (frame, motor) of a file."""
     with needs_extra("LeRobot data sets need pyarrow", "lerobot"):
-        import pyarrow as pa
         import pyarrow.parquet as pq
 
     wanted = [EPISODE, FRAME, ACTION, STATE]
-    try:
-        there = pq.read_schema(file).names
-        for column in wanted:
-            if column not in there:
-                raise InputError(f"{file}: {unknown_name('column', column, there)}")
-        table = pq.read_table(file, columns=wanted)
-    except (OSError, pa.ArrowException) as error:
-        raise InputError(f"{file}: cannot be read as parquet ({error}).") from error
-    episode, frame = (np.asarray(table[name], dtype=np.int64) for name in wanted[:2])
-    values = [_matrix(table, n, p, file) for n, p in zip((ACTION, STATE), picks, strict=True)]
+    with reading(file, "parquet", "Fetch the data set again."):
+        with pq.ParquetFile(file) as stored:
+            there = stored.schema_arrow.names
+            for column in wanted:
+                if column not in there:
+                    raise InputError(f"{file}: {unknown_name('column', column, there)}")
+            _check_claims(stored.metadata, len(picks[0]), file)
+            table = stored.read(columns=wanted)
+        episode, frame = (np.asarray(table[name], dtype=np.int64) for name in wanted[:2])
+        values = [_matrix(table, n, p, file) for n, p in zip((ACTION, STATE), picks, strict=True)]
     return episode, frame, values[0], values[1]
+
+
+def _check_claims(said: pq.FileMetaData, motors: int, file: Path) -> None:
+    """Raise InputError if the rows of a parquet file are more than it can mean."""
+    groups = [said.row_group(i) for i in range(said.num_row_groups)]
+    values = sum(g.column(i).num_values for g in groups for i in range(g.num_columns))
+    check_size(NUMBER_BYTES * max(values, said.num_rows * motors), file, "its numbers")
 
 
 def _matrix(table: pa.Table, name: str, pick: Sequence[int], file: Path) -> FloatArray:

@@ -18,10 +18,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.foreign import as_cell, reading
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.runs import AXES, RunTable, Truth, truth_of
 from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.data_knowledge.file_claims import check_matlab
 from failuretwin.data_knowledge.raw_sessions import PUBLISHED_FREEZE, READING_RATE_HZ
 from failuretwin.data_knowledge.recovery import (
     path_error,
@@ -120,14 +122,13 @@ def _load(path: Path) -> dict[str, Any]:
             f"{path}: MATLAB files need mat-io ({error}). Install it: "
             "pip install 'failuretwin[files]'."
         ) from error
-    with path.open("rb") as file:
+    with reading(path, "a MATLAB file"), path.open("rb") as file:
         newest = file.read(10) == b"MATLAB 7.3"
     if newest:
         raise InputError(f"{path}: is of MATLAB's version 7.3. Save it again with the option -v7.")
-    try:
+    check_matlab(path)
+    with reading(path, "a MATLAB file", "Save it again with the option -v7."):
         return dict(load_from_mat(str(path)))
-    except Exception as error:  # the reader raises whatever a broken byte leads it to
-        raise InputError(f"{path}: cannot be read as a MATLAB file ({error}).") from error
 
 
 def _cell_array_runs(
@@ -218,8 +219,9 @@ def _hidden(path: Path, motors: int) -> tuple[FloatArray, FloatArray, FloatArray
         )
     found = []
     for half in halves:
-        series = [_series(item, path) for item in np.ravel(half)[:motors]]
-        found += [series[0][0], np.stack([values for _, values in series], axis=1)]
+        with reading(path, "commands and responses", "Expected a timeseries for each motor."):
+            series = [_series(item, path) for item in np.ravel(half)[:motors]]
+            found += [series[0][0], np.stack([values for _, values in series], axis=1)]
     return found[0], found[1], found[2], found[3]
 
 
@@ -436,7 +438,8 @@ def write_csv(runs: xr.Dataset, path: Path) -> None:
     parts = []
     for run, end in enumerate(ends):
         kept = time <= end + 1e-9
-        columns: dict[str, Any] = {"run": str(runs["run"].values[run]), "time_s": time[kept]}
+        name = as_cell(str(runs["run"].values[run]))
+        columns: dict[str, Any] = {"run": name, "time_s": time[kept]}
         for m, motor in enumerate(runs["motor"].values):
             columns[f"command_{motor}_rad"] = runs["command"].values[run, kept, m]
         for a, axis in enumerate(AXES):

@@ -12,12 +12,13 @@ from typing import Literal
 import numpy as np
 
 from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.foreign import check_memory
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Movements
-from failuretwin.core.runs import RunTable, Truth
+from failuretwin.core.runs import RunTable, Truth, padded_bytes
 from failuretwin.core.types import MS_PER_S, FloatArray, as_floats
 from failuretwin.data_knowledge.csv_log import load_csv, numbers
-from failuretwin.data_knowledge.timed_log import check_clock
+from failuretwin.data_knowledge.timed_log import check_clock, check_grid
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -240,6 +241,9 @@ def session_runs(
         _check_length(session, span)
     runs = [make(session, robot, span, label) for span in spans]
     length = max(len(run.command) for run in runs)
+    check_memory(
+        padded_bytes(len(runs), length, len(robot.motors)), str(session.folder), "its runs"
+    )
     step = GRID_STEP_S if how == "measured" else PUBLISHED_TIME[1]
     return RunTable(
         run=[f"{session.name}/run_{i + 1:02d}" for i in range(len(runs))],
@@ -271,6 +275,7 @@ def _measured_run(session: RawSession, robot: Robot, span: RowSpan, label: int |
     begin, end = _measured_window(session, span)
     stamps = np.concatenate([session.command_time[span.first : span.stop], session.reading_time])
     check_clock(stamps[(stamps >= begin) & (stamps <= end)], str(session.folder))
+    check_grid((end - begin) / GRID_STEP_S, len(stamps), str(session.folder))
     time = as_floats(np.arange(round((end - begin) / GRID_STEP_S) + 1) * GRID_STEP_S)
     movements = _movements(session, robot, span, begin, _initial_counts(session, span, begin))
     inside = (session.reading_time >= begin) & (session.reading_time <= end)

@@ -20,16 +20,15 @@ from typing import TYPE_CHECKING, Any
 
 from failuretwin import __version__
 from failuretwin.core.config import fingerprint
-from failuretwin.core.errors import FailureTwinError, InputError, OutputError
+from failuretwin.core.errors import FailureTwinError, InputError, OutputError, reason
 from failuretwin.data_knowledge.generate import CHUNK_RUNS, Plan, simulate, simulate_runs
 from failuretwin.data_knowledge.store import (
     atomic_replace,
     check_destination,
-    quiet_zarr,
-    reason,
     save_run_set,
     sole_writer,
     write_files,
+    writing_zarr,
 )
 from failuretwin.data_knowledge.workers import ONE_PROCESS, Workforce
 
@@ -109,7 +108,7 @@ class Generation:
         """Return the hash of a chunk: SHA-256 over name, NUL, size, NUL, bytes of its files."""
         total = hashlib.sha256()
         for name in sorted(f.replace("/c.0", f"/c.{chunk}") for f in self.chunk_files.values()):
-            if (self.store / name).is_file():  # what is all missing has no file
+            if (self.store / name).is_file():  # one that was lost gives another hash
                 data = (self.store / name).read_bytes()
                 total.update(f"{name}\0{len(data)}\0".encode() + data)
         return total.hexdigest()
@@ -167,7 +166,7 @@ def make_chunk(generation: Generation, chunk: int) -> str:
         )
     runs = generation.runs_of(chunk)
     part = simulate_runs(generation.plan, runs).to_dataset()
-    with quiet_zarr():
+    with writing_zarr():
         for name in generation.chunk_files:
             array = zarr.open_array(generation.store / name, mode="r+")
             array[runs.start : runs.stop] = part[name].values
@@ -215,7 +214,7 @@ def _template(
 
     content: dict[str, Buffer] = {}
     store = MemoryStore(content)
-    with quiet_zarr():
+    with writing_zarr():
         example.to_zarr(store, mode="w", consolidated=False, encoding=encoding)
         for name in encoding:
             array = zarr.open_array(store, path=name, mode="r+")

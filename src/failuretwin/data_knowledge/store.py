@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import socket
 import warnings
@@ -11,8 +12,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from failuretwin.core.errors import InputError, OutputError
-from failuretwin.core.runs import check_runs
+from failuretwin.core.errors import InputError, OutputError, reason
+from failuretwin.core.foreign import reading
+from failuretwin.core.runs import check_duration, check_runs, time_step
+from failuretwin.data_knowledge.file_claims import check_netcdf, check_zarr
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -21,34 +24,49 @@ if TYPE_CHECKING:
 SUFFIXES = (".nc", ".zarr")
 
 
+EXPECTED = (
+    "Expected NetCDF (.nc) or Zarr (.zarr) as `failuretwin simulate` and `failuretwin import` "
+    "write them."
+)
+
+
 def load_run_set(path: Path) -> xr.Dataset:
-    """Read a stored run set into memory.
+    """Read a stored run set into memory, once what it claims to be has been checked.
 
     Raises:
-        InputError: If the file cannot be read or is not a run set.
+        InputError: If the file cannot be read, is not a run set, claims more than it can mean, or
+            has a codec that this package does not write.
     """
-    opener = _open_netcdf if path.suffix == ".nc" else _open_zarr
-    try:
-        with opener(path) as stored:
-            runs = stored.load()
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        raise InputError(
-            f"{path}: cannot be read as a run set ({reason(error)}). Expected NetCDF (.nc) or "
-            "Zarr (.zarr) as `failuretwin simulate` and `failuretwin import` write them."
-        ) from error
-    return check_runs(runs, str(path))
+    with reading(path, "a run set", EXPECTED):
+        if path.suffix == ".nc":
+            check_netcdf(path)
+            opened = _open_netcdf(path)
+        else:
+            check_zarr(path)
+            opened = _open_zarr(path)
+        with opened as stored:
+            runs = check_runs(stored.load(), str(path))
+            # A step more is let in: whoever thinned the grid kept the length.
+            check_duration(runs, str(path), float(runs["time"].values[-1]) + time_step(runs))
+            return runs
 
 
 def _open_netcdf(path: Path) -> xr.Dataset:
     import xarray as xr
 
-    return xr.open_dataset(path, engine="h5netcdf")
+    return xr.open_dataset(path, engine="h5netcdf", decode_times=False)
 
 
 def _open_zarr(path: Path) -> xr.Dataset:
+    """Return a store by the very metadata that were checked, not by the copy in its root.
+
+    It is read at once, so nothing is gained by Dask's arrays.
+    """
     import xarray as xr
 
-    return xr.open_zarr(path, chunks=None)  # read at once, so nothing is gained by Dask's arrays
+    with warnings.catch_warnings():  # our manifest lies beside the arrays
+        warnings.filterwarnings("ignore", message="Object at .* is not recognized")
+        return xr.open_zarr(path, chunks=None, consolidated=False, decode_times=False)
 
 
 def save_run_set(runs: xr.Dataset, path: Path) -> None:
@@ -72,7 +90,7 @@ def _zarr_files(runs: xr.Dataset) -> dict[str, Buffer]:
     from zarr.storage import MemoryStore
 
     content: dict[str, Buffer] = {}
-    with quiet_zarr():
+    with writing_zarr():
         runs.to_zarr(MemoryStore(content), mode="w", consolidated=True)
     return content
 
@@ -90,9 +108,14 @@ def write_files(content: Mapping[str, Buffer], folder: Path) -> None:
 
 
 @contextmanager
-def quiet_zarr() -> Iterator[None]:
-    """Keep to ourselves that text and consolidated metadata are not in Zarr's final text yet."""
-    with warnings.catch_warnings():
+def writing_zarr() -> Iterator[None]:
+    """Write every chunk, so that one without a file is one that was lost.
+
+    That text and consolidated metadata are not in Zarr's final text yet, we keep to ourselves.
+    """
+    import zarr
+
+    with warnings.catch_warnings(), zarr.config.set({"array.write_empty_chunks": True}):
         warnings.filterwarnings("ignore", message=".*Zarr (V3|format 3).*")
         yield
 
@@ -143,9 +166,10 @@ def replacing(path: Path) -> Iterator[Path]:
         yield path  # a pipe or a device: nothing there can be replaced
         return
     target = path.resolve()  # a link stays a link
-    partial = target.with_name(f".{path.name}.{os.getpid()}.partial{path.suffix}")
+    partial = target.with_name(f".{path.name}.{_owner()}.partial{path.suffix}")
     try:
         check_writable(path)
+        _sweep(target.parent, path.name)
         yield partial
         atomic_replace(partial, target)
     except (OSError, RuntimeError) as error:
@@ -162,11 +186,12 @@ def filling(folder: Path) -> Iterator[Path]:
     Raises:
         OutputError: If writing fails; `folder` is as before.
     """
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    partial = folder.with_name(f".{folder.name}.{_owner()}.partial")
     made = [parent for parent in folder.parents if not parent.exists()]
     try:
         if folder.exists() and not folder.is_dir():
             raise OutputError(f"{folder}: is a file. Give the name of a folder.")
+        _sweep(folder.parent, folder.name)
         partial.mkdir(parents=True)
         yield partial
         if folder.exists():
@@ -182,6 +207,38 @@ def filling(folder: Path) -> Iterator[Path]:
         raise _output_error(folder, error) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def _owner() -> str:
+    """Return what tells unfinished work of this process from that of others."""
+    return f"{_host()}-{os.getpid()}"
+
+
+def _host() -> str:
+    return re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())
+
+
+def _sweep(folder: Path, name: str) -> None:
+    """Remove unfinished work for `name` in a folder, of processes of this machine that are dead."""
+    pattern = re.compile(rf"\.{re.escape(name)}\.{_host()}-(\d+)\.partial.*")
+    for other in folder.iterdir() if folder.is_dir() else ():
+        match = pattern.fullmatch(other.name)
+        if match and not _alive(int(match.group(1))):
+            with suppress(OSError):
+                shutil.rmtree(other) if other.is_dir() else other.unlink()
+
+
+def _alive(process: int) -> bool:
+    """Return whether a process of this machine may still be running."""
+    if os.name != "posix":
+        return True  # asking would end it there
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True
+    return True
 
 
 def _output_error(path: Path, error: BaseException) -> OutputError:
@@ -209,17 +266,6 @@ def check_writable(path: Path) -> None:
         )
     if path.is_file() and path.suffix == ".zarr":
         raise OutputError(f"{path}: is a file, and a Zarr store is a folder. Choose another name.")
-
-
-def reason(error: BaseException) -> str:
-    """Return what the system or a library says of an error, on one line."""
-    text = getattr(error, "strerror", None) or str(error)
-    return one_line(text) or type(error).__name__
-
-
-def one_line(text: str) -> str:
-    """Return the text of another library's error on one line, without its inner details."""
-    return " ".join(text.partition("(")[0].split())
 
 
 # One writer at a time: a lock that ends with the process that holds it.

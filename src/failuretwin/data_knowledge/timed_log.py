@@ -21,6 +21,10 @@ STEP_S = 0.01
 """Step of the time grid [s]; finer where the sensor is faster."""
 LONGEST_SILENCE_S = 60.0
 """Longer without any command or reading is a jump of the clock [s], and no time grid spans it."""
+SAMPLES_PER_STAMP = 200
+"""Steps of the time grid for each command or reading: two seconds of silence on average."""
+SAMPLES_ALWAYS = 100_000
+"""Steps of the time grid that any log may have: a thousand seconds."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,8 @@ def timed_run(log: TimedLog, robot: Robot) -> RunTable:
     """Return a log as a run on a uniform grid, readings at their nearest grid times.
 
     Raises:
-        InputError: If the log has no tool path and no motor readings, or its times do not increase.
+        InputError: If the log has no tool path and no motor readings, its times do not increase or
+            are so far apart that their unit must be another.
     """
     log = _distinct(log)
     tool = _tool_path(log, robot)
@@ -87,6 +92,7 @@ def timed_run(log: TimedLog, robot: Robot) -> RunTable:
     check_clock(stamps, log.name)
     begin, end = stamps[0], max(tool.time[-1], stamps[0] + STEP_S)
     step = _grid_step(stamps, tool)
+    check_grid((end - begin) / step, len(stamps), log.name)
     time = as_floats(np.arange(round((end - begin) / step) + 1) * step)
     command, movements = _command(log, time, begin)
     return RunTable(
@@ -177,6 +183,22 @@ def check_clock(time: FloatArray, where: str) -> None:
         raise InputError(
             f"{where}: the clock jumps by {steps.max():.0f} s, {before:.1f} s after the start. "
             "Cut the log there."
+        )
+
+
+def check_grid(samples: float, stamps: int, where: str) -> None:
+    """Raise InputError if a time grid has far more samples than there are stamps in a log.
+
+    Args:
+        samples: Samples of the grid.
+        stamps: Commands and readings of the log.
+        where: Its name, for the error text.
+    """
+    if samples > max(SAMPLES_ALWAYS, SAMPLES_PER_STAMP * stamps):
+        raise InputError(
+            f"{where}: its {stamps} commands and readings lie {samples:.2g} steps of the time grid "
+            f"apart, expected {SAMPLES_PER_STAMP} steps each at most. Check the unit of its times: "
+            "milliseconds may have been taken for seconds."
         )
 
 

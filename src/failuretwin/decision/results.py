@@ -12,6 +12,7 @@ from typing import Any
 
 from failuretwin.core.config import from_table
 from failuretwin.core.errors import InputError
+from failuretwin.core.foreign import as_cell, check_memory, reading, stored_bytes
 from failuretwin.core.hypothesis import Diagnosis, Interval
 from failuretwin.data_knowledge.store import replacing
 
@@ -19,6 +20,8 @@ SUM_ERROR = 1e-6
 """Probabilities of a run may sum to 1 plus or minus this."""
 NAMED_RUNS = 3
 """So many runs are named in an error."""
+JSON_EXPANSION = 20
+"""What a byte of JSON takes at most once it is read."""
 EXPECTED = "Expected the output of diagnose --json."
 
 
@@ -91,10 +94,9 @@ def read_results(path: str | Path) -> Results:
     Raises:
         InputError: If the file cannot be read, a line is not a diagnosis, or a run is there twice.
     """
-    try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}). {EXPECTED}") from error
+    check_memory(JSON_EXPANSION * stored_bytes(Path(path)), str(path), "its lines")
+    with reading(path, "results", EXPECTED):
+        lines = Path(path).read_text(encoding="utf-8").split("\n")
     records = [
         _read_record(line, f"{path}: line {number}")
         for number, line in enumerate(lines, start=1)
@@ -106,10 +108,8 @@ def read_results(path: str | Path) -> Results:
 
 
 def _read_record(line: str, where: str) -> Record:
-    try:
+    with reading(where, "JSON", EXPECTED):
         stored = json.loads(line)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{where}: not JSON ({error}). {EXPECTED}") from error
     missing = [key for key in NEEDED if not isinstance(stored, dict) or key not in stored]
     if missing:
         raise InputError(f"{where}: no {', '.join(missing)}. {EXPECTED}")
@@ -141,7 +141,7 @@ def write_csv(diagnoses: Iterable[Diagnosis], path: Path) -> None:
         columns = dict.fromkeys(column for row in rows for column in row)
         writer = csv.DictWriter(file, fieldnames=list(columns))
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows({key: as_cell(value) for key, value in row.items()} for row in rows)
 
 
 def _csv_row(diagnosis: Diagnosis) -> dict[str, Any]:

@@ -11,7 +11,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from failuretwin.core.config import from_table, read_toml
+import numpy as np
+
+from failuretwin.core.config import Bounded, from_table, read_toml
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import (
@@ -19,8 +21,9 @@ from failuretwin.digital_model.nonidealities import (
     SETTLING_LISTS,
     Imperfections,
 )
-from failuretwin.digital_model.robot import Motor, Robot, load_robot
+from failuretwin.digital_model.robot import Motor, Robot, SpeedLimit, load_robot
 from failuretwin.digital_model.servo import ServoLoop
+from failuretwin.digital_model.settling import Settling, largest_load
 from failuretwin.digital_model.twin import DigitalTwin
 
 CALIBRATION_TABLE = "calibration"
@@ -28,7 +31,7 @@ CALIBRATION_TABLE = "calibration"
 
 
 @dataclass(frozen=True)
-class CalibratedLoop:
+class CalibratedLoop(Bounded):
     """Servo loop of a motor as its step tests speak for it.
 
     Attributes:
@@ -43,7 +46,11 @@ class CalibratedLoop:
     P: float
     I: float  # noqa: E741 - the field's name for an integral gain
     filter_s: float
-    speed_limit: float
+    speed_limit: SpeedLimit
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        ServoLoop(self.P, self.I, self.filter_s)  # checks the gains
 
     def of(self, motor: Motor) -> Motor:
         """Return a motor with this loop and speed limit."""
@@ -132,7 +139,7 @@ def load_calibration(
     robot = load_robot(robot)
     if str(name_or_path) == GENERIC or (name_or_path is None and robot.imperfections_file is None):
         return CalibratedRobot(robot, generic_imperfections(robot))
-    if name_or_path == "none":
+    if str(name_or_path) == "none":
         return CalibratedRobot(robot, NO_IMPERFECTIONS)
     path = _file_of(str(name_or_path or robot.name), robot)
     table = read_toml(path)
@@ -144,6 +151,7 @@ def load_calibration(
         )
     imperfections = _completed(from_table(Imperfections, table, str(path)), len(robot.motors))
     check_fit(imperfections, robot, path)
+    _check_sane(imperfections.settling, robot, path)
     return CalibratedRobot(with_loops(robot, record.loops), imperfections)
 
 
@@ -173,6 +181,29 @@ def _completed(imperfections: Imperfections, motors: int) -> Imperfections:
         name: getattr(settling, name) or (0.0,) * motors for name in SETTLING_LISTS
     }
     return replace(imperfections, settling=replace(settling, **whole))
+
+
+LARGEST_ERROR = 1.0 / 8.0
+"""Largest error of a healthy motor as a share of where it may stand, such as 20 of 160 deg: a
+guess, ten times what hobby servos do. Far beyond it a healthy motor looks like a stuck one."""
+
+
+def _check_sane(settling: Settling | None, robot: Robot, path: Path) -> None:
+    """Raise InputError unless the settled errors of a file can be those of a healthy robot."""
+    if settling is None:
+        return
+    limit = LARGEST_ERROR * np.diff(robot.travel, axis=1)[:, 0]
+    sag = np.asarray(settling.compliance) * largest_load(robot, settling.payload)
+    errors = {name: np.asarray(getattr(settling, name)) for name in ("bias", "friction", "scatter")}
+    for name, values in (errors | {"compliance times the largest load": sag}).items():
+        for k in np.flatnonzero(~(np.abs(values) <= limit)):
+            raise InputError(
+                f"{path}: settling: {name} of {robot.motor_names[k]!r} is {values[k]:.3g}, "
+                f"expected {limit[k]:.3g} at most, an eighth of where the motor may stand "
+                f"({robot.travel[k, 0]:.3g} to {robot.travel[k, 1]:.3g}, by the travel of its "
+                "profile or the limits of its joint). Check the unit (rad, or m where it slides), "
+                "or calibrate again."
+            )
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,9 @@ from failuretwin.digital_model.settling import Settling
 
 Range = Annotated[tuple[float, float], Bounds(in_order=True)]
 """Lowest and highest value, from zero on."""
+LONGEST_S = 60.0
+"""Longest delay, lag or time between movements [s]: logs with a longer silence are not read."""
+Seconds = Annotated[tuple[float, float], Bounds(0.0, LONGEST_S, in_order=True)]
 Spreads = Annotated[tuple[float, ...], Bounds()]
 
 PROTOCOLS = ("P0", "P0c", "P1", "P2")
@@ -41,12 +44,12 @@ class Timing(Bounded):
             come back with the late start.
     """
 
-    delay_s: Annotated[tuple[float, float], Bounds(-1.0, in_order=True)] = (0.0, 0.0)
-    lag_s: Range = (0.0, 0.0)
+    delay_s: Annotated[tuple[float, float], Bounds(-1.0, LONGEST_S, in_order=True)] = (0.0, 0.0)
+    lag_s: Seconds = (0.0, 0.0)
     ramp_shortening: Annotated[tuple[float, float], Bounds(-1.0, 0.99, in_order=True)] = (0.0, 0.0)
     late_rate: Share = 0.0
-    late_s: Range = (0.0, 0.0)
-    gap_start_s: Range = (0.0, 0.0)
+    late_s: Seconds = (0.0, 0.0)
+    gap_start_s: Seconds = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -74,8 +77,8 @@ class Schedule(Bounded):
         whole_counts: Whether targets are whole servo counts.
     """
 
-    first_start_s: Range = (0.0, 0.0)
-    period_s: Annotated[tuple[float, float], Bounds(0.05, in_order=True)] = (2.0, 2.0)
+    first_start_s: Seconds = (0.0, 0.0)
+    period_s: Annotated[tuple[float, float], Bounds(0.05, LONGEST_S, in_order=True)] = (2.0, 2.0)
     whole_counts: bool = False
 
 

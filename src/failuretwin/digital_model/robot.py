@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
-from failuretwin.core.config import from_table, read_toml
+from failuretwin.core.config import Bounded, Bounds, from_table, read_toml
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.types import BoolArray, FloatArray, ServoUnits, frozen_array
 from failuretwin.digital_model.geometry import (
@@ -36,8 +37,16 @@ from failuretwin.digital_model.urdf import Triple, read_urdf
 POSES = ("log", "physical")
 
 
+FASTEST = 1e3
+"""Largest speed limit that makes sense [rad/s or m/s]."""
+FARTHEST = 1e3
+"""Largest target, and farthest place of a tool [rad or m]."""
+SpeedLimit = Annotated[float, Bounds(1e-6, FASTEST)]
+Angles = Annotated[tuple[float, float], Bounds(-FARTHEST, FARTHEST, in_order=True)]
+
+
 @dataclass(frozen=True)
-class Motor:
+class Motor(Bounded):
     """One motor that can move the tool point.
 
     Attributes:
@@ -56,31 +65,39 @@ class Motor:
     name: str
     joint: str
     loop: ServoLoop
-    speed_limit: float
-    movement_range: tuple[float, float]
+    speed_limit: SpeedLimit
+    movement_range: Angles
     travel: tuple[float, float] | None = None
     sense: float = 1.0
     log_column: str = ""
     home: float | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.sense not in (1.0, -1.0):
             raise InputError(f"motor {self.name!r}: sense is {self.sense}, expected 1 or -1.")
         ranges = {"movement_range": self.movement_range, "travel": self.travel}
         for name, ends in ranges.items():
-            if ends is not None and not ends[0] < ends[1]:
+            if ends is not None and not -FARTHEST <= ends[0] < ends[1] <= FARTHEST:
                 raise InputError(
                     f"motor {self.name!r}: {name} is {list(ends)}, expected the lowest and the "
                     "highest angle [rad]."
                 )
+        if self.home is not None and not abs(self.home) <= FARTHEST:
+            raise InputError(
+                f"motor {self.name!r}: home is {self.home:g}, expected an angle [rad]."
+            )
         if set(self.name) & set(":+,") or not self.name:
             raise InputError(
                 f"motor name {self.name!r} cannot stand in hypotheses. Leave out ':', '+', ','."
             )
 
 
+Place = Annotated[Triple, Bounds(-FARTHEST, FARTHEST)]
+
+
 @dataclass(frozen=True)
-class Profile:
+class Profile(Bounded):
     """What a TOML profile says beside the URDF.
 
     Attributes:
@@ -110,8 +127,8 @@ class Profile:
     base_link: str
     tool_link: str
     motors: tuple[Motor, ...]
-    tool_xyz: Triple = NO_OFFSET
-    base_xyz_rpy: Pose = NOT_MOVED
+    tool_xyz: Place = NO_OFFSET
+    base_xyz_rpy: Annotated[Pose, Bounds(-FARTHEST, FARTHEST)] = NOT_MOVED
     geometry: Geometry = AS_STATED
     sensor_pose: str = "physical"
     servo_units: ServoUnits | None = None
@@ -122,6 +139,7 @@ class Profile:
     sources: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.sensor_pose not in POSES:
             raise unknown_name("sensor_pose", self.sensor_pose, POSES)
         if not self.motors:

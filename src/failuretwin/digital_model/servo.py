@@ -8,26 +8,44 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from failuretwin.core.config import AtLeastZero, Bounded, Bounds
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
 
+SLOWEST_S = 100.0
+"""Longest time constant of a loop [s]: slower than that, no movement is ever seen."""
+
 
 @dataclass(frozen=True)
-class ServoLoop:
+class ServoLoop(Bounded):
     """Gains of one closed loop.
 
     Attributes:
         P: Proportional gain [-].
         I: Integral gain [1/s].
         filter_s: Time constant tau of the input filter [s].
+
+    Raises:
+        InputError: If the loop never gets to its command or is not stable.
     """
 
-    P: float
-    I: float  # noqa: E741 - the field's name for an integral gain
-    filter_s: float
+    P: AtLeastZero
+    I: Annotated[float, Bounds(0.0, 1e6)]  # noqa: E741 - the field's name for an integral gain
+    filter_s: Annotated[float, Bounds(1e-6, SLOWEST_S)]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        least, most = (1.0 + self.P) / SLOWEST_S, 2.0 * (1.0 + self.P) / self.filter_s
+        if not least <= self.I < most:
+            raise InputError(
+                f"I is {self.I:g}, expected {least:g} to {most:g}: with less the motor takes "
+                f"longer than {SLOWEST_S:g} s to its target, (1 + P) / I; from 2 (1 + P) / "
+                "filter_s on the loop is not stable (Routh and Hurwitz)."
+            )
 
     def discretise(self, step: float) -> tuple[FloatArray, FloatArray]:
         """Return numerator and denominator (b, a) of the loop sampled every `step` [s].

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 
 from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.foreign import TEXT_BYTES, reading
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.kinematics import Joint, Loads, SerialChain, rotation_to_z
 
@@ -19,6 +21,10 @@ MOVING_TYPES = ("revolute", "continuous", "prismatic")
 HELD_TYPES = ("fixed", "floating", "planar")
 
 Triple = tuple[float, float, float]
+FARTHEST = 1e3
+"""Largest length or angle of a URDF [m or rad]."""
+LARGEST_NUMBER = 1e9
+"""Largest mass, moment, speed or limit of a URDF, in SI units; beyond it there is none."""
 
 _XML_COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
 _XACRO = re.compile(rb"<xacro:|\$\{|\$\((?:find|arg|eval|env|optenv)\b")
@@ -109,20 +115,30 @@ class Urdf:
         children = {joint.child for joint in self.joints}
         return [link for link in dict.fromkeys(self.links) if link not in children]
 
-    def ways(self, base: str) -> dict[str, tuple[UrdfJoint, ...]]:
-        """Return the joints from `base` to each link that hangs from it, `base` itself first.
+    @cached_property
+    def _next(self) -> Mapping[str, Sequence[UrdfJoint]]:
+        """Joints that lead on from each link: first to its children, then back by fixed joints."""
+        onward: dict[str, list[UrdfJoint]] = {}
+        for joint in self.joints:
+            onward.setdefault(joint.parent, []).append(joint)
+        for joint in self.joints:
+            if joint.type == "fixed":
+                onward.setdefault(joint.child, []).append(joint.reversed)
+        return onward
+
+    def steps(self, base: str) -> dict[str, UrdfJoint | None]:
+        """Return the joint by which each link hangs from `base`, nearer links first; its own: None.
 
         What `base` is fixed to hangs from it too: a fixed joint leads either way.
         """
-        ways: dict[str, tuple[UrdfJoint, ...]] = {base: ()}
+        steps: dict[str, UrdfJoint | None] = {base: None}
         waiting = [base]
         for link in waiting:
-            onward = [j for j in self.joints if j.parent == link and j.child not in ways]
-            back = [j for j in self.joints if j.child == link and j.parent not in ways]
-            onward += [joint.reversed for joint in back if joint.type == "fixed"]
-            ways |= {joint.child: (*ways[link], joint) for joint in onward}
-            waiting += dict.fromkeys(joint.child for joint in onward)
-        return ways
+            for joint in self._next.get(link, ()):
+                if joint.child not in steps:
+                    steps[joint.child] = joint
+                    waiting.append(joint.child)
+        return steps
 
     def tools(self, base: str) -> dict[str, int]:
         """Return the ends of all branches above `base` and how many motors are on the way there.
@@ -131,12 +147,24 @@ class Urdf:
         the one with the longest way along the joint frames.
         """
         ends = set(self.links) - {joint.parent for joint in self.joints}
-        rank = {}
-        for link, way in self.ways(base).items():
-            length = sum(float(np.linalg.norm(joint.T_pc[:3, 3])) for joint in way)
-            if link in ends:
-                rank[link] = -sum(joint.has_motor for joint in way), -round(length, 9), link
+        ways = self.lengths(base)
+        rank = {
+            link: (-motors, -round(length, 9), link)
+            for link, (motors, length) in ways.items()
+            if link in ends
+        }
         return {link: -rank[link][0] for link in sorted(rank, key=rank.__getitem__)}
+
+    def lengths(self, base: str) -> dict[str, tuple[int, float]]:
+        """Return how many motors and how much length [m] lie between `base` and each link."""
+        known: dict[str, tuple[int, float]] = {}
+        for link, joint in self.steps(base).items():
+            motors, length = known[joint.parent] if joint else (0, 0.0)
+            if joint is not None:
+                motors += joint.has_motor
+                length += float(np.linalg.norm(joint.T_pc[:3, 3]))
+            known[link] = motors, length
+        return known
 
     def path(self, base_link: str, tool_link: str) -> tuple[UrdfJoint, ...]:
         """Return the joints from `base_link` to `tool_link`, in that order.
@@ -147,13 +175,17 @@ class Urdf:
         for link in (base_link, tool_link):
             if link not in self.links:
                 raise InputError(f"{self.source}: {unknown_name('link', link, self.links)}")
-        way = self.ways(base_link).get(tool_link)
-        if way is None:
+        steps = self.steps(base_link)
+        if tool_link not in steps:
             raise InputError(
                 f"{self.source}: no chain of joints leads from {base_link!r} to {tool_link!r}. "
                 "Name a base link that carries the tool."
             )
-        return way
+        way, link = [], tool_link
+        while (joint := steps[link]) is not None:
+            way.append(joint)
+            link = joint.parent
+        return tuple(reversed(way))
 
     def chain(self, base_link: str, tool_link: str, moving: Collection[str]) -> SerialChain:
         """Return the chain to the tool link in which the joints `moving` move.
@@ -192,7 +224,7 @@ class Urdf:
         Raises:
             InputError: If there is no such joint.
         """
-        names = [joint.name for joint in self.joints]
+        names = {joint.name for joint in self.joints}
         for name in changes:
             if name not in names:
                 raise InputError(f"{self.source}: {unknown_name('joint', name, names)}")
@@ -204,20 +236,25 @@ class Urdf:
 
         Links without a mass weigh nothing.
         """
-        names = [joint.name for joint in chain.joints]
+        names = {joint.name: k for k, joint in enumerate(chain.joints)}
         mass, moment = np.zeros(len(names)), np.zeros((len(names), 3))
-        for link, way in self.ways(base_link).items():
-            carriers = [k for k, joint in enumerate(way) if joint.name in names]
-            fact = self.facts.get(link)
-            if not carriers or fact is None or fact.mass is None:
+        carried: dict[str, tuple[UrdfJoint, FloatArray]] = {}  # by whom, and the pose behind it
+        for link, joint in self.steps(base_link).items():
+            if joint is None:
                 continue
-            first = carriers[-1]
-            at = np.array(fact.centre)
-            for joint in reversed(way[first + 1 :]):
-                at = joint.T_pc[:3, :3] @ at + joint.T_pc[:3, 3]
-            segment = names.index(way[first].name)
+            if joint.name in names:
+                carried[link] = joint, np.eye(4)
+            elif joint.parent in carried:
+                carrier, T = carried[joint.parent]
+                carried[link] = carrier, T @ joint.T_pc
+            fact = self.facts.get(link)
+            if link not in carried or fact is None or fact.mass is None:
+                continue
+            carrier, T = carried[link]
+            at = T[:3, :3] @ np.array(fact.centre) + T[:3, 3]
+            segment = names[carrier.name]
             mass[segment] += fact.mass
-            moment[segment] += fact.mass * (at @ rotation_to_z(way[first].axis))
+            moment[segment] += fact.mass * (at @ rotation_to_z(carrier.axis))
         weighs = mass[:, None] > 0
         centre = np.divide(moment, mass[:, None], out=np.zeros_like(moment), where=weighs)
         return Loads(chain, mass, centre)
@@ -256,10 +293,10 @@ def read_root(path: Path) -> ElementTree.Element:
             f"{path}: is the profile of a robot, expected its URDF. A profile is checked wherever "
             "it is used as --robot; make one of a URDF by: failuretwin robot init URDF --out FILE."
         )
-    try:
+    with reading(path, "a URDF"):
+        if path.stat().st_size > TEXT_BYTES:
+            raise InputError(f"{path}: is larger than a URDF can be. Check the name of the file.")
         data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
     if _XACRO.search(_XML_COMMENT.sub(b"", data)):
         stem = path.name.removesuffix(".xacro").removesuffix(".urdf")
         out = f"{stem}.urdf" if path.suffix == ".xacro" else f"{stem}_expanded.urdf"
@@ -269,7 +306,7 @@ def read_root(path: Path) -> ElementTree.Element:
         )
     try:
         root = ElementTree.fromstring(data)
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, ValueError, LookupError, RecursionError) as error:
         raise InputError(f"{path}: not an XML file ({error}). Expected a URDF.") from error
     if root.tag != "robot":
         raise InputError(f"{path}: the top element is <{root.tag}>, a URDF has <robot>.")
@@ -315,7 +352,9 @@ def _triple(
     text = default if element is None else element.get(key, default)
     values = _three_numbers(text)
     if values is None:
-        raise InputError(f"{where}: {key}={text!r}, expected three finite numbers.")
+        raise InputError(
+            f"{where}: {key}={text[:40]!r}, expected three finite numbers within +-{FARTHEST:g}."
+        )
     return values
 
 
@@ -324,7 +363,9 @@ def _three_numbers(text: str) -> Triple | None:
         x, y, z = (float(part) for part in text.split())
     except ValueError:
         return None
-    return (x, y, z) if math.isfinite(x + y + z) else None
+    return (
+        (x, y, z) if max(abs(x), abs(y), abs(z)) <= FARTHEST and not math.isnan(x + y + z) else None
+    )
 
 
 def _number(element: ElementTree.Element | None, key: str, where: str) -> float:
@@ -338,7 +379,7 @@ def _number(element: ElementTree.Element | None, key: str, where: str) -> float:
 def _above_zero(element: ElementTree.Element | None, key: str, where: str) -> float | None:
     """Return a limit; exporters write 0 for one that they do not know."""
     value = _number(element, key, where)
-    return value if 0.0 < value < math.inf else None
+    return value if 0.0 < value <= LARGEST_NUMBER else None
 
 
 def transform(xyz: Triple, rpy: Triple) -> FloatArray:
@@ -372,4 +413,4 @@ def _stated(element: ElementTree.Element | None, key: str) -> float | None:
         value = float("nan" if element is None else element.get(key, "nan"))
     except ValueError:
         return None
-    return value if math.isfinite(value) else None
+    return value if abs(value) <= LARGEST_NUMBER else None

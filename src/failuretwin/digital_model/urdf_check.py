@@ -31,6 +31,8 @@ SEVERITIES = ("error", "warning", "note")
 SHORT_LEVER_M = 0.01
 """A motor that moves the tool by less for each radian can hardly be watched [m/rad]."""
 
+MOST_MOTORS = 64
+"""Motors of an arm: the longest snakes have half as many."""
 NAMES_SHOWN = 4
 PICTURE = "Only the picture is missing; kinematics works."
 
@@ -181,7 +183,7 @@ def _with_motors(
     moves = dict(zip(names, motion.lever.tolist(), strict=True))
     levers = {name: lever for name, lever in moves.items() if lever >= max(noise_m, CANNOT_MOVE)}
     short = {name: lever for name, lever in moves.items() if CANNOT_MOVE <= lever < noise_m}
-    moving = urdf.ways(motors[0].child)
+    moving = urdf.steps(motors[0].child)
     return replace(
         report,
         joints=_joint_reports(urdf, path, list(levers), short),
@@ -194,13 +196,14 @@ def _joint_reports(
     urdf: Urdf, path: Sequence[UrdfJoint], movers: Sequence[str], short: Collection[str]
 ) -> tuple[JointReport, ...]:
     on_path = {joint.name for joint in path}
+    number = {name: k for k, name in enumerate(movers, start=1)}
     ordered = [*path, *(joint for joint in urdf.joints if joint.name not in on_path)]
     return tuple(
         JointReport(
             joint=joint,
-            motor=f"motor_{movers.index(joint.name) + 1}" if joint.name in movers else None,
+            motor=f"motor_{number[joint.name]}" if joint.name in number else None,
             reason=""
-            if joint.name in movers
+            if joint.name in number
             else _reason(joint, joint.name in on_path, joint.name in short),
             mass=urdf.facts[joint.child].mass if joint.child in urdf.facts else None,
         )
@@ -247,7 +250,8 @@ def _name_findings(urdf: Urdf) -> Iterator[Finding]:
     yield from _of_names("error", _repeated(urdf.links), "link" + text)
     yield from _of_names("error", _repeated(joint.name for joint in urdf.joints), "joint" + text)
     ends = (link for joint in urdf.joints for link in (joint.parent, joint.child))
-    absent = [link for link in dict.fromkeys(ends) if link not in urdf.links]
+    there = set(urdf.links)
+    absent = [link for link in dict.fromkeys(ends) if link not in there]
     text = "link NAMES is named by a joint but has no <link> element. Add it."
     yield from _of_names("warning", absent, text)
 
@@ -271,7 +275,8 @@ def _root_findings(urdf: Urdf, base: str | None) -> Iterator[Finding]:
 
 def _loop_findings(urdf: Urdf, path: Sequence[UrdfJoint]) -> Iterator[Finding]:
     twice = _repeated(joint.child for joint in urdf.joints)
-    on_path = [joint.child for joint in path if joint.child in twice]
+    again = set(twice)
+    on_path = [joint.child for joint in path if joint.child in again]
     text = (
         "link NAMES is the child of several joints, which closes a loop on the way to the tool; "
         "only serial chains can be used. Remove all but one of them."
@@ -304,10 +309,20 @@ def _joint_findings(urdf: Urdf, path: Sequence[UrdfJoint]) -> Iterator[Finding]:
             "no joint on the way to the tool moves, so there is no motor to watch. Name another "
             "tool with --tool LINK, or check the joint types.",
         )
+    motors = sum(joint.has_motor for joint in path)
+    if motors > MOST_MOTORS:
+        yield Finding(
+            "error",
+            f"{motors} joints on the way to the tool move, expected {MOST_MOTORS} at most: a tool "
+            "path cannot tell so many motors apart. Name a tool nearer to the base with --tool "
+            "LINK.",
+        )
     for joint in path:
         for severity, text in _oddities(joint):
             yield Finding(severity, f"joint {joint.name!r} {text}")
-    beside = [joint.name for joint in urdf.joints if joint.mimic is not None and joint not in path]
+    known = {joint.name for joint in path}
+    followers = [joint.name for joint in urdf.joints if joint.mimic is not None]
+    beside = [name for name in followers if name not in known]
     text = "joint NAMES follows another joint (mimic), so it is no motor."
     yield from _of_names("note", beside, text)
 
@@ -368,11 +383,7 @@ def _mass_findings(urdf: Urdf, path: Sequence[UrdfJoint]) -> Iterator[Finding]:
     Links held together by fixed joints are one body, so a frame without mass on a heavy link is
     fine; what a moving joint carries has to weigh something.
     """
-    bodies = [
-        [link for link, way in urdf.ways(j.child).items() if all(k.type == "fixed" for k in way)]
-        for j in path
-        if j.type != "fixed"
-    ]
+    bodies = _bodies(urdf, path)
     facts = {n: urdf.facts[n] for body in bodies for n in body if n in urdf.facts}
     mass = {name: fact.mass for name, fact in facts.items() if fact.mass is not None}
     not_positive = [name for name in mass if mass[name] <= 0.0]
@@ -388,16 +399,45 @@ def _mass_findings(urdf: Urdf, path: Sequence[UrdfJoint]) -> Iterator[Finding]:
     yield from _of_names("warning", no_inertia, text + "computed for it.")
 
 
+def _bodies(urdf: Urdf, path: Sequence[UrdfJoint]) -> list[list[str]]:
+    """Return the links of each body that a moving joint of the path carries, its own link first."""
+    onward: dict[str, list[str]] = {}
+    for joint in urdf.joints:
+        if joint.type == "fixed":
+            onward.setdefault(joint.parent, []).append(joint.child)
+            onward.setdefault(joint.child, []).append(joint.parent)
+    bodies, seen = [], set[str]()
+    for joint in path:
+        if joint.type == "fixed" or joint.child in seen:
+            continue
+        body = [joint.child]
+        seen.add(joint.child)
+        for link in body:
+            beside = [name for name in onward.get(link, ()) if name not in seen]
+            seen.update(beside)
+            body += dict.fromkeys(beside)
+        bodies.append(body)
+    return bodies
+
+
 def _mesh_findings(links: Iterable[LinkFacts], folder: Path) -> Iterator[Finding]:
     """Yield what cannot be shown: meshes change no number."""
     meshes = dict.fromkeys(mesh for link in links for mesh in link.meshes)
     remote = [mesh for mesh in meshes if "://" in mesh and not mesh.startswith("file://")]
+    elsewhere = set(remote)
     text = " named by a package address that only ROS can resolve (NAMES). "
     yield from _of_names("note", remote, _counted(remote) + text + PICTURE)
-    local = [mesh for mesh in meshes if mesh not in remote]
-    missing = [m for m in local if not (folder / m.removeprefix("file://")).is_file()]
+    local = [mesh for mesh in meshes if mesh not in elsewhere]
+    missing = [m for m in local if not _is_file(folder / m.removeprefix("file://"))]
     text = f" not found (NAMES), looked for from {folder}. "
     yield from _of_names("warning", missing, _counted(missing) + text + PICTURE)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # no name that a file can have
+        return False
 
 
 def _counted(meshes: Sequence[str]) -> str:

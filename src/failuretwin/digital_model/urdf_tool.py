@@ -20,6 +20,8 @@ TOOL_NAMES = (
 """Names of links that carry a tool, the surest first; a name counts where it stands as a word."""
 BESIDE = r"finger|jaw|knuckle|thumb|pad|camera|cam|optical|imu|lidar|laser|sensor|marker|inertial"
 """Names of what hangs on a hand and is no tool."""
+COMPARED = 100
+"""Candidates for the tool that are compared with the best one."""
 OWN_MOTORS = 2
 """Motors of its own from which another branch is an arm and no finger."""
 
@@ -49,12 +51,14 @@ def choose_tool(urdf: Urdf, base: str) -> ToolChoice:
     ends = {name: count for name, count in urdf.tools(base).items() if not is_beside(name)}
     named = _named(urdf, base)
     if named:
-        return ToolChoice(named[0], _counts(urdf, base, named), _on_other_arms(urdf, base, named))
+        return ToolChoice(
+            named[0], _counts(urdf, base, named), _on_other_arms(urdf, base, named[:COMPARED])
+        )
     if not ends:
         ends = _before_fingers(urdf, base)
     links = list(ends)
     link = links[0] if links else base
-    return ToolChoice(link, ends, _on_other_arms(urdf, base, links))
+    return ToolChoice(link, ends, _on_other_arms(urdf, base, links[:COMPARED]))
 
 
 def is_beside(link: str) -> bool:
@@ -70,7 +74,7 @@ def _word(pattern: str, link: str) -> bool:
 
 def _named(urdf: Urdf, base: str) -> list[str]:
     """Return links with the surest name that moving joints carry, most motors first."""
-    counts = {link: sum(joint.has_motor for joint in way) for link, way in urdf.ways(base).items()}
+    counts = {link: motors for link, (motors, _) in urdf.lengths(base).items()}
     for pattern in TOOL_NAMES:
         links = [
             link

@@ -18,6 +18,7 @@ from failuretwin.app.commands.options import (
     plugin_option,
     reading_options,
 )
+from failuretwin.app.terminal import tell
 from failuretwin.core.errors import counted
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def import_(
     model = load_robot(robot)
     runs = read_inputs(sources, model, reading)
     export_runs(runs, out, DigitalTwin(model))
-    click.echo(f"{counted(runs.sizes['run'], 'run')} written to {out}")
+    tell(f"{counted(runs.sizes['run'], 'run')} written to {out}")
 
 
 # `failuretwin simulate`: runs made by the twin.
@@ -160,8 +161,8 @@ def simulate(
     )
     workforce = Workforce(workers, scheduler)
     with progress_bar("simulating", plan.size) as advance:
-        produce(plan, out, workforce, advance, tell=lambda text: click.echo(text, err=True))
-    click.echo(f"{counted(plan.size, 'run')} written to {out}")
+        produce(plan, out, workforce, advance, tell=lambda text: tell(text, err=True))
+    tell(f"{counted(plan.size, 'run')} written to {out}")
 
 
 # `failuretwin robot`: bring a robot of your own, from its URDF.
@@ -245,8 +246,8 @@ def init(
         partial.write_text(text, encoding="utf-8")
         load_robot(partial)
     for message in report.having("warning"):
-        click.echo(f"warning: {message}", err=True)
-    click.echo(
+        tell(f"warning: {message}", err=True)
+    tell(
         f"profile with {counted(len(report.motors), 'motor')} written to {out}; go through the "
         "lines that say 'assumed'"
     )
@@ -301,4 +302,4 @@ def fit_(logs: tuple[Path, ...], out: Path, reading: LogOptions, robot: str, see
         partial.write_text(text, encoding="utf-8")
         load_robot(partial)
     print_registration(found)
-    click.echo(f"written to {out}; use it with --robot {out}")
+    tell(f"written to {out}; use it with --robot {out}")

@@ -15,6 +15,7 @@ from failuretwin.app.commands.options import (
     plugin_option,
     reading_options,
 )
+from failuretwin.app.terminal import tell
 
 
 @click.command()
@@ -82,9 +83,9 @@ def calibrate(
             write_calibration_page(found, runs, model, folder)
     save_calibration(found, model, out)
     print_calibration(found, model)
-    click.echo(f"written to {out}")
+    tell(f"written to {out}")
     if found.beats_uncalibrated is not False:
-        click.echo(f"use it with `failuretwin diagnose --calibration {out}`")
+        tell(f"use it with `failuretwin diagnose --calibration {out}`")
 
 
 def _pool(calibrations: tuple[Path, ...], out: Path, name: str | None, robot: str) -> None:
@@ -102,8 +103,8 @@ def _pool(calibrations: tuple[Path, ...], out: Path, name: str | None, robot: st
     found = replace(population, imperfections=replace(figures, name=name or figures.name))
     save_calibration(found.calibration, model, out)
     print_population(found.calibration, model)
-    click.echo(f"written to {out}")
-    click.echo(
+    tell(f"written to {out}")
+    tell(
         "use it for another robot of the kind with `failuretwin diagnose LOGS --self-calibrate "
         f"--calibration {out} --out MINE.toml`, or without --self-calibrate for a single run"
     )
@@ -169,14 +170,14 @@ def train(
             plan, known.robot, known.imperfections, lambda done: advance(1)
         )
     save_network(diagnoser, out)
-    click.echo(
+    tell(
         f"of {alone.runs} simulated runs of the physics engine {100.0 * alone.accuracy:.1f} % "
         f"right, log score {alone.log_score:.3f} nats a run, "
         f"temperature {diagnoser.temperature_:.2f}; "
         f"blended with Bayes {100.0 * both.accuracy:.1f} %, {both.log_score:.3f} nats"
     )
-    click.echo(f"written to {out}; use it with `failuretwin diagnose --method {out}`")
-    click.echo(f"or together with Bayes: --method bayes+{out}")
+    tell(f"written to {out}; use it with `failuretwin diagnose --method {out}`")
+    tell(f"or together with Bayes: --method bayes+{out}")
 
 
 @click.command()
@@ -231,8 +232,8 @@ def study(
     )
     check_learning()
     trainings = len(list(plan.jobs()))
-    click.echo(f"{trainings} trainings of {plan.iterations} iterations each")
+    tell(f"{trainings} trainings of {plan.iterations} iterations each")
     total = trainings * plan.iterations
     with progress_bar("training", total) as advance:
         page = paper.run_study(plan, model, test, out, advance)
-    click.echo(f"written to {page}")
+    tell(f"written to {page}")

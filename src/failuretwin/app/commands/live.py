@@ -18,6 +18,7 @@ from failuretwin.app.commands.options import (
     live_options,
     plugin_option,
 )
+from failuretwin.app.terminal import tell
 
 if TYPE_CHECKING:
     from failuretwin.failure_behavior.injection import ScheduledFault
@@ -75,9 +76,9 @@ def watch(
             until = time.monotonic() + length
             watch_until_end(shadow, link, sinks, motors, console(), until)
         except KeyboardInterrupt:
-            click.echo("stopped")
+            tell("stopped")
     arm = statuses(shadow.snapshot.answer, motors)[0]
-    click.echo(f"last answer: {arm.message}")
+    tell(f"last answer: {arm.message}")
 
 
 # `failuretwin emulate`: a robot that exists only as physics, on a network or in a file.
@@ -141,17 +142,17 @@ def emulate(
                 sink.put(event)
                 if sink.trouble != trouble:
                     trouble = sink.trouble
-                    click.echo(trouble or "going on")
+                    tell(trouble or "going on")
                 now = state_at(schedule, event.time - zero, model.motor_names)
                 if now != state:
-                    click.echo(f"{event.time - zero:8.1f} s  {now}")
+                    tell(f"{event.time - zero:8.1f} s  {now}")
                     state = now
         except KeyboardInterrupt:
-            click.echo("stopped")
+            tell("stopped")
     if sink.trouble:
         raise InputError(sink.trouble)
     if source.ended and not on_ros:
-        click.echo(f"{length:g} s written to {target}")
+        tell(f"{length:g} s written to {target}")
 
 
 def _file_length(schedule: Sequence[ScheduledFault]) -> float:

@@ -12,7 +12,6 @@ import base64
 import json
 import platform
 import textwrap
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.resources import files
@@ -29,7 +28,9 @@ from torch.fx.passes.shape_prop import ShapeProp
 from failuretwin import __version__
 from failuretwin.core.config import fingerprint, from_table
 from failuretwin.core.errors import InputError, needs_extra
-from failuretwin.data_knowledge.store import reason, replacing
+from failuretwin.core.foreign import reading
+from failuretwin.data_knowledge.file_claims import check_npz
+from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision.learned.diagnoser import LearnedDiagnoser, network_shape
 from failuretwin.decision.learned.feature_encoder import (
     DAMPING_M,
@@ -51,11 +52,6 @@ SUFFIX = ".npz"
 _WEIGHT = "weight/"
 _NOT_STORED = ("encoder", "network")
 """Arguments of the estimator that have a place of their own in the file."""
-UNREADABLE = (
-    *(OSError, ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile),
-    *(KeyError, RuntimeError),
-)
-"""What reading a damaged file may raise."""
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -128,17 +124,11 @@ def load_network(path: str | Path, robot: Robot | None = None) -> LearnedDiagnos
         InputError: If the file cannot be read, is no network, or is one for another robot.
     """
     path = Path(path)
-    try:
+    with reading(path, "a network", "Expected a file that `failuretwin train` wrote."):
+        check_npz(path)
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         return _restored(json.loads(arrays["configuration"].tobytes()), arrays, robot, path)
-    except InputError:
-        raise
-    except UNREADABLE as error:
-        raise InputError(
-            f"{path}: cannot be read as a network ({reason(error)}). Expected a file that "
-            "`failuretwin train` wrote."
-        ) from error
 
 
 def _restored(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,9 +15,11 @@ from numpy.typing import ArrayLike
 from failuretwin.connection.links.base import OK, STALE, Answer
 from failuretwin.core.config import fingerprint
 from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.foreign import reading
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.store import reason, replacing
+from failuretwin.data_knowledge.file_claims import check_npz
+from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision.streaming.fleet import MOVEMENTS, StreamingFleet
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
@@ -76,7 +77,8 @@ def load_fleet(
         InputError: If it is no such file or of another robot, method or number of robots.
     """
     path = Path(path)
-    try:
+    with reading(path, "a stream", "Expected a file that `save` of a stream wrote."):
+        check_npz(path)
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         header = json.loads(arrays.pop(HEADER).tobytes())
@@ -86,13 +88,6 @@ def load_fleet(
         fleet = StreamingFleet(diagnoser, header["robots"], header["rate_hz"], header["movements"])
         fleet.restore(arrays)
         said = [Diagnosis.from_fields(fields) for fields in header["said"]]
-    except InputError:
-        raise
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(
-            f"{path}: cannot be read as a stream ({reason(error)}). Expected a file that `save` of "
-            "a stream wrote."
-        ) from error
     return fleet, said
 
 

@@ -1,0 +1,259 @@
+"""What stored arrays claim to be, looked at before any of them is decoded.
+
+A file of a kilobyte can say that it holds a terabyte, and a Zarr store may name a codec that runs
+code. So sizes, codecs and links are read from the metadata first; what does not fit the file or
+the memory is refused by `check_size`, whatever else it holds.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.foreign import LEAST_BYTES, check_size, read_text, reading
+
+if TYPE_CHECKING:
+    import h5py
+
+TEXT_CELL_BYTES = 64
+"""What a short text takes in memory beside its letters [bytes]."""
+
+# NetCDF: HDF5 with conventions.
+
+
+def check_netcdf(path: Path) -> None:
+    """Raise InputError unless the arrays of a NetCDF file can be meant and lie in it alone."""
+    import h5py
+
+    found: list[float] = []
+
+    def weigh(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset):
+            _check_inside(path, name, item)
+            cell = TEXT_CELL_BYTES if h5py.check_string_dtype(item.dtype) else item.dtype.itemsize
+            largest = max(math.prod(item.shape or ()), math.prod(item.chunks or ()))
+            found.append(float(largest) * cell)
+
+    with h5py.File(path, "r") as file:
+        for name in file:
+            if isinstance(file.get(name, getlink=True), h5py.ExternalLink):
+                raise InputError(
+                    f"{path}: {name!r} lies in another file. Write all of it into one."
+                )
+        file.visititems(weigh)
+    check_size(sum(found), path, "its arrays")
+
+
+def _check_inside(path: Path, name: str, dataset: h5py.Dataset) -> None:
+    if dataset.external or dataset.is_virtual:
+        raise InputError(f"{path}: {name!r} lies in another file. Write all of it into one.")
+
+
+# Zarr: a folder of chunks, with a JSON file for each array.
+
+ZARR_FORMAT = 3
+CODECS = ("bytes", "vlen-utf8", "zstd", "blosc")
+"""Codecs that this package writes; no other is let in, for some run code of the file's maker."""
+CELL_BYTES = {"string": TEXT_CELL_BYTES, "bool": 1} | {
+    f"{kind}{bits}": bits // 8
+    for kind in ("int", "uint", "float")
+    for bits in (8, 16, 32, 64)
+    if (kind, bits) != ("float", 8)
+}
+"""Types of elements that are let in, and what one takes in memory [bytes]."""
+FIXED_TEXT = "fixed_length_utf32"
+"""Type of text that is equally long throughout; its metadata say how long."""
+MAY_BE_EMPTY = ("onset", "magnitude", "position", "temperature", "voltage")
+"""Variables that may be unknown throughout; other writers leave out chunks that are all unknown."""
+
+
+def check_zarr(path: Path) -> None:
+    """Raise InputError unless a Zarr store has only known codecs, sane sizes and all its chunks."""
+    total = 0.0
+    for file in sorted(path.rglob("zarr.json")):
+        node = json.loads(read_text(file, "Zarr metadata"))
+        if not isinstance(node, dict) or node.get("zarr_format") != ZARR_FORMAT:
+            raise _not_version_3(path)
+        _check_codecs(node, file)
+        if node.get("node_type") == "array":
+            total += _array_bytes(node, file)
+            check_size(total, path, "its arrays")
+            _check_chunks(node, file.parent)
+    if any((path / name).exists() for name in (".zgroup", ".zarray", ".zmetadata")):
+        raise _not_version_3(path)
+
+
+def _not_version_3(path: Path) -> InputError:
+    return InputError(
+        f"{path}: is no Zarr store of format {ZARR_FORMAT}. Write it again with "
+        f"to_zarr(..., zarr_format={ZARR_FORMAT})."
+    )
+
+
+def _check_codecs(node: Any, file: Path) -> None:
+    """Raise InputError if any part of some metadata, however deep, names another codec."""
+    if isinstance(node, Mapping):
+        for key in ("codecs", "index_codecs", "storage_transformers"):
+            for codec in node.get(key) or ():
+                name = codec.get("name") if isinstance(codec, Mapping) else codec
+                if key != "codecs" or name not in CODECS:
+                    raise InputError(
+                        f"{file}: has the codec {name!r}, expected {', '.join(CODECS)}: others may "
+                        "run code of whoever made the file. Write it again with one of these."
+                    )
+        for value in node.values():
+            _check_codecs(value, file)
+    elif isinstance(node, list):
+        for value in node:
+            _check_codecs(value, file)
+
+
+def _array_bytes(node: Mapping[str, Any], file: Path) -> float:
+    """Return what an array of a Zarr store takes, or one of its chunks if that is more [bytes]."""
+    cell = _cell_bytes(node["data_type"], file)
+    grid = [int(n) for n in node["chunk_grid"]["configuration"]["chunk_shape"]]
+    shape = [int(n) for n in node["shape"]]
+    if len(grid) != len(shape) or min([*shape, *grid], default=0) < 0 or 0 in grid:
+        raise InputError(f"{file}: has the shape {shape} and chunks of {grid}, which do not fit.")
+    return float(max(math.prod(shape), math.prod(grid))) * cell
+
+
+def _cell_bytes(kind: Any, file: Path) -> float:
+    if isinstance(kind, Mapping) and kind.get("name") == FIXED_TEXT:
+        return float(kind["configuration"]["length_bytes"])
+    if not isinstance(kind, str) or kind not in CELL_BYTES:
+        expected = ", ".join((*CELL_BYTES, FIXED_TEXT))
+        raise InputError(f"{file}: has the type {kind!r}, expected {expected}.")
+    return CELL_BYTES[kind]
+
+
+def _check_chunks(node: Mapping[str, Any], folder: Path) -> None:
+    """Raise InputError if a chunk is missing, which would pass for readings that nobody took."""
+    if folder.name in MAY_BE_EMPTY:
+        return
+    separator = node["chunk_key_encoding"].get("configuration", {}).get("separator", "/")
+    shape = zip(node["shape"], node["chunk_grid"]["configuration"]["chunk_shape"], strict=True)
+    counts = [-(-size // chunk) for size, chunk in shape]
+    there = sum(1 for file in folder.rglob("*") if file.is_file() and file.name != "zarr.json")
+    if there >= math.prod(counts):
+        return
+    missing = next((key for key in _keys(counts, separator) if not (folder / key).is_file()), None)
+    if missing is not None:
+        raise InputError(
+            f"{folder}: chunk {missing} is missing ({there} of {math.prod(counts)} are there). "
+            "Copy the store again; if it is whole, write it with write_empty_chunks=True."
+        )
+
+
+def _keys(counts: Sequence[int], separator: str) -> Iterator[str]:
+    """Return the names of all chunks in order."""
+    total = math.prod(counts)
+    for number in range(total):
+        index, rest = [], number
+        for count in reversed(counts):
+            rest, place = divmod(rest, count)
+            index.append(str(place))
+        yield separator.join(["c", *reversed(index)])
+
+
+# MATLAB, versions 5 to 7: elements with a tag that says type and length, also within each other.
+
+HEADER_BYTES = 128
+MATRIX, COMPRESSED, INT32 = 14, 15, 5
+DEEPEST = 32
+"""Cells within cells; published files have three."""
+ELEMENT_BYTES = 16
+"""What an element of a matrix takes at most: two doubles, or an object [bytes]."""
+
+
+def check_matlab(path: Path) -> None:
+    """Raise InputError unless the elements of a MATLAB file lie within it and can be meant."""
+    with reading(path, "a MATLAB file", "Save it again with the option -v7."):
+        data = path.read_bytes()
+        if len(data) < HEADER_BYTES or data[126:128] not in (b"IM", b"MI"):
+            raise InputError(f"{path}: is no MATLAB file. Save it with the option -v7.")
+        walk = _MatlabWalk(path, "little" if data[126:128] == b"IM" else "big")
+        walk.elements(memoryview(data)[HEADER_BYTES:], 0)
+
+
+class _MatlabWalk:
+    """Adds up what the matrices of a file claim, each of which has to lie within what holds it."""
+
+    def __init__(self, path: Path, order: Any) -> None:
+        self.path, self.order, self.total = path, order, 0.0
+
+    def elements(self, data: memoryview, depth: int) -> None:
+        """Go through the elements of a buffer."""
+        if depth > DEEPEST:
+            raise InputError(f"{self.path}: holds cells within cells more than {DEEPEST} deep.")
+        for kind, body in self._split(data):
+            if kind == COMPRESSED:
+                self.elements(self._inflated(body), depth + 1)
+            elif kind == MATRIX:
+                self._claim(body)
+                self.elements(body, depth + 1)
+
+    def _split(self, data: memoryview) -> Iterator[tuple[int, memoryview]]:
+        at = 0
+        while at + 8 <= len(data):
+            kind, size = self._number(data[at : at + 4]), self._number(data[at + 4 : at + 8])
+            start = at + 8
+            if kind >> 16:  # up to four bytes stand in the tag itself
+                kind, size, start = kind & 0xFFFF, kind >> 16, at + 4
+            if start + size > len(data) or (start == at + 4 and size > 4):
+                raise InputError(
+                    f"{self.path}: an element claims {size} bytes where {len(data) - start} are "
+                    "left. The file was cut off or changed: copy it again."
+                )
+            yield kind, data[start : start + size]
+            padding = 0 if kind == COMPRESSED else -size % 8
+            at = at + 8 if start == at + 4 else start + size + padding
+
+    def _number(self, data: memoryview) -> int:
+        return int.from_bytes(data, self.order)
+
+    def _inflated(self, data: memoryview) -> memoryview:
+        limit = max(LEAST_BYTES, len(data))
+        inflate, parts, size = zlib.decompressobj(), [], 0
+        rest = bytes(data)
+        while rest and not inflate.eof:
+            part = inflate.decompress(rest, limit)
+            rest = inflate.unconsumed_tail
+            size += len(part)
+            check_size(self.total + size, self.path, "what is compressed in it")
+            parts.append(part)
+        return memoryview(b"".join(parts))
+
+    def _claim(self, matrix: memoryview) -> None:
+        """Add what a matrix takes by its dimensions, the second of its elements."""
+        elements = self._split(matrix)
+        next(elements, None)
+        kind, body = next(elements, (0, memoryview(b"")))
+        if kind == INT32:
+            sizes = [self._number(body[i : i + 4]) for i in range(0, len(body) - 3, 4)]
+            self.total += float(math.prod(sizes)) * ELEMENT_BYTES
+            check_size(self.total, self.path, "its matrices")
+
+
+# npz: a ZIP archive of arrays, each with a header that says shape and type.
+
+
+def check_npz(path: Path) -> None:
+    """Raise InputError unless the arrays of an .npz archive can be meant."""
+    from numpy.lib import format as npy
+
+    total = 0.0
+    with zipfile.ZipFile(path) as archive:
+        for entry in archive.infolist():
+            with archive.open(entry) as file:
+                version = npy.read_magic(file)
+                read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+                shape, _, dtype = read(file)
+                total += max(float(math.prod(shape)) * dtype.itemsize, float(entry.file_size))
+            check_size(total, path, "its arrays")
