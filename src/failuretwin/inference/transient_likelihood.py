@@ -16,7 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
-from failuretwin.core.numerics import along_polyline, log_fall, log_norm, log_of, log_sum
+from failuretwin.core.numerics import along_polyline, log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.evidence import SettledEvidence, TransientSamples
 from failuretwin.inference.healthy_model import HealthyModel, StartNodes
@@ -25,6 +25,7 @@ from failuretwin.inference.joint_likelihood import (
     JointLikelihood,
     MovementLikelihoods,
 )
+from failuretwin.inference.reading_density import log_density_on_way
 
 KNOTS = 11
 """Instants of a ramp at which the path is computed; between them it is a straight line."""
@@ -32,12 +33,6 @@ SEEN, UNSEEN = 0.3, 12.0
 """Factors on the variance of the settled scatter, where both ends of a movement were seen and where
 not. All readings of a movement share its ends, so that each tells a twelfth of what is not known of
 them; what is known of them is taken as it was seen."""
-JITTER_S = 0.012
-"""Standard deviation of the stamps of single readings [s], on top of the shared lag."""
-DOF = 4.0
-"""Degrees of freedom of single readings: heavy tails."""
-GLITCH_RATE = 0.03
-"""Share of readings that may be anywhere within reach [-]."""
 STARTS_RAD = np.linspace(-LARGEST_OFFSET_RAD, LARGEST_OFFSET_RAD, 13)
 """Where a motor may stand before the run if not where it should, from there."""
 RARELY_ELSEWHERE = 0.01
@@ -362,14 +357,15 @@ class TransientLikelihood:
         if duration is None:
             duration = self.settled.movements.ramp_duration[item][:, None]
         late = np.zeros(origin.shape[1:]) if delay is None else delay
-        path, longest = self._path(origin, destination, np.nan_to_num(duration), late)
+        path, longest, lead = self._path(origin, destination, np.nan_to_num(duration), late)
         variance = self._variance(item, destination[:, 0]) + spread_m**2
         found = np.full(origin.shape[:2], -np.inf)
         for start, log_chance in self._starts:
             chance = log_chance[item]
             some = np.flatnonzero(chance > -np.inf)
             if len(some) > 0:
-                at, ways = tuple(index[some] for index in item), (path[some], longest[some])
+                at = tuple(index[some] for index in item)
+                ways = path[some], longest[some], lead[some]
                 says = self._of_starts(at, *ways, variance[some], start)
                 found[some] = np.logaddexp(found[some], says + chance[some, None])
         return found
@@ -386,42 +382,35 @@ class TransientLikelihood:
         item: tuple[IntArray, ...],
         path: FloatArray,
         longest: FloatArray,
+        lead: FloatArray,
         variance: FloatArray,
         start: StartNodes,
     ) -> FloatArray:
         """Return log densities of movements that begin so late, (item, case).
 
-        A reading is of a 3-variate Student t around the path, wider along it by the doubt of its
-        time, or anywhere within reach.
-
         Args:
             item: Runs and numbers of movements, (item,) each.
-            path: The tool at each knot, (item, case, knot, axis) [m].
-            longest: Time of the last knot, (item, case) [s].
+            path: What is seen at each knot, (item, case, knot, axis) [m].
+            longest: Time from the first knot to the last, (item, case) [s].
+            lead: How long before the start the first one is, (item, case) [s].
             variance: Of a reading on each axis, (item,) [m2].
             start: How late.
         """
-        variance = variance[:, None, None, None]
         since = self.moving.since[item][:, None, :, None] - start.delay  # (.., reading, start)
-        predicted, velocity = along_polyline(path, longest, since)
+        if lead.any():
+            since = since + lead[..., None, None]
+        way = along_polyline(path, longest, since)
         point = self.moving.point[item][:, None, :, None]
-        error = [point[..., axis] - predicted[axis] for axis in range(3)]
-        speed2 = sum(v * v for v in velocity)
-        along2 = sum(e * v for e, v in zip(error, velocity, strict=True)) ** 2
-        along2 /= np.maximum(speed2, 1e-12)
-        error2 = sum(e * e for e in error)
-        stretched = variance + speed2 * (JITTER_S**2 + start.step_s**2 / 12.0)
-        square = np.maximum(error2 - along2, 0.0) / variance + along2 / stretched
-        log_at = log_fall(square, DOF) - 0.5 * np.log(stretched)
-        log_at += log_norm(DOF) - np.log(variance) + np.log1p(-GLITCH_RATE)
-        log_at = np.logaddexp(log_at, np.log(GLITCH_RATE) + self.model.anywhere_log_density)
+        sensors, step_s = self.model.sensors, start.step_s
+        log_at = log_density_on_way(point, *way, variance[:, None, None, None], step_s, sensors)
         log_at *= self.moving.seen[item][:, None, :, None]
         return log_sum(log_at.sum(axis=2) + start.log_weight, axis=-1)
 
     def _variance(self, item: tuple[IntArray, ...], destination: FloatArray) -> FloatArray:
         """Return the variance of a reading on each axis, (item,) [m2]; ends (item, motor) [rad]."""
-        _, jacobian = self.model.twin.path_and_jacobian(destination)
-        scaled = np.sum((jacobian * self.model.scatter) ** 2, axis=(-1, -2)) / 3.0
+        jacobian = self.model.sensors.jacobian_on_way(destination)
+        axes = jacobian.shape[-2]
+        scaled = np.sum((jacobian * self.model.scatter) ** 2, axis=(-1, -2)) / axes
         seen = self.settled.usable.copy()
         seen[:, 1:] &= self.settled.usable[:, :-1]
         rough = self.model.settings.path_roughness_m
@@ -429,19 +418,25 @@ class TransientLikelihood:
 
     def _path(
         self, origin: FloatArray, destination: FloatArray, duration: FloatArray, delay: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the tool at each knot, (item, case, knot, axis) [m], and its time at the last one.
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return what is seen at each knot, (item, case, knot, axis) [m], and when knots are.
 
-        The latter is (item, case) [s]; arguments as for `log_density`.
+        The latter is the time from the first to the last and that from the first to the start,
+        (item, case) [s] each; arguments as for `log_density`. What accelerates is seen at rest
+        before and after, at a knot of its own.
         """
         duration = duration * (1.0 - self.model.shortening)
         longest = np.maximum((duration + delay).max(axis=-1), 0.05)
         longest = np.broadcast_to(longest, origin.shape[:2])
+        beyond = 2 * self.model.sensors.accelerates
+        step = longest / (KNOTS - 1)
         at = longest[..., None] * np.linspace(0.0, 1.0, KNOTS)
+        if beyond:
+            at = step[..., None] * np.arange(-beyond, KNOTS + beyond)
         since = at[..., None] - delay[:, None]  # (item, case, knot, motor)
         share = np.clip(since / np.maximum(duration, 1e-6)[..., None, :], 0.0, 1.0)
         pose = origin[..., None, :] + share * (destination - origin)[..., None, :]
-        return self.model.twin.path(pose), longest
+        return self.model.sensors.along(pose, step), longest + 2 * beyond * step, beyond * step
 
 
 def _at(values: FloatArray, outcome: IntArray) -> FloatArray:

@@ -95,6 +95,12 @@ def import_(
     "gears that stick and joints that flex.",
 )
 @click.option(
+    "--sensors",
+    metavar="KIND,...",
+    help="Sensors to simulate beside that of the tool's position, as the profile has them: "
+    "accelerometer, gyroscope, orientation, wire.",
+)
+@click.option(
     "--faults",
     type=PATH,
     metavar="FILE",
@@ -122,6 +128,7 @@ def simulate(
     hypotheses: str | None,
     imperfections: str,
     engine: str,
+    sensors: str | None,
     faults: Path | None,
     workers: int,
     scheduler: str | None,
@@ -155,6 +162,7 @@ def simulate(
         seed=seed,
         imperfections=known.imperfections,
         engine=engine,
+        sensors=[] if sensors is None else [kind.strip() for kind in sensors.split(",")],
         modes=MODES if faults is None else load_modes(faults),
     )
     workforce = Workforce(workers, scheduler)
