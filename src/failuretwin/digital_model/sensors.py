@@ -36,9 +36,9 @@ UP = GRAVITY * AXES3[2]
 """What an accelerometer at rest reads in the base frame: the push that keeps it there [m/s2]."""
 LONGEST_WAY = 3.0
 """An accelerometer that may read anything on the way reads up to so many g; assumed."""
-JERKY = 0.15
+JERKY = 0.08
 """What bent ramps, servo transients and a shaking arm add to an accelerometer on the way [g]."""
-UNEVEN = 0.1
+UNEVEN = 0.05
 """The same of a gyroscope, as a share of the fastest motor's speed [-]."""
 
 

@@ -60,19 +60,13 @@ def sensing_of(runs: xr.Dataset, sensing: str | None) -> tuple[str, ...]:
             run set has it, else all others that it has, but for the readings of the motors.
 
     Raises:
-        InputError: If it has no reading of one that is asked for, or of any.
+        InputError: If it has no reading of one that is asked for.
     """
     there = [kind for kind, of in SENSORS.items() if _has_readings(runs, of.variable)]
     if sensing is None:
-        if Tool.kind in there or not there:
-            return TOOL_ALONE
         others = [kind for kind in there if kind != Encoders.kind]
-        if any(SENSORS[kind].at_rest for kind in others):
-            return tuple(others)
-        raise InputError(
-            f"the runs hold no tool position, only {', '.join(there)}. Name what to believe, such "
-            "as --sensing encoders: readings of the motors are not believed unasked."
-        )
+        alone = Tool.kind in there or not any(SENSORS[kind].at_rest for kind in others)
+        return TOOL_ALONE if alone else tuple(others)
     asked = parse_sensing(sensing)
     for kind in asked:
         if kind not in there:
