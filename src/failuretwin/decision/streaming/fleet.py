@@ -97,8 +97,8 @@ class StreamingFleet:
             )
         if not diagnoser.healthy_model.sensors.tool_alone:
             raise InputError(
-                f"sensing {diagnoser.sensing}: a stream sees by the tool's position alone. Diagnose "
-                "recorded runs, or leave sensing out."
+                f"sensing {diagnoser.sensing}: a stream sees by the tool's position alone. "
+                "Diagnose recorded runs, or leave sensing out."
             )
         self.diagnoser = diagnoser
         self.hypotheses = [str(hypothesis) for hypothesis in diagnoser.hypothesis_set]
