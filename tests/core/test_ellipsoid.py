@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from failuretwin.core.numerics import Ellipsoid, log_fall, log_norm
+from failuretwin.core.numerics import Covariance, Ellipsoid, log_fall, log_norm
 
 DOFS = [1.0, 2.5, 4.0, 30.0, np.inf]
 
@@ -104,3 +104,29 @@ def test_the_inverse_root_by_hand():
     factor = np.array([[2.0, 1.0, 0.0], [0.0, 2.0, 2.0], [0.0, 0.0, 3.0]])
     found = Ellipsoid.of(np.linalg.inv(factor), 0.0).inverse_root
     np.testing.assert_allclose(found, factor, atol=1e-9)
+
+
+@pytest.mark.parametrize("dims", [1, 2, 3, 5, 9])
+@pytest.mark.parametrize("dof", [2.5, np.inf])
+def test_densities_in_any_number_of_dimensions_are_those_of_scipy(dims, dof):
+    rng = np.random.default_rng(dims)
+    root, error = rng.normal(size=(4, dims, 3)), rng.normal(size=(4, dims))
+    spread = Covariance.of(root, 0.3)
+    for at in range(4):
+        shape = root[at] @ root[at].T + 0.3 * np.eye(dims)
+        expected = student(shape, dof).logpdf(error[at])
+        assert spread.log_student(error, dof)[at] == pytest.approx(expected, abs=1e-9)
+        whitened = spread.inverse_root[at] @ error[at]
+        assert whitened @ whitened == pytest.approx(spread.product(error, error)[at])
+        np.testing.assert_allclose(np.tril(spread.inverse_root[at], -1), 0.0, atol=1e-12)
+
+
+def test_on_a_surface_the_density_is_that_of_fewer_dimensions():
+    """Deviations along two of five axes: but for a constant, a Student t of two."""
+    root = np.zeros((5, 2))
+    root[0, 0], root[1, 1] = 2.0, 0.5
+    spread, plane = Covariance.of(root, 0.1, dims=2), root[:2] @ root[:2].T + 0.1 * np.eye(2)
+    points = np.random.default_rng(0).normal(size=(6, 2))
+    found = [spread.log_student(np.array([*p, 0.0, 0.0, 0.0]), 4.0) for p in points]
+    constant = -0.5 * 3 * np.log(0.1)
+    np.testing.assert_allclose(found, student(plane, 4.0).logpdf(points) + constant)

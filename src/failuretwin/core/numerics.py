@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from math import lgamma, log, pi
 
@@ -87,29 +88,69 @@ def _quantiles(values: FloatArray, weights: FloatArray, levels: tuple[float, ...
     return np.asarray(np.interp(levels, steps / total, np.repeat(values[first], 2)))
 
 
-# Covariances of points in space, many at once: S = A A^T + noise I, solved in closed form.
+# Covariances of what sensors see, many at once: S = A A^T + noise I.
 
 
 @dataclass(frozen=True)
-class Ellipsoid:
-    """Covariances (...) by their adjugates, which numpy handles faster than small matrices.
+class Covariance(ABC):
+    """Covariances (...) of deviations in d dimensions.
+
+    Attributes:
+        determinant: (...).
+        dims: Dimensions that deviations can have; the density is a Student t in so many. Fewer than
+            d where what sensors see lies on a surface, such as rotations among matrices.
+    """
+
+    determinant: FloatArray
+    dims: int
+
+    @staticmethod
+    def of(root: FloatArray, noise: float, dims: int | None = None) -> Covariance:
+        """Return S = A A^T + noise I; three dimensions in closed form, others by inversion.
+
+        Args:
+            root: A, (..., d, column).
+            noise: Variance added on each axis.
+            dims: Dimensions that deviations can have; None: d.
+        """
+        made = Ellipsoid if root.shape[-2] == 3 else DenseCovariance
+        return made.of_root(root, noise, dims or root.shape[-2])
+
+    @abstractmethod
+    def solve(self, b: FloatArray) -> FloatArray:
+        """Return S^-1 b of vectors (..., d), as (..., d)."""
+
+    @property
+    @abstractmethod
+    def inverse_root(self) -> FloatArray:
+        """A with A^T A = S^-1, upper triangular, (..., d, d): whitens deviations."""
+
+    def product(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        """Return a^T S^-1 b of vectors (..., d), as (...)."""
+        return np.asarray(np.sum(a * self.solve(b), axis=-1))
+
+    def log_norm(self, dof: float) -> FloatArray:
+        """Return the log density at the centre of a Student t with this scale matrix, (...)."""
+        return log_norm(dof, self.dims) - 0.5 * np.log(self.determinant)
+
+    def log_student(self, error: FloatArray, dof: float) -> FloatArray:
+        """Return log t_nu(error; S) of deviations (..., d), as (...)."""
+        return self.log_norm(dof) + log_fall(self.product(error, error), dof, self.dims)
+
+
+@dataclass(frozen=True)
+class Ellipsoid(Covariance):
+    """Covariances in space by their adjugates, which numpy handles faster than small matrices.
 
     Attributes:
         adjugate: xx, yy, zz, xy, xz, yz of the adjugate, each (...).
-        determinant: (...).
     """
 
     adjugate: tuple[FloatArray, ...]
-    determinant: FloatArray
 
     @classmethod
-    def of(cls, root: FloatArray, noise: float) -> Ellipsoid:
-        """Return S = A A^T + noise I.
-
-        Args:
-            root: A, (..., 3, column).
-            noise: Variance added on each axis.
-        """
+    def of_root(cls, root: FloatArray, noise: float, dims: int) -> Ellipsoid:
+        """Return A A^T + noise I; see `Covariance.of`."""
         x, y, z = (root[..., axis, :] for axis in range(3))
         dot = "...i,...i->..."
         xx, yy, zz = (np.einsum(dot, a, a) + noise for a in (x, y, z))
@@ -118,11 +159,8 @@ class Ellipsoid:
             *(yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy),
             *(xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz),
         )
-        return cls(adjugate, xx * adjugate[0] + xy * adjugate[3] + xz * adjugate[4])
-
-    def product(self, a: FloatArray, b: FloatArray) -> FloatArray:
-        """Return a^T S^-1 b of vectors (..., 3), as (...)."""
-        return np.asarray(np.sum(a * self.solve(b), axis=-1))
+        determinant = xx * adjugate[0] + xy * adjugate[3] + xz * adjugate[4]
+        return cls(determinant, dims, adjugate)
 
     def solve(self, b: FloatArray) -> FloatArray:
         """Return S^-1 b of vectors (..., 3), as (..., 3)."""
@@ -147,13 +185,31 @@ class Ellipsoid:
         root[..., 2, 2] = np.sqrt(np.maximum(rest, 0.0))
         return root
 
-    def log_norm(self, dof: float) -> FloatArray:
-        """Return the log density at the centre of a Student t with this scale matrix, (...)."""
-        return log_norm(dof) - 0.5 * np.log(self.determinant)
 
-    def log_student(self, error: FloatArray, dof: float) -> FloatArray:
-        """Return log t_nu(error; S) of deviations (..., 3), as (...)."""
-        return self.log_norm(dof) + log_fall(self.product(error, error), dof)
+@dataclass(frozen=True)
+class DenseCovariance(Covariance):
+    """Covariances in any number of dimensions.
+
+    Attributes:
+        inverse: S^-1, (..., d, d).
+    """
+
+    inverse: FloatArray
+
+    @classmethod
+    def of_root(cls, root: FloatArray, noise: float, dims: int) -> DenseCovariance:
+        """Return A A^T + noise I; see `Covariance.of`."""
+        matrix = root @ np.swapaxes(root, -1, -2) + noise * np.eye(root.shape[-2])
+        return cls(np.linalg.det(matrix), dims, as_floats(np.linalg.inv(matrix)))
+
+    def solve(self, b: FloatArray) -> FloatArray:
+        """Return S^-1 b of vectors (..., d), as (..., d)."""
+        return np.asarray(np.einsum("...ij,...j->...i", self.inverse, b))
+
+    @property
+    def inverse_root(self) -> FloatArray:
+        """A with A^T A = S^-1, upper triangular, (..., d, d): whitens deviations."""
+        return np.swapaxes(np.linalg.cholesky(self.inverse), -1, -2)
 
 
 # Student t in d dimensions, with nu degrees of freedom and scale S; nu infinite: normal.
@@ -193,15 +249,15 @@ def log_fall(square: FloatArray, dof: float, dims: int = 3) -> FloatArray:
 
 
 def log_student(error: FloatArray, root: FloatArray, noise: float, dof: float) -> FloatArray:
-    """Return log t_nu(error; A A^T + noise I) in three dimensions, (...).
+    """Return log t_nu(error; A A^T + noise I) in d dimensions, (...).
 
     Args:
-        error: Deviations, (..., 3).
-        root: A, (..., 3, column).
+        error: Deviations, (..., d).
+        root: A, (..., d, column).
         noise: Variance added on each axis.
         dof: nu; infinite: normal.
     """
-    return Ellipsoid.of(root, noise).log_student(error, dof)
+    return Covariance.of(root, noise).log_student(error, dof)
 
 
 def log_normal_2d(error: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -1,7 +1,10 @@
 """The run set: an `xarray.Dataset` of commands and tool paths on one uniform time grid.
 
 Shorter runs are padded: `measured` NaN, `command` held. Variables, dimensions and units are those
-of `VARIABLES`; only `command` and `measured` are required.
+of `VARIABLES`; only `command` and `measured` are required. `measured` is NaN throughout where
+nobody watched the tool's position, but another sensor: `tool_orientation`, a rotation vector in the
+frame of `measured`; `accelerometer` and `gyroscope` on the tool, in their own frames; `wire`, a
+length; `position`, the readings of the motors.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.foreign import check_memory
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray, as_floats
@@ -38,13 +41,24 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str]] = {
     "position": (("run", "time", "motor"), "rad"),
     "temperature": (("run", "time", "motor"), "degC"),
     "voltage": (("run", "time", "motor"), "V"),
+    "tool_orientation": (("run", "time", "axis"), "rad"),
+    "accelerometer": (("run", "time", "axis"), "m/s2"),
+    "gyroscope": (("run", "time", "axis"), "rad/s"),
+    "wire": (("run", "time"), "m"),
 }
 """Dimensions and unit of every variable that a run set may hold."""
 
 UNIFORM = 1e-3
 """Steps of a time grid may differ by this share; single precision rounds by a tenth of it."""
-LARGEST = {"command": 1e6, "measured": 1e6}
-"""Largest sensible value of a reference [rad] and of a tool position [m]."""
+LARGEST = {
+    "command": 1e6,
+    "measured": 1e6,
+    "tool_orientation": 10.0,
+    "accelerometer": 1e4,
+    "gyroscope": 1e4,
+    "wire": 1e6,
+}
+"""Largest sensible value of each, in its unit."""
 REQUIRED = ("command", "measured")
 
 
@@ -73,6 +87,7 @@ class RunTable:
         movements: The movements commanded, where known.
         truth: What was wrong, where known.
         position: Motor readings, (run, time, motor) [rad], where known.
+        sensors: What sensors beside that of the tool's position read, by variable.
     """
 
     run: Sequence[str]
@@ -85,6 +100,7 @@ class RunTable:
     movements: Movements | None = None
     truth: Truth | None = None
     position: FloatArray | None = None
+    sensors: Mapping[str, FloatArray] = field(default_factory=dict)
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
     def to_dataset(self) -> xr.Dataset:
@@ -96,6 +112,7 @@ class RunTable:
         import xarray as xr
 
         values: dict[str, Any] = {"command": self.command, "measured": self.measured}
+        values |= self.sensors
         values["duration"] = (
             np.full(len(self.run), self.time[-1]) if self.duration is None else self.duration
         )
@@ -136,11 +153,12 @@ class RunTable:
 def run_set(
     time: ArrayLike,
     command: ArrayLike,
-    measured: ArrayLike,
+    measured: ArrayLike | None = None,
     *,
     motors: Sequence[str] | None = None,
     names: Sequence[str] | None = None,
     measured_rate_hz: float | None = None,
+    sensors: Mapping[str, ArrayLike] | None = None,
 ) -> xr.Dataset:
     """Return a run set from plain arrays.
 
@@ -148,18 +166,27 @@ def run_set(
         time: Uniform grid from 0, (time,) [s].
         command: Reference of each motor, (run, time, motor), or (time, motor) of one run [rad].
         measured: Path of the tool in the base frame, (run, time, axis), or (time, axis) of one
-            run [m]; NaN = no sample.
+            run [m]; NaN = no sample. None: nobody watched it.
         motors: Names of the motors in chain order; None: ``motor_1``, ``motor_2``, ...
         names: Unique name of each run; None: ``run_1``, ``run_2``, ...
         measured_rate_hz: True rate of the tool sensor [Hz]; None: every sample of the grid is a
             reading of its own.
+        sensors: What others read, by variable (`accelerometer`, `position`, ...), each with a first
+            axis for runs, or without where `command` has none.
 
     Raises:
         InputError: If shapes do not fit together, or the grid is not uniform from 0.
     """
-    grid, reference, path = as_floats(time), as_floats(command), as_floats(measured)
+    grid, reference = as_floats(time), as_floats(command)
+    unseen = np.full((*reference.shape[:-1], len(AXES)), np.nan)
+    path = unseen if measured is None else as_floats(measured)
+    others = {name: as_floats(values) for name, values in (sensors or {}).items()}
+    for name in others:
+        if name not in VARIABLES:
+            raise unknown_name("sensor variable", name, VARIABLES)
     if reference.ndim == 2 and path.ndim == 2:
         reference, path = reference[None], path[None]
+        others = {name: values[None] for name, values in others.items()}
     if grid.ndim != 1 or len(grid) < 2 or reference.ndim != 3 or path.ndim != 3:
         raise InputError(
             f"the arrays have shapes {grid.shape} (time), {reference.shape} (command) and "
@@ -173,6 +200,7 @@ def run_set(
         command=reference,
         measured=path,
         measured_rate_hz=float(rate),
+        sensors=others,
     ).to_dataset()
 
 
@@ -231,11 +259,17 @@ def _check_variables(runs: xr.Dataset, where: str) -> None:
             raise InputError(
                 f"{where}: `{name}` has dimensions {runs[name].dims}, expected {dims}."
             )
-    for name in REQUIRED:
+    _check_values(runs, where)
+
+
+def _check_values(runs: xr.Dataset, where: str) -> None:
+    for name, most in LARGEST.items():
+        if name not in runs:
+            continue
         if runs[name].dtype.kind not in "fiu":
             raise InputError(f"{where}: `{name}` holds {runs[name].dtype}, expected numbers.")
         largest = float(np.nanmax(np.abs(runs[name].values), initial=0.0))
-        if largest > LARGEST[name]:
+        if largest > most:
             raise InputError(
                 f"{where}: `{name}` holds values up to {largest:g} {VARIABLES[name][1]}. Check "
                 "its unit."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.foreign import check_memory, reading, stored_bytes
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
-from failuretwin.data_knowledge.timed_log import Samples, Targets, TimedLog
+from failuretwin.data_knowledge.timed_log import SHAPES, Samples, Targets, TimedLog
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:
@@ -99,6 +100,28 @@ class ToolColumns:
 
 
 @dataclass(frozen=True)
+class SensorColumns:
+    """What another sensor read, in SI units.
+
+    Attributes:
+        variable: Its variable in a run set, such as ``accelerometer``.
+        columns: One for each channel.
+    """
+
+    variable: str
+    columns: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if self.variable not in SHAPES:
+            raise unknown_name("sensor variable", self.variable, SHAPES)
+        count = math.prod(SHAPES[self.variable])
+        if len(self.columns) != count:
+            raise InputError(
+                f"{self.variable}: {len(self.columns)} columns, expected {count}, one a channel."
+            )
+
+
+@dataclass(frozen=True)
 class ColumnMap:
     """Which column of a CSV is what.
 
@@ -110,6 +133,7 @@ class ColumnMap:
         run: Column that tells runs apart; without it a file is one run.
         separator: Between columns.
         decimal: Decimal point, or comma where the log writes 0,5.
+        sensors: Other sensors.
     """
 
     time: TimeColumn
@@ -119,6 +143,7 @@ class ColumnMap:
     run: str | None = None
     separator: str = ","
     decimal: str = "."
+    sensors: tuple[SensorColumns, ...] = ()
 
 
 def read_column_map(path: Path, robot: Robot) -> ColumnMap:
@@ -139,7 +164,7 @@ def read_column_map(path: Path, robot: Robot) -> ColumnMap:
             f"{where}: targets need to know how long a movement takes. Name duration_columns, or "
             "give duration_s for all."
         )
-    if mapping.tool is None and mapping.position is None:
+    if mapping.tool is None and mapping.position is None and not mapping.sensors:
         raise InputError(f"{where}: needs a [tool] table, or [position] to compute the path from.")
     if mapping.tool is not None:
         _check_unit(mapping.tool.unit, LENGTH_UNITS, f"{where}: tool")
@@ -266,7 +291,11 @@ def _log(table: pd.DataFrame, name: str, path: Path, mapping: ColumnMap, robot: 
     if mapping.position is not None:
         counts = numbers(table, mapping.position.columns, path)
         position = _present(time, _angles(counts, mapping.position, robot))
-    return TimedLog(name, _commands(table, time, mapping.command, path, robot), tool, position)
+    sensors = {
+        one.variable: _present(time, numbers(table, one.columns, path)) for one in mapping.sensors
+    }
+    commands = _commands(table, time, mapping.command, path, robot)
+    return TimedLog(name, commands, tool, position, sensors)
 
 
 def _times(table: pd.DataFrame, column: TimeColumn, path: Path) -> FloatArray:

@@ -30,6 +30,7 @@ from failuretwin.core.hypothesis import (
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable, Truth
 from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.data_knowledge.simulated_sensors import SIMULATED, simulated_sensors
 from failuretwin.data_knowledge.workers import Workforce
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.disturbances import (
@@ -41,11 +42,7 @@ from failuretwin.digital_model.disturbances import (
     sense,
     stack,
 )
-from failuretwin.digital_model.nonidealities import (
-    NO_IMPERFECTIONS,
-    Imperfections,
-    deterministic,
-)
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfections
 from failuretwin.digital_model.physics_engine import PhysicsEngine
 from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.settling import Settling, loads_in_range
@@ -83,6 +80,8 @@ class Plan:
         movements: How movements are drawn.
         modes: Fault modes with their distributions, by id.
         engine: What moves the robot: ``servo`` (the published loops) or ``physics``.
+        sensors: Sensors beside that of the tool's position and the motors' own, such as
+            ``accelerometer``.
 
     Raises:
         InputError: If a name or a hypothesis cannot be read, a hypothesis cannot be simulated or
@@ -97,6 +96,7 @@ class Plan:
     movements: RandomMovements
     modes: Mapping[str, FaultMode]
     engine: str
+    sensors: tuple[str, ...]
 
     def __init__(
         self,
@@ -108,6 +108,7 @@ class Plan:
         movements: RandomMovements | None = None,
         modes: Mapping[str, FaultMode] | None = None,
         engine: str = "servo",
+        sensors: Sequence[str] = (),
     ) -> None:
         """Take values or their text form.
 
@@ -131,6 +132,7 @@ class Plan:
             "movements": movements or RandomMovements(),
             "modes": dict(MODES) if modes is None else modes,
             "engine": engine,
+            "sensors": tuple(sensors),
         }
         for name, value in given.items():
             object.__setattr__(self, name, value)
@@ -141,6 +143,9 @@ class Plan:
             raise InputError(f"runs per class is {self.runs_per_class}, expected 1 or more.")
         if self.engine not in ENGINES:
             raise unknown_name("engine", self.engine, ENGINES)
+        for kind in self.sensors:
+            if kind not in SIMULATED:
+                raise unknown_name("sensor", kind, SIMULATED)
         for hypothesis in self.hypotheses:
             if not hypothesis.known:
                 raise InputError("'unknown' cannot be simulated. Name the faults to simulate.")
@@ -198,6 +203,8 @@ class Plan:
             "movements": vars(self.movements),
             "modes": {name: vars(mode) for name, mode in self.modes.items()},
         }
+        if self.sensors:
+            configuration["sensors"] = list(self.sensors)
         return {
             "robot": self.robot.name,
             "source": f"simulated by the {self.engine} engine",
@@ -304,6 +311,8 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
     duration = _durations(plan, commanded, chance)
     over = time > duration[:, None] + 1e-9
     measured[over], read[over] = np.nan, np.nan
+    seen = np.asarray(np.isfinite(measured).all(axis=-1))
+    seeds = [[plan.seed, run] for run in runs]
     return RunTable(
         run=[_run_name(plan, run) for run in runs],
         motor=plan.robot.motor_names,
@@ -315,6 +324,9 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
         movements=commanded,
         truth=_truth(plan, runs, injection.as_struck(position, time, commanded.start)),
         position=read,
+        sensors=simulated_sensors(
+            plan.sensors, DigitalTwin(plan.robot), plan.imperfections, position, seen, STEP_S, seeds
+        ),
         attributes=plan.attributes(),
     )
 
@@ -417,32 +429,3 @@ def _assembled(
     shared = part.drop_dims("run").assign_coords(run=arrays.pop("run"))
     filled = {name: (part[name].dims, array, part[name].attrs) for name, array in arrays.items()}
     return shared.assign(filled)[list(part.data_vars)]
-
-
-# Runs in which nothing is left to chance: the signature that a fault leaves on the tool.
-
-
-def noise_free_path(
-    twin: DigitalTwin,
-    imperfections: Imperfections,
-    movements: Movements,
-    time: FloatArray,
-    injection: Injection,
-) -> FloatArray:
-    """Return the path of the tool with faults, and without scatter, losses, stalls and glitches.
-
-    Args:
-        twin: Digital twin of the robot.
-        imperfections: How the healthy robot differs from it.
-        movements: As commanded.
-        time: Uniform grid, (time,) [s].
-        injection: Faults of the runs.
-
-    Returns:
-        (run, time, axis) [m].
-    """
-    runs, count = movements.start.shape
-    rng = np.random.default_rng(0)  # asked, but nothing that it says counts
-    luck = draw_disturbances(deterministic(imperfections), twin.robot, count, 0.0, rng)
-    drive = drive_of(movements, movements.reference(time), time, injection, stack([luck] * runs))
-    return twin.path(ServoEngine(twin.robot).angles(drive, time))

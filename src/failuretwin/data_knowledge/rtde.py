@@ -2,7 +2,8 @@
 
 The recorder writes one row each controller cycle, in SI units. ``target_q`` is where the joints are
 told to be, ``actual_q`` where their encoders are, and ``actual_TCP_pose`` what the controller
-computes from the encoders with the arm's own kinematic calibration: no second sensor.
+computes from the encoders with the arm's own kinematic calibration: no second sensor. That of the
+tool flange is ``actual_tool_accelerometer`` [m/s2].
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from failuretwin.data_knowledge.csv_log import (
     AngleColumns,
     ColumnMap,
     CommandColumns,
+    SensorColumns,
     TimeColumn,
     ToolColumns,
     read_mapped_csv,
@@ -26,6 +28,7 @@ from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
 TIME, TARGET, ACTUAL, TCP = "timestamp", "target_q_", "actual_q_", "actual_TCP_pose_"
+ACCELEROMETER = "actual_tool_accelerometer_"
 UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 """Joints of every Universal Robots arm in the order of `target_q`, by the names of its URDFs."""
 TCP_FAR_M = 0.02
@@ -62,6 +65,7 @@ def read_rtde(path: Path, robot: Robot) -> TimedLog:
     index = _joint_index(robot, path)
     target, actual = ([f"{lead}{i}" for i in index] for lead in (TARGET, ACTUAL))
     tool = [f"{TCP}{i}" for i in range(3)]
+    force = tuple(f"{ACCELEROMETER}{i}" for i in range(3))
     lacking = [name for name in target if name not in names]
     if lacking:
         raise InputError(
@@ -79,6 +83,7 @@ def read_rtde(path: Path, robot: Robot) -> TimedLog:
         tool=ToolColumns((tool[0], tool[1], tool[2])) if has_tool else None,
         position=AngleColumns(tuple(actual)) if has_actual else None,
         separator=BLANKS,
+        sensors=(SensorColumns("accelerometer", force),) if set(force) <= set(names) else (),
     )
     log = read_mapped_csv(path, mapping, robot)[0]
     _check_tcp(log, robot, path)

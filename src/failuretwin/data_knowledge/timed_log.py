@@ -6,7 +6,8 @@ units and in the sense of the robot's commands when they get here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -60,6 +61,15 @@ class Targets:
     duration: FloatArray
 
 
+SHAPES: Mapping[str, tuple[int, ...]] = {
+    "tool_orientation": (3,),
+    "accelerometer": (3,),
+    "gyroscope": (3,),
+    "wire": (),
+}
+"""Channels of the sensors that a log may hold beside tool and motors."""
+
+
 @dataclass(frozen=True)
 class TimedLog:
     """One run as logged.
@@ -70,20 +80,22 @@ class TimedLog:
         tool: Tool path (sample, axis) [m]; None: computed from the motor readings, like the
             published virtual sensor.
         position: Motor readings (sample, motor) [rad], NaN where one is missing.
+        sensors: What other sensors read, by variable of a run set, (sample, channel).
     """
 
     name: str
     command: Samples | Targets
     tool: Samples | None = None
     position: Samples | None = None
+    sensors: Mapping[str, Samples] = field(default_factory=dict)
 
 
 def timed_run(log: TimedLog, robot: Robot) -> RunTable:
     """Return a log as a run on a uniform grid, readings at their nearest grid times.
 
     Raises:
-        InputError: If the log has no tool path and no motor readings, its times do not increase or
-            are so far apart that their unit must be another.
+        InputError: If the log has no tool path, no motor readings and no other sensor, or its times
+            do not increase or are so far apart that their unit must be another.
     """
     log = _distinct(log)
     tool = _tool_path(log, robot)
@@ -104,6 +116,10 @@ def timed_run(log: TimedLog, robot: Robot) -> RunTable:
         measured_rate_hz=tool.rate_hz,
         movements=movements,
         position=None if log.position is None else _on_grid(log.position, time, begin)[None],
+        sensors={
+            name: _on_grid(samples, time, begin).reshape(1, len(time), *SHAPES[name])
+            for name, samples in log.sensors.items()
+        },
     )
 
 
@@ -126,7 +142,8 @@ def _distinct(log: TimedLog) -> TimedLog:
         command = last(command) or command
     else:
         _check_times(command.time, log.name)
-    return TimedLog(log.name, command, last(log.tool), last(log.position))
+    sensors = {name: last(samples) or samples for name, samples in log.sensors.items()}
+    return TimedLog(log.name, command, last(log.tool), last(log.position), sensors)
 
 
 def _check_commands(log: TimedLog) -> None:
@@ -154,6 +171,9 @@ def _tool_path(log: TimedLog, robot: Robot) -> Samples:
         if len(log.tool.time) < 2 or log.tool.time[-1] <= log.tool.time[0]:
             raise InputError(f"{log.name}: fewer than two readings of the tool. Log for longer.")
         return log.tool
+    if log.position is None and log.sensors:
+        time = next(iter(log.sensors.values())).time
+        return Samples(time, np.full((len(time), 3), np.nan))
     if log.position is None or len(log.position.time) < 2:
         raise InputError(
             f"{log.name}: holds neither a tool path nor motor readings. Name one of them."

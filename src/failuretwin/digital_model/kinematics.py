@@ -149,6 +149,45 @@ class SerialChain:
         lead = np.shape(q)[:-1]
         return point_out.reshape(*lead, 3), jacobian.reshape(*lead, 3, len(self.joints))
 
+    def in_tool_frame(self, direction: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return a direction of the base frame as the tool's frame has it, and its Jacobian.
+
+            v = R(q)^T u,    dv/dq_j = R^T (u x axis_j)
+
+        Args:
+            direction: u in the base frame, (3,); of any length and unit.
+            q: Joint values in chain order, (..., joint) [rad or m].
+
+        Returns:
+            v, (..., 3), and dv/dq, (..., 3, joint) [1/rad]; a joint that slides turns nothing.
+        """
+        flat = self._flatten(q)
+        out, jacobian = np.empty((len(flat), 3)), np.zeros((len(flat), 3, len(self.joints)))
+        for rows in _chunks(len(flat)):
+            vector, columns = self._carry_up(direction, flat[rows].T.copy())
+            for axis in range(3):
+                out[rows, axis] = vector[axis]
+                for j, column in enumerate(columns):
+                    jacobian[rows, axis, j] = column[axis]
+        lead = np.shape(q)[:-1]
+        return out.reshape(*lead, 3), jacobian.reshape(*lead, 3, len(self.joints))
+
+    def _carry_up(self, direction: FloatArray, q: FloatArray) -> tuple[Vector, list[Vector]]:
+        """Carry a direction and its derivatives from base to tool for `q` (joint, pose)."""
+        vector: Vector = tuple(direction.tolist())
+        columns: list[Vector] = []
+        for joint, value in zip(self.joints, q, strict=True):
+            back = joint.T_pj.T
+            vector, columns = _turn(back, vector), [_turn(back, column) for column in columns]
+            tangent: Vector = (0.0, 0.0, 0.0)
+            if not joint.prismatic:
+                c, s = np.cos(value), -np.sin(value)
+                vector, columns = _spin(c, s, vector), [_spin(c, s, column) for column in columns]
+                tangent = (vector[1], _scale(-1.0, vector[0]), 0.0)
+            columns.append(tangent)
+        last = self.T_jt.T
+        return _turn(last, vector), [_turn(last, column) for column in columns]
+
     def _flatten(self, q: FloatArray) -> FloatArray:
         q = as_floats(q)
         if q.ndim == 0 or q.shape[-1] != len(self.joints):

@@ -15,6 +15,7 @@ import numpy as np
 from failuretwin.core.config import AtLeastZero, Bounded, Bounds, Share
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.types import FloatArray
+from failuretwin.digital_model.sensor_profile import SensorProfile
 from failuretwin.digital_model.settling import Settling
 
 Range = Annotated[tuple[float, float], Bounds(in_order=True)]
@@ -143,6 +144,7 @@ class Imperfections:
         schedule: When movements are commanded.
         readings: The tool sensor; None: a perfect sample at every grid time.
         variation: Differences from run to run; None: every run has the same robot.
+        sensors: What was learned of sensors beside that of the tool's position.
     """
 
     name: str
@@ -154,6 +156,7 @@ class Imperfections:
     schedule: Schedule = field(default_factory=Schedule)
     readings: Readings | None = None
     variation: Variation | None = None
+    sensors: tuple[SensorProfile, ...] = ()
 
     def __post_init__(self) -> None:
         if self.protocol not in PROTOCOLS:

@@ -31,6 +31,7 @@ from failuretwin.digital_model.kinematics import (
     has_range,
     levers,
 )
+from failuretwin.digital_model.sensor_profile import SensorProfile
 from failuretwin.digital_model.servo import ServoLoop
 from failuretwin.digital_model.urdf import Triple, read_urdf
 
@@ -120,6 +121,7 @@ class Profile(Bounded):
         arm_class: What kind of arm it is, for what is believed of it before it is calibrated; see
             `failuretwin.digital_model.arm_classes`. Empty: by its reach.
         sources: Where each group of numbers comes from.
+        sensors: Sensors beside that of the tool's position, where they are not as usual.
     """
 
     name: str
@@ -137,6 +139,7 @@ class Profile(Bounded):
     inference: dict[str, float] = field(default_factory=dict)
     arm_class: str = ""
     sources: dict[str, str] = field(default_factory=dict)
+    sensors: tuple[SensorProfile, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()

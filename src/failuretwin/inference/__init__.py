@@ -9,10 +9,12 @@ section of docs/diagnosis.md or docs/shared_unknowns.md (words and symbols: docs
 
     readings, log_quality    which samples were measured, and what is wrong with them
     evidence, settings       e_m, where the tool settled; transient samples on the way
+    sensors                  what is believed, as one: channels in one unit
     healthy_model            where a healthy arm settles; residual and covariance S; start delay
     command_loss             w_a, which commands got lost: a hidden Markov chain; late starts
     joint_likelihood         what a movement says of the angle of one motor: a parabola
-    transient_likelihood     what the readings on the way say
+    path_likelihood          what readings say of motors that go from one pose to another
+    transient_likelihood     what they say of each fault
     run_likelihood           all of it for some runs: what every hypothesis draws from
     marginal                 the sum over change point m0 and nodes z
     priors                   p(m0), ranges of sizes, odds

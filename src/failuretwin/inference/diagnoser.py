@@ -24,6 +24,7 @@ from failuretwin.core.types import BoolArray
 from failuretwin.data_knowledge.read import RunsLike, as_runs
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
 from failuretwin.digital_model.nonidealities import Imperfections
+from failuretwin.digital_model.sensors import Encoders
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.explanation import worded
@@ -34,6 +35,7 @@ from failuretwin.inference.posterior import (
 )
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.sensors import SensorStack, parse_sensing, sensing_of
 from failuretwin.inference.shared_posterior import set_up_in_doubt, shared_posterior
 
 if TYPE_CHECKING:
@@ -41,6 +43,8 @@ if TYPE_CHECKING:
 
 JUDGED_RUNS = 32
 """So many runs of a set, evenly spread, tell whether its set-up may be off."""
+OF_ENCODERS = ("encoder_bias", "encoder_scale")
+"""Faults that make the reading of a motor wrong."""
 CHUNK_RUNS = 64
 """Runs of five movements at a time: keeps the work on nodes in about 100 MB."""
 
@@ -60,10 +64,12 @@ class BayesDiagnoser:
         priors: Beliefs about onset and size.
         whole_run: Whether readings on the way count beside settled poses, where it is known how
             late this robot starts to move.
+        sensing: Sensors that are believed, such as ``accelerometer`` or ``tool+encoders``; None:
+            the tool's position where runs have it, else what they have.
 
     Raises:
         InputError: If a hypothesis cannot be read or weighed, names a motor that the robot does
-            not have, or is given twice, or none is given.
+            not have, or is given twice, or none is given; or if there is no such sensor.
     """
 
     twin: DigitalTwin
@@ -71,6 +77,7 @@ class BayesDiagnoser:
     hypotheses: Sequence[Hypothesis | str] | None
     priors: Priors
     whole_run: bool
+    sensing: str | None
 
     def __init__(
         self,
@@ -79,6 +86,7 @@ class BayesDiagnoser:
         hypotheses: Sequence[Hypothesis | str] | None = None,
         priors: Priors | None = None,
         whole_run: bool = True,
+        sensing: str | None = None,
     ) -> None:
         """Take values or their text form.
 
@@ -89,15 +97,18 @@ class BayesDiagnoser:
             hypotheses: None: the paper's classes.
             priors: None: the usual ones.
             whole_run: Whether readings on the way count.
+            sensing: Sensors that are believed.
         """
         if not (isinstance(twin, DigitalTwin) and _are_figures(imperfections)):
             known = calibrated(twin, imperfections)
             twin, imperfections = known.twin, known.imperfections
-        values = (twin, imperfections, hypotheses, priors or Priors(), whole_run)
+        values = (twin, imperfections, hypotheses, priors or Priors(), whole_run, sensing)
         for entry, value in zip(fields(self), values, strict=True):
             object.__setattr__(self, entry.name, value)
         for hypothesis in self.hypothesis_set:
             check_diagnosable(hypothesis)
+        if sensing is not None:
+            parse_sensing(sensing)
 
     @cached_property
     def hypothesis_set(self) -> Sequence[Hypothesis]:
@@ -109,24 +120,28 @@ class BayesDiagnoser:
 
     @cached_property
     def healthy_model(self) -> HealthyModel:
-        """What a healthy run looks like."""
-        return HealthyModel.of(self.twin, self.imperfections)
+        """What a healthy run looks like, by the position of the tool if nothing else is said."""
+        model = HealthyModel.of(self.twin, self.imperfections)
+        return model if self.sensing is None else model.seen_by(parse_sensing(self.sensing))
 
     @cached_property
     def uses_transients(self) -> bool:
         """Whether readings on the way count."""
         return self.whole_run and self.healthy_model.knows_timing
 
-    def transient_mask(self, usable: BoolArray) -> BoolArray:
+    def transient_mask(self, usable: BoolArray, sensors: SensorStack | None = None) -> BoolArray:
         """Return the movements whose readings on the way count, (run, movement).
 
         Where a motor settled says all about most faults, and more reliably, so readings on the
-        way count beside it only where some hypothesis shows nowhere else, or where that was not
-        seen.
+        way count beside it only where some hypothesis or some motor shows nowhere else, or where
+        that was not seen.
 
         Args:
             usable: Movements with a settled point, (run, movement).
+            sensors: What is believed; None: the tool's position alone.
         """
+        if sensors and not sensors.tells_all_at_rest:
+            return np.ones_like(usable)
         if any(shows_in_transients(hypothesis) for hypothesis in self.hypothesis_set):
             return np.ones_like(usable)
         unseen = ~usable
@@ -136,14 +151,18 @@ class BayesDiagnoser:
     def diagnose(self, runs: RunsLike) -> list[Diagnosis]:
         """Return the diagnosis of each run of a run set, or of any logs by their path.
 
-        Reads `command` and `measured` alone; the truth, where there is any, is only passed on.
+        Reads `command` and the sensors that are believed alone; the truth, where there is any, is
+        only passed on.
 
         Raises:
-            InputError: If the run set is of another robot or no run holds a movement.
+            InputError: If the run set is of another robot, holds no readings of a sensor that is
+                to be believed, or no run holds a movement.
         """
         runs = as_runs(runs, self.twin.robot)
         self._check(runs)
-        seen = Evidence(runs, self.healthy_model.settings)
+        model = self.healthy_model.seen_by(sensing_of(runs, self.sensing))
+        self._check_shown(model)
+        seen = Evidence(runs, model.settings, model.sensors)
         evidence, moving = seen.sound.settled, None
         if evidence.movements.start.shape[1] == 0:
             raise InputError(
@@ -151,19 +170,20 @@ class BayesDiagnoser:
                 "of one movement at least."
             )
         if self.uses_transients:
-            moving = seen.sound.transient.where(self.transient_mask(evidence.usable))
+            mask = self.transient_mask(evidence.usable, model.sensors)
+            moving = seen.sound.transient.where(mask)
         names = [str(name) for name in runs["run"].values]
         faults = truth_of(runs)
         truth: list[str | None] = [None] * len(names) if faults is None else list(faults)
         results = []
         some = np.unique(np.linspace(0, len(names) - 1, JUDGED_RUNS).astype(np.int64))
-        sample = RunLikelihood(evidence[some], self.healthy_model)
+        sample = RunLikelihood(evidence[some], model)
         in_doubt = set_up_in_doubt(sample, self.hypothesis_set, self.priors)
         chunk = _runs_at_a_time(evidence.movements.start.shape[1])
         for first in range(0, len(names), chunk):
             rows = slice(first, first + chunk)
             way = None if moving is None else moving[rows]
-            likelihood = RunLikelihood(evidence[rows], self.healthy_model, way)
+            likelihood = RunLikelihood(evidence[rows], model, way)
             posterior_of_runs = shared_posterior(
                 likelihood, self.hypothesis_set, self.priors, in_doubt
             )
@@ -174,6 +194,15 @@ class BayesDiagnoser:
                     )
                 )
         return results
+
+    def _check_shown(self, model: HealthyModel) -> None:
+        """Refuse faults that say that a sensor which is believed is wrong."""
+        for fault in {fault for h in self.hypothesis_set for fault in h.faults}:
+            if fault.mode in OF_ENCODERS and Encoders.kind in model.sensing:
+                raise InputError(
+                    f"'{fault}' is a fault of the motor's own reading, which is believed (sensing "
+                    f"{'+'.join(model.sensing)}). Leave out encoders, or that fault."
+                )
 
     def _check(self, runs: xr.Dataset) -> None:
         check_runs(runs, "the run set")
@@ -194,6 +223,7 @@ def diagnose(
     calibration: HealthyLike = None,
     hypotheses: Sequence[Hypothesis | str] | None = None,
     priors: Priors | None = None,
+    sensing: str | None = None,
 ) -> list[Diagnosis]:
     """Diagnose runs in one call; see `BayesDiagnoser` for more.
 
@@ -203,11 +233,14 @@ def diagnose(
         calibration: What `calibrate` learned of it, by name or path; None: what its profile names.
         hypotheses: What may be the case; None: the paper's nine classes.
         priors: Beliefs about onset and size; None: the usual ones.
+        sensing: Sensors to believe, such as ``accelerometer`` or ``tool+encoders``; None: the
+            tool's position where runs have it, else what they have but for ``encoders``.
 
     Raises:
         InputError: If something cannot be read, or does not fit together.
     """
-    return BayesDiagnoser(robot, calibration, hypotheses, priors).diagnose(runs)
+    diagnoser = BayesDiagnoser(robot, calibration, hypotheses, priors, sensing=sensing)
+    return diagnoser.diagnose(runs)
 
 
 def _runs_at_a_time(movements: int) -> int:

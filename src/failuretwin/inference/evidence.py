@@ -1,6 +1,7 @@
 """What a run says at system level: where the tool settled after each movement, and its way there.
 
-Only `command` and `measured` of the run set are looked at, here and in everything that follows.
+Only `command` and the sensors that are believed, `measured` if nothing else is said, are looked at,
+here and in everything that follows.
 
     e_m = median of the readings of the last 0.6 s at rest after movement m
 
@@ -20,12 +21,14 @@ from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.numerics import masked_median
 from failuretwin.core.runs import measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
-from failuretwin.inference.log_quality import LogQuality, drop_invalid, log_quality
+from failuretwin.inference.log_quality import LogQuality, drop_invalid, log_quality, sensor_quality
 from failuretwin.inference.readings import MeasuredSamples, grid_steps, measured_samples
 from failuretwin.inference.settings import USUAL, InferenceSettings
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from failuretwin.inference.sensors import SensorStack
 
 SETTLING_S = 0.15
 """Time after the end of a ramp before the tool counts as settled [s]: lag of 0.06 s, twice over."""
@@ -48,20 +51,26 @@ class Evidence:
         runs: The run set; `command` (run, time, motor) [rad] and `measured` (run, time, axis) [m]
             are read.
         settings: How near is at rest.
+        sensors: What is believed; None: the tool's position alone.
     """
 
     runs: xr.Dataset
     settings: InferenceSettings = USUAL
+    sensors: SensorStack | None = None
 
     @cached_property
     def readings(self) -> MeasuredSamples:
-        """The readings behind the samples of `measured`."""
-        return measured_samples(self.runs)
+        """The readings behind the samples of the run set."""
+        return self.sensors.read(self.runs) if self.sensors else measured_samples(self.runs)
 
     @cached_property
     def quality(self) -> list[LogQuality]:
         """Defects of the log of each run."""
-        return log_quality(self.runs, self.readings, self.settings)
+        if self.sensors and not self.sensors.sees_tool:
+            return sensor_quality(self.runs, self.readings)
+        alone = self.sensors is None or self.sensors.tool_alone
+        tool = self.readings if alone else measured_samples(self.runs)
+        return log_quality(self.runs, tool, self.settings)
 
     @cached_property
     def sound(self) -> Evidence:
@@ -79,7 +88,10 @@ class Evidence:
         silence = SILENT_PERIODS / measured_rate(self.runs)
         found = replace(
             SettledEvidence.empty(
-                run=len(end), movement=end.shape[1], motor=movements.initial.shape[1], axis=3
+                run=len(end),
+                movement=end.shape[1],
+                motor=movements.initial.shape[1],
+                axis=readings.point.shape[-1],
             ),
             movements=movements,
             begin=begin,
@@ -88,7 +100,7 @@ class Evidence:
         )
         item = np.nonzero(movements.exists & (begin < end))
         samples, inside = _between(readings.point, time, item[0], begin[item], end[item])
-        found.settle(item, estimate_rest(samples, inside, self.settings.moving_spread_m))
+        found.settle(item, estimate_rest(samples, inside, self._moving_spread_m))
         return found
 
     @cached_property
@@ -103,14 +115,25 @@ class Evidence:
         for run in np.flatnonzero(readings.filled):
             read[run] &= _corners(readings.point[run], grid_steps(self.runs))
         start, until = settled.movements.start, settled.transient_until
-        runs, movements = start.shape
-        found = TransientSamples.empty(run=runs, movement=movements, reading=MOST_READINGS, axis=3)
+        points = self.sensors.read_on_way(self.runs, readings) if self.sensors else readings.point
+        found = TransientSamples.empty(
+            run=len(start),
+            movement=start.shape[1],
+            reading=MOST_READINGS,
+            axis=points.shape[-1],
+        )
         for run, movement in np.argwhere(settled.movements.exists & (until > start)):
             first, stop = np.searchsorted(time, [start[run, movement], until[run, movement] - 1e-9])
             rows = first + np.flatnonzero(read[run, first:stop])
-            item, point = (run, movement), readings.point[run, rows]
+            item, point = (run, movement), points[run, rows]
             found.take_in(item, start[item], time[rows], point, least_step)
         return found
+
+    @property
+    def _moving_spread_m(self) -> float:
+        if self.sensors is None:
+            return self.settings.moving_spread_m
+        return self.sensors.moving_spread_m(self.settings)
 
 
 def settled_evidence(runs: xr.Dataset) -> SettledEvidence:
@@ -128,8 +151,8 @@ class SettledEvidence(ArrayStruct):
 
     Attributes:
         movements: Movements found in `command`.
-        point: Median of the readings at the end of each plateau, (run, movement, axis) [m]; 0 where
-            there is none.
+        point: Median of the readings at the end of each plateau, (run, movement, axis) [m], an axis
+            for each channel of what is believed; 0 where there is none.
         usable: Movements with a settled point, (run, movement).
         moving: Movements whose readings do not come to rest, (run, movement).
         begin: When the readings that count begin, (run, movement) [s].
@@ -237,7 +260,9 @@ def estimate_rest(samples: FloatArray, inside: BoolArray, moving_spread_m: float
         moving_spread_m: Median distance from their median above which it is still moving [m].
     """
     kept = inside & np.isfinite(samples).all(axis=-1)
-    point = np.stack([masked_median(samples[..., axis], kept) for axis in range(3)], axis=-1)
+    point = np.stack(
+        [masked_median(samples[..., axis], kept) for axis in range(samples.shape[-1])], axis=-1
+    )
     from_point = np.where(kept[..., None], samples, 0.0) - point[:, None]
     spread = masked_median(np.linalg.norm(from_point, axis=-1), kept)
     some, moving = kept.any(axis=1), spread > moving_spread_m

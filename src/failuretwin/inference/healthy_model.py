@@ -18,7 +18,7 @@ import numpy as np
 
 from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.movements import Movements
-from failuretwin.core.numerics import Ellipsoid, log_sum
+from failuretwin.core.numerics import Covariance, log_sum
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
 from failuretwin.digital_model.nonidealities import Imperfections, Timing
@@ -31,6 +31,7 @@ from failuretwin.inference.command_loss import (
     Standing,
 )
 from failuretwin.inference.evidence import SettledEvidence
+from failuretwin.inference.sensors import TOOL_ALONE, SensorStack
 from failuretwin.inference.settings import InferenceSettings
 
 # How long after its command a movement begins: one distribution, wherever it is asked for.
@@ -141,12 +142,14 @@ class HealthyModel:
         imperfections: Offsets, scatter and rates of lost commands.
         scatter_factor: Factor on all scatter and noise; 1 for a robot as it is.
         untold_noise_m: Noise of the sensor beside what is known of it [m].
+        sensing: Names of the sensors that are believed.
     """
 
     twin: DigitalTwin
     imperfections: Imperfections
     scatter_factor: float = 1.0
     untold_noise_m: float = 0.0
+    sensing: tuple[str, ...] = TOOL_ALONE
 
     @classmethod
     def of(cls, twin: RobotLike, imperfections: HealthyLike = None) -> HealthyModel:
@@ -154,10 +157,20 @@ class HealthyModel:
         known = calibrated(twin, imperfections)
         return cls(known.twin, known.imperfections)
 
+    def seen_by(self, sensing: tuple[str, ...]) -> HealthyModel:
+        """Return the same with other sensors believed."""
+        return self if sensing == self.sensing else replace(self, sensing=sensing)
+
     @cached_property
     def settings(self) -> InferenceSettings:
         """Lengths and angles by which runs of this robot are read."""
         return InferenceSettings.of(self.twin.robot, self.imperfections)
+
+    @cached_property
+    def sensors(self) -> SensorStack:
+        """The sensors that are believed, as one."""
+        known, rough = self._known_noise, self.settings.path_roughness_m
+        return SensorStack.of(self.sensing, self.twin, self.imperfections, known, rough)
 
     @cached_property
     def motor_names(self) -> list[str]:
@@ -251,11 +264,11 @@ class HealthyModel:
         """
         low, high = self.twin.robot.travel.T
         poses = np.random.default_rng(0).uniform(low, high, (LEAST_VISIBLE_POSES, len(low)))
-        _, jacobian = self.twin.path_and_jacobian(poses)
+        _, jacobian = self.sensors.expected(poses)
         found = []
         for motor, own in enumerate(self.scatter):
             others = np.where(np.arange(len(self.scatter)) == motor, 0.0, self.scatter)
-            spread = Ellipsoid.of(jacobian * others, self.path_noise**2)
+            spread = Covariance.of(jacobian * others, self.path_noise**2)
             lever = jacobian[..., motor]
             precision = np.maximum(spread.product(lever, lever), 1e-12)
             found.append(float(np.median(np.sqrt(1.0 / precision + own**2))))
@@ -294,12 +307,12 @@ class HealthyModel:
 
     @cached_property
     def anywhere_log_density(self) -> float:
-        """Log density of a tool that is anywhere within reach [log 1/m3]."""
-        return -float(np.log(4.0 / 3.0 * np.pi * self.twin.robot.reach**3))
+        """Log density of what is seen of an arm that may stand anyhow [log 1/m^dims]."""
+        return self.sensors.log_anywhere(self.path_noise)
 
     @cached_property
     def outlier_log_density(self) -> float:
-        """Log of the outlier rate times the density of "anywhere within reach" [log 1/m3]."""
+        """Log of the outlier rate times the density of "anywhere" [log 1/m^dims]."""
         return float(np.log(OUTLIER_RATE) + self.anywhere_log_density)
 
     @cached_property
@@ -349,22 +362,23 @@ class HealthyModel:
 
     def residual(
         self, point: FloatArray, pose: FloatArray, scale: FloatArray
-    ) -> tuple[FloatArray, FloatArray, Ellipsoid]:
-        """Return what the tool sensor says of poses: all that a settled position is weighed by.
+    ) -> tuple[FloatArray, FloatArray, Covariance]:
+        """Return what the sensors say of poses: all that a settled position is weighed by.
 
-        Linear in the scatter of the motors, r = J dq + noise with J the Jacobian of the position.
+        Linear in the scatter of the motors, r = J dq + noise with J the Jacobian of the channels.
 
         Args:
-            point: Settled positions, (..., 3) [m].
+            point: Settled positions, (..., channel) [m].
             pose: Angles at which the motors settle, (..., motor) [rad].
             scale: Scale of their scatter, (..., motor) [rad]; 0: held.
 
         Returns:
-            The residual r, seen minus expected, (..., 3) [m]; J, (..., 3, motor) [m/rad]; and the
-            scale matrix of r, (...) [m2].
+            The residual r, seen minus expected, (..., channel) [m]; J, (..., channel, motor)
+            [m/rad]; and the scale matrix of r, (...) [m2].
         """
-        predicted, jacobian = self.twin.path_and_jacobian(pose)
-        spread = Ellipsoid.of(jacobian * scale[..., None, :], self.path_noise**2)
+        predicted, jacobian = self.sensors.expected(pose)
+        root = jacobian * scale[..., None, :]
+        spread = Covariance.of(root, self.path_noise**2, self.sensors.dims)
         return point - predicted, jacobian, spread
 
     def outcomes_as_seen(
@@ -419,15 +433,15 @@ class HealthyModel:
 
 
 def scattered(
-    spread: Ellipsoid, jacobian: FloatArray, scale: FloatArray, error: FloatArray
+    spread: Covariance, jacobian: FloatArray, scale: FloatArray, error: FloatArray
 ) -> FloatArray:
     """Return by how much motors scatter, at the most probable, to meet a settled position.
 
     Args:
         spread: Covariance of the position, (...).
-        jacobian: Its derivative by the angles, (..., 3, motor) [m/rad].
+        jacobian: Its derivative by the angles, (..., channel, motor) [m/rad].
         scale: Scatter of each motor, (motor,) [rad].
-        error: Position minus expected position, (..., 3) [m].
+        error: Position minus expected position, (..., channel) [m].
 
     Returns:
         (..., motor) [rad].

@@ -59,6 +59,7 @@ class JointLikelihood(ArrayStruct):
         scatter: Scale of its own settled scatter [rad].
         held_scatter: The same if it is held.
         dof: Degrees of freedom of the scatter.
+        dims: Dimensions in which what is seen can differ.
         outlier: Log density of the tool being anywhere, times its rate.
         usable: Movements with evidence, (run, movement).
         wraps: Whether angles a full turn apart, which are the same, may both come up.
@@ -77,6 +78,7 @@ class JointLikelihood(ArrayStruct):
     scatter: float
     held_scatter: float
     dof: float
+    dims: int
     outlier: float
     usable: Annotated[BoolArray, Axes("run", "movement", empty=False)]
     wraps: bool
@@ -92,7 +94,7 @@ class JointLikelihood(ArrayStruct):
         """
         precision, log_weight = self._with_scatter(held)
         off = self.turned(angle - self.mode)
-        return log_weight + log_fall(self.min_distance2 + precision * off**2, self.dof)
+        return log_weight + log_fall(self.min_distance2 + precision * off**2, self.dof, self.dims)
 
     def log_density(self, angle: FloatArray, held: bool) -> FloatArray:
         """Return the log density of each settled position, whatever became of the commands.
@@ -109,9 +111,8 @@ class JointLikelihood(ArrayStruct):
         lead = log_weight.shape[:-1]
         angle = np.broadcast_to(angle, (*lead, *angle.shape[-2:]))
         total = np.ones((*lead, angle.shape[-2]))
-        matters = (
-            log_weight + log_fall(self.min_distance2, self.dof) > self.outlier - NEGLIGIBLE_NATS
-        )
+        highest = log_weight + log_fall(self.min_distance2, self.dof, self.dims)
+        matters = highest > self.outlier - NEGLIGIBLE_NATS
         # Alternative by alternative: large temporary arrays would cost more than the arithmetic.
         for k in range(log_weight.shape[-1]):
             some = matters[..., k]
@@ -122,7 +123,7 @@ class JointLikelihood(ArrayStruct):
             off *= off
             off *= precision[some, k, None]
             off += self.min_distance2[some, k, None]
-            fall = log_fall(off, self.dof)
+            fall = log_fall(off, self.dof, self.dims)
             fall += log_weight[some, k, None] - self.outlier
             total[some] += np.exp(fall, out=fall)
         found = self.outlier + np.log(total)
@@ -179,14 +180,14 @@ def joint_likelihoods(
     worthwhile[..., 0] = True  # where the motor settles if it gets its command is always told
     possible = np.broadcast_to(worthwhile, lead)
     base, direction = base[possible], np.broadcast_to(direction, base.shape)[possible]
-    point = np.broadcast_to(point, (*lead, 3))[possible]
+    point = np.broadcast_to(point, (*lead, point.shape[-1]))[possible]
     log_weight = np.broadcast_to(log_weight, lead)[possible]
     expected = model.settle(base, direction, another)
     # A leading axis for the motors: own marks each of them among all, (own, 1, motor).
     own = np.eye(len(model.scatter), dtype=bool)[list(motors)][:, None]
     rest = np.where(another & other_held, model.held_scatter, model.scatter)
     scale = np.where(own, 0.0, rest)
-    angle = nearest_on_circle(model, expected, own, point)
+    angle = model.sensors.nearest(expected, own, point)
     for _ in range(REFINEMENTS):
         pose = np.where(own, angle[..., None], base)
         settled = model.settle(pose, direction, own | another)
@@ -220,6 +221,7 @@ def joint_likelihoods(
             scatter=float(model.scatter[motor]),
             held_scatter=float(model.held_scatter[motor]),
             dof=dof,
+            dims=model.sensors.dims,
             outlier=model.outlier_log_density,
             usable=evidence.usable,
             wraps=_may_turn_around(model, motor),
@@ -259,36 +261,6 @@ def _may_turn_around(model: HealthyModel, motor: int) -> bool:
     """Return whether a motor may be half a turn or more from where it should be."""
     low, high = model.twin.robot.travel[motor]
     return not model.twin.robot.slides[motor] and FURTHEST_OFF * (high - low) > np.pi
-
-
-def nearest_on_circle(
-    model: HealthyModel, pose: FloatArray, own: BoolArray, point: FloatArray
-) -> FloatArray:
-    """Return the angle of each motor that brings the tool nearest to `point`, (own, ...) [rad].
-
-    Three poses say where the circle lies (the line, if the joint slides).
-
-    Args:
-        model: The healthy robot.
-        pose: Angles of all motors, (..., motor) [rad].
-        own: Which motor is meant, (own, ..., motor).
-        point: Tool position, (..., axis) [m].
-    """
-    turned = np.array([0.0, 0.5 * np.pi, np.pi])[:, None]
-    path = model.twin.path(np.where(own[..., None, :], turned, pose[..., None, :]))
-    first, quarter, half = path[..., 0, :], path[..., 1, :], path[..., 2, :]
-    centre = 0.5 * (first + half)
-    cosine, sine, toward = first - centre, quarter - centre, point - centre
-    found = np.arctan2(np.sum(toward * sine, axis=-1), np.sum(toward * cosine, axis=-1))
-    here = np.sum(pose * own, axis=-1)
-    found = found + 2.0 * np.pi * np.rint((here - found) / (2.0 * np.pi))
-    slides = model.twin.robot.slides
-    if not slides.any():
-        return np.asarray(found)
-    along = (half - first) / np.pi
-    length = np.maximum(np.sum(along**2, axis=-1), 1e-12)
-    reached = np.sum((point - first) * along, axis=-1) / length
-    return np.where((own & slides).any(axis=-1), reached, found)
 
 
 # What every movement says by itself: of a healthy robot, and of each motor alone.

@@ -43,19 +43,21 @@ class Whitened(ArrayStruct):
     """Residuals and their columns in units of their scale, (run, movement, outcome, ...).
 
     Attributes:
-        rho: L^-1 r, (..., 3).
-        gamma: L^-1 G, (..., 3, theta).
+        rho: L^-1 r, (..., channel).
+        gamma: L^-1 G, (..., channel, theta).
         log_norm: Log density at the centre, (...).
-        levers: L^-1 J, (..., 3, motor).
+        levers: L^-1 J, (..., channel, motor).
+        dims: Dimensions in which what is seen can differ.
     """
 
     rho: Vector
     gamma: Annotated[FloatArray, Axes("run", "movement", "outcome", "axis", "theta")]
     log_norm: PerOutcome
     levers: Annotated[FloatArray, Axes("run", "movement", "outcome", "axis", "motor")]
+    dims: int = 3
 
     def off(self, delta: FloatArray) -> FloatArray:
-        """Return rho - Gamma delta, (run, movement, outcome, 3).
+        """Return rho - Gamma delta, (run, movement, outcome, channel).
 
         Args:
             delta: Change of theta, (run, theta).
@@ -193,7 +195,9 @@ class LinearResponse:
             motors: The motors; the others stand as at theta.
         """
         density = self.healthy.log_norm
-        density = density + log_fall(self.healthy.square(delta), self.model.settling.tail_dof)
+        density = density + log_fall(
+            self.healthy.square(delta), self.model.settling.tail_dof, self.model.sensors.dims
+        )
         outcomes = self.model.filtered_outcomes(self.evidence, self.usual, density)
         profiles = list(self.findings.profiles)
         for k in motors:
@@ -247,4 +251,5 @@ class _Place:
         g = columns(self.model, pose, jacobian, direction, self.layout)
         rho = np.matmul(inverse, error[..., None])[..., 0]
         norm = spread.log_norm(self.model.settling.tail_dof)
-        return Whitened(rho, np.matmul(inverse, g), norm, np.matmul(inverse, jacobian))
+        levers, dims = np.matmul(inverse, jacobian), self.model.sensors.dims
+        return Whitened(rho, np.matmul(inverse, g), norm, levers, dims)

@@ -140,6 +140,27 @@ def unused_movements(evidence: SettledEvidence, run: int) -> list[str]:
     return lines
 
 
+def sensor_quality(runs: xr.Dataset, readings: MeasuredSamples) -> list[LogQuality]:
+    """Return the defects of each run's log where the tool's position is not seen.
+
+    Args:
+        runs: A run set; `command` is read.
+        readings: The readings of the sensors that are believed.
+    """
+    time, rate = as_floats(runs["time"].values), measured_rate(runs)
+    told = as_floats(runs["command"].values)
+    found = []
+    for command, point, seen in zip(told, readings.point, readings.seen, strict=True):
+        if seen.sum() < 2:
+            found.append(LogQuality(fatal="the log holds no readings of the sensors"))
+            continue
+        remarks = (*_timing(time[seen], rate), *_gaps(time[seen], rate))
+        frozen = [_frozen(time, command, values, seen) for values in point.T]
+        dead = "the sensors stand still though motors are told to move: they are dead"
+        found.append(LogQuality(remarks, dead if all(frozen) else ""))
+    return found
+
+
 def drop_invalid(runs: xr.Dataset, quality: Sequence[LogQuality]) -> xr.Dataset:
     """Return the runs with spoilt readings missing; the given run set stays as it is."""
     if not any(q.spoilt for q in quality):

@@ -242,7 +242,9 @@ def abstention_reason(
     if 2 * unexplained.sum() <= usable.sum():
         return ""
     which = ", ".join(str(m + 1) for m in np.flatnonzero(unexplained))
-    target, point = evidence.movements.target[run][usable], evidence.point[run][usable]
+    if not model.sensors.sees_tool:
+        return f"after movement {which} no hypothesis explains what the sensors read"
+    target, point = evidence.movements.target[run][usable], evidence.point[run][usable, :3]
     return f"after movement {which} {NOWHERE}: {nowhere_near(model.twin, target, point)}"
 
 
@@ -347,6 +349,7 @@ class Posterior:
         posterior = self.posterior(run, undecided)
         unused = unused_movements(evidence, run)
         used = "settled poses" if self.likelihood.moving is None else "whole run"
+        used += "" if model.sensors.tool_alone else f", by {'+'.join(model.sensing)}"
         diagnosis = Diagnosis(
             run=name,
             truth=truth,

@@ -4,9 +4,9 @@
 
 By Fisher's identity the score b is the mean of the complete score over all that is unknown; by
 Louis's identity the information A is the complete information less what the unknown angle of the
-faulty motor takes away. With weights w of outcomes and states, u = (nu + 3)/(nu + D^2),
+faulty motor takes away. With weights w of outcomes and states, u = (nu + d)/(nu + D^2),
 
-    b = sum w u Gamma^T rho,    A = sum w (nu + 3)/(nu + 5) Gamma^T Gamma - missing
+    b = sum w u Gamma^T rho,    A = sum w (nu + d)/(nu + d + 2) Gamma^T Gamma - missing
 
 A motor with an active fault says nothing of its own offsets. An angle that holds for the run is
 common to its movements; an offset that is drawn anew takes away all along its lever.
@@ -163,12 +163,12 @@ def _sums(
         nu: Degrees of freedom of the scatter.
     """
     runs, size = len(off), seen.gamma.shape[-1]
-    u = _pull(square, nu)
+    u = _pull(square, nu, seen.dims)
     score = np.matmul(
         np.reshape((u * weight)[..., None] * off, (runs, 1, -1)),
         np.reshape(seen.gamma, (runs, -1, size)),
     )
-    scaled = seen.gamma * np.sqrt(_mean_pull(nu) * weight)[..., None, None]
+    scaled = seen.gamma * np.sqrt(_mean_pull(nu, seen.dims) * weight)[..., None, None]
     scaled = np.reshape(scaled, (runs, -1, size))
     lead = tuple(range(1, weight.ndim))
     moved = np.einsum("...k,...kn->...n", off, seen.levers) ** 2 * u[..., None]
@@ -221,7 +221,9 @@ def _faulty_sums(
         np.arange(response.layout.motors) == fault_model.motor, 0.0, response.model.scatter
     )
     sums = _sums(motor.seen, off, square, weight, others, nu)
-    pull, mean = _pull(square, nu) * weight * loose, _mean_pull(nu) * weight * loose
+    dims = motor.seen.dims
+    pull = _pull(square, nu, dims) * weight * loose
+    mean = _mean_pull(nu, dims) * weight * loose
     score = sums.score - np.einsum("rma,rmat->rt", pull * beyond, motor.lever)
     if fault_model.redrawn is None:
         along = _along_lever(motor, mean, precision, spread)
@@ -305,14 +307,14 @@ def _redrawn_angle(
     return mean, np.einsum("rmn,rmna->rma", share, (angle - mean[:, :, None]) ** 2)
 
 
-def _pull(square: FloatArray, nu: float) -> FloatArray:
+def _pull(square: FloatArray, nu: float, dims: int) -> FloatArray:
     """Return u, the weight that a Student t gives a deviation of squared distance D^2."""
-    return np.ones_like(square) if np.isinf(nu) else (nu + 3.0) / (nu + square)
+    return np.ones_like(square) if np.isinf(nu) else (nu + dims) / (nu + square)
 
 
-def _mean_pull(nu: float) -> float:
+def _mean_pull(nu: float, dims: int) -> float:
     """Return what the information of a Student t is of that of a normal with its scale."""
-    return 1.0 if np.isinf(nu) else (nu + 3.0) / (nu + 5.0)
+    return 1.0 if np.isinf(nu) else (nu + dims) / (nu + dims + 2.0)
 
 
 # A normal distribution of theta times a local likelihood: its integral and what is left of it.

@@ -55,7 +55,7 @@ def set_up_in_doubt(
         priors: Beliefs about faults and set-ups.
     """
     scored = [h for h in hypotheses if has_score(h)]
-    if priors.setup.doubt == 0.0 or not scored:
+    if priors.setup.doubt == 0.0 or not scored or not likelihood.model.sensors.tool_alone:
         return False
     settled = replace(likelihood, moving=None)
     told = [*scored, *(h for h in hypotheses if len(h.faults) > 1)]
@@ -80,7 +80,7 @@ def shared_posterior(
     weighing = SharedWeighing(likelihood, hypotheses, priors)
     if in_doubt:
         return Mixture.of(weighing, weighing.candidates).posterior()
-    if weighing.layout.offsets:
+    if weighing.layout.offsets or likelihood.model.sensors.in_doubt:
         return Mixture.of(weighing, weighing.as_told).posterior()
     return compute_posterior(likelihood, hypotheses, priors)
 

@@ -25,6 +25,7 @@ from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.settling import Settling, loads_in_range
 from failuretwin.inference.evidence import SettledEvidence, TransientSamples
 from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.sensors import SensorStack
 
 ORIGIN, TURN, SCALE = slice(0, 3), slice(3, 6), slice(6, 7)
 """Places of t [m], w [rad] and k [-] in theta."""
@@ -63,24 +64,35 @@ def columns(
     direction: FloatArray,
     layout: SharedLayout,
 ) -> FloatArray:
-    """Return G, the derivative of expected tool positions by theta, (..., 3, theta).
+    """Return G, the derivative of what is expected by theta, (..., channel, theta).
+
+    Registration is that of one sensor; the channels of others do not change with it.
 
     Args:
         model: The healthy robot.
         pose: Angles at which the motors settle, (..., motor) [rad].
-        jacobian: J there, (..., 3, motor) [m/rad].
+        jacobian: J there, (..., channel, motor) [m/rad].
         direction: Sign of their last travel, (..., motor).
         layout: What stands in theta.
     """
-    x = model.twin.path(pose)
-    origin = np.broadcast_to(np.eye(3), (*x.shape[:-1], 3, 3))
-    turn = np.swapaxes(np.cross(np.eye(3), x[..., None, :]), -1, -2)
-    rigid = [origin, turn, x[..., None]]
+    rigid = [_rigid(model, pose)]
     if not layout.offsets:
         return np.concatenate(rigid, axis=-1)
     load = loads(model, pose)[..., None, :]
     parts = [*rigid, jacobian, jacobian * load, -jacobian * direction[..., None, :]]
     return np.concatenate(parts, axis=-1)
+
+
+def _rigid(model: HealthyModel, pose: FloatArray) -> FloatArray:
+    """Return the columns of t, w and k, (..., channel, 7)."""
+    value, own = model.sensors.value(pose), model.sensors.registered
+    found = np.zeros((*value.shape, REGISTRATION))
+    if own is not None:
+        x = value[..., own]
+        found[..., own, ORIGIN] = np.eye(3)
+        found[..., own, TURN] = np.swapaxes(np.cross(np.eye(3), x[..., None, :]), -1, -2)
+        found[..., own, SCALE] = x[..., None]
+    return found
 
 
 def loads(model: HealthyModel, pose: FloatArray) -> FloatArray:
@@ -108,14 +120,38 @@ def registered(point: FloatArray, theta: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("rji,r...j->r...i", turn, shifted) / scale)
 
 
-def registered_evidence(evidence: SettledEvidence, theta: FloatArray) -> SettledEvidence:
-    """Return settled positions in the robot's base frame; `theta` as for `registered`."""
-    return replace(evidence, point=registered(evidence.point, theta))
+def registered_evidence(
+    evidence: SettledEvidence, theta: FloatArray, sensors: SensorStack | None = None
+) -> SettledEvidence:
+    """Return settled positions as the model has them; `theta` as for `registered`.
+
+    Args:
+        evidence: Settled positions.
+        theta: Registration of each run, (run, 7 or more).
+        sensors: What is believed; None: the tool's position alone.
+    """
+    own = slice(None) if sensors is None else sensors.registered
+    return replace(evidence, point=_registered(evidence.point, theta, own))
 
 
-def registered_samples(samples: TransientSamples, theta: FloatArray) -> TransientSamples:
-    """Return readings on the way in the robot's base frame; `theta` as for `registered`."""
-    return replace(samples, point=registered(samples.point, theta))
+def registered_samples(
+    samples: TransientSamples, theta: FloatArray, sensors: SensorStack | None = None
+) -> TransientSamples:
+    """Return readings on the way as the model has them; see `registered_evidence`."""
+    if sensors is None:
+        return replace(samples, point=registered(samples.point, theta))
+    there = theta.copy()
+    there[:, ORIGIN] *= sensors.unit_on_way
+    return replace(samples, point=_registered(samples.point, there, sensors.registered))
+
+
+def _registered(point: FloatArray, theta: FloatArray, own: slice | None) -> FloatArray:
+    """Return channels with those of the sensor that theta is of registered."""
+    if own is None:
+        return point
+    found = point.copy()
+    found[..., own] = registered(point[..., own], theta)
+    return found
 
 
 # What is believed of theta before a run is seen: a mixture of normal distributions about the model.
@@ -231,6 +267,9 @@ def components(
     least[motors : 2 * motors] /= np.maximum(typical_load(model), 1e-3)
     offsets = np.maximum(offset_deviation(model), least)[: layout.size - REGISTRATION]
     known = np.concatenate([np.full(3, KNOWN * 0.003 * reach), np.full(4, KNOWN * 0.003), offsets])
+    constant, turned = model.sensors.deviations
+    known[ORIGIN] = np.maximum(known[ORIGIN], constant)
+    known[TURN] = np.maximum(known[TURN], turned)
 
     def off(name: str, rate: float, origin: float, turn: float, scale: float) -> SharedComponent:
         deviation = known.copy()

@@ -209,9 +209,9 @@ class SharedWeighing:
         """Return some of the runs, registered."""
         likelihood = self.likelihood
         model = replace(likelihood.model, untold_noise_m=untold_noise_m)
-        seen = registered_evidence(likelihood.evidence[rows], place)
+        seen = registered_evidence(likelihood.evidence[rows], place, model.sensors)
         way = likelihood.moving
-        way = None if way is None else registered_samples(way[rows], place)
+        way = None if way is None else registered_samples(way[rows], place, model.sensors)
         return Expansion(LinearResponse.of(seen, model, self.layout, way), place)
 
     def search(self, at: Expansion, prior: Normal, start: FloatArray) -> Weighed:

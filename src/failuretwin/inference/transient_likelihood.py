@@ -16,28 +16,15 @@ from functools import cached_property
 
 import numpy as np
 
-from failuretwin.core.numerics import along_polyline, log_fall, log_norm, log_of, log_sum
+from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.inference.evidence import SettledEvidence, TransientSamples
-from failuretwin.inference.healthy_model import HealthyModel, StartNodes
 from failuretwin.inference.joint_likelihood import (
     LARGEST_OFFSET_RAD,
     JointLikelihood,
     MovementLikelihoods,
 )
+from failuretwin.inference.path_likelihood import PathLikelihood
 
-KNOTS = 11
-"""Instants of a ramp at which the path is computed; between them it is a straight line."""
-SEEN, UNSEEN = 0.3, 12.0
-"""Factors on the variance of the settled scatter, where both ends of a movement were seen and where
-not. All readings of a movement share its ends, so that each tells a twelfth of what is not known of
-them; what is known of them is taken as it was seen."""
-JITTER_S = 0.012
-"""Standard deviation of the stamps of single readings [s], on top of the shared lag."""
-DOF = 4.0
-"""Degrees of freedom of single readings: heavy tails."""
-GLITCH_RATE = 0.03
-"""Share of readings that may be anywhere within reach [-]."""
 STARTS_RAD = np.linspace(-LARGEST_OFFSET_RAD, LARGEST_OFFSET_RAD, 13)
 """Where a motor may stand before the run if not where it should, from there."""
 RARELY_ELSEWHERE = 0.01
@@ -56,20 +43,14 @@ movement was not seen."""
 
 
 @dataclass(frozen=True)
-class TransientLikelihood:
+class TransientLikelihood(PathLikelihood):
     """Log densities of the readings on the way, for healthy robots and for faults of one motor.
 
     Attributes:
-        model: The healthy robot.
-        settled: Settled positions of the runs: their movements and times.
-        moving: Readings on the way.
         findings: What every movement says by itself.
         start: Pose of a healthy arm before the run, (run, motor) [rad].
     """
 
-    model: HealthyModel
-    settled: SettledEvidence
-    moving: TransientSamples
     findings: MovementLikelihoods
     start: FloatArray
 
@@ -92,12 +73,13 @@ class TransientLikelihood:
             (run, movement, node).
         """
         usable, lost = self.settled.usable[..., None], self.findings.outcomes.lost
-        seen = np.argmax(profile.log_terms(profile.mode, True), axis=-1)
+        terms = profile.log_terms(profile.mode, True)
+        seen = np.argmax(terms, axis=-1)
         nearest = self._nearest_seen(_at(profile.mode, seen), motor)[..., None]
         ends = np.where(usable[..., None], profile.map_pose, self.findings.expected)
         ends[..., motor] = nearest
         whatever = lost | (np.arange(lost.shape[1]) == motor)  # becomes of its own command
-        chosen, log_correction = self._fill_in(ends, seen, whatever)
+        chosen, log_correction = self._fill_in(ends, seen, whatever, terms)
         origin, destination = self._course(ends, chosen, whatever)
         begin, end, duration = (
             np.repeat(values[:, :, None], angle.shape[1], axis=2)
@@ -129,16 +111,19 @@ class TransientLikelihood:
         """
         usable, largest = self.settled.usable[..., None], LARGEST_OFFSET_RAD
         near = profile.expected + np.clip(profile.mode - profile.expected, -largest, largest)
-        seen = np.argmax(profile.log_terms(near, False), axis=-1)
+        terms = profile.log_terms(near, False)
+        seen = np.argmax(terms, axis=-1)
         ends = np.where(usable[..., None], profile.map_pose, self.findings.expected)
         unseen = profile.expected
         if gain is not None:
             amount = self._amount(_at(near - profile.expected, seen), _at(gain, seen))
             unseen = unseen + np.clip(gain * amount[:, None, None], -largest, largest)
         ends[..., motor] = np.where(usable, near, unseen)
-        return self.toward(ends, seen, motor)
+        return self.toward(ends, seen, motor, terms)
 
-    def toward(self, ends: FloatArray, outcome: IntArray, off: int) -> FloatArray:
+    def toward(
+        self, ends: FloatArray, outcome: IntArray, off: int, terms: FloatArray | None = None
+    ) -> FloatArray:
         """Return the log density if the motors go from one given pose to the next.
 
         Args:
@@ -146,12 +131,13 @@ class TransientLikelihood:
                 (run, movement, outcome, motor) [rad].
             outcome: What did, where its end was seen, (run, movement).
             off: Motor that may have been off before the run.
+            terms: What is seen at rest of each outcome, as for `_fill_in`.
 
         Returns:
             (run, movement).
         """
         lost = self.findings.outcomes.lost
-        chosen, log_correction = self._fill_in(ends, outcome, lost)
+        chosen, log_correction = self._fill_in(ends, outcome, lost, terms)
         return self._from_to(*self._course(ends, chosen, lost), log_correction, off)
 
     def delayed_or_slow(
@@ -257,21 +243,41 @@ class TransientLikelihood:
         return np.where(lost[chosen], destination, before), destination
 
     def _fill_in(
-        self, ends: FloatArray, chosen: IntArray, lost: BoolArray
+        self,
+        ends: FloatArray,
+        chosen: IntArray,
+        lost: BoolArray,
+        terms: FloatArray | None = None,
     ) -> tuple[IntArray, FloatArray]:
         """Find out what became of movements whose end was not seen, by the way there and on.
+
+        Of all movements where what is seen at rest does not show every motor: each outcome then
+        weighs what that leaves it.
+
+        Args:
+            ends: As for `_course`.
+            chosen: What became of each movement, where its end was seen.
+            lost: Motors that lose their command in each outcome, (outcome, motor).
+            terms: Log weight times density of what was seen at rest under each outcome,
+                (run, movement, outcome); None: of a healthy robot.
 
         Returns:
             What became of each movement, the most probable where its end was not seen, and the
             log of what all outcomes together say over what that one says alone, (run, movement).
         """
-        usable = self.settled.usable
+        usable, log_weight = self.settled.usable, self.findings.outcomes.log_weight
+        power = 1.0  # to which the way is taken beside what is known of each outcome
+        if not self.model.sensors.tells_all_at_rest:
+            terms = self.findings.terms if terms is None else terms
+            left = terms - log_sum(terms, axis=-1)[..., None]
+            log_weight, usable = np.where(usable[..., None], left, log_weight), usable & False
+            power = TEMPERING
         chosen, log_correction = np.where(usable, chosen, 0), np.zeros(usable.shape)
         unseen = np.nonzero(self.settled.movements.exists & ~usable)
         if len(unseen[0]) == 0:
             return chosen, log_correction
         origin, destination = self._course(ends, chosen, lost)
-        log_weight = self.findings.outcomes.log_weight[unseen]
+        log_weight = log_weight[unseen]
         item, outcome = np.nonzero(np.isfinite(log_weight))
         run, number = unseen[0][item], unseen[1][item]
         here = ends[run, number, outcome]
@@ -284,9 +290,9 @@ class TransientLikelihood:
         says = np.full(log_weight.shape, -np.inf)
         says[item, outcome] = self.log_density((run, number), begin[:, None], here[:, None])[:, 0]
         says[item, outcome] += np.where(follows, next_one, 0.0)
-        weighed = says + np.where(np.isfinite(says), log_weight, 0.0)
+        weighed = power * says + np.where(np.isfinite(says), log_weight, 0.0)
         chosen[unseen] = best = np.argmax(weighed, axis=-1)
-        log_correction[unseen] = log_sum(weighed, axis=-1) - _at(says, best)
+        log_correction[unseen] = log_sum(weighed, axis=-1) / power - _at(says, best)
         return chosen, log_correction
 
     def _from_anywhere(
@@ -322,126 +328,6 @@ class TransientLikelihood:
             other[run] += log_sum(weighed, axis=-1) - np.log(len(STARTS_RAD))
             total = np.logaddexp(total, other)
         return np.concatenate([total.T[:, None], says[:, 1:]], axis=1)
-
-    def _of_runs(
-        self,
-        origin: FloatArray,
-        destination: FloatArray,
-        duration: FloatArray | None = None,
-        delay: FloatArray | None = None,
-        spread_m: float = 0.0,
-    ) -> FloatArray:
-        """Return `log_density` of all movements, (run, movement, case); 0 without readings."""
-        item = np.nonzero(self.moving.seen.any(axis=-1))
-        found = np.zeros(origin.shape[:-1])
-        lasts = None if duration is None else duration[item]
-        found[item] = self.log_density(
-            item, origin[item], destination[item], lasts, delay, spread_m
-        )
-        return found
-
-    def log_density(
-        self,
-        item: tuple[IntArray, ...],
-        origin: FloatArray,
-        destination: FloatArray,
-        duration: FloatArray | None = None,
-        delay: FloatArray | None = None,
-        spread_m: float = 0.0,
-    ) -> FloatArray:
-        """Return the log density of the readings of some movements, (item, case).
-
-        Args:
-            item: Their runs and numbers, (item,) each.
-            origin: Where each motor starts, (item, case, motor) [rad].
-            destination: Where it goes, (item, case, motor) [rad].
-            duration: How long it takes, (item, case, motor) [s]; None: as commanded.
-            delay: How much later than the others it starts, (case, motor) [s]; None: no later.
-            spread_m: How far the tool may stray from its way beside what is usual [m].
-        """
-        if duration is None:
-            duration = self.settled.movements.ramp_duration[item][:, None]
-        late = np.zeros(origin.shape[1:]) if delay is None else delay
-        path, longest = self._path(origin, destination, np.nan_to_num(duration), late)
-        variance = self._variance(item, destination[:, 0]) + spread_m**2
-        found = np.full(origin.shape[:2], -np.inf)
-        for start, log_chance in self._starts:
-            chance = log_chance[item]
-            some = np.flatnonzero(chance > -np.inf)
-            if len(some) > 0:
-                at, ways = tuple(index[some] for index in item), (path[some], longest[some])
-                says = self._of_starts(at, *ways, variance[some], start)
-                found[some] = np.logaddexp(found[some], says + chance[some, None])
-        return found
-
-    @cached_property
-    def _starts(self) -> tuple[tuple[StartNodes, FloatArray], ...]:
-        """Punctual and late starts, and the log probability of each, (run, movement)."""
-        late = log_of(self.model.late(self.settled.movements, self.settled.first_reading_delay))
-        delay, on_time = self.model.start_delay, log_of(-np.expm1(np.minimum(late, 0.0)))
-        return (delay.punctual, on_time), (delay.late, late)
-
-    def _of_starts(
-        self,
-        item: tuple[IntArray, ...],
-        path: FloatArray,
-        longest: FloatArray,
-        variance: FloatArray,
-        start: StartNodes,
-    ) -> FloatArray:
-        """Return log densities of movements that begin so late, (item, case).
-
-        A reading is of a 3-variate Student t around the path, wider along it by the doubt of its
-        time, or anywhere within reach.
-
-        Args:
-            item: Runs and numbers of movements, (item,) each.
-            path: The tool at each knot, (item, case, knot, axis) [m].
-            longest: Time of the last knot, (item, case) [s].
-            variance: Of a reading on each axis, (item,) [m2].
-            start: How late.
-        """
-        variance = variance[:, None, None, None]
-        since = self.moving.since[item][:, None, :, None] - start.delay  # (.., reading, start)
-        predicted, velocity = along_polyline(path, longest, since)
-        point = self.moving.point[item][:, None, :, None]
-        error = [point[..., axis] - predicted[axis] for axis in range(3)]
-        speed2 = sum(v * v for v in velocity)
-        along2 = sum(e * v for e, v in zip(error, velocity, strict=True)) ** 2
-        along2 /= np.maximum(speed2, 1e-12)
-        error2 = sum(e * e for e in error)
-        stretched = variance + speed2 * (JITTER_S**2 + start.step_s**2 / 12.0)
-        square = np.maximum(error2 - along2, 0.0) / variance + along2 / stretched
-        log_at = log_fall(square, DOF) - 0.5 * np.log(stretched)
-        log_at += log_norm(DOF) - np.log(variance) + np.log1p(-GLITCH_RATE)
-        log_at = np.logaddexp(log_at, np.log(GLITCH_RATE) + self.model.anywhere_log_density)
-        log_at *= self.moving.seen[item][:, None, :, None]
-        return log_sum(log_at.sum(axis=2) + start.log_weight, axis=-1)
-
-    def _variance(self, item: tuple[IntArray, ...], destination: FloatArray) -> FloatArray:
-        """Return the variance of a reading on each axis, (item,) [m2]; ends (item, motor) [rad]."""
-        _, jacobian = self.model.twin.path_and_jacobian(destination)
-        scaled = np.sum((jacobian * self.model.scatter) ** 2, axis=(-1, -2)) / 3.0
-        seen = self.settled.usable.copy()
-        seen[:, 1:] &= self.settled.usable[:, :-1]
-        rough = self.model.settings.path_roughness_m
-        return np.where(seen[item], SEEN, UNSEEN) * scaled + self.model.path_noise**2 + rough**2
-
-    def _path(
-        self, origin: FloatArray, destination: FloatArray, duration: FloatArray, delay: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the tool at each knot, (item, case, knot, axis) [m], and its time at the last one.
-
-        The latter is (item, case) [s]; arguments as for `log_density`.
-        """
-        duration = duration * (1.0 - self.model.shortening)
-        longest = np.maximum((duration + delay).max(axis=-1), 0.05)
-        longest = np.broadcast_to(longest, origin.shape[:2])
-        at = longest[..., None] * np.linspace(0.0, 1.0, KNOTS)
-        since = at[..., None] - delay[:, None]  # (item, case, knot, motor)
-        share = np.clip(since / np.maximum(duration, 1e-6)[..., None, :], 0.0, 1.0)
-        pose = origin[..., None, :] + share * (destination - origin)[..., None, :]
-        return self.model.twin.path(pose), longest
 
 
 def _at(values: FloatArray, outcome: IntArray) -> FloatArray:

@@ -22,7 +22,6 @@ from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.inference.command_loss import CommandOutcomes
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.joint_likelihood import nearest_on_circle
 
 SCANNED = 16
 """Angles of the first motor from which a way is looked for; more find no other ways."""
@@ -95,7 +94,11 @@ def two_joint_likelihood(
         near = _laplace(evidence.point, model, chosen, pair, angle)
         angle = angle + near.step
     dof = model.settling.tail_dof
-    log_weight = chosen.log_weight[..., None] + near.log_norm + log_fall(near.square, dof, dims=1)
+    log_weight = (
+        chosen.log_weight[..., None]
+        + near.log_norm
+        + log_fall(near.square, dof, model.sensors.dims - 2)
+    )
     log_weight = np.where(_found(model, pair, angle, near.covariance), log_weight, -np.inf)
     shape = (*evidence.usable.shape, len(followed) * SOLUTIONS)
     return TwoJointLikelihood(
@@ -160,7 +163,7 @@ def _laplace(
         step,
         np.maximum(spread.product(error, error) - np.sum(step * left, axis=-1), 0.0),
         covariance,
-        log_norm(model.settling.tail_dof, dims=1) + 0.5 * np.log(area),
+        log_norm(model.settling.tail_dof, model.sensors.dims - 2) + 0.5 * np.log(area),
     )
 
 
@@ -184,8 +187,8 @@ def _starts(
     poses[..., first] = grid
     point = point[:, :, None, None]
     own = (np.arange(pose.shape[-1]) == second).reshape(1, *(1,) * (poses.ndim - 1), -1)
-    poses[..., second] = nearest_on_circle(model, poses, own, point)[0]
-    distance = np.sum((model.twin.path(poses) - point) ** 2, axis=-1)
+    poses[..., second] = model.sensors.nearest(poses, own, point)[0]
+    distance = np.sum((model.sensors.value(poses) - point) ** 2, axis=-1)
     wall = np.full_like(distance[..., :1], np.inf)
     left = np.concatenate([wall, distance[..., :-1]], axis=-1)
     right = np.concatenate([distance[..., 1:], wall], axis=-1)

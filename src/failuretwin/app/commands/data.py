@@ -97,6 +97,12 @@ def import_(
     "gears that stick and joints that flex.",
 )
 @click.option(
+    "--sensors",
+    metavar="KIND,...",
+    help="Sensors to simulate beside that of the tool's position, as the profile has them: "
+    "accelerometer, gyroscope, orientation, wire.",
+)
+@click.option(
     "--faults",
     type=PATH,
     metavar="FILE",
@@ -124,6 +130,7 @@ def simulate(
     hypotheses: str | None,
     imperfections: str,
     engine: str,
+    sensors: str | None,
     faults: Path | None,
     workers: int,
     scheduler: str | None,
@@ -157,6 +164,7 @@ def simulate(
         seed=seed,
         imperfections=known.imperfections,
         engine=engine,
+        sensors=[] if sensors is None else [kind.strip() for kind in sensors.split(",")],
         modes=MODES if faults is None else load_modes(faults),
     )
     workforce = Workforce(workers, scheduler)

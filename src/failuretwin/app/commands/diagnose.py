@@ -83,6 +83,12 @@ if TYPE_CHECKING:
     "0.1 2 deg.",
 )
 @click.option("--onset", type=float, metavar="SECONDS", help="Onset of stuck faults, where known.")
+@click.option(
+    "--sensing",
+    metavar="SENSOR+...",
+    help="What to believe: tool (its position), orientation, accelerometer, gyroscope, wire, "
+    "encoders, or several joined by '+'. Default: tool where runs have it, else what they have.",
+)
 @click.option("--json", "json_file", type=PATH, help="Write an object a line, a line a run.")
 @click.option("--csv", "csv_file", type=PATH, help="Write a table, a row a run.")
 @click.option(
@@ -106,6 +112,7 @@ def diagnose(
     sse_range: tuple[float, float] | None,
     error_range: tuple[float, float, str] | None,
     onset: float | None,
+    sensing: str | None,
     json_file: Path | None,
     csv_file: Path | None,
     plot: Path | None,
@@ -113,7 +120,7 @@ def diagnose(
     robot: str,
     seed: int,
 ) -> None:
-    """Diagnose runs from commands and tool path alone.
+    """Diagnose runs from commands and tool path alone, or what other sensors saw (--sensing).
 
     INPUT is a run set (.nc, .zarr), a folder with raw sessions or published MATLAB files (searched
     downwards), such a file (.mat), a bag (.bag, .mcap), a LeRobot data set (a folder), an RTDE
@@ -139,6 +146,7 @@ def diagnose(
     from failuretwin.inference.fault_course import FaultCourse
     from failuretwin.inference.posterior import log_prior
     from failuretwin.inference.priors import priors_of
+    from failuretwin.inference.sensors import TOOL_ALONE, sensing_of
 
     model = load_robot(robot)
     known = load_calibration(calibration, model)
@@ -147,6 +155,7 @@ def diagnose(
         imperfections=known.imperfections,
         hypotheses=parse_cli_hypotheses(hypotheses, model),
         priors=priors_of(model, sse_range, onset, error_range),
+        sensing=sensing,
     )
     settings = {
         "--calibration": calibration,
@@ -156,9 +165,10 @@ def diagnose(
         "--sse-range": sse_range,
         "--error-range": error_range,
         "--onset": onset,
+        "--sensing": sensing,
     }
     diagnoser = chosen_diagnoser(method, bayes, settings)
-    _check_together(calibration, track, self_calibrate, out, independent)
+    _check_together(calibration, track, self_calibrate, out, independent, sensing)
     history = tracking.open_history(bayes, calibration) if track and calibration else None
     runs = read_inputs(inputs, model, reading)
     warn_mismatch(runs, expected_name(diagnoser, bayes))
@@ -176,7 +186,7 @@ def diagnose(
     if tracked is not None:
         tracking.keep_history(tracked)
     reports.print_diagnoses(diagnoses)
-    if method == "bayes":
+    if method == "bayes" and sensing_of(runs, sensing) == TOOL_ALONE:
         show(*reports.isolability_summary(runs, bayes))
     reports.print_scores(Judged.of(diagnoses))
     prior = np.exp(log_prior(bayes.hypothesis_set, bayes.priors))
@@ -196,6 +206,7 @@ def _check_together(
     self_calibrate: bool,
     out: Path | None,
     independent: bool,
+    sensing: str | None,
 ) -> None:
     """Refuse ways of weighing runs together that contradict each other.
 
@@ -208,6 +219,11 @@ def _check_together(
         raise InputError("--out is for what --self-calibrate learns. Add --self-calibrate.")
     if independent and not (track or self_calibrate):
         raise InputError("--independent is for runs weighed together: --track or --self-calibrate.")
+    if sensing not in (None, "tool") and (track or self_calibrate):
+        raise InputError(
+            "--track and --self-calibrate learn from the tool's position. Leave out --sensing, or "
+            "them."
+        )
     if track and self_calibrate:
         raise InputError("--track follows a calibration, --self-calibrate makes one. Choose one.")
     if track and calibration is None:

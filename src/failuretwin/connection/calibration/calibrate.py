@@ -28,6 +28,11 @@ from failuretwin.connection.calibration.parameters import (
     timing_parameters,
 )
 from failuretwin.connection.calibration.result import Calibration, HeldOut, LeftOut, Parameter
+from failuretwin.connection.calibration.sensor_fit import (
+    LEAST_MOVEMENTS,
+    SensorFit,
+    fit_sensors,
+)
 from failuretwin.connection.calibration.settling_fit import (
     SettlingFit,
     best_payload,
@@ -48,7 +53,9 @@ from failuretwin.data_knowledge.read import RunsLike, as_runs
 from failuretwin.digital_model.arm_classes import class_of
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.digital_model.robot import Robot, load_robot, shown_unit
+from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.isolability import fault_probabilities
+from failuretwin.inference.sensors import TOOL_ALONE, sensing_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -242,6 +249,8 @@ def calibrate(
     runs = as_runs(runs, robot)
     check_motors(runs, robot.name, robot.motor_names)
     runs, labelled = _without_faulty_labels(runs)
+    if sensing_of(runs, None) != TOOL_ALONE:
+        return replace(_of_sensors_alone(runs, robot, name, source), left_out=labelled)
     inside = _held_out_runs(runs, hold_out)
     learning = runs.isel(run=np.flatnonzero(~inside))
     first = fit_calibration(learning, robot, name, source, thorough=False)
@@ -251,7 +260,43 @@ def calibrate(
     judged = runs.isel(run=np.flatnonzero(inside)) if inside.any() else None
     found = fit_calibration(learning, robot, name, source, fault_probability=doubt, judged=judged)
     _refuse_left_out(found)
-    return replace(found, left_out=(*labelled, *found.left_out))
+    found = replace(found, left_out=(*labelled, *found.left_out))
+    model = HealthyModel.of(found.applied_to(robot).twin, found.imperfections)
+    return _with_sensors(found, fit_sensors(learning, model))
+
+
+def _with_sensors(found: Calibration, fits: Sequence[SensorFit]) -> Calibration:
+    sensors = tuple(fit.profile for fit in fits)
+    parameters = tuple(parameter for fit in fits for parameter in fit.parameters)
+    return replace(
+        found,
+        imperfections=replace(found.imperfections, sensors=sensors),
+        parameters=(*found.parameters, *parameters),
+    )
+
+
+def _of_sensors_alone(runs: xr.Dataset, robot: Robot, name: str, source: str) -> Calibration:
+    """Return a calibration of sensors by runs of which nobody saw the tool's position.
+
+    Raises:
+        InputError: If no sensor comes to rest often enough.
+    """
+    model = HealthyModel.of(robot)
+    fits = fit_sensors(runs, model)
+    if not fits:
+        raise InputError(
+            "nobody watched the tool's position, and no other sensor is seen at rest after "
+            f"{LEAST_MOVEMENTS} movements. Expected longer logs, or those of a tool sensor."
+        )
+    remark = (
+        "nobody watched the tool's position: constant errors and noise of the sensors were "
+        f"learned, and the motors taken to be as {model.imperfections.name} has them"
+    )
+    motors = replace(model.imperfections, name=name, source=source or model.imperfections.source)
+    sessions = tuple(dict.fromkeys(session_names(runs)))
+    count = max(fit.movements for fit in fits)
+    plain = Calibration(motors, (), sessions, runs.sizes["run"], count, False, remarks=(remark,))
+    return _with_sensors(plain, fits)
 
 
 def _without_faulty_labels(runs: xr.Dataset) -> tuple[xr.Dataset, tuple[LeftOut, ...]]:

@@ -95,6 +95,11 @@ class StreamingFleet:
                 f"a stream of {robots} robots, {movements} movements, {rate_hz} Hz. Expected one "
                 "robot and one movement at least, and a rate above 0 or None."
             )
+        if not diagnoser.healthy_model.sensors.tool_alone:
+            raise InputError(
+                f"sensing {diagnoser.sensing}: a stream sees by the tool's position alone. "
+                "Diagnose recorded runs, or leave sensing out."
+            )
         self.diagnoser = diagnoser
         self.hypotheses = [str(hypothesis) for hypothesis in diagnoser.hypothesis_set]
         self.robots, self.rate_hz, self.movements = robots, rate_hz, movements

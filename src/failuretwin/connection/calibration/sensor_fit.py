@@ -1,0 +1,206 @@
+"""What healthy runs teach of sensors beside that of the tool's position: constant error and noise.
+
+    y seen = y(q) + b + w x y(q) + J dq + n,    b ~ N(0, far^2),  w ~ N(0, turn_doubt^2)
+
+with q where healthy motors settle, their scatter dq and the noise n of a reading; robustly, each
+movement weighed by a Student t. Noise is how readings scatter about their mean at rest. How the
+sensor is turned on its mount, w, is asked only where the profile says that it is in doubt.
+
+Section: docs/sensors.md#calibration-of-sensors
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from failuretwin.connection.calibration.result import Parameter
+from failuretwin.core.movements import find_movements
+from failuretwin.core.numerics import Covariance
+from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.digital_model.sensor_profile import SensorProfile
+from failuretwin.digital_model.sensors import SENSORS, Encoders, Sensor, Tool, sensor_of
+from failuretwin.inference.evidence import rest_begin
+from failuretwin.inference.healthy_model import HealthyModel
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+FAR = 20.0
+"""A constant error is looked for within so many times its usual doubt, or its noise."""
+ROUNDS = 20
+"""Rounds of weighing; each moves the fit by a fraction of the one before."""
+LEAST_MOVEMENTS = 5
+"""Fewer settled movements say nothing of a sensor."""
+RESTLESS = 4.0
+"""A window whose readings scatter by so many times the usual is no rest."""
+
+
+@dataclass(frozen=True)
+class SensorFit:
+    """What runs say of a sensor.
+
+    Attributes:
+        profile: The sensor as it is now known.
+        movements: Settled movements that it rests on.
+        parameters: Its figures, with their 95 % intervals.
+    """
+
+    profile: SensorProfile
+    movements: int
+    parameters: tuple[Parameter, ...]
+
+
+def fit_sensors(runs: xr.Dataset, model: HealthyModel) -> tuple[SensorFit, ...]:
+    """Return what healthy runs say of every sensor whose readings they hold.
+
+    Of the tool's position and of the motors' own readings nothing is learned here.
+
+    Args:
+        runs: Healthy runs.
+        model: Where the healthy robot settles.
+    """
+    told = (model.imperfections.sensors, model.twin.robot.profile.sensors)
+    fits = []
+    for kind, of in SENSORS.items():
+        if kind in (Tool.kind, Encoders.kind) or of.variable not in runs:
+            continue
+        fit = _fit(runs, model, sensor_of(kind, model.twin, *told))
+        if fit is not None:
+            fits.append(fit)
+    return tuple(fits)
+
+
+def _fit(runs: xr.Dataset, model: HealthyModel, sensor: Sensor) -> SensorFit | None:
+    before = sensor.profile or SensorProfile(sensor.kind)
+    plain = type(sensor)(sensor.twin, replace(before, bias=()))
+    seen, pose, noise = _at_rest(runs, model, plain)
+    if len(seen) < LEAST_MOVEMENTS:
+        return None
+    value, jacobian = plain.expected(pose)
+    turns = before.turn_doubt > 0.0 and plain.errors == plain.channels == 3
+    columns = _columns(plain, value, turns)
+    errors = plain.errors
+    far = FAR * max(plain.usual_doubt, noise)
+    prior = np.concatenate([np.full(errors, far), np.full(3 * turns, before.turn_doubt)])
+    root = jacobian * model.scatter
+    estimate, deviation = _robust(seen - value, columns, root, noise, prior, plain.dims)
+    bias, turn = estimate[:errors], estimate[errors:]
+    mount = Rotation.from_euler("xyz", before.rpy)
+    if turns:
+        mount = mount * Rotation.from_rotvec(turn).inv()
+    roll, pitch, yaw = mount.as_euler("xyz")
+    found = replace(
+        before,
+        noise=float(noise),
+        bias=tuple(float(b) for b in bias),
+        doubt=float(deviation[:errors].max()),
+        turn_doubt=float(deviation[errors:].max(initial=0.0)),
+        rpy=(float(roll), float(pitch), float(yaw)) if turns else before.rpy,
+    )
+    return SensorFit(found, len(seen), _parameters(plain, estimate, deviation, noise))
+
+
+def _columns(sensor: Sensor, value: FloatArray, turns: bool) -> FloatArray:
+    """Return the derivative of the channels by b, and by w, (movement, channel, parameter)."""
+    step, none = 1e-5, np.zeros((len(value), sensor.errors))
+    parts = []
+    for unit in step * np.eye(sensor.errors):
+        moved = sensor.to_channels(sensor.with_errors(value, none + unit))
+        parts.append((moved - value) / step)
+    columns = np.stack(parts, axis=-1)
+    if not turns:
+        return columns
+    about = np.swapaxes(np.cross(np.eye(3), value[:, None, :]), -1, -2)
+    return np.concatenate([columns, about], axis=-1)
+
+
+def _at_rest(
+    runs: xr.Dataset, model: HealthyModel, sensor: Sensor
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return settled channels (movement, channel), healthy poses (movement, motor), noise."""
+    time = as_floats(runs["time"].values)
+    movements = find_movements(as_floats(runs["command"].values), time)
+    channels = sensor.to_channels(as_floats(runs[sensor.variable].values))
+    end = np.full_like(movements.start, time[-1])
+    end[:, :-1] = np.fmin(movements.start[:, 1:], time[-1])
+    begin = rest_begin(movements.start, movements.ramp_duration, end)
+    usual = model.outcomes(movements)
+    poses = model.settle(usual.base, usual.direction, model.none_held)[:, :, 0]
+    points, spreads, at = [], [], []
+    for run, number in np.argwhere(movements.exists):
+        inside = (time >= begin[run, number]) & (time < end[run, number] - 1e-9)
+        values = channels[run, inside]
+        values = values[np.isfinite(values).all(axis=1)]
+        if len(values) > 2:
+            points.append(np.median(values, axis=0))
+            free = sensor.dims * (len(values) - 1)
+            square = np.sum((values - values.mean(axis=0)) ** 2) / free
+            spreads.append(square / (1.0 - 2.0 / (9.0 * free)) ** 3)  # the median of chi2 / free
+            at.append(poses[run, number])
+    if not points:
+        return np.zeros((0, sensor.channels)), np.zeros((0, len(model.scatter))), 0.0
+    size = np.sqrt(spreads)
+    still: BoolArray = size <= RESTLESS * np.median(size)
+    noise = float(np.median(size[still]))
+    return np.array(points)[still], np.array(at)[still], max(noise, 1e-9)
+
+
+def _robust(
+    error: FloatArray,
+    columns: FloatArray,
+    root: FloatArray,
+    noise: float,
+    prior: FloatArray,
+    dims: int,
+    dof: float = 4.0,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the parameters and their standard deviations, (parameter,) each.
+
+    Args:
+        error: Seen minus expected, (movement, channel).
+        columns: Derivative by the parameters, (movement, channel, parameter).
+        root: J diag(s), the scatter of the motors, (movement, channel, motor).
+        noise: Of a reading on each channel.
+        prior: Standard deviations beforehand, (parameter,).
+        dims: Dimensions in which channels can differ.
+        dof: Degrees of freedom of the weights.
+    """
+    spread = Covariance.of(root, noise**2, dims)
+    pull = np.stack([spread.solve(columns[..., k]) for k in range(columns.shape[-1])], axis=-1)
+    found = np.zeros(len(prior))
+    for _ in range(ROUNDS):
+        left = error - columns @ found
+        weight = (dof + dims) / (dof + spread.product(left, left))
+        information = np.einsum("m,mck,mcl->kl", weight, columns, pull) + np.diag(prior**-2.0)
+        found = np.linalg.solve(information, np.einsum("m,mck,mc->k", weight, pull, error))
+    return found, np.sqrt(np.diag(np.linalg.inv(information)))
+
+
+def _parameters(
+    sensor: Sensor, estimate: FloatArray, deviation: FloatArray, noise: float
+) -> tuple[Parameter, ...]:
+    factor, unit = UNITS[sensor.kind]
+    found = []
+    for k, (value, sd) in enumerate(zip(estimate, deviation, strict=True)):
+        constant = k < sensor.errors
+        name = f"constant error {k + 1}" if constant else f"turn {k + 1 - sensor.errors}"
+        scale, of = (factor, unit) if constant else (DEG, "deg")
+        low, high = float(value - 1.96 * sd), float(value + 1.96 * sd)
+        told = (scale * float(value), scale * low, scale * high)
+        found.append(Parameter(f"{sensor.kind}: {name}", "", of, told[0], told[1], told[2]))
+    size = factor * noise
+    return (*found, Parameter(f"{sensor.kind}: noise", "", unit, size, size, size))
+
+
+DEG = float(np.rad2deg(1.0))
+UNITS = {
+    "orientation": (DEG, "deg"),
+    "accelerometer": (1.0, "m/s2"),
+    "gyroscope": (DEG, "deg/s"),
+    "wire": (1e3, "mm"),
+}
+"""Unit in which each sensor's errors are told, and factor to it."""

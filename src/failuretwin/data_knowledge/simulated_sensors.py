@@ -1,0 +1,61 @@
+"""What sensors beside that of the tool's position read in simulated runs: noise and bias on top.
+
+    y seen = y(q(t)) + b + n,    b ~ N(bias, doubt^2) of each run,    n ~ N(0, noise^2) of a reading
+
+Section: docs/sensors.md#simulated-sensors
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.digital_model.nonidealities import Imperfections
+from failuretwin.digital_model.sensor_profile import KINDS
+from failuretwin.digital_model.sensors import sensor_of
+from failuretwin.digital_model.twin import DigitalTwin
+
+SIMULATED = tuple(kind for kind in KINDS if kind != "encoders")
+"""Sensors that are simulated when they are asked for; readings of the motors always are."""
+
+
+def simulated_sensors(
+    kinds: Sequence[str],
+    twin: DigitalTwin,
+    imperfections: Imperfections,
+    position: FloatArray,
+    seen: BoolArray,
+    step_s: float,
+    seeds: Sequence[Sequence[int]],
+) -> dict[str, FloatArray]:
+    """Return what sensors read, by variable of a run set, (run, time, ...).
+
+    They are read when the tool is. Chance of their own leaves all other chance as it was.
+
+    Args:
+        kinds: The sensors.
+        twin: Kinematics.
+        imperfections: May say what the sensors are like; else the profile, else as usual.
+        position: True angles, (run, time, motor) [rad].
+        seen: When the tool is read, (run, time).
+        step_s: Step of the grid [s].
+        seeds: Seed of each run.
+    """
+    found = {}
+    for kind in kinds:
+        sensor = sensor_of(kind, twin, imperfections.sensors, twin.robot.profile.sensors)
+        true = sensor.along(position, np.full(len(position), step_s))
+        values = []
+        for channels, seed in zip(true, seeds, strict=True):
+            rng = np.random.default_rng([*seed, KINDS.index(kind)])
+            turn = Rotation.from_rotvec(rng.normal(0.0, 1.0, 3) * sensor.turn_doubt).as_matrix()
+            constant = rng.normal(0.0, 1.0, sensor.errors) * sensor.doubt
+            noise = rng.normal(0.0, sensor.noise, (position.shape[1], sensor.errors))
+            turned = channels @ turn.T if sensor.turn_doubt else channels
+            values.append(sensor.with_errors(turned, constant + noise))
+        found[sensor.variable] = np.stack(values)
+        found[sensor.variable][~seen] = np.nan
+    return found

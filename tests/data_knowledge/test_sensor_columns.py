@@ -1,0 +1,69 @@
+"""Logs with other sensors than one of the tool's position: CSV by a map, and RTDE."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import failuretwin as ft
+from failuretwin.core.errors import InputError
+from failuretwin.data_knowledge.csv_log import read_column_map
+
+MAP = """
+[time]
+column = "t"
+[command]
+columns = ["c1", "c2", "c3", "c4"]
+[[sensors]]
+variable = "accelerometer"
+columns = ["ax", "ay", "az"]
+[[sensors]]
+variable = "wire"
+columns = ["l"]
+"""
+
+
+def table():
+    time = np.arange(40) * 0.1
+    return pd.DataFrame(
+        {"t": time, "ax": 0.1 * time, "ay": 0.0, "az": 9.81, "l": 0.5 + time}
+        | {f"c{k}": np.where(time < 1.0, 0.0, 0.1 * k) for k in range(1, 5)}
+    )
+
+
+def read(folder):
+    mapping = read_column_map(folder / "map.toml", ft.load_robot("armpi_fpv"))
+    return ft.read_runs(folder / "log.csv", "armpi_fpv", ft.ReadOptions(columns=mapping))
+
+
+def test_a_log_with_an_accelerometer_alone_is_a_run_set(tmp_path):
+    table().to_csv(tmp_path / "log.csv", index=False)
+    (tmp_path / "map.toml").write_text(MAP)
+    runs = read(tmp_path)
+    assert np.isnan(runs["measured"].values).all()
+    seen = np.isfinite(runs["accelerometer"].values[0, :, 0])
+    np.testing.assert_allclose(runs["accelerometer"].values[0, seen, 0], table()["ax"])
+    np.testing.assert_allclose(runs["wire"].values[0, seen], table()["l"])
+    assert runs.attrs["measured_rate_hz"] == pytest.approx(10.0)
+
+
+def test_a_sensor_lacks_no_channel(tmp_path):
+    table().to_csv(tmp_path / "log.csv", index=False)
+    (tmp_path / "map.toml").write_text(MAP.replace('"ax", ', ""))
+    with pytest.raises(InputError, match="accelerometer: 2 columns, expected 3"):
+        read(tmp_path)
+
+
+def test_rtde_recordings_bring_the_accelerometer_of_the_flange(tmp_path):
+    robot, time = ft.load_robot("ur5e"), np.arange(100) * 0.01
+    target = np.zeros((100, 6))
+    target[30:] = [0.2, -0.1, 0.1, 0.0, 0.1, 0.0]
+    columns = {"timestamp": time}
+    columns |= {f"target_q_{k}": target[:, k] for k in range(6)}
+    columns |= {f"actual_q_{k}": target[:, k] for k in range(6)}
+    columns |= {f"actual_tool_accelerometer_{k}": 1.0 + k + time for k in range(3)}
+    pd.DataFrame(columns).to_csv(tmp_path / "log.csv", sep=" ", index=False)
+    runs = ft.read_runs(tmp_path / "log.csv", robot)
+    np.testing.assert_allclose(runs["accelerometer"].values[0, :, 1], 2.0 + time)
+    assert np.isfinite(runs["measured"].values).all()
