@@ -167,16 +167,18 @@ class SharedWeighing:
         likelihood: The runs as they were seen.
         hypotheses: What may be the case.
         priors: Beliefs about faults and set-ups.
+        known_layout: What stands in theta; None: what is in doubt of the model.
     """
 
     likelihood: RunLikelihood
     hypotheses: Sequence[Hypothesis]
     priors: Priors
+    known_layout: SharedLayout | None = None
 
     @cached_property
     def layout(self) -> SharedLayout:
         """What stands in theta."""
-        return layout_of(self.likelihood.model)
+        return self.known_layout or layout_of(self.likelihood.model)
 
     @cached_property
     def parts(self) -> list[SharedComponent]:
