@@ -39,8 +39,10 @@ from failuretwin.inference.shared_weighing import (
     Weighed,
 )
 
-SCATTER_COUNT, RATE_COUNT = 12.0, 30.0
-"""Movements that the prior of a scatter and of a loss rate counts for."""
+SCATTER_SPREAD = 0.3
+"""Deviation of the logarithm of the scatter within a class; assumed."""
+RATE_COUNT = 30.0
+"""Movements that the prior of a loss rate counts for."""
 LEAST_SHARE = 1e-3
 """Components of the belief that are less probable are not weighed."""
 CHUNK_RUNS = 64
@@ -48,56 +50,63 @@ CHUNK_RUNS = 64
 
 
 @dataclass(frozen=True)
-class Counts:
+class Habits:
     """What movements say of scatter and lost commands, sums over them.
 
     Attributes:
-        scatter: Sum of squares of how far each motor has scattered, and of how many times it has,
-            (..., 2, motor) [rad2, -].
+        precision: Information about the logarithm of each motor's scatter beside that of the model
+            that was given, (..., motor, motor).
+        shift: That times the logarithm that is most probable, (..., motor).
         losses: How often each set of motors has lost a command, of how many movements; punctual
             and late ones, (..., entry, 2, 2).
     """
 
-    scatter: FloatArray
+    precision: FloatArray
+    shift: FloatArray
     losses: FloatArray
 
     @classmethod
-    def believed(cls, given: Imperfections) -> Counts:
-        """Return what is believed of a robot, as movements that would say so."""
-        if given.settling is None:
-            return cls(np.zeros((2, 0)), np.zeros((0, 2, 2)))
-        scatter = np.asarray(given.settling.scatter)
+    def believed(cls, given: Imperfections) -> Habits:
+        """Return what is believed of a robot before any run."""
+        motors = 0 if given.settling is None else len(given.settling.scatter)
         rate = np.array([[e.rate, e.rate_when_late] for e in given.lost_commands]).reshape(-1, 2)
-        return cls(
-            SCATTER_COUNT * np.stack([scatter**2, np.ones_like(scatter)]),
-            RATE_COUNT * np.stack([rate, np.ones_like(rate)], axis=-1),
-        )
+        losses = RATE_COUNT * np.stack([rate, np.ones_like(rate)], axis=-1)
+        return cls(SCATTER_SPREAD**-2.0 * np.eye(motors), np.zeros(motors), losses)
 
     @classmethod
-    def none(cls, runs: int, given: Imperfections) -> Counts:
-        """Return the counts of runs that have said nothing yet."""
+    def none(cls, runs: int, given: Imperfections) -> Habits:
+        """Return what runs say that have said nothing yet."""
         like = cls.believed(given)
-        return cls(np.zeros((runs, *like.scatter.shape)), np.zeros((runs, *like.losses.shape)))
+        parts = (like.precision, like.shift, like.losses)
+        return cls(*(np.zeros((runs, *part.shape)) for part in parts))
 
-    def __getitem__(self, rows: slice | IntArray) -> Counts:
-        """Return the counts of some of the runs alone."""
-        return Counts(self.scatter[rows], self.losses[rows])
+    def __getitem__(self, rows: slice | IntArray) -> Habits:
+        """Return what some of the runs say."""
+        return Habits(self.precision[rows], self.shift[rows], self.losses[rows])
 
-    def plus(self, told: Counts) -> Counts:
+    def put(self, rows: IntArray, told: Habits) -> None:
+        """Write down what some of the runs say."""
+        self.precision[rows], self.shift[rows] = told.precision, told.shift
+        self.losses[rows] = told.losses
+
+    def plus(self, told: Habits) -> Habits:
         """Return these and those of some runs together."""
-        return Counts(
-            self.scatter + told.scatter.sum(axis=0), self.losses + told.losses.sum(axis=0)
+        return Habits(
+            self.precision + told.precision.sum(axis=0),
+            self.shift + told.shift.sum(axis=0),
+            self.losses + told.losses.sum(axis=0),
         )
 
-    def times(self, share: float) -> Counts:
-        """Return counts of a share of the movements."""
-        return Counts(share * self.scatter, share * self.losses)
+    @property
+    def log_scatter(self) -> FloatArray:
+        """Most probable logarithm of the scatter beside that given, (motor,)."""
+        return np.asarray(np.linalg.solve(self.precision, self.shift))
 
     def most_probable(self, given: Imperfections) -> Imperfections:
-        """Return the imperfections with the scatter and the rates that these movements have."""
+        """Return the imperfections with the scatter and the rates that are most probable."""
         if given.settling is None:
             return given
-        scatter = np.sqrt(self.scatter[0] / self.scatter[1])
+        scatter = np.asarray(given.settling.scatter) * np.exp(self.log_scatter)
         rates = self.losses[..., 0] / self.losses[..., 1]
         lost = tuple(
             replace(entry, rate=float(rate), rate_when_late=float(when_late))
@@ -146,19 +155,26 @@ class Judged:
         table = np.where(first, whole, -np.inf)
         return Mixture(self.weighing, self.candidates, table).posterior()
 
-    def counts(self, given: Imperfections) -> Counts:
-        """Return what the runs say of scatter and losses, (run, ...); faulty motors left out."""
-        share = self.share
-        told = [each.found for each in self.candidates]
-        scatter = sum(
-            np.einsum("rh,rhkn->rkn", share[:, c], found.scattered) for c, found in enumerate(told)
-        )
-        outcomes = sum(
-            share[:, c, :, None, None] * found.outcomes for c, found in enumerate(told)
-        )
+    def habits(self, given: Imperfections, covariance: FloatArray, at: FloatArray) -> Habits:
+        """Return what the runs say of scatter and losses, (run, ...); faulty motors left out.
+
+        Args:
+            given: What was given of the robot.
+            covariance: Of theta under each hypothesis, (run, candidate, hypothesis, theta, theta).
+            at: Logarithm of the scatter that the runs were weighed with, (motor,).
+        """
+        share, found = self.share, [each.found for each in self.candidates]
+        score = np.stack([each.scatter_score for each in found], axis=1)
+        slack = np.stack([each.scatter_slack for each in found], axis=1)
+        score = score + np.einsum("rchntu,rchtu->rchn", slack, covariance, optimize=True)
+        told = np.stack([each.scatter_information for each in found], axis=1)
+        precision = np.einsum("rch,rchnk->rnk", share, told)
+        shift = np.einsum("rch,rchn->rn", share, score) + precision @ at
+        outcomes = sum(share[:, c, :, None, None] * each.outcomes for c, each in enumerate(found))
         losses = [self._losses(entry, np.asarray(outcomes)) for entry in given.lost_commands]
         shape = (len(share), len(losses), 2, 2)
-        return Counts(np.asarray(scatter), np.reshape(np.stack(losses, 1) if losses else [], shape))
+        stacked = np.stack(losses, axis=1) if losses else np.zeros(0)
+        return Habits(precision, shift, np.reshape(stacked, shape))
 
     def _losses(self, entry: LostCommand, outcomes: FloatArray) -> FloatArray:
         """Return how often some motors lose a command, punctual and late, (run, 2, 2)."""
@@ -191,7 +207,7 @@ class RunsTogether:
         base: What is believed of theta without these runs, one mixture, in units.
         sites: What each run says, in units.
         here: Where runs are expanded, (theta,).
-        counts: What is believed of scatter and losses without these runs; None: they are known.
+        habits: What is believed of scatter and losses without these runs; None: they are known.
         told: What each run says of them.
         start: Where to search for the best theta of each, (run, hypothesis, theta); NaN: not known.
         model: The healthy robot with scatter and rates that were learned.
@@ -205,8 +221,8 @@ class RunsTogether:
     base: Belief
     sites: Normal
     here: FloatArray
-    counts: Counts | None
-    told: Counts
+    habits: Habits | None
+    told: Habits
     start: FloatArray
     model: HealthyModel = field(init=False)
 
@@ -235,8 +251,8 @@ class RunsTogether:
             base,
             Normal(np.zeros((runs, size, size)), np.zeros((runs, size))),
             np.zeros(size),
-            Counts.believed(given) if learns else None,
-            Counts.none(runs, given),
+            Habits.believed(given) if learns else None,
+            Habits.none(runs, given),
             np.full((runs, len(weighing.hypotheses), size), np.nan),
         )
 
@@ -276,25 +292,32 @@ class RunsTogether:
             damping: Share of a new site that is taken.
         """
         for judged in found:
-            rows = judged.rows
-            site = self._site(judged)
+            rows, covariance = judged.rows, self._covariance(judged)
+            site = self._site(judged, covariance)
             old = Normal(self.sites.precision[rows], self.sites.shift[rows])
             self.sites.precision[rows] += damping * (site.precision - old.precision)
             self.sites.shift[rows] += damping * (site.shift - old.shift)
             self.start[rows] = judged.best + self.here
-            if self.counts is not None:
-                told = judged.counts(self.given.model.imperfections)
-                self.told.scatter[rows], self.told.losses[rows] = told.scatter, told.losses
+            if self.habits is not None:
+                covariance = covariance * np.outer(self.unit, self.unit)
+                given = self.given.model.imperfections
+                self.told.put(rows, judged.habits(given, covariance, self._log_scatter))
         self.maximise()
         self.here = self.belief.moments[0][0] * self.unit
 
     def maximise(self) -> None:
         """Take the scatter and the rates that explain the runs best."""
-        if self.counts is None:
+        if self.habits is None:
             return
         given = self.given.model
-        known = self.counts.plus(self.told).most_probable(given.imperfections)
+        known = self.habits.plus(self.told).most_probable(given.imperfections)
         self.model = replace(given, imperfections=known)
+
+    @property
+    def _log_scatter(self) -> FloatArray:
+        """Logarithm of the scatter beside that given, (motor,)."""
+        now, given = (np.asarray(m.settling.scatter) for m in (self.model, self.given.model))
+        return np.asarray(np.log(now / given))
 
     def _cavity(self, rows: IntArray) -> Belief:
         """Return the belief without the sites of some runs, each without its own."""
@@ -344,12 +367,15 @@ class RunsTogether:
         prior = self._local(cavity.matched())
         return [weighing.search(coarse, prior, np.zeros_like(place)).theta]
 
-    def _site(self, judged: Judged) -> Normal:
-        """Return what each run says beside its cavity, in units."""
-        units = np.outer(self.unit, self.unit)
-        theta = np.stack([each.found.theta for each in judged.candidates], axis=1)
+    def _covariance(self, judged: Judged) -> FloatArray:
+        """Return that of theta in units, (run, candidate, hypothesis, theta, theta)."""
         information = np.stack([each.found.information for each in judged.candidates], axis=1)
-        covariance = np.linalg.inv(judged.cavity.precision[:, :, None] + information * units)
+        units = np.outer(self.unit, self.unit)
+        return np.linalg.inv(judged.cavity.precision[:, :, None] + information * units)
+
+    def _site(self, judged: Judged, covariance: FloatArray) -> Normal:
+        """Return what each run says beside its cavity, in units."""
+        theta = np.stack([each.found.theta for each in judged.candidates], axis=1)
         mean, spread = mixed(judged.share, (theta + self.here) / self.unit, covariance)
         cavity = judged.cavity.matched()
         site = positive(np.linalg.inv(spread) - cavity.precision, 0.0)
