@@ -3,10 +3,13 @@
     theta_i = theta_i-1 + N(0, Q),    p(theta | runs before) = base times sites of the latest runs
 
 The folder posterior in order of time: assumed density filtering over the runs that are behind,
-expectation propagation over the latest ones, which are judged again with what came after them, so
+expectation propagation over the latest ones. Those are judged again with what came after them, so
 that a start that was judged wrongly is put right. A run that leaves the window stays as its site.
 
-Section: docs/calibration_tracking.md
+The latest runs are compared with what is behind and with what that was a while ago: what changes
+faster than by wear is a fault, whatever each run by itself looks like, and is not learned.
+
+Section: docs/calibration_tracking.md#state-evidence-and-filter
 """
 
 from __future__ import annotations
@@ -18,20 +21,329 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
+from failuretwin.digital_model.nonidealities import Imperfections
+from failuretwin.digital_model.settling import largest_load
 from failuretwin.inference.evidence import SettledEvidence, TransientSamples
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.runs_together import Counts, RunsTogether
-from failuretwin.inference.shared_belief import Belief
+from failuretwin.inference.runs_together import Habits, RunsTogether
+from failuretwin.inference.shared_belief import Belief, summed
 from failuretwin.inference.shared_likelihood import Normal
+from failuretwin.inference.shared_posterior import set_up_in_doubt
+from failuretwin.inference.shared_unknowns import REGISTRATION, SharedLayout, layout_of
 from failuretwin.inference.shared_weighing import SharedWeighing
 
 WINDOW = 24
-"""Latest runs that are judged again as more come."""
+"""Latest runs that are judged again as more come, and compared with what is behind."""
 AGAIN = 8
-"""Runs after which those of the window are judged again; among the first ones, whenever they have
-become half as many again."""
+"""Runs after which those of the window are judged again; of the first ones sooner: whenever they
+are half as many again."""
+ROUNDS, DAMPING = 2, 0.7
+"""Times that they are judged then, and the share of a new site that is taken."""
+FEWEST = 5
+"""Runs below which nothing is said of a sudden change."""
+CHANCE = 4.0
+"""The latest runs may lie this many standard deviations off by chance."""
+ANYWHERE = 30.0
+"""How far a sudden change may go, a standard deviation in scatters: as good as anywhere."""
+LEAST_SPREAD = 1e-6
+"""The same of an offset that wear does not change, in units."""
 REMEMBERED = 200.0
 """Runs by which scatter and loss rates are known at most: older ones fade."""
+LEAST_LOAD_NM = 1e-6
+"""A motor that never carries more torque than this does not sag [N m]."""
+LEAST_SCATTER_RAD = 1e-5
+"""Wear is counted by scatters of this size at least [rad]."""
+OFFSETS = ("bias", "compliance", "friction")
+
+
+@dataclass(frozen=True)
+class WearLimits:
+    """How fast and how far a healthy motor may change, in scatters of the motor.
+
+    The same figures hold for its bias, its friction and its sag at the largest load. No long
+    records of a real arm exist, so they are assumed: on the ArmPi FPV, where a scatter is 1 to 1.7
+    counts, swings of a count in some hundred runs are followed, as of temperature, and wear of some
+    counts in all.
+
+    Attributes:
+        rate: Random walk from run to run, its standard deviation [per root run].
+        reach: How far the latest runs may lie off what is behind, beyond chance: more is a fault
+            that grows, not wear.
+        limit: How far the robot may go from where it began; beyond that, calibrate again.
+        horizon: The latest runs are compared with what was believed so many runs ago [run].
+    """
+
+    rate: float = 0.025
+    reach: float = 0.5
+    limit: float = 4.0
+    horizon: int = 200
+
+
+def wear_unit(model: HealthyModel) -> FloatArray:
+    """Return what moves a motor by its scatter, at its largest load, (3 motor,).
+
+    It is 0 for the compliance of a motor that gravity does not load.
+    """
+    load = largest_load(model.twin.robot, model.settling.payload)
+    scatter = np.maximum(model.settling.scatter, LEAST_SCATTER_RAD)
+    sag = np.divide(scatter, load, out=np.zeros_like(load), where=load > LEAST_LOAD_NM)
+    return np.concatenate([scatter, sag, scatter])
+
+
+@dataclass
+class LifeFilter:
+    """What is believed of a robot between two of its runs; theta as of `RunsTogether`.
+
+    Attributes:
+        model: The healthy robot as it was believed to be at the beginning.
+        hypotheses: What may be the case.
+        priors: Beliefs about faults and set-ups.
+        limits: How fast and how far it may change.
+        unit: Unit of theta, (theta,).
+        base: What is believed without the latest runs, in units.
+        habits: What is believed of scatter and losses without them; None: they are known.
+        past: Mean and deviation of the offsets after every `WINDOW` runs of the last horizon,
+            oldest first, (..., 2, 3 motor).
+        window: The latest runs; None before the first.
+        arrived: Runs so far.
+        due: Runs at which those of the window are judged again.
+        alarm: What changes as no wear does, or empty.
+        moved: Whether the sensor was found not to stand where the profile says.
+    """
+
+    model: HealthyModel
+    hypotheses: Sequence[Hypothesis]
+    priors: Priors
+    limits: WearLimits
+    unit: FloatArray
+    base: Belief
+    habits: Habits | None
+    past: FloatArray
+    window: RunsTogether | None = None
+    arrived: int = 0
+    due: int = 2
+    alarm: str = ""
+    moved: bool = False
+
+    @classmethod
+    def of(
+        cls,
+        model: HealthyModel,
+        hypotheses: Sequence[Hypothesis],
+        priors: Priors,
+        limits: WearLimits = WearLimits(),
+    ) -> LifeFilter:
+        """Return what is believed before any run: what the model's variation says.
+
+        Args:
+            model: A calibrated robot, or what arms of its kind are like.
+            hypotheses: What may be the case.
+            priors: Beliefs about faults and set-ups.
+            limits: How fast and how far it may change.
+        """
+        motors = len(model.scatter)
+        runs = SettledEvidence.empty(run=0, movement=1, motor=motors, axis=3)
+        layout = SharedLayout(motors, offsets=True)
+        weighing = SharedWeighing(RunLikelihood(runs, model), hypotheses, priors, layout)
+        told = [part for part in weighing.parts if not part.name]
+        unit = told[0].deviation
+        learns = layout_of(model).offsets and model.imperfections.settling is not None
+        habits = Habits.believed(model.imperfections) if learns else None
+        base = Belief.of(told, unit)
+        return cls(model, hypotheses, priors, limits, unit, base, habits, _state(base, unit)[None])
+
+    def follow(
+        self, evidence: SettledEvidence, moving: TransientSamples | None = None
+    ) -> Posterior:
+        """Return what is the case in the next runs by those before them alone, then learn of them.
+
+        Args:
+            evidence: Settled positions of the runs, one at least.
+            moving: Their readings on the way; None: they are left aside.
+        """
+        first = 0 if self.window is None else self.window.runs
+        window = self.window = self._joined(evidence)
+        again = self.arrived + len(evidence.usable) >= self.due
+        if again and not self.moved and self._in_doubt(window):
+            self._look_for_sensor(window)
+        (found,) = window.judge(np.arange(first, window.runs), moving)
+        window.learn([found])
+        if again:
+            self._judge_again(window)
+        for _ in range(len(evidence.usable)):
+            self.arrived += 1
+            if self.arrived % WINDOW == 0:
+                kept = self.limits.horizon // WINDOW
+                self.past = np.concatenate([self.past, _state(self.base, self.unit)[None]])[-kept:]
+        self.alarm = self._unlike_wear(window)
+        if self.alarm:
+            window.counted[:] = False
+            window.maximise()
+        self.window = self._without_oldest(window)
+        return found.posterior()
+
+    @property
+    def belief(self) -> Belief:
+        """What is believed of theta now, in units."""
+        return self.base if self.window is None else self.window.belief
+
+    @property
+    def offsets(self) -> tuple[FloatArray, FloatArray]:
+        """Mean and deviation of bias, compliance and friction, (3, motor) each [rad, rad/(N m)]."""
+        given = np.stack([getattr(self.model.settling, name) for name in OFFSETS])
+        mean, deviation = _state(self.belief, self.unit).reshape(2, *given.shape)
+        return given + mean, deviation
+
+    @property
+    def learned(self) -> Imperfections:
+        """The healthy robot with the offsets, scatter and rates that are most probable now."""
+        if self.window is None:
+            return self.model.imperfections
+        return self.window.at(self.belief.moments[0][0] * self.unit).imperfections
+
+    # The latest runs: joined by new ones, judged again, let go of.
+
+    def _joined(self, evidence: SettledEvidence) -> RunsTogether:
+        """Return the latest runs with new ones behind them."""
+        before = self.window
+        if before is None:
+            return self._together(evidence)
+        after = self._together(_behind(before.given.evidence, evidence))
+        _take(after, slice(0, before.runs), before, slice(None))
+        return after
+
+    def _together(self, evidence: SettledEvidence) -> RunsTogether:
+        likelihood = RunLikelihood(evidence, self.model)
+        layout = SharedLayout(len(self.model.scatter), offsets=True)
+        weighing = SharedWeighing(likelihood, self.hypotheses, self.priors, layout)
+        found = RunsTogether.of(weighing, self.base, self.unit)
+        found.habits = self.habits
+        found.here = self.base.moments[0][0] * self.unit
+        found.maximise()
+        return found
+
+    def _judge_again(self, window: RunsTogether) -> None:
+        arrived = self.arrived + 1
+        self.due = max(self.arrived + 2, min(arrived + (arrived + 1) // 2, arrived + AGAIN))
+        for _ in range(ROUNDS if window.runs > 1 else 0):
+            window.learn(window.judge(np.arange(window.runs)), DAMPING)
+
+    def _without_oldest(self, window: RunsTogether) -> RunsTogether:
+        """Return the latest runs alone; what older ones say becomes part of the base."""
+        old = window.runs - WINDOW
+        if old <= 0:
+            return window
+        for row in range(old):
+            if window.counted[row]:
+                one = slice(row, row + 1)
+                site = Normal(window.sites.precision[one], window.sites.shift[one])
+                self.base = self.base.times(site).pruned()
+                if self.habits is not None:
+                    fading = self.habits.fading(1.0 - 1.0 / REMEMBERED, self.model.imperfections)
+                    self.habits = fading.plus(window.told[one])
+            self.base = self.base.blurred(self._walk)
+        kept = slice(old, None)
+        rest = self._together(window.given.evidence[kept])
+        _take(rest, slice(None), window, kept)
+        return rest
+
+    @property
+    def _walk(self) -> FloatArray:
+        """Variance of the random walk of a run, in units, (theta,)."""
+        step = np.zeros(len(self.unit))
+        step[REGISTRATION:] = self.limits.rate * wear_unit(self.model) / self.unit[REGISTRATION:]
+        return step**2
+
+    # Where the sensor stands.
+
+    def _in_doubt(self, window: RunsTogether) -> bool:
+        """Return whether the latest runs say that the sensor stands elsewhere."""
+        likelihood = replace(window.given, model=window.at(window.here))
+        return set_up_in_doubt(likelihood, self.hypotheses, self.priors)
+
+    def _look_for_sensor(self, window: RunsTogether) -> None:
+        """Let the frame of the sensor be anywhere near, and judge the latest runs anew."""
+        weighing = SharedWeighing(window.given, self.hypotheses, self.priors, window.layout)
+        variance = (weighing.broad / self.unit) ** 2
+        variance[REGISTRATION:] = 0.0
+        self.moved, self.base = True, self.base.blurred(variance)
+        window.base, window.start[:] = self.base, np.nan
+        window.sites.precision[:], window.sites.shift[:] = 0.0, 0.0
+        window.here = weighing.register_together()[0]
+
+    # What changes as no wear does.
+
+    def _unlike_wear(self, window: RunsTogether) -> str:
+        """Return what has changed more than wear can make it, or nothing.
+
+        The latest runs by themselves are compared with what is behind them and with what that was a
+        horizon ago: a fault that grows slowly drags the belief along before it shows.
+        """
+        if window.runs < FEWEST:
+            return ""
+        wear = wear_unit(self.model)
+        now, chance = self._by_itself(window, wear)
+
+        def off(known: FloatArray, most: float) -> FloatArray:
+            """Return by how much each offset lies off beyond `most` and chance."""
+            return np.abs(now - known[0]) - most * wear - CHANCE * np.hypot(chance, known[1])
+
+        behind = (_state(self.base, self.unit), self.past[0])
+        fast = np.max([off(known, self.limits.reach) for known in behind], axis=0)
+        begun = np.stack([np.zeros_like(wear), self._begun_deviation])
+        excess = np.maximum(fast, off(begun, self.limits.limit))
+        over = np.divide(excess, wear, out=np.zeros_like(wear), where=wear > 0.0)
+        worst = int(np.argmax(over))
+        if over[worst] <= 0.0:
+            return ""
+        kind, motor = divmod(worst, len(self.model.scatter))
+        how = (
+            "changes faster than by wear" if fast[worst] > 0.0 else "is worn beyond what is normal"
+        )
+        return f"{OFFSETS[kind]} of {self.model.motor_names[motor]} {how}"
+
+    @property
+    def _begun_deviation(self) -> FloatArray:
+        """What the offsets of the robot may differ by from what was told, (3 motor,)."""
+        return self.unit[REGISTRATION:]
+
+    def _by_itself(self, window: RunsTogether, wear: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return offsets that the latest runs have if any are as good, and their deviation."""
+        (mean,), (covariance,) = self.base.moments
+        frame, offsets = slice(0, REGISTRATION), slice(REGISTRATION, None)
+        precision = np.zeros_like(covariance)
+        precision[frame, frame] = np.linalg.inv(covariance[frame, frame])
+        spread = np.maximum(ANYWHERE * wear / self.unit[offsets], LEAST_SPREAD)
+        precision[offsets, offsets] = np.diag(spread**-2.0)
+        anywhere = Belief(np.zeros((1, 1)), precision[None, None], (precision @ mean)[None, None])
+        return tuple(_state(anywhere.times(summed(window.sites)), self.unit))
+
+
+def _state(belief: Belief, unit: FloatArray) -> FloatArray:
+    """Return mean and deviation of the offsets beside those given, (2, 3 motor)."""
+    (mean,), (covariance,) = belief.moments
+    both = np.stack([mean, np.sqrt(np.diag(covariance))]) * unit
+    return np.asarray(both[:, REGISTRATION:])
+
+
+def _behind(before: SettledEvidence, evidence: SettledEvidence) -> SettledEvidence:
+    """Return runs with others behind them; shorter ones are padded."""
+    runs, new = len(before.usable), len(evidence.usable)
+    movements = max(before.usable.shape[1], evidence.usable.shape[1])
+    both = before.blank(runs + new, movements)
+    both.put((slice(0, runs), slice(0, before.usable.shape[1])), before)
+    both.put((slice(runs, None), slice(0, evidence.usable.shape[1])), evidence)
+    return both
+
+
+def _take(after: RunsTogether, rows: slice, before: RunsTogether, kept: slice) -> None:
+    """Take over what is known of some runs."""
+    after.sites.precision[rows] = before.sites.precision[kept]
+    after.sites.shift[rows] = before.sites.shift[kept]
+    after.start[rows], after.counted[rows] = before.start[kept], before.counted[kept]
+    after.told.put(rows, before.told[kept])
+    after.here = before.here
+    after.maximise()

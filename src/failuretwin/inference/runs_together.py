@@ -3,8 +3,9 @@
 Expectation propagation. Each run i sends a site, a normal factor of theta; the belief is what was
 believed before times all sites. A run is judged with the cavity, the belief without its own site:
 
-    q_-i(theta) = sum over c of w_c,-i N_c,-i,    p_i(h) ~ p(h) sum_c w_c,-i integral p(run_i | h) N_c,-i
-    m, V = moments of the mixture over h and c,   Lambda_i = V^-1 - V_-i^-1, no direction negative
+    q_-i(theta) = sum over c of w_c,-i N_c,-i,
+    p_i(h) ~ p(h) sum over c of w_c,-i integral of p(run_i | h, theta) N_c,-i
+    m, V = moments of the mixture over h and c,    Lambda_i = V^-1 - V_-i^-1, no direction negative
 
 with m_-i, V_-i the moments of the cavity. A run whose hypothesis is open sends a wide site, so that
 what is faulty teaches little. Scatter and loss rates are learned beside it, by expectation and
@@ -22,8 +23,9 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
-from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.nonidealities import Imperfections, LostCommand
+from failuretwin.inference.evidence import TransientSamples
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
 from failuretwin.inference.priors import Priors
@@ -35,6 +37,7 @@ from failuretwin.inference.shared_unknowns import REGISTRATION, SharedLayout, of
 from failuretwin.inference.shared_weighing import (
     COARSE_TO_FINE,
     Candidate,
+    Expansion,
     SharedWeighing,
     Weighed,
 )
@@ -84,7 +87,7 @@ class Habits:
         """Return what some of the runs say."""
         return Habits(self.precision[rows], self.shift[rows], self.losses[rows])
 
-    def put(self, rows: IntArray, told: Habits) -> None:
+    def put(self, rows: slice | IntArray, told: Habits) -> None:
         """Write down what some of the runs say."""
         self.precision[rows], self.shift[rows] = told.precision, told.shift
         self.losses[rows] = told.losses
@@ -95,6 +98,15 @@ class Habits:
             self.precision + told.precision.sum(axis=0),
             self.shift + told.shift.sum(axis=0),
             self.losses + told.losses.sum(axis=0),
+        )
+
+    def fading(self, share: float, given: Imperfections) -> Habits:
+        """Return what is left where a share of what runs have said is remembered."""
+        first = Habits.believed(given)
+        return Habits(
+            first.precision + share * (self.precision - first.precision),
+            first.shift + share * (self.shift - first.shift),
+            first.losses + share * (self.losses - first.losses),
         )
 
     @property
@@ -210,6 +222,7 @@ class RunsTogether:
         habits: What is believed of scatter and losses without these runs; None: they are known.
         told: What each run says of them.
         start: Where to search for the best theta of each, (run, hypothesis, theta); NaN: not known.
+        counted: Whether others are judged with what each says, (run,).
         model: The healthy robot with scatter and rates that were learned.
     """
 
@@ -224,6 +237,7 @@ class RunsTogether:
     habits: Habits | None
     told: Habits
     start: FloatArray
+    counted: BoolArray
     model: HealthyModel = field(init=False)
 
     def __post_init__(self) -> None:
@@ -254,6 +268,7 @@ class RunsTogether:
             Habits.believed(given) if learns else None,
             Habits.none(runs, given),
             np.full((runs, len(weighing.hypotheses), size), np.nan),
+            np.ones(runs, dtype=bool),
         )
 
     @property
@@ -264,7 +279,7 @@ class RunsTogether:
     @property
     def belief(self) -> Belief:
         """What is believed given all runs, one mixture, in units."""
-        return self.base.times(summed(self.sites))
+        return self.base.times(summed(self.sites, self.counted))
 
     @property
     def learned(self) -> HealthyModel:
@@ -279,10 +294,15 @@ class RunsTogether:
         settling = offsets_of(theta, replace(given, scatter=self.model.settling.scatter))
         return replace(self.model, imperfections=replace(imperfections, settling=settling))
 
-    def judge(self, rows: IntArray) -> list[Judged]:
-        """Return what some runs say, each with its cavity; so many at a time as fit."""
-        parts = np.split(rows, np.arange(CHUNK_RUNS, len(rows), CHUNK_RUNS))
-        return [self._judge(part) for part in parts]
+    def judge(self, rows: IntArray, moving: TransientSamples | None = None) -> list[Judged]:
+        """Return what some runs say, each with its cavity; so many at a time as fit.
+
+        Args:
+            rows: The runs.
+            moving: Their readings on the way; None: they are left aside.
+        """
+        parts = np.split(np.arange(len(rows)), np.arange(CHUNK_RUNS, len(rows), CHUNK_RUNS))
+        return [self._judge(rows[p], None if moving is None else moving[p]) for p in parts]
 
     def learn(self, found: Sequence[Judged], damping: float = 1.0) -> None:
         """Take in what runs say: sites, where to search for them, scatter, rates.
@@ -310,7 +330,8 @@ class RunsTogether:
         if self.habits is None:
             return
         given = self.given.model
-        known = self.habits.plus(self.told).most_probable(given.imperfections)
+        told = self.habits.plus(self.told[np.flatnonzero(self.counted)])
+        known = told.most_probable(given.imperfections)
         self.model = replace(given, imperfections=known)
 
     @property
@@ -321,25 +342,26 @@ class RunsTogether:
 
     def _cavity(self, rows: IntArray) -> Belief:
         """Return the belief without the sites of some runs, each without its own."""
-        whole = summed(self.sites)
-        precision = whole.precision - self.sites.precision[rows]
-        return self.base.times(Normal(precision, whole.shift - self.sites.shift[rows]))
+        whole, own = summed(self.sites, self.counted), self.counted[rows]
+        precision = whole.precision - own[:, None, None] * self.sites.precision[rows]
+        shift = whole.shift - own[:, None] * self.sites.shift[rows]
+        return self.base.times(Normal(precision, shift))
 
     def _local(self, normal: Normal) -> Normal:
         """Return normals of theta about where runs are expanded, no longer in units."""
         precision = normal.precision / np.outer(self.unit, self.unit)
         return Normal(precision, normal.shift / self.unit - precision @ self.here)
 
-    def _judge(self, rows: IntArray) -> Judged:
-        cavity = self._cavity(rows)
-        likelihood = replace(self.given[rows], model=self.at(self.here), remembered=None)
+    def _judge(self, rows: IntArray, moving: TransientSamples | None) -> Judged:
+        cavity, model = self._cavity(rows), self.at(self.here)
+        likelihood = RunLikelihood(self.given.evidence[rows], model, moving)
         weighing = SharedWeighing(likelihood, self.hypotheses, self.priors, self.layout)
         place = np.tile(self.here, (len(rows), 1))
         place[:, REGISTRATION:] = 0.0
         at = weighing.expand(np.arange(len(rows)), place)
         starts = self._starts(weighing, rows, place, cavity)
         asked = np.flatnonzero((cavity.weight > LEAST_SHARE).any(axis=0))
-        found = [self._search(weighing, at, self._local(cavity[c]), starts) for c in asked]
+        found = [self._search(weighing, at, self._local(cavity[int(c)]), starts) for c in asked]
         candidates = [Candidate(0, np.arange(len(rows)), each) for each in found]
         height = np.stack([each.log_evidence for each in found], axis=1)
         height += cavity.log_weight[:, asked, None]
@@ -350,7 +372,7 @@ class RunsTogether:
 
     @staticmethod
     def _search(
-        weighing: SharedWeighing, at: object, prior: Normal, starts: Sequence[FloatArray]
+        weighing: SharedWeighing, at: Expansion, prior: Normal, starts: Sequence[FloatArray]
     ) -> Weighed:
         found = [weighing.search(at, prior, start) for start in starts]
         return found[0] if len(found) == 1 else found[0].better(found[1])
@@ -371,7 +393,8 @@ class RunsTogether:
         """Return that of theta in units, (run, candidate, hypothesis, theta, theta)."""
         information = np.stack([each.found.information for each in judged.candidates], axis=1)
         units = np.outer(self.unit, self.unit)
-        return np.linalg.inv(judged.cavity.precision[:, :, None] + information * units)
+        precision = judged.cavity.precision[:, :, None] + information * units
+        return np.asarray(np.linalg.inv(precision))
 
     def _site(self, judged: Judged, covariance: FloatArray) -> Normal:
         """Return what each run says beside its cavity, in units."""

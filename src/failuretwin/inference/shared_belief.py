@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from failuretwin.core.numerics import log_sum
-from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.inference.shared_likelihood import Normal
 from failuretwin.inference.shared_unknowns import SharedComponent
 
@@ -81,13 +81,13 @@ class Belief:
     def matched(self) -> Normal:
         """Return the normal distribution with the mean and covariance of each mixture."""
         mean, covariance = self.moments
-        precision = np.linalg.inv(covariance)
+        precision = np.asarray(np.linalg.inv(covariance))
         return Normal(precision, np.einsum("rtu,ru->rt", precision, mean))
 
     @property
     def moments(self) -> tuple[FloatArray, FloatArray]:
         """Mean (run, theta) and covariance (run, theta, theta)."""
-        covariance = np.linalg.inv(self.precision)
+        covariance = np.asarray(np.linalg.inv(self.precision))
         each = np.einsum("rctu,rcu->rct", covariance, self.shift)
         return mixed(self.weight, each, covariance)
 
@@ -132,7 +132,7 @@ def positive(matrix: FloatArray, least: float) -> FloatArray:
     )
 
 
-def summed(sites: Normal, rows: IntArray | slice = slice(None)) -> Normal:
+def summed(sites: Normal, rows: BoolArray | slice = slice(None)) -> Normal:
     """Return the sum of some sites, of one row."""
     return Normal(sites.precision[rows].sum(axis=0)[None], sites.shift[rows].sum(axis=0)[None])
 

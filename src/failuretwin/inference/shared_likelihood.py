@@ -164,7 +164,7 @@ def _sums(
     With a = s^2 lambda^T lambda, p = 3 axes, and u as of `_pull`, the logarithm of a scatter has
 
         score = sum w (u s^2 (lambda^T rho)^2 - a)
-        information = sum w (2 (nu + p) s_k^2 s_l^2 (lambda_k^T lambda_l)^2 - 2 a_k a_l) / (nu + p + 2)
+        information = sum w 2 ((nu + p) (s_k s_l lambda_k^T lambda_l)^2 - a_k a_l) / (nu + p + 2)
 
     (Lange, Little and Taylor, JASA 84 (1989) 881, for a multivariate t).
 
