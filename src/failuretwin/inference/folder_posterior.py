@@ -62,6 +62,12 @@ class FolderPosterior:
     posteriors: Sequence[Posterior]
 
     @property
+    def moved(self) -> bool:
+        """Whether the sensor may stand elsewhere than the profile says."""
+        frame = slice(0, REGISTRATION)
+        return bool((self.prior_deviation[frame] > 1.5 * self.usual_deviation[frame]).any())
+
+    @property
     def deviation(self) -> FloatArray:
         """Standard deviation of theta, (theta,)."""
         return np.sqrt(np.diag(self.covariance))

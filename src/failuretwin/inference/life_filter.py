@@ -14,8 +14,8 @@ Section: docs/calibration_tracking.md#state-evidence-and-filter
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.settling import largest_load
 from failuretwin.inference.evidence import SettledEvidence, TransientSamples
+from failuretwin.inference.folder_posterior import FolderPosterior
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
 from failuretwin.inference.priors import Priors
@@ -41,7 +42,7 @@ AGAIN = 8
 """Runs after which those of the window are judged again; of the first ones sooner: whenever they
 are half as many again."""
 ROUNDS, DAMPING = 2, 0.7
-"""Times that they are judged then, and the share of a new site that is taken."""
+"""Times that they are judged then among the first ones, later once; share of a new site taken."""
 FEWEST = 5
 """Runs below which nothing is said of a sudden change."""
 CHANCE = 4.0
@@ -109,9 +110,11 @@ class LifeFilter:
             oldest first, (..., 2, 3 motor).
         window: The latest runs; None before the first.
         arrived: Runs so far.
+        movements: Settled movements so far.
         due: Runs at which those of the window are judged again.
         alarm: What changes as no wear does, or empty.
         moved: Whether the sensor was found not to stand where the profile says.
+        begun: What was believed of the healthy robot at the beginning.
     """
 
     model: HealthyModel
@@ -125,8 +128,13 @@ class LifeFilter:
     window: RunsTogether | None = None
     arrived: int = 0
     due: int = 2
+    movements: int = 0
     alarm: str = ""
     moved: bool = False
+    begun: Imperfections = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.begun = self.model.imperfections
 
     @classmethod
     def of(
@@ -134,7 +142,7 @@ class LifeFilter:
         model: HealthyModel,
         hypotheses: Sequence[Hypothesis],
         priors: Priors,
-        limits: WearLimits = WearLimits(),
+        limits: WearLimits,
     ) -> LifeFilter:
         """Return what is believed before any run: what the model's variation says.
 
@@ -169,6 +177,7 @@ class LifeFilter:
         again = self.arrived + len(evidence.usable) >= self.due
         if again and not self.moved and self._in_doubt(window):
             self._look_for_sensor(window)
+        self.movements += int(evidence.usable.sum())
         (found,) = window.judge(np.arange(first, window.runs), moving)
         window.learn([found])
         if again:
@@ -204,15 +213,104 @@ class LifeFilter:
             return self.model.imperfections
         return self.window.at(self.belief.moments[0][0] * self.unit).imperfections
 
+    @property
+    def told(self) -> FolderPosterior:
+        """What all runs say together; of single ones nothing is kept."""
+        (mean,), (covariance,) = self.belief.moments
+        size, usual, broad = len(self.unit), self.unit, self.unit.copy()
+        if self.moved:
+            broad[:REGISTRATION] = np.inf
+        place = mean * usual
+        place[REGISTRATION:] = 0.0
+        none = Normal(np.zeros((0, size, size)), np.zeros((0, size)))
+        return FolderPosterior(
+            replace(self.model, imperfections=self.learned),
+            place,
+            mean * usual,
+            covariance * np.outer(usual, usual),
+            broad,
+            usual,
+            none,
+            np.zeros(0),
+            (),
+        )
+
+    # The state as arrays, to go on from.
+
+    def to_arrays(self) -> dict[str, FloatArray]:
+        """Return all that is believed, by name; its size does not grow with the runs."""
+        told = {
+            "arrived": np.array([self.arrived, self.due, self.moved, self.movements]),
+            "alarm": np.array(self.alarm),
+            "past": self.past,
+            **_fields("base", self.base),
+            **({} if self.habits is None else _fields("habits", self.habits)),
+        }
+        if self.window is None:
+            return told
+        window = self.window
+        seen = window.given.evidence
+        names = np.array([str(hypothesis) for hypothesis in self.hypotheses])
+        return {
+            **told,
+            **_fields("sites", window.sites),
+            **_fields("told", window.told),
+            **seen.to_arrays("seen"),
+            "window": np.array(seen.usable.shape),
+            "names": names,
+            "start": window.start,
+            "counted": window.counted,
+            "here": window.here,
+        }
+
+    def resumed(self, arrays: Mapping[str, FloatArray]) -> LifeFilter:
+        """Return what was believed when `to_arrays` was asked; begun as this one.
+
+        Raises:
+            KeyError: If something is missing.
+            ValueError: If something is of another shape.
+        """
+        arrived, due, moved, settled = arrays["arrived"].astype(int).tolist()
+        base = Belief(*(arrays[f"base/{f.name}"] for f in fields(Belief)))
+        habits = None if self.habits is None else _read(Habits, "habits", arrays)
+        found = replace(
+            self,
+            base=base,
+            habits=habits,
+            past=arrays["past"],
+            arrived=arrived,
+            due=due,
+            moved=bool(moved),
+            movements=settled,
+            alarm=str(arrays["alarm"]),
+        )
+        if "window" not in arrays:
+            return found
+        runs, movements = arrays["window"].astype(int).tolist()
+        motors = len(self.model.scatter)
+        seen = SettledEvidence.empty(run=runs, movement=movements, motor=motors, axis=3)
+        seen.from_arrays("seen", arrays)
+        window = found._together(seen)
+        window.sites = Normal(arrays["sites/precision"], arrays["sites/shift"])
+        window.told = _read(Habits, "told", arrays)
+        if arrays["names"].tolist() == [str(hypothesis) for hypothesis in self.hypotheses]:
+            window.start = arrays["start"]
+        window.counted[:], window.here = arrays["counted"], arrays["here"]
+        window.maximise()
+        found.window = window
+        return found
+
     # The latest runs: joined by new ones, judged again, let go of.
+
+    def joined_evidence(self, evidence: SettledEvidence) -> SettledEvidence:
+        """Return the settled positions of the latest runs with new ones behind them."""
+        return evidence if self.window is None else _behind(self.window.given.evidence, evidence)
 
     def _joined(self, evidence: SettledEvidence) -> RunsTogether:
         """Return the latest runs with new ones behind them."""
-        before = self.window
-        if before is None:
-            return self._together(evidence)
-        after = self._together(_behind(before.given.evidence, evidence))
-        _take(after, slice(0, before.runs), before, slice(None))
+        before, after = self.window, self._together(self.joined_evidence(evidence))
+        if before is not None:
+            _take(after, slice(0, before.runs), before, slice(None))
         return after
 
     def _together(self, evidence: SettledEvidence) -> RunsTogether:
@@ -228,7 +326,8 @@ class LifeFilter:
     def _judge_again(self, window: RunsTogether) -> None:
         arrived = self.arrived + 1
         self.due = max(self.arrived + 2, min(arrived + (arrived + 1) // 2, arrived + AGAIN))
-        for _ in range(ROUNDS if window.runs > 1 else 0):
+        rounds = ROUNDS if arrived < WINDOW else 1
+        for _ in range(rounds if window.runs > 1 else 0):
             window.learn(window.judge(np.arange(window.runs)), DAMPING)
 
     def _without_oldest(self, window: RunsTogether) -> RunsTogether:
@@ -327,6 +426,16 @@ def _state(belief: Belief, unit: FloatArray) -> FloatArray:
     (mean,), (covariance,) = belief.moments
     both = np.stack([mean, np.sqrt(np.diag(covariance))]) * unit
     return np.asarray(both[:, REGISTRATION:])
+
+
+def _fields(name: str, value: Belief | Normal | Habits) -> dict[str, FloatArray]:
+    """Return the arrays of a value by ``name/field``."""
+    return {f"{name}/{f.name}": getattr(value, f.name) for f in fields(value)}
+
+
+def _read(kind: type[Habits], name: str, arrays: Mapping[str, FloatArray]) -> Habits:
+    """Return a value from its arrays."""
+    return kind(*(arrays[f"{name}/{f.name}"] for f in fields(kind)))
 
 
 def _behind(before: SettledEvidence, evidence: SettledEvidence) -> SettledEvidence:
