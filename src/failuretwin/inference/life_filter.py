@@ -44,7 +44,7 @@ are half as many again."""
 ROUNDS, DAMPING = 2, 0.7
 """Times that they are judged then among the first ones, later once; share of a new site taken."""
 FEWEST = 5
-"""Runs below which nothing is said of a sudden change."""
+"""Runs below which nothing is said of a sudden change, or of where the sensor stands."""
 CHANCE = 4.0
 """The latest runs may lie this many standard deviations off by chance."""
 ANYWHERE = 30.0
@@ -360,8 +360,8 @@ class LifeFilter:
 
     def _in_doubt(self, window: RunsTogether) -> bool:
         """Return whether the latest runs say that the sensor stands elsewhere."""
-        likelihood = replace(window.given, model=window.at(window.here))
-        return set_up_in_doubt(likelihood, self.hypotheses, self.priors)
+        few = window.runs < FEWEST
+        return not few and set_up_in_doubt(window.given, self.hypotheses, self.priors)
 
     def _look_for_sensor(self, window: RunsTogether) -> None:
         """Let the frame of the sensor be anywhere near, and judge the latest runs anew."""
