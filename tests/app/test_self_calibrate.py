@@ -72,9 +72,12 @@ def test_without_it_nothing_is_learned(runs, tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--out", "own.toml"], "--out is for what --self-calibrate learns. Add --self-calibrate"),
-        (["--track", "--self-calibrate"], "--track follows a calibration, --self-calibrate makes"),
-        (["--track"], "--track keeps its history beside the calibration: name one"),
+        (["--out", "own.toml"], "--out is for what is learned: add --self-calibrate or --track"),
+        (["--track", "--self-calibrate"], "--track judges each run by those before it, --self"),
+        (
+            ["--track", "--out", "own.toml", "--calibration", "armpi_fpv"],
+            "--track keeps what it learns beside the calibration that it began with",
+        ),
         (["--self-calibrate", "--out", "own.json"], "own.json: a calibration ends in .toml"),
         (["--self-calibrate", "--out", "no/own.toml"], "does not exist. Make it first"),
     ],

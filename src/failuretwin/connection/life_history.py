@@ -74,10 +74,10 @@ def open_history(calibration: Path, start: LifeFilter, cold: bool) -> History:
         with np.load(state, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         size = int(arrays.pop(SIZE))
+        if len(content) < size:
+            raise InputError(f"{path}: is shorter than it was. Move it and {state} away.")
         lines = content[:size].decode().splitlines()
         rows = [_object(line, f"{path}: line {n}") for n, line in enumerate(lines, start=1)]
-        if len(content) < size or not rows:
-            raise InputError(f"{path}: is shorter than it was. Move it and {state} away.")
         _check_head(rows[0], path, start)
         return History(start.resumed(arrays), cold, path, size, tuple(r["key"] for r in rows[1:]))
     except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
