@@ -40,7 +40,9 @@ WINDOW = 24
 """Latest runs that are judged again as more come, and compared with what is behind."""
 AGAIN = 8
 """Runs after which those of the window are judged again; of the first ones sooner: whenever they
-are half as many again."""
+are half as many again. With a calibration, once in the window: it does not begin wrongly."""
+FIRST = 2
+"""Runs that are judged again the first time."""
 ROUNDS, DAMPING = 2, 0.7
 """Times that they are judged then among the first ones, later once; share of a new site taken."""
 FEWEST = 5
@@ -127,7 +129,7 @@ class LifeFilter:
     past: FloatArray
     window: RunsTogether | None = None
     arrived: int = 0
-    due: int = 2
+    due: int = FIRST
     movements: int = 0
     alarm: str = ""
     moved: bool = False
@@ -161,7 +163,9 @@ class LifeFilter:
         learns = layout_of(model).offsets and model.imperfections.settling is not None
         habits = Habits.believed(model.imperfections) if learns else None
         base = Belief.of(told, unit)
-        return cls(model, hypotheses, priors, limits, unit, base, habits, _state(base, unit)[None])
+        begun = _state(base, unit)[None]
+        due = FIRST if learns else WINDOW
+        return cls(model, hypotheses, priors, limits, unit, base, habits, begun, due=due)
 
     def follow(
         self, evidence: SettledEvidence, moving: TransientSamples | None = None
@@ -325,7 +329,8 @@ class LifeFilter:
 
     def _judge_again(self, window: RunsTogether) -> None:
         arrived = self.arrived + 1
-        self.due = max(self.arrived + 2, min(arrived + (arrived + 1) // 2, arrived + AGAIN))
+        sooner = min(arrived + (arrived + 1) // 2, arrived + AGAIN)
+        self.due = max(self.arrived + 2, sooner) if self.habits is not None else arrived + WINDOW
         rounds = ROUNDS if arrived < WINDOW else 1
         for _ in range(rounds if window.runs > 1 else 0):
             window.learn(window.judge(np.arange(window.runs)), DAMPING)
