@@ -13,8 +13,9 @@ from failuretwin.digital_model.nonidealities import Imperfections, Readings, Var
 from failuretwin.digital_model.settling import Settling
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.life_filter import LifeFilter, WearLimits
+from failuretwin.inference.life_filter import LifeFilter
 from failuretwin.inference.shared_unknowns import SetupPrior
+from failuretwin.inference.wear_limits import WearLimits
 
 COUNT = np.deg2rad(0.24)
 MOVEMENTS = 5

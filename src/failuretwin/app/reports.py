@@ -30,7 +30,7 @@ from failuretwin.digital_model.urdf_check import JointReport, UrdfReport
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.explanation import plain_name, size_words
 from failuretwin.inference.isolability import IsolabilityReport, isolability
-from failuretwin.inference.life_filter import wear_unit
+from failuretwin.inference.wear_limits import wear_unit
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -28,8 +28,9 @@ from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.evidence import Evidence, SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.life_filter import LifeFilter, WearLimits, wear_unit
+from failuretwin.inference.life_filter import LifeFilter
 from failuretwin.inference.shared_likelihood import has_score
+from failuretwin.inference.wear_limits import WearLimits, wear_unit
 
 if TYPE_CHECKING:
     import xarray as xr

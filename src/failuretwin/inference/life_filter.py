@@ -22,7 +22,6 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.nonidealities import Imperfections
-from failuretwin.digital_model.settling import largest_load
 from failuretwin.inference.evidence import SettledEvidence, TransientSamples
 from failuretwin.inference.folder_posterior import FolderPosterior
 from failuretwin.inference.healthy_model import HealthyModel
@@ -35,6 +34,7 @@ from failuretwin.inference.shared_likelihood import Normal
 from failuretwin.inference.shared_posterior import set_up_in_doubt
 from failuretwin.inference.shared_unknowns import REGISTRATION, SharedLayout, layout_of
 from failuretwin.inference.shared_weighing import SharedWeighing
+from failuretwin.inference.wear_limits import WearLimits, wear_unit
 
 WINDOW = 24
 """Latest runs that are judged again as more come, and compared with what is behind."""
@@ -55,45 +55,7 @@ LEAST_SPREAD = 1e-6
 """The same of an offset that wear does not change, in units."""
 REMEMBERED = 200.0
 """Runs by which scatter and loss rates are known at most: older ones fade."""
-LEAST_LOAD_NM = 1e-6
-"""A motor that never carries more torque than this does not sag [N m]."""
-LEAST_SCATTER_RAD = 1e-5
-"""Wear is counted by scatters of this size at least [rad]."""
 OFFSETS = ("bias", "compliance", "friction")
-
-
-@dataclass(frozen=True)
-class WearLimits:
-    """How fast and how far a healthy motor may change, in scatters of the motor.
-
-    The same figures hold for its bias, its friction and its sag at the largest load. No long
-    records of a real arm exist, so they are assumed: on the ArmPi FPV, where a scatter is 1 to 1.7
-    counts, swings of a count in some hundred runs are followed, as of temperature, and wear of some
-    counts in all.
-
-    Attributes:
-        rate: Random walk from run to run, its standard deviation [per root run].
-        reach: How far the latest runs may lie off what is behind, beyond chance: more is a fault
-            that grows, not wear.
-        limit: How far the robot may go from where it began; beyond that, calibrate again.
-        horizon: The latest runs are compared with what was believed so many runs ago [run].
-    """
-
-    rate: float = 0.025
-    reach: float = 0.5
-    limit: float = 4.0
-    horizon: int = 200
-
-
-def wear_unit(model: HealthyModel) -> FloatArray:
-    """Return what moves a motor by its scatter, at its largest load, (3 motor,).
-
-    It is 0 for the compliance of a motor that gravity does not load.
-    """
-    load = largest_load(model.twin.robot, model.settling.payload)
-    scatter = np.maximum(model.settling.scatter, LEAST_SCATTER_RAD)
-    sag = np.divide(scatter, load, out=np.zeros_like(load), where=load > LEAST_LOAD_NM)
-    return np.concatenate([scatter, sag, scatter])
 
 
 @dataclass

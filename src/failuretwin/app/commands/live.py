@@ -89,8 +89,8 @@ def _rests_on(known: Imperfections) -> str:
     if known.name != GENERIC_NAME:
         return f"healthy behaviour: {known.name} ({known.protocol}; {known.source})"
     return (
-        f"healthy behaviour: {known.name}; {known.source}. What this robot does is not known, "
-        "so small errors do not show: `failuretwin diagnose LOGS --track --out FILE` learns it from "
+        f"healthy behaviour: {known.name}; {known.source}. What this robot does is not known, so "
+        "small errors do not show: `failuretwin diagnose LOGS --track --out FILE` learns it from "
         "its runs, and --calibration FILE uses it"
     )
 
