@@ -46,7 +46,8 @@ def test_runs_are_judged_together_and_the_robot_is_kept(runs, armpi, tmp_path):
     assert [r["diagnosis"] for r in found] == [name for name in TRUTHS for _ in range(2)]
     assert {r["protocol"] for r in found} == {"P1"}
     learned = read_calibration(out, armpi)
-    assert learned.imperfections.settling.bias[1] == pytest.approx(0.02, abs=0.005)
+    bias, doubt = learned.imperfections.settling.bias[1], learned.imperfections.variation.bias[1]
+    assert abs(bias - 0.02) < 3.0 * doubt < 0.01  # three deviations off its class: pulled there
     told = [line for line in answer.output.splitlines() if line.startswith("self-calibrated: ")]
     assert [line.removeprefix("self-calibrated: ") for line in told] == list(learned.remarks)
     assert "6 of 6 runs right" in answer.output
