@@ -108,15 +108,19 @@ def folder_posterior(
 def begun(weighing: SharedWeighing) -> tuple[RunsTogether, FloatArray]:
     """Return runs of which nothing was judged yet, and what others of their kind differ by.
 
-    What arms of the kind are like is the prior of theta; the frame of the sensor is known, unless
-    the runs say that it is not.
+    What arms of the kind are like is the prior of theta. The frame of the sensor is known; if the
+    runs say that it may not be, it is known or anywhere near, by the odds of the set-up.
     """
     told = [part for part in weighing.parts if not part.name]
     usual = unit = told[0].deviation
     in_doubt = doubted(weighing)
     if in_doubt:
-        unit = weighing.broad
-        told = [replace(p, deviation=_in_doubt(p.deviation, unit)) for p in told]
+        unit, odds = weighing.broad, weighing.priors.setup.doubt
+        moved = float(np.log(odds) - np.log1p(-odds))
+        told += [
+            replace(p, log_weight=p.log_weight + moved, deviation=_in_doubt(p.deviation, unit))
+            for p in told
+        ]
     together = RunsTogether.of(weighing, Belief.of(told, unit), unit)
     if in_doubt:
         together.here = weighing.register_together()[0]

@@ -335,7 +335,8 @@ class LifeFilter:
         weighing = SharedWeighing(window.given, self.hypotheses, self.priors, window.layout)
         variance = (weighing.broad / self.unit) ** 2
         variance[REGISTRATION:] = 0.0
-        self.moved, self.base = True, self.base.blurred(variance)
+        odds = self.priors.setup.doubt / (1.0 - self.priors.setup.doubt)
+        self.moved, self.base = True, self.base.or_moved(variance, odds)
         window.base, window.start[:] = self.base, np.nan
         window.sites.precision[:], window.sites.shift[:] = 0.0, 0.0
         window.here = weighing.register_together()[0]

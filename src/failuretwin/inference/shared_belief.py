@@ -100,6 +100,16 @@ class Belief:
         precision = np.linalg.inv(covariance + np.diag(variance))
         return Belief(self.log_weight, precision, np.einsum("rctu,rcu->rct", precision, mean))
 
+    def or_moved(self, variance: FloatArray, odds: float) -> Belief:
+        """Return what is believed if theta may also have moved by that variance, with some odds."""
+        moved, log_odds = self.blurred(variance), float(np.log(odds))
+        log_weight = np.concatenate([self.log_weight, moved.log_weight + log_odds], axis=1)
+        return Belief(
+            log_weight - log_sum(log_weight, axis=1)[:, None],
+            np.concatenate([self.precision, moved.precision], axis=1),
+            np.concatenate([self.shift, moved.shift], axis=1),
+        )
+
     def pruned(self) -> Belief:
         """Return one mixture without the components that are not to be reckoned with."""
         kept = np.flatnonzero(self.weight[0] > LEAST_WEIGHT)
