@@ -106,10 +106,8 @@ AREAS: dict[str, tuple[str, ...]] = {
     ),
     "connection/self_calibration.py": ("tests/connection/test_self_calibration.py",),
     "digital_model/arm_classes.py": ("tests/digital_model/test_arm_classes.py",),
-    "connection/wear*.py": (
-        "tests/connection/test_tracker_history.py",
-        "tests/connection/test_tracker.py",
-    ),
+    "connection/life_history.py": ("tests/connection/test_life_history.py",),
+    "inference/life_filter.py": ("tests/connection/test_life_filter.py",),
     "connection/calibration/step_*.py": ("tests/connection/test_step_fit.py",),
     "connection/calibration/servo_loops.py": ("tests/connection/test_step_fit.py",),
     "connection/calibration": (

@@ -9,15 +9,14 @@ import argparse
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
 from failuretwin.connection.calibration.calibrate import fit_calibration
-from failuretwin.connection.tracked_diagnosis import History, Tracked, diagnose_tracked
-from failuretwin.connection.wear_tracker import Tracker
+from failuretwin.connection.life_history import History
+from failuretwin.connection.tracked_diagnosis import begin, diagnose_tracked
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import concatenate
 from failuretwin.core.types import FloatArray, as_floats
@@ -28,6 +27,7 @@ from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import loads_in_range
 from failuretwin.failure_behavior.modes import SteadyStateError
 from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.life_filter import LifeFilter
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -121,8 +121,8 @@ class World:
         self, trial: Trial, first: int, runs: int
     ) -> Iterator[tuple[FloatArray, xr.Dataset]]:
         """Yield wear and run sets of a trial that begins with run `first`, without readings."""
-        for begin in range(0, runs, BLOCK):
-            since = np.arange(begin, min(begin + BLOCK, runs))
+        for block in range(0, runs, BLOCK):
+            since = np.arange(block, min(block + BLOCK, runs))
             wear = self.wear(as_floats(since + first), since[:, None] * np.asarray(trial.growth))
             tables = [
                 simulate_runs(self._plan(trial, now, first + runs), [first + int(number)])
@@ -147,47 +147,39 @@ class World:
 class Followed:
     """What was seen along the runs of a trial."""
 
-    tracker: Tracker
+    life: LifeFilter
     off: list[FloatArray] = field(default_factory=list)
     tracked: list[Diagnosis] = field(default_factory=list)
     untracked: list[Diagnosis] = field(default_factory=list)
     alarms: list[str] = field(default_factory=list)
-    filter_s: float = 0.0
 
 
 def follow(
-    world: World, diagnoser: BayesDiagnoser, tracker: Tracker, trial: Trial, first: int, plain: bool
+    world: World, diagnoser: BayesDiagnoser, life: LifeFilter, trial: Trial, first: int, plain: bool
 ) -> Followed:
     """Diagnose and track the runs of a trial.
 
     Args:
         world: The true robot.
         diagnoser: The diagnoser with the calibration.
-        tracker: The tracker before.
+        life: What is believed of the robot before.
         trial: What happens.
         first: Number of the first run.
-        plain: Whether to diagnose without the tracker as well.
+        plain: Whether to diagnose without it as well.
     """
-    seen = Followed(tracker)
+    seen = Followed(life)
     for wear, runs in world.blocks(trial, first, trial.runs):
-        history = History(Path("none"), 0, (), seen.tracker)
-        done = diagnose_tracked(runs, diagnoser, history)
+        done = diagnose_tracked(runs, diagnoser, History(seen.life, cold=False))
         seen.tracked += done.diagnoses
-        seen.alarms += [step.alarm for step in done.steps]
-        seen.off += [step.state.mean - now for step, now in zip(done.steps, wear, strict=True)]
-        seen.filter_s += _filter_seconds(seen.tracker, done)
-        seen.tracker = done.tracker
+        seen.alarms += [str(row["alarm"]) for row in done.rows]
+        seen.off += [
+            np.array([*row["bias"], *row["compliance"]]) - now
+            for row, now in zip(done.rows, wear, strict=True)
+        ]
+        seen.life = done.life
         if plain:
             seen.untracked += diagnoser.diagnose(runs)
     return seen
-
-
-def _filter_seconds(tracker: Tracker, done: Tracked) -> float:
-    """Return the time that the filter alone takes for the runs of a block [s]."""
-    begin = time.perf_counter()
-    for step in done.steps:
-        tracker, _ = tracker.follow(step.evidence, step.fault_probability)
-    return time.perf_counter() - begin
 
 
 def false_alarms(diagnoses: list[Diagnosis]) -> str:
@@ -196,10 +188,10 @@ def false_alarms(diagnoses: list[Diagnosis]) -> str:
     return f"{count} of {len(diagnoses)} ({100.0 * count / len(diagnoses):.1f} %)"
 
 
-def print_errors(name: str, off: FloatArray, tracker: Tracker) -> None:
+def print_errors(name: str, off: FloatArray, robot: Robot) -> None:
     """Print rms and worst errors of tracked wear, (run, 2 motor), in counts."""
-    angle = np.array([tracker.in_angle(row) for row in off]) / COUNT
-    load = loads_in_range(tracker.robot, 0.0) * tracker.robot.sense
+    load = loads_in_range(robot, 0.0) * robot.sense
+    angle = _in_angle(off, robot) / COUNT
     bias, compliance = np.split(off, 2, axis=1)
     pose = np.mean((bias[:, None] + compliance[:, None] * load) ** 2, axis=1) ** 0.5 / COUNT
     parts = [*np.split(angle, 2, axis=1), pose]
@@ -210,11 +202,17 @@ def print_errors(name: str, off: FloatArray, tracker: Tracker) -> None:
         print(f"  {name:12s} {what:24s} rms {_row(rms)}   worst {_row(worst)}")
 
 
+def _in_angle(off: FloatArray, robot: Robot) -> FloatArray:
+    """Return bias and compliance as angles, these at the largest load, (..., 2 motor) [rad]."""
+    largest = np.abs(loads_in_range(robot, 0.0)).max(axis=0)
+    return off * np.concatenate([np.ones_like(largest), largest])
+
+
 def _row(values: FloatArray) -> str:
     return " ".join(f"{value:5.2f}" for value in values)
 
 
-def print_trial(seen: Followed, before: Tracker, trial: Trial) -> None:
+def print_trial(seen: Followed, before: LifeFilter, trial: Trial) -> None:
     """Print when the fault was found and how far the tracked state moved with it."""
     wanted = f"{trial.motor}:"
     named = [
@@ -224,15 +222,16 @@ def print_trial(seen: Followed, before: Tracker, trial: Trial) -> None:
         for d in seen.tracked
     ]
     found = named.index(True) + 1 if any(named) else None
-    declared = [alarm not in ("", "the last runs look faulty") for alarm in seen.alarms]
+    declared = [bool(alarm) for alarm in seen.alarms]
     alarm = declared.index(True) + 1 if any(declared) else None
-    after = before.in_angle(seen.tracker.state.mean - before.state.mean) / COUNT
+    moved = (seen.life.offsets[0] - before.offsets[0])[:2].ravel()
+    after = _in_angle(moved, before.model.twin.robot) / COUNT
     size = ""
     if trial.growth[0]:
         size = f" (the fault: {trial.growth[0] * trial.runs:.0f})"
     print(
         f"  {trial.name:36s} named first in run {found}, in {sum(named)} of {len(named)} runs; "
-        f"tracker stops for good in run {alarm}: {seen.alarms[alarm - 1] if alarm else ''}; state "
+        f"learning stops in run {alarm}: {seen.alarms[alarm - 1] if alarm else ''}; state "
         f"moved by {np.abs(after).max():.2f} counts at most{size}"
     )
 
@@ -249,18 +248,18 @@ def main() -> None:
         simulate(healthy), robot, "fresh", "simulated", use_readings=False, thorough=False
     )
     diagnoser = BayesDiagnoser(DigitalTwin(robot), learned.imperfections)
-    start = Tracker.of(learned.imperfections, robot)
+    start = begin(diagnoser, cold=False)
 
-    begin = time.perf_counter()
+    begun_s = time.perf_counter()
     seen = follow(world, diagnoser, start, Trial("wear", runs=options.runs), 0, True)
     print(
-        f"{options.runs} runs of wear, {time.perf_counter() - begin:.0f} s; the filter alone "
-        f"{seen.filter_s:.1f} s. Errors in counts, motors 1 to 4:"
+        f"{options.runs} runs of wear, {time.perf_counter() - begun_s:.0f} s. Errors in counts, "
+        "motors 1 to 4:"
     )
     off = np.array(seen.off)
     wear = world.wear(as_floats(np.arange(options.runs)))
-    print_errors("tracked", off, start)
-    print_errors("not tracked", start.start.mean - wear, start)
+    print_errors("tracked", off, robot)
+    print_errors("not tracked", start.offsets[0][:2].ravel() - wear, robot)
     quarter = options.runs // 4
     print(
         f"false alarms with the tracker {false_alarms(seen.tracked)}, last quarter "
@@ -270,13 +269,11 @@ def main() -> None:
         f"false alarms without          {false_alarms(seen.untracked)}, last quarter "
         f"{false_alarms(seen.untracked[-quarter:])}"
     )
-    stops = sum(alarm not in ("", "the last runs look faulty") for alarm in seen.alarms)
-    held = sum(bool(alarm) for alarm in seen.alarms)
-    print(f"learning held in {held} runs, of these for a declared fault in {stops}\n")
+    print(f"learning stopped in {sum(bool(alarm) for alarm in seen.alarms)} runs\n")
     print("then a fault:", flush=True)
     for trial in TRIALS:
         print_trial(
-            follow(world, diagnoser, seen.tracker, trial, options.runs, False), seen.tracker, trial
+            follow(world, diagnoser, seen.life, trial, options.runs, False), seen.life, trial
         )
 
 

@@ -46,7 +46,8 @@ def test_runs_are_judged_together_and_the_robot_is_kept(runs, armpi, tmp_path):
     assert [r["diagnosis"] for r in found] == [name for name in TRUTHS for _ in range(2)]
     assert {r["protocol"] for r in found} == {"P1"}
     learned = read_calibration(out, armpi)
-    assert learned.imperfections.settling.bias[1] == pytest.approx(0.02, abs=0.005)
+    bias, doubt = learned.imperfections.settling.bias[1], learned.imperfections.variation.bias[1]
+    assert abs(bias - 0.02) < 3.0 * doubt < 0.01  # three deviations off its class: pulled there
     told = [line for line in answer.output.splitlines() if line.startswith("self-calibrated: ")]
     assert [line.removeprefix("self-calibrated: ") for line in told] == list(learned.remarks)
     assert "6 of 6 runs right" in answer.output
@@ -72,9 +73,12 @@ def test_without_it_nothing_is_learned(runs, tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--out", "own.toml"], "--out is for what --self-calibrate learns. Add --self-calibrate"),
-        (["--track", "--self-calibrate"], "--track follows a calibration, --self-calibrate makes"),
-        (["--track"], "--track keeps its history beside the calibration: name one"),
+        (["--out", "own.toml"], "--out is for what is learned: add --self-calibrate or --track"),
+        (["--track", "--self-calibrate"], "--track judges each run by those before it, --self"),
+        (
+            ["--track", "--out", "own.toml", "--calibration", "armpi_fpv"],
+            "--track keeps what it learns beside the calibration that it began with",
+        ),
         (["--self-calibrate", "--out", "own.json"], "own.json: a calibration ends in .toml"),
         (["--self-calibrate", "--out", "no/own.toml"], "does not exist. Make it first"),
     ],

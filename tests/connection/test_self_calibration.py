@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from failuretwin import load_robot
 from failuretwin.connection.calibration.result import read_calibration, save_calibration
-from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser, _more_when_late
+from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser, more_when_late
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.arm_classes import generic_imperfections
@@ -216,10 +216,10 @@ def test_a_population_of_ones_own_counts(armpi, own):
 
 
 def test_more_commands_get_lost_where_movements_start_late():
-    assert _more_when_late(LostCommand(("motor_1",), 0.03, 0.03)).rate_when_late == pytest.approx(
+    assert more_when_late(LostCommand(("motor_1",), 0.03, 0.03)).rate_when_late == pytest.approx(
         0.12
     )
-    assert _more_when_late(LostCommand(("motor_1",), 0.08, 0.08)).rate_when_late == 0.2
+    assert more_when_late(LostCommand(("motor_1",), 0.08, 0.08)).rate_when_late == 0.2
 
 
 def test_timing_is_that_of_the_commands(armpi):

@@ -1,4 +1,4 @@
-"""A robot that wears, by its own short simulation, for the tests of the tracker."""
+"""A robot that wears, by its own short simulation, for the tests of what follows it."""
 
 from __future__ import annotations
 
@@ -6,15 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from failuretwin import DigitalTwin
-from failuretwin.connection.calibration.observations import Observations
-from failuretwin.connection.wear import run_evidence
-from failuretwin.connection.wear_tracker import Tracker
-from failuretwin.digital_model.nonidealities import Imperfections, Variation
+from failuretwin import DigitalTwin, Priors
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.movements import Movements
+from failuretwin.digital_model.nonidealities import Imperfections, Readings, Variation
 from failuretwin.digital_model.settling import Settling
+from failuretwin.inference.evidence import SettledEvidence
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.life_filter import LifeFilter
+from failuretwin.inference.shared_unknowns import SetupPrior
+from failuretwin.inference.wear_limits import WearLimits
 
 COUNT = np.deg2rad(0.24)
 MOVEMENTS = 5
+NOISE_M = 0.0005
 SETTLING = Settling(
     bias=(0.002, -0.004, 0.0, 0.003),
     compliance=(0.0, 0.14, 0.16, 0.2),
@@ -23,69 +28,76 @@ SETTLING = Settling(
     tail_dof=4.0,
     source="made up",
 )
-DOUBT = Variation(bias=(0.001,) * 4, compliance=(0.05,) * 4)
-CALIBRATION = Imperfections("made up", "test", "P0c", SETTLING, variation=DOUBT)
+DOUBT = Variation(bias=(0.001,) * 4, compliance=(0.05,) * 4, friction=(0.001,) * 4)
+READINGS = Readings(rate_hz=10.0, noise_m=NOISE_M)
+CALIBRATION = Imperfections("made up", "test", "P0c", SETTLING, readings=READINGS, variation=DOUBT)
+KNOWN = Priors(setup=SetupPrior.known())
 
 
-def normal(calibration):
+def normal(calibration=CALIBRATION):
     """Return the calibration with scatter of a normal distribution."""
     return replace(calibration, settling=replace(calibration.settling, tail_dof=np.inf))
 
 
-def truth(runs, bias=0.0, compliance=0.0, calibration=CALIBRATION):
-    """Return bias and compliance of each run, (run, 2 motor); changes (run or 1, motor)."""
-    settling = calibration.settling
-    wear = np.zeros((runs, 8))
-    wear[:, :4] = np.asarray(settling.bias) + bias
-    wear[:, 4:] = np.asarray(settling.compliance) + compliance
+def truth(runs, bias=0.0, compliance=0.0, settling=SETTLING):
+    """Return bias, compliance and friction of each run, (run, 3, motor)."""
+    wear = np.zeros((runs, 3, 4))
+    wear[:, 0] = np.asarray(settling.bias) + bias
+    wear[:, 1] = np.asarray(settling.compliance) + compliance
+    wear[:, 2] = settling.friction
     return wear
 
 
-def observe_wear(robot, wear, rng, readings=False, calibration=CALIBRATION):
-    """Return five movements for each run of a robot with that wear, (run, 2 motor)."""
-    settling, runs = calibration.settling, len(wear)
+def seen(robot, wear, seed=0, calibration=CALIBRATION, held=None):
+    """Return where the tool of a robot with that wear settles, five movements a run.
+
+    Args:
+        robot: The robot.
+        wear: Of each run, (run, 3, motor).
+        seed: Of the draws.
+        calibration: Its scatter.
+        held: A motor that stays at an angle of its own in each run.
+    """
+    rng, settling, runs = np.random.default_rng(seed), calibration.settling, len(wear)
     low, high = np.array([motor.movement_range for motor in robot.motors]).T
     target = rng.uniform(low, high, (runs, MOVEMENTS, 4))
     origin = np.concatenate([np.zeros((runs, 1, 4)), target[:, :-1]], axis=1)
-    bias, compliance = wear[:, None, :4], wear[:, None, 4:]
-    short = np.asarray(settling.friction) * np.sign(target - origin)
+    bias, compliance, friction = np.moveaxis(wear[:, None], 2, 0)
     pose = target
     for _ in range(3):  # gravity acts in the pose that the arm is really in
         torque = robot.sense * robot.loads.torque(pose * robot.sense)
-        pose = target + bias + compliance * torque - short
-    shape = (runs, MOVEMENTS, 4)
+        pose = target + bias + compliance * torque - friction * np.sign(target - origin)
     infinite = np.isinf(settling.tail_dof)
+    shape = target.shape
     unit = rng.normal(size=shape) if infinite else rng.standard_t(settling.tail_dof, shape)
-    pose = (pose + unit * settling.scatter).reshape(-1, 4)
-    return Observations(
-        run=np.repeat(np.arange(runs), MOVEMENTS),
-        session=np.zeros(runs * MOVEMENTS, dtype=np.int64),
-        number=np.tile(np.arange(MOVEMENTS), runs),
-        origin=origin.reshape(-1, 4),
-        target=target.reshape(-1, 4),
-        point=DigitalTwin(robot).path(pose) + rng.normal(0.0, 0.001, (len(pose), 3)),
-        position=pose if readings else None,
-        sessions=("session",),
-        runs=tuple(f"run {i}" for i in range(runs)),
+    pose = pose + unit * settling.scatter
+    if held is not None:
+        pose[..., held] = rng.uniform(-0.5, 0.5, (runs, 1))
+    start = np.tile(2.0 * np.arange(MOVEMENTS), (runs, 1))
+    movements = Movements(np.zeros((runs, 4)), target, np.full(shape, 0.8), start)
+    empty = SettledEvidence.empty(run=runs, movement=MOVEMENTS, motor=4, axis=3)
+    return replace(
+        empty,
+        movements=movements,
+        point=DigitalTwin(robot).path(pose) + rng.normal(0.0, NOISE_M, (*shape[:2], 3)),
+        usable=np.ones(shape[:2], dtype=bool),
+        begin=start + 1.5,
+        end=start + 2.0,
     )
 
 
-def evidence_of(robot, wear, seed=0, readings=False, calibration=CALIBRATION):
-    """Return the evidence of each run, linear at the calibration."""
-    seen = observe_wear(robot, wear, np.random.default_rng(seed), readings, calibration)
-    return run_evidence(seen, robot, calibration.settling, range(len(wear)))
+def life(robot, hypotheses=("healthy",), calibration=CALIBRATION, limits=None):
+    """Return what is believed of the robot before any run."""
+    model = HealthyModel(DigitalTwin(robot), calibration)
+    parsed = [Hypothesis.parse(name) for name in hypotheses]
+    return LifeFilter.of(model, parsed, KNOWN, limits or WearLimits())
 
 
-def follow_all(tracker, evidence, fault_probability=0.1):
-    """Return the tracker after many runs, and all steps; one suspicion, or one for each run."""
-    steps = []
-    for run, chance in zip(
-        evidence, np.broadcast_to(fault_probability, len(evidence)), strict=True
-    ):
-        tracker, step = tracker.follow(run, float(chance))
-        steps.append(step)
-    return tracker, steps
-
-
-def fresh(robot, calibration=CALIBRATION, limits=None):
-    return Tracker.of(calibration, robot, limits)
+def follow_all(found, evidence, batch=10):
+    """Return offsets (step, 2, 3, motor) and alarms after every few runs."""
+    offsets, alarms = [], []
+    for first in range(0, len(evidence.usable), batch):
+        found.follow(evidence[first : first + batch])
+        offsets.append(np.stack(found.offsets))
+        alarms.append(found.alarm)
+    return np.array(offsets), alarms

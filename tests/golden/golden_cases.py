@@ -12,7 +12,6 @@ from golden_entry import (
     MODES,
     MONITORING,
     StreamingFleet,
-    Tracker,
     augmented_features,
     evidence_of,
     expected_log_bayes_factors,
@@ -20,11 +19,9 @@ from golden_entry import (
     healthy,
     log_quality,
     monitor,
-    observe,
     original_features,
     priors_of,
     robust_features,
-    run_evidence,
     signals_of,
     twin,
     with_log_evidence,
@@ -290,29 +287,6 @@ def _figures(imperfections):
     }
 
 
-def tracked():
-    """Return the state of a tracker that sees the healthy runs four times, then faulty ones."""
-    robot, known = twin().robot, healthy("measured", twin().robot)
-    tracker, found = Tracker.of(known, robot), {}
-    healthy_runs, faulty = (observe(load(n), use_readings=False) for n in ("sessions", "nine"))
-    for turn, seen in enumerate((healthy_runs,) * 4 + (faulty,)):
-        runs = range(len(seen.runs))
-        outcomes = []
-        for one in run_evidence(seen, robot, tracker.tracked_settling, runs):
-            tracker, step = tracker.follow(one, 0.8 if seen is faulty else 0.1)
-            outcomes += [list(outcome) for outcome in step.outcomes]
-        state = tracker.state
-        found[f"turn {turn}"] = {
-            "mean": state.mean,
-            "covariance": state.covariance,
-            "level": tracker.cusum,
-            "learned at": tracker.learned_at,
-            "alarm": tracker.alarm,
-            "fates": outcomes,
-        }
-    return found
-
-
 def _in_unknown(*others):
     return {"hypotheses": (*PAPER, *others, "unknown")}
 
@@ -368,7 +342,6 @@ CASES = {
     "separation, modes": Case(partial(separated, "modes", ("healthy", *EVERY[2:40:6]))),
     "calibration": Case(partial(calibrated, True, False), FITTED),
     "calibration, tool path": Case(partial(calibrated, False, False), FITTED),
-    "tracker": Case(tracked),
 }
 
 

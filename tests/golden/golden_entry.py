@@ -11,8 +11,6 @@ import numpy as np
 import failuretwin as ft
 from failuretwin.connection.calibration.calibrate import fit_calibration
 from failuretwin.connection.calibration.observations import observe
-from failuretwin.connection.wear import run_evidence
-from failuretwin.connection.wear_tracker import Tracker
 from failuretwin.core.hypothesis import parse_hypotheses
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
 from failuretwin.decision.learned.feature_encoder import (
@@ -41,7 +39,6 @@ __all__ = [
     "LostCommand",
     "Readings",
     "StreamingFleet",
-    "Tracker",
     "augmented_features",
     "expected_log_bayes_factors",
     "fit_calibration",
@@ -53,7 +50,6 @@ __all__ = [
     "original_features",
     "parse_hypotheses",
     "priors_of",
-    "run_evidence",
     "save_run_set",
     "signals_of",
 ]

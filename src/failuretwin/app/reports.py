@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -32,6 +31,7 @@ from failuretwin.digital_model.urdf_check import JointReport, UrdfReport
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.explanation import plain_name, size_words
 from failuretwin.inference.isolability import IsolabilityReport, isolability
+from failuretwin.inference.wear_limits import wear_unit
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -375,32 +375,29 @@ def _with_unit(value: float | None, scale: float, unit: str) -> str:
 
 
 def tracking_line(tracked: Tracked) -> str:
-    """Return what the tracker did with the runs, in one line."""
-    outcomes = Counter(outcome for step in tracked.steps for _, outcome in step.outcomes)
-    parts = [
-        f"{outcomes['learned']} runs learned",
-        f"{outcomes['discarded'] + outcomes['frozen']} left out",
-        f"{sum(run.open for run in tracked.tracker.window)} waiting",
-    ]
+    """Return what was learned of the runs, in one line."""
+    life, history = tracked.life, tracked.history
+    parts = [f"{len(tracked.rows)} runs learned", f"{life.arrived} in all"]
     if tracked.known:
         parts.append(f"{tracked.known} known already")
-    told = f"tracked: {', '.join(parts)}"
-    if outcomes["learned"]:
-        told += f"; {_largest_changes(tracked)}"
-    if tracked.tracker.alarm:
-        told += f"; learning is stopped: {tracked.tracker.alarm}"
-    return f"{told}; history: {tracked.history.path}"
+    told = f"tracked: {', '.join(parts)}; {_largest_changes(tracked)}"
+    if life.alarm:
+        told += f"; learning is stopped: {life.alarm}"
+    return told if history.path is None else f"{told}; history: {history.path}"
 
 
 def _largest_changes(tracked: Tracked) -> str:
     """Return the largest changes of bias and of sag, with their deviations."""
-    before, after = tracked.history.tracker, tracked.tracker
-    moved = np.split(after.in_angle(after.state.mean - before.state.mean), 2)
-    doubt = np.split(after.in_angle(after.state.deviation), 2)
+    life = tracked.life
+    unit = wear_unit(life.model).reshape(3, -1)
+    share = np.divide(unit[0], unit[1], out=np.zeros_like(unit[0]), where=unit[1] > 0.0)
+    in_angle = np.stack([np.ones_like(share), share])  # of a compliance: at the largest load
+    (before, _), (after, doubt) = (one.offsets for one in (tracked.history.life, life))
+    moved, doubt = in_angle * (after - before)[:2], in_angle * doubt[:2]
     told = []
     for kind, change, deviation in zip(("bias", "sag"), moved, doubt, strict=True):
         worst = int(np.argmax(np.abs(change)))
         degrees, error = np.rad2deg(change[worst]), np.rad2deg(deviation[worst])
-        motor = after.robot.motor_names[worst]
+        motor = life.model.motor_names[worst]
         told.append(f"{kind} of {motor} {degrees:+.2f} deg (deviation {error:.2f})")
     return f"largest changes: {', '.join(told)}"

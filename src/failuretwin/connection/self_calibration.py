@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 import xarray as xr
+from scipy.spatial.transform import Rotation
 
 from failuretwin.connection.calibration.observations import session_names
 from failuretwin.connection.calibration.parameters import readings_of, schedule_of, timing_of
@@ -27,7 +28,12 @@ from failuretwin.core.runs import truth_of
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.read import RunsLike, as_runs
 from failuretwin.digital_model.arm_classes import generic_imperfections
-from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
+from failuretwin.digital_model.calibrated_robot import (
+    HealthyLike,
+    RobotLike,
+    calibrated,
+)
+from failuretwin.digital_model.geometry import SensorFrame, roll_pitch_yaw
 from failuretwin.digital_model.nonidealities import Imperfections, LostCommand, Variation
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import poses_in_range
@@ -156,7 +162,7 @@ class SelfCalibratingDiagnoser:
                 run = first + at
                 told = posterior.to_diagnosis(at, names[run], seen.quality[run], truths[run])
                 diagnoses.append(replace(told, protocol="P1", method=_method(robot)))
-        learned = _calibration(found, believed, robot, runs)
+        learned = as_calibration(found, believed, robot, runs)
         prior = np.exp(log_prior(bayes.hypothesis_set, bayes.priors))
         return SelfCalibration(diagnoses, learned, prior, found.taught)
 
@@ -170,7 +176,7 @@ class SelfCalibratingDiagnoser:
         timing = timing_of(None, late, gap_starts(runs, movements, late.late))
         losses = believed.imperfections.lost_commands
         if timing.late_rate > 0.0:
-            losses = tuple(_more_when_late(entry) for entry in losses)
+            losses = tuple(more_when_late(entry) for entry in losses)
         return replace(
             believed.imperfections,
             timing=timing,
@@ -187,14 +193,22 @@ def _method(robot: Robot) -> str:
     return f"bayes, settled poses; healthy behaviour: {_name(robot)}"
 
 
-def _more_when_late(entry: LostCommand) -> LostCommand:
+def more_when_late(entry: LostCommand) -> LostCommand:
+    """Return how often some motors lose a command, late movements more often."""
     return replace(entry, rate_when_late=min(LATE_LOSSES * entry.rate, 0.2))
 
 
-def _calibration(
+def as_calibration(
     found: FolderPosterior, believed: Imperfections, robot: Robot, runs: xr.Dataset
 ) -> Calibration:
-    """Return what was learned as a calibration, which anybody may use."""
+    """Return what was learned as a calibration, which anybody may use.
+
+    Args:
+        found: What runs say together.
+        believed: What was believed before.
+        robot: The robot.
+        runs: The runs.
+    """
     learned = found.model.imperfections
     source = f"{counted(runs.sizes['run'], 'run')} without labels; {believed.name}"
     parameters = _parameters(found, believed, robot)
@@ -213,15 +227,32 @@ def _calibration(
         movements=int(sum(p.likelihood.evidence.usable.sum() for p in found.posteriors)),
         used_readings=False,
         remarks=tuple(_remarks(parameters, found, runs)),
+        frame=_frame(found),
     )
 
 
+def _frame(found: FolderPosterior) -> SensorFrame | None:
+    """Return where the sensor was found to stand; None: where the profile says."""
+    before = found.model.twin.robot.frame
+    if not found.moved:
+        return before
+    turn = Rotation.from_rotvec(found.place[TURN]).as_matrix()
+    x, y, z = found.place[ORIGIN].tolist()
+    here = SensorFrame((x, y, z, *roll_pitch_yaw(turn)), 1.0 + float(found.place[SCALE][0]))
+    return here.after(before)
+
+
 def _variation(found: FolderPosterior) -> Variation:
-    """Return the deviations of what was learned, as a calibration states them."""
+    """Return the deviations of what was learned, as a calibration states them.
+
+    They are those beside the frame that the calibration holds: what the two make up for is no doubt
+    of where the tool comes to rest.
+    """
     motors = len(found.model.scatter)
     if len(found.mean) == REGISTRATION:
         return found.model.imperfections.variation or Variation()
-    bias, compliance, friction = found.deviation[REGISTRATION:].reshape(3, motors)
+    own = np.linalg.inv(np.linalg.inv(found.covariance)[REGISTRATION:, REGISTRATION:])
+    bias, compliance, friction = np.sqrt(np.diag(own)).reshape(3, motors)
     mean = np.abs(np.asarray(found.model.settling.compliance))
     relative = np.divide(compliance, mean, out=np.zeros(motors), where=mean > 1e-9)
     return Variation(
@@ -268,7 +299,8 @@ def _remarks(
     if second is not None:
         lines.append(two_robots(second, names))
     most = [f"{names[i]} ({found.taught[i]:.1f} nats)" for i in np.argsort(-found.taught)[:3]]
-    lines.append(f"most was learned from {', '.join(most)}")
+    if most:
+        lines.append(f"most was learned from {', '.join(most)}")
     lines.append(
         "a constant error that is there in every run cannot be told from the robot's own, up to "
         "what such robots differ by"
@@ -297,8 +329,8 @@ def _set_up(found: FolderPosterior) -> list[str]:
         "the sensor does not seem to stand where the profile says: the tool appears about "
         f"{1e3 * away.mean():.2g} mm off, its frame by ({origin}) mm, turned by ({turn}) deg, "
         f"scale {1e2 * found.place[SCALE][0]:+.1f} %. Offsets were learned beside that, and a "
-        "calibration does not hold it: `failuretwin robot fit` on healthy runs finds the frame, so "
-        "do that first"
+        "calibration that is written holds both. `failuretwin robot fit` on healthy runs finds the "
+        "frame more exactly"
     ]
 
 

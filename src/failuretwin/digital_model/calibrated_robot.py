@@ -16,6 +16,7 @@ import numpy as np
 from failuretwin.core.config import Bounded, from_table, read_toml
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.digital_model.arm_classes import generic_imperfections
+from failuretwin.digital_model.geometry import SensorFrame
 from failuretwin.digital_model.nonidealities import (
     NO_IMPERFECTIONS,
     SETTLING_LISTS,
@@ -152,7 +153,7 @@ def load_calibration(
     imperfections = _completed(from_table(Imperfections, table, str(path)), len(robot.motors))
     check_fit(imperfections, robot, path)
     _check_sane(imperfections.settling, robot, path)
-    return CalibratedRobot(with_loops(robot, record.loops), imperfections)
+    return CalibratedRobot(record.applied_to(robot), imperfections)
 
 
 def _file_of(name_or_path: str, robot: Robot) -> Path:
@@ -212,12 +213,18 @@ class _Record:
 
     robot: str = ""
     loops: tuple[CalibratedLoop, ...] = ()
+    frame: SensorFrame | None = None
+
+    def applied_to(self, robot: Robot) -> Robot:
+        """Return a robot with what the calibration knows of its loops and its sensor."""
+        with_own = with_loops(robot, self.loops)
+        return with_own.seen_from(self.frame)
 
 
 def _record(table: object, path: Path) -> _Record:
     if not isinstance(table, dict):
         raise InputError(f"{path}: {CALIBRATION_TABLE} is {table!r}, expected a table.")
-    known = {name: table[name] for name in ("robot", "loops") if name in table}
+    known = {name: table[name] for name in ("robot", "loops", "frame") if name in table}
     return from_table(_Record, known, f"{path}: {CALIBRATION_TABLE}")
 
 

@@ -81,6 +81,32 @@ class Geometry(Bounded):
         return urdf.with_joints({c.joint: c.apply for c in self.joints})
 
 
+@dataclass(frozen=True)
+class SensorFrame(Bounded):
+    """Where the tool sensor was found to stand, beside what the profile says.
+
+    x_seen = scale R(rpy) x_profile + xyz
+
+    Attributes:
+        xyz_rpy: Pose of the frame that the profile states in the frame that was found.
+        scale: Length that the sensor tells of a metre of the profile's sensor [-].
+    """
+
+    xyz_rpy: Pose = NOT_MOVED
+    scale: Annotated[float, Bounds(0.5, 2.0)] = 1.0
+
+    def after(self, first: SensorFrame | None) -> SensorFrame:
+        """Return the frame of a sensor found here beside another one that was found before."""
+        if first is None:
+            return self
+        before, this = (transform(f.xyz_rpy[:3], f.xyz_rpy[3:]) for f in (first, self))
+        turn = this[:3, :3]
+        x, y, z = (this[:3, 3] + self.scale * turn @ before[:3, 3]).tolist()
+        return SensorFrame(
+            (x, y, z, *roll_pitch_yaw(turn @ before[:3, :3])), self.scale * first.scale
+        )
+
+
 AS_STATED = Geometry()
 """The arm is as its URDF states it."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
@@ -21,6 +21,7 @@ from failuretwin.digital_model.geometry import (
     NOT_MOVED,
     Geometry,
     Pose,
+    SensorFrame,
     seen_chain,
     with_tool,
 )
@@ -159,12 +160,28 @@ class Robot:
             motor.
         loads: What its motors carry; their chain is in the frame of the base link.
         source: The file of its profile.
+        frame: Where the sensor was found to stand beside the profile; None: where that says.
     """
 
     profile: Profile
     chain: SerialChain
     loads: Loads
     source: Path
+    frame: SensorFrame | None = None
+
+    def seen_from(self, frame: SensorFrame | None) -> Robot:
+        """Return the robot as a sensor sees it that stands there; None: where the profile says.
+
+        With joints that slide, the scale is left out.
+        """
+        if frame == self.frame:
+            return self
+        geometry = self.profile.geometry
+        chain = seen_chain(self.loads.chain, self.profile.base_xyz_rpy, geometry.sensor_scale)
+        if frame is not None:
+            scale = 1.0 if self.slides.any() else frame.scale
+            chain = seen_chain(chain, frame.xyz_rpy, scale)
+        return replace(self, chain=chain, frame=frame)
 
     @property
     def folder(self) -> Path:

@@ -48,8 +48,11 @@ class LocalLikelihood:
         score: b, (run, theta).
         information: A, (run, theta, theta).
         misfit: Mean D^2 of what is explained, (run,); 3 if all is well.
-        scattered: Expected sum of squares of how far each healthy motor has scattered, and of how
-            many times it has, (run, 2, motor) [rad2, -].
+        scatter_score: Derivative of L by the logarithm of the scatter of each motor, (run, motor);
+            a faulty motor says nothing of its own.
+        scatter_information: Expected information about that, (run, motor, motor).
+        scatter_slack: What a covariance C of theta adds to the score, tr(slack C),
+            (run, motor, theta, theta): theta was fitted to the same movements.
         outcomes: Expected share of each outcome of each movement, (run, movement, outcome).
     """
 
@@ -58,7 +61,9 @@ class LocalLikelihood:
     score: FloatArray
     information: FloatArray
     misfit: FloatArray
-    scattered: FloatArray
+    scatter_score: FloatArray
+    scatter_information: FloatArray
+    scatter_slack: FloatArray
     outcomes: FloatArray
 
 
@@ -101,7 +106,9 @@ class _Sums:
     score: FloatArray
     information: FloatArray
     square: FloatArray
-    scattered: FloatArray
+    scatter_score: FloatArray
+    scatter_information: FloatArray
+    scatter_slack: FloatArray
     weight: FloatArray
 
     def __add__(self, other: _Sums) -> _Sums:
@@ -115,8 +122,10 @@ class _Sums:
         count = np.maximum(usable.sum(axis=1), 1)
         explained = self.weight.sum(axis=(1, 2))
         misfit = (self.square + OUTLYING * (count - explained)) / count
-        told = (self.score, self.information, misfit, self.scattered, self.weight)
-        return LocalLikelihood(theta, log_likelihood, *told)
+        spread = (self.scatter_score, self.scatter_information, self.scatter_slack)
+        return LocalLikelihood(
+            theta, log_likelihood, self.score, self.information, misfit, *spread, self.weight
+        )
 
 
 def has_score(hypothesis: Hypothesis) -> bool:
@@ -152,7 +161,12 @@ def _sums(
 ) -> _Sums:
     """Return the sums of some movements.
 
-    Motors scatter by s^2 lambda^T rho at the most probable, with s^2 - s^4 lambda^T lambda left.
+    With a = s^2 lambda^T lambda, p = 3 axes, and u as of `_pull`, the logarithm of a scatter has
+
+        score = sum w (u s^2 (lambda^T rho)^2 - a)
+        information = sum w 2 ((nu + p) (s_k s_l lambda_k^T lambda_l)^2 - a_k a_l) / (nu + p + 2)
+
+    (Lange, Little and Taylor, JASA 84 (1989) 881, for a multivariate t).
 
     Args:
         seen: Residuals, columns and levers.
@@ -162,7 +176,7 @@ def _sums(
         scatter: Scale of each motor's scatter, (motor,) [rad]; 0: it tells nothing.
         nu: Degrees of freedom of the scatter.
     """
-    runs, size = len(off), seen.gamma.shape[-1]
+    runs, size, motors = len(off), seen.gamma.shape[-1], len(scatter)
     u = _pull(square, nu, seen.dims)
     score = np.matmul(
         np.reshape((u * weight)[..., None] * off, (runs, 1, -1)),
@@ -170,16 +184,27 @@ def _sums(
     )
     scaled = seen.gamma * np.sqrt(_mean_pull(nu, seen.dims) * weight)[..., None, None]
     scaled = np.reshape(scaled, (runs, -1, size))
+    levers = seen.levers * scatter
+    transposed = np.swapaxes(levers, -1, -2)
+    moved = np.matmul(transposed, off[..., None])[..., 0]
+    gram = np.matmul(transposed, levers)
+    own = np.diagonal(gram, axis1=-2, axis2=-1)
     lead = tuple(range(1, weight.ndim))
-    moved = np.einsum("...k,...kn->...n", off, seen.levers) ** 2 * u[..., None]
-    moved = moved - np.einsum("...kn,...kn->...n", seen.levers, seen.levers)
-    second = scatter**4 * np.einsum("rman,rma->rn", moved, weight)
-    times = weight.sum(lead)[:, None] * (scatter > 0.0)
+    weighted = weight[..., None]
+    spread = ((u[..., None] * moved**2 - own) * weighted).sum(lead)
+    flat = np.reshape(own * np.sqrt(weighted), (runs, -1, motors))
+    inert = 0.0 if np.isinf(nu) else 2.0 / (nu + seen.dims + 2.0)
+    information = 2.0 * _mean_pull(nu, seen.dims) * (gram**2 * weighted[..., None]).sum(lead)
+    information -= inert * np.matmul(np.swapaxes(flat, 1, 2), flat)
+    along = np.matmul(transposed, seen.gamma) * np.sqrt(u * weight)[..., None, None]
+    along = np.moveaxis(np.reshape(along, (runs, -1, motors, size)), 2, 1)
     return _Sums(
         score[:, 0],
         np.matmul(np.swapaxes(scaled, 1, 2), scaled),
         (square * weight).sum(lead),
-        np.stack([second + scatter**2 * times, times], axis=1),
+        spread,
+        information,
+        np.matmul(np.swapaxes(along, -1, -2), along),
         weight,
     )
 

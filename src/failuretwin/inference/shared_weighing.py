@@ -98,7 +98,9 @@ class Weighed:
         log_evidence: (run, hypothesis).
         misfit: Mean D^2 there, (run, hypothesis).
         information: A there, (run, hypothesis, theta, theta).
-        scattered: As of `LocalLikelihood`, (run, hypothesis, 2, motor).
+        scatter_score: As of `LocalLikelihood`, (run, hypothesis, motor).
+        scatter_information: As there, (run, hypothesis, motor, motor).
+        scatter_slack: As there, (run, hypothesis, motor, theta, theta).
         outcomes: As of `LocalLikelihood`, (run, hypothesis, movement, outcome).
     """
 
@@ -108,7 +110,9 @@ class Weighed:
     misfit: FloatArray
 
     information: FloatArray
-    scattered: FloatArray
+    scatter_score: FloatArray
+    scatter_information: FloatArray
+    scatter_slack: FloatArray
     outcomes: FloatArray
 
     @classmethod
@@ -119,7 +123,7 @@ class Weighed:
             return np.stack([getattr(each, name) for each in says], axis=1)
 
         log_evidence = np.stack([integrated(prior, each) for each in says], axis=1)
-        rest = ("misfit", "information", "scattered", "outcomes")
+        rest = [field.name for field in fields(cls)[3:]]
         return cls(at, stacked("theta"), log_evidence, *map(stacked, rest))
 
     def __getitem__(self, rows: slice | IntArray) -> Weighed:
@@ -167,16 +171,18 @@ class SharedWeighing:
         likelihood: The runs as they were seen.
         hypotheses: What may be the case.
         priors: Beliefs about faults and set-ups.
+        known_layout: What stands in theta; None: what is in doubt of the model.
     """
 
     likelihood: RunLikelihood
     hypotheses: Sequence[Hypothesis]
     priors: Priors
+    known_layout: SharedLayout | None = None
 
     @cached_property
     def layout(self) -> SharedLayout:
         """What stands in theta."""
-        return layout_of(self.likelihood.model)
+        return self.known_layout or layout_of(self.likelihood.model)
 
     @cached_property
     def parts(self) -> list[SharedComponent]:

@@ -20,7 +20,9 @@ from failuretwin.app.commands.options import (
 if TYPE_CHECKING:
     import xarray as xr
 
+    from failuretwin.connection.life_history import History
     from failuretwin.connection.self_calibration import SelfCalibration
+    from failuretwin.connection.tracked_diagnosis import Tracked
     from failuretwin.core.hypothesis import Diagnosis
     from failuretwin.digital_model.twin import DigitalTwin
     from failuretwin.inference.diagnoser import BayesDiagnoser
@@ -39,8 +41,9 @@ if TYPE_CHECKING:
 @click.option(
     "--track",
     is_flag=True,
-    help="Follow the wear of the robot from run to run, and keep its history beside the "
-    "calibration (FILE.history.jsonl). Give runs in their order, the oldest first.",
+    help="Judge each run by what those before it teach of the robot, and go on learning. Give runs "
+    "in their order, the oldest first. Without --calibration it begins with what such arms are "
+    "like. What is known is kept beside the calibration, or beside --out (FILE.history.jsonl).",
 )
 @click.option(
     "--self-calibrate",
@@ -59,7 +62,7 @@ if TYPE_CHECKING:
     "--out",
     type=PATH,
     metavar="FILE",
-    help="Where to write the calibration that --self-calibrate learns.",
+    help="Where to write the calibration that --self-calibrate learns, or --track that began cold.",
 )
 @click.option(
     "--hypotheses",
@@ -169,7 +172,7 @@ def diagnose(
     }
     diagnoser = chosen_diagnoser(method, bayes, settings)
     _check_together(calibration, track, self_calibrate, out, independent, sensing)
-    history = tracking.open_history(bayes, calibration) if track and calibration else None
+    history = _history(bayes, calibration, out) if track else None
     runs = read_inputs(inputs, model, reading)
     warn_mismatch(runs, expected_name(diagnoser, bayes))
     tracked = learned = None
@@ -184,7 +187,7 @@ def diagnose(
         diagnoses = diagnoser.diagnose(runs)
     _write(runs, diagnoses, known.twin, json_file, csv_file, plot)
     if tracked is not None:
-        tracking.keep_history(tracked)
+        _keep(tracked, runs, out)
     reports.print_diagnoses(diagnoses)
     if method == "bayes" and sensing_of(runs, sensing) == TOOL_ALONE:
         show(*reports.isolability_summary(runs, bayes))
@@ -215,8 +218,13 @@ def _check_together(
     """
     from failuretwin.core.errors import InputError
 
-    if out is not None and not self_calibrate:
-        raise InputError("--out is for what --self-calibrate learns. Add --self-calibrate.")
+    if out is not None and not (self_calibrate or track):
+        raise InputError("--out is for what is learned: add --self-calibrate or --track.")
+    if out is not None and track and calibration is not None:
+        raise InputError(
+            "--track keeps what it learns beside the calibration that it began with. Leave out "
+            "--out, or --calibration to begin with what the kind of arm is like."
+        )
     if independent and not (track or self_calibrate):
         raise InputError("--independent is for runs weighed together: --track or --self-calibrate.")
     if sensing not in (None, "tool") and (track or self_calibrate):
@@ -225,12 +233,33 @@ def _check_together(
             "them."
         )
     if track and self_calibrate:
-        raise InputError("--track follows a calibration, --self-calibrate makes one. Choose one.")
-    if track and calibration is None:
         raise InputError(
-            "--track keeps its history beside the calibration: name one (--calibration FILE; "
-            "`failuretwin calibrate` makes it)."
+            "--track judges each run by those before it, --self-calibrate by all. Choose one."
         )
+
+
+def _history(bayes: BayesDiagnoser, calibration: Path | None, out: Path | None) -> History:
+    """Return what has been seen of a robot before; nothing is kept where no file is named."""
+    from failuretwin.connection.calibration.result import check_calibration_file
+    from failuretwin.connection.life_history import History, open_history
+    from failuretwin.connection.tracked_diagnosis import begin
+
+    cold = calibration is None
+    start, beside = begin(bayes, cold), calibration or out
+    if out is not None:
+        check_calibration_file(out)
+    return History(start, cold) if beside is None else open_history(beside, start, cold)
+
+
+def _keep(tracked: Tracked, runs: xr.Dataset, out: Path | None) -> None:
+    """Keep what was learned of the runs."""
+    from failuretwin.connection.calibration.result import save_calibration
+    from failuretwin.connection.life_history import keep_history
+    from failuretwin.connection.tracked_diagnosis import calibration_of
+
+    if out is not None:
+        save_calibration(calibration_of(tracked.life, runs), tracked.life.model.twin.robot, out)
+    keep_history(tracked.history, tracked.life, tracked.rows)
 
 
 def _write(

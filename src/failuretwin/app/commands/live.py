@@ -21,6 +21,7 @@ from failuretwin.app.commands.options import (
 from failuretwin.app.terminal import tell
 
 if TYPE_CHECKING:
+    from failuretwin.digital_model.nonidealities import Imperfections
     from failuretwin.failure_behavior.injection import ScheduledFault
 
 
@@ -65,6 +66,7 @@ def watch(
     model = load_robot(robot)
     known, motors = load_calibration(calibration, model), model.motor_names
     diagnoser, wait_s = monitor(known.twin, known.imperfections), topics_of(live.topics).wait_s
+    tell(_rests_on(known.imperfections))
     # An emulated robot ends by itself, a log when it is over.
     length = live.duration if live.duration and source != "emulated" else math.inf
     with ExitStack() as stack:
@@ -79,6 +81,19 @@ def watch(
             tell("stopped")
     arm = statuses(shadow.snapshot.answer, motors)[0]
     tell(f"last answer: {arm.message}")
+
+
+def _rests_on(known: Imperfections) -> str:
+    """Return what the answers rest on, in one sentence."""
+    from failuretwin.digital_model.arm_classes import GENERIC_NAME
+
+    if known.name != GENERIC_NAME:
+        return f"healthy behaviour: {known.name} ({known.protocol}; {known.source})"
+    return (
+        f"healthy behaviour: {known.name}; {known.source}. What this robot does is not known, so "
+        "small errors do not show: `failuretwin diagnose LOGS --track --out FILE` learns it from "
+        "its runs, and --calibration FILE uses it"
+    )
 
 
 # `failuretwin emulate`: a robot that exists only as physics, on a network or in a file.

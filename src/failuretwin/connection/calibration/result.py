@@ -19,6 +19,7 @@ from failuretwin.digital_model.calibrated_robot import (
     load_calibration,
     with_loops,
 )
+from failuretwin.digital_model.geometry import SensorFrame
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
 
@@ -113,6 +114,7 @@ class Calibration:
         remarks: What else the user should know, in sentences.
         loops: Servo loops from step tests; motors without any keep those of the profile. Timing is
             what is left on top of them.
+        frame: Where the tool sensor stands beside what the profile says; None: as that says.
     """
 
     imperfections: Imperfections
@@ -125,14 +127,16 @@ class Calibration:
     held_out: tuple[HeldOut, ...] = ()
     remarks: tuple[str, ...] = ()
     loops: tuple[CalibratedLoop, ...] = ()
+    frame: SensorFrame | None = None
 
     def applied_to(self, robot: Robot) -> CalibratedRobot:
-        """Return a robot with these loops and imperfections, as from the file of this calibration.
+        """Return a robot with these loops, frame and imperfections, as from the file of this.
 
         Raises:
             InputError: If the calibration names a motor that the robot does not have.
         """
-        return CalibratedRobot(with_loops(robot, self.loops), self.imperfections)
+        known = with_loops(robot, self.loops).seen_from(self.frame)
+        return CalibratedRobot(known, self.imperfections)
 
     @property
     def beats_uncalibrated(self) -> bool | None:

@@ -1,0 +1,166 @@
+"""The history of a robot's life: a line a run for people, and beside it what is believed now.
+
+``CAL.history.jsonl`` holds a head, which says of which robot and prior it is, and a line a run;
+``CAL.history.npz`` the state from which the next command goes on, digit for digit. The state says
+how much of the lines counts, so that a writer that is killed between the two does no harm.
+
+Section: docs/calibration_tracking.md#the-history-file
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from failuretwin.core.config import fingerprint
+from failuretwin.core.errors import InputError, OutputError
+from failuretwin.core.foreign import reading
+from failuretwin.data_knowledge.file_claims import check_npz
+from failuretwin.data_knowledge.store import check_writable, replacing
+from failuretwin.inference.life_filter import LifeFilter
+
+LINES, STATE = ".history.jsonl", ".history.npz"
+SIZE = "size"
+"""Name in the state of how many bytes of the lines count."""
+
+
+@dataclass(frozen=True)
+class History:
+    """What has been seen of a robot before.
+
+    Attributes:
+        life: What is believed of it.
+        cold: Whether it began with nothing but what its kind is like.
+        path: File of the lines; None: nothing is kept.
+        size: Bytes of it that count.
+        keys: Fingerprints of the runs so far.
+    """
+
+    life: LifeFilter
+    cold: bool
+    path: Path | None = None
+    size: int = 0
+    keys: tuple[str, ...] = ()
+
+
+def history_path(calibration: Path) -> Path:
+    """Return where the history of a calibration is kept: CAL.history.jsonl beside CAL.toml."""
+    return calibration.with_suffix(LINES)
+
+
+def open_history(calibration: Path, start: LifeFilter, cold: bool) -> History:
+    """Return the history beside a calibration; where there is none, it begins with `start`.
+
+    Args:
+        calibration: The file beside which it is kept.
+        start: What is believed before any run.
+        cold: Whether that is what its kind is like.
+
+    Raises:
+        InputError: If the history cannot be read, is damaged, or has begun with something else.
+        OutputError: If a history cannot be written there.
+    """
+    path = history_path(calibration)
+    state = path.with_suffix("").with_suffix(STATE)
+    check_writable(path)
+    if not (path.exists() and state.exists()):
+        return History(start, cold, path)
+    with reading(path, "a history", f"It is damaged: move it and {state} away."):
+        content = path.read_bytes()
+        check_npz(state)
+        with np.load(state, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        size = int(arrays.pop(SIZE))
+        if len(content) < size:
+            raise InputError(f"{path}: is shorter than it was. Move it and {state} away.")
+        lines = content[:size].decode().splitlines()
+        rows = [_object(line, f"{path}: line {n}") for n, line in enumerate(lines, start=1)]
+        _check_head(rows[0], path, start)
+        return History(start.resumed(arrays), cold, path, size, tuple(r["key"] for r in rows[1:]))
+
+
+def keep_history(history: History, life: LifeFilter, rows: Sequence[dict[str, Any]]) -> None:
+    """Add runs to the files that `history` was read from, and what is believed after them.
+
+    Raises:
+        OutputError: If that cannot be done, or the files have changed since; they are as before.
+    """
+    path = history.path
+    if path is None or not rows:
+        return
+    lines = [json.dumps(row) for row in rows]
+    if history.size == 0:
+        lines.insert(0, json.dumps(_head(history.life)))
+    text = "".join(f"{line}\n" for line in lines).encode()
+    state = path.with_suffix("").with_suffix(STATE)
+    if _counted(state) != history.size:
+        raise OutputError(
+            f"{path}: has changed since it was read; another diagnosis tracks with the same "
+            "calibration. It is as that one left it; run the command again."
+        )
+    try:
+        _append(path, text, history.size)
+    except OSError as error:
+        raise OutputError(
+            f"{path}: could not be written ({error.strerror}). It is as before; free some space or "
+            "make its folder writable."
+        ) from error
+    with replacing(state) as partial, partial.open("wb") as file:
+        size = np.array(history.size + len(text))
+        np.savez(file, allow_pickle=False, **{SIZE: size, **life.to_arrays()})
+
+
+def _counted(state: Path) -> int:
+    """Return how many bytes of the lines count now."""
+    if not state.exists():
+        return 0
+    with np.load(state, allow_pickle=False) as stored:
+        return int(stored[SIZE])
+
+
+def _append(path: Path, text: bytes, size: int) -> None:
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        os.ftruncate(descriptor, size)
+        os.lseek(descriptor, size, os.SEEK_SET)
+        try:
+            written = 0
+            while written < len(text):
+                written += os.write(descriptor, text[written:])
+            os.fsync(descriptor)
+        except OSError:
+            os.ftruncate(descriptor, size)
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def _head(start: LifeFilter) -> dict[str, Any]:
+    """Return the first line: which robot, which prior and which limits the history is of."""
+    given = start.begun
+    known = [given.settling, given.variation, start.limits]
+    return {"history_of": start.model.twin.robot.name, "calibration": fingerprint(known)}
+
+
+def _check_head(head: dict[str, Any], path: Path, start: LifeFilter) -> None:
+    if "history_of" not in head or "calibration" not in head:
+        raise InputError(f"{path}: is no history of a calibration. Move it away.")
+    if head != _head(start):
+        raise InputError(
+            f"{path}: is the history of another calibration (of robot {head['history_of']!r}); the "
+            "one beside it has been learned again since. Move the history away to begin a new one."
+        )
+
+
+def _object(line: str, where: str) -> dict[str, Any]:
+    with reading(where, "JSON", "It is damaged: move the file away."):
+        value = json.loads(line)
+    if not isinstance(value, dict):
+        raise InputError(f"{where}: is damaged (no object). Move the file away.")
+    return value

@@ -1,0 +1,406 @@
+"""Runs of one robot, judged with what the others say of what all of them share.
+
+Expectation propagation. Each run i sends a site, a normal factor of theta; the belief is what was
+believed before times all sites. A run is judged with the cavity, the belief without its own site:
+
+    q_-i(theta) = sum over c of w_c,-i N_c,-i,
+    p_i(h) ~ p(h) sum over c of w_c,-i integral of p(run_i | h, theta) N_c,-i
+    m, V = moments of the mixture over h and c,    Lambda_i = V^-1 - V_-i^-1, no direction negative
+
+with m_-i, V_-i the moments of the cavity. A run whose hypothesis is open sends a wide site, so that
+what is faulty teaches little. Scatter and loss rates are learned beside it, by expectation and
+maximisation with pseudo-counts.
+
+Section: docs/self_calibration.md#the-model-population-runs-offsets
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.numerics import log_sum
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.digital_model.nonidealities import Imperfections, LostCommand
+from failuretwin.inference.evidence import TransientSamples
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.posterior import Posterior
+from failuretwin.inference.priors import Priors
+from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.shared_belief import Belief, mixed, positive, summed
+from failuretwin.inference.shared_likelihood import Normal
+from failuretwin.inference.shared_posterior import Mixture
+from failuretwin.inference.shared_unknowns import REGISTRATION, SharedLayout, offsets_of
+from failuretwin.inference.shared_weighing import (
+    COARSE_TO_FINE,
+    Candidate,
+    Expansion,
+    SharedWeighing,
+    Weighed,
+)
+
+SCATTER_SPREAD = 0.3
+"""Deviation of the logarithm of the scatter within a class; assumed."""
+RATE_COUNT = 30.0
+"""Movements that the prior of a loss rate counts for."""
+LEAST_SHARE = 1e-3
+"""Components of the belief that are less probable are not weighed."""
+CHUNK_RUNS = 64
+"""Runs that are weighed at a time."""
+
+
+@dataclass(frozen=True)
+class Habits:
+    """What movements say of scatter and lost commands, sums over them.
+
+    Attributes:
+        precision: Information about the logarithm of each motor's scatter beside that of the model
+            that was given, (..., motor, motor).
+        shift: That times the logarithm that is most probable, (..., motor).
+        losses: How often each set of motors has lost a command, of how many movements; punctual
+            and late ones, (..., entry, 2, 2).
+    """
+
+    precision: FloatArray
+    shift: FloatArray
+    losses: FloatArray
+
+    @classmethod
+    def believed(cls, given: Imperfections) -> Habits:
+        """Return what is believed of a robot before any run."""
+        motors = 0 if given.settling is None else len(given.settling.scatter)
+        rate = np.array([[e.rate, e.rate_when_late] for e in given.lost_commands]).reshape(-1, 2)
+        losses = RATE_COUNT * np.stack([rate, np.ones_like(rate)], axis=-1)
+        return cls(SCATTER_SPREAD**-2.0 * np.eye(motors), np.zeros(motors), losses)
+
+    @classmethod
+    def none(cls, runs: int, given: Imperfections) -> Habits:
+        """Return what runs say that have said nothing yet."""
+        like = cls.believed(given)
+        parts = (like.precision, like.shift, like.losses)
+        return cls(*(np.zeros((runs, *part.shape)) for part in parts))
+
+    def __getitem__(self, rows: slice | IntArray) -> Habits:
+        """Return what some of the runs say."""
+        return Habits(self.precision[rows], self.shift[rows], self.losses[rows])
+
+    def put(self, rows: slice | IntArray, told: Habits) -> None:
+        """Write down what some of the runs say."""
+        self.precision[rows], self.shift[rows] = told.precision, told.shift
+        self.losses[rows] = told.losses
+
+    def plus(self, told: Habits) -> Habits:
+        """Return these and those of some runs together."""
+        return Habits(
+            self.precision + told.precision.sum(axis=0),
+            self.shift + told.shift.sum(axis=0),
+            self.losses + told.losses.sum(axis=0),
+        )
+
+    def fading(self, share: float, given: Imperfections) -> Habits:
+        """Return what is left where a share of what runs have said is remembered."""
+        first = Habits.believed(given)
+        return Habits(
+            first.precision + share * (self.precision - first.precision),
+            first.shift + share * (self.shift - first.shift),
+            first.losses + share * (self.losses - first.losses),
+        )
+
+    @property
+    def log_scatter(self) -> FloatArray:
+        """Most probable logarithm of the scatter beside that given, (motor,)."""
+        return np.asarray(np.linalg.solve(self.precision, self.shift))
+
+    def most_probable(self, given: Imperfections) -> Imperfections:
+        """Return the imperfections with the scatter and the rates that are most probable."""
+        if given.settling is None:
+            return given
+        scatter = np.asarray(given.settling.scatter) * np.exp(self.log_scatter)
+        rates = self.losses[..., 0] / self.losses[..., 1]
+        lost = tuple(
+            replace(entry, rate=float(rate), rate_when_late=float(when_late))
+            for entry, (rate, when_late) in zip(given.lost_commands, rates, strict=True)
+        )
+        settling = replace(given.settling, scatter=tuple(scatter.tolist()))
+        return replace(given, settling=settling, lost_commands=lost)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What some of the runs say, each with its cavity.
+
+    Attributes:
+        rows: Which they are.
+        weighing: The runs.
+        cavity: What was believed without them, in units.
+        candidates: What was found with each component of that.
+        log_evidence: Log of weight times evidence, (run, candidate, hypothesis).
+    """
+
+    rows: IntArray
+    weighing: SharedWeighing
+    cavity: Belief
+    candidates: Sequence[Candidate]
+    log_evidence: FloatArray
+
+    @property
+    def share(self) -> FloatArray:
+        """Probability of each hypothesis with each candidate, (run, candidate, hypothesis)."""
+        height = self.log_evidence + self.weighing.log_odds
+        return np.exp(height - log_sum(height, axis=(1, 2))[:, None, None])
+
+    @property
+    def best(self) -> FloatArray:
+        """Best theta of each hypothesis beside where the runs are expanded, (run, h, theta)."""
+        theta = np.stack([each.found.theta for each in self.candidates], axis=1)
+        winner = np.argmax(self.log_evidence, axis=1)[:, None, :, None]
+        return np.take_along_axis(theta, winner, axis=1)[:, 0]
+
+    def posterior(self) -> Posterior:
+        """Return the posterior over hypotheses of each run."""
+        top = np.argmax(self.log_evidence, axis=1)[:, None]
+        first = np.arange(len(self.candidates))[None, :, None] == top
+        whole = log_sum(self.log_evidence, axis=1)[:, None]
+        table = np.where(first, whole, -np.inf)
+        return Mixture(self.weighing, self.candidates, table).posterior()
+
+    def habits(self, given: Imperfections, covariance: FloatArray, at: FloatArray) -> Habits:
+        """Return what the runs say of scatter and losses, (run, ...); faulty motors left out.
+
+        Args:
+            given: What was given of the robot.
+            covariance: Of theta under each hypothesis, (run, candidate, hypothesis, theta, theta).
+            at: Logarithm of the scatter that the runs were weighed with, (motor,).
+        """
+        share, found = self.share, [each.found for each in self.candidates]
+        score = np.stack([each.scatter_score for each in found], axis=1)
+        slack = np.stack([each.scatter_slack for each in found], axis=1)
+        score = score + np.einsum("rchntu,rchtu->rchn", slack, covariance, optimize=True)
+        told = np.stack([each.scatter_information for each in found], axis=1)
+        precision = np.einsum("rch,rchnk->rnk", share, told)
+        shift = np.einsum("rch,rchn->rn", share, score) + precision @ at
+        outcomes = sum(share[:, c, :, None, None] * each.outcomes for c, each in enumerate(found))
+        losses = [self._losses(entry, np.asarray(outcomes)) for entry in given.lost_commands]
+        shape = (len(share), len(losses), 2, 2)
+        stacked = np.stack(losses, axis=1) if losses else np.zeros(0)
+        return Habits(precision, shift, np.reshape(stacked, shape))
+
+    def _losses(self, entry: LostCommand, outcomes: FloatArray) -> FloatArray:
+        """Return how often some motors lose a command, punctual and late, (run, 2, 2)."""
+        likelihood = self.weighing.likelihood
+        names, late = likelihood.model.motor_names, likelihood.late
+        lost = np.isin(names, entry.motors)
+        patterns = self.candidates[0].found.expansion.response.usual.lost
+        told = np.zeros((len(outcomes), 2, 2))
+        for h, hypothesis in enumerate(self.weighing.hypotheses):
+            faulty = np.isin(names, [fault.motor for fault in hypothesis.faults])
+            if (lost & faulty).any():
+                continue
+            hit = (patterns[:, ~faulty] == lost[~faulty]).all(axis=1)
+            for k, kind in enumerate((1.0 - late, late)):
+                told[:, k, 0] += (outcomes[:, h][..., hit].sum(axis=-1) * kind).sum(axis=1)
+                told[:, k, 1] += (outcomes[:, h].sum(axis=-1) * kind).sum(axis=1)
+        return told
+
+
+@dataclass
+class RunsTogether:
+    """The state of the recursion; theta is relative to the model that was given.
+
+    Attributes:
+        given: The runs, with the model that was given.
+        hypotheses: What may be the case.
+        priors: Beliefs about faults and set-ups.
+        layout: What stands in theta.
+        unit: Unit of each part of theta, (theta,).
+        base: What is believed of theta without these runs, one mixture, in units.
+        sites: What each run says, in units.
+        here: Where runs are expanded, (theta,).
+        habits: What is believed of scatter and losses without these runs; None: they are known.
+        told: What each run says of them.
+        start: Where to search for the best theta of each, (run, hypothesis, theta); NaN: not known.
+        counted: Whether others are judged with what each says, (run,).
+        model: The healthy robot with scatter and rates that were learned.
+    """
+
+    given: RunLikelihood
+    hypotheses: Sequence[Hypothesis]
+    priors: Priors
+    layout: SharedLayout
+    unit: FloatArray
+    base: Belief
+    sites: Normal
+    here: FloatArray
+    habits: Habits | None
+    told: Habits
+    start: FloatArray
+    counted: BoolArray
+    model: HealthyModel = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.model = self.given.model
+        self.maximise()
+
+    @classmethod
+    def of(cls, weighing: SharedWeighing, base: Belief, unit: FloatArray) -> RunsTogether:
+        """Return the state before anything was judged.
+
+        Args:
+            weighing: The runs.
+            base: What is believed before, in units.
+            unit: Unit of each part of theta, (theta,).
+        """
+        likelihood, size = weighing.likelihood, len(unit)
+        runs, given = len(likelihood.usable), likelihood.model.imperfections
+        learns = weighing.layout.offsets and given.settling is not None
+        return cls(
+            likelihood,
+            weighing.hypotheses,
+            weighing.priors,
+            weighing.layout,
+            unit,
+            base,
+            Normal(np.zeros((runs, size, size)), np.zeros((runs, size))),
+            np.zeros(size),
+            Habits.believed(given) if learns else None,
+            Habits.none(runs, given),
+            np.full((runs, len(weighing.hypotheses), size), np.nan),
+            np.ones(runs, dtype=bool),
+        )
+
+    @property
+    def runs(self) -> int:
+        """How many they are."""
+        return len(self.sites.shift)
+
+    @property
+    def belief(self) -> Belief:
+        """What is believed given all runs, one mixture, in units."""
+        return self.base.times(summed(self.sites, self.counted))
+
+    @property
+    def learned(self) -> HealthyModel:
+        """The healthy robot with the offsets that are most probable by all runs."""
+        return self.at(self.belief.moments[0][0] * self.unit)
+
+    def at(self, theta: FloatArray) -> HealthyModel:
+        """Return the healthy robot with some offsets beside those given."""
+        if len(theta) == REGISTRATION:
+            return self.model
+        imperfections, given = self.model.imperfections, self.given.model.settling
+        settling = offsets_of(theta, replace(given, scatter=self.model.settling.scatter))
+        return replace(self.model, imperfections=replace(imperfections, settling=settling))
+
+    def judge(self, rows: IntArray, moving: TransientSamples | None = None) -> list[Judged]:
+        """Return what some runs say, each with its cavity; so many at a time as fit.
+
+        Args:
+            rows: The runs.
+            moving: Their readings on the way; None: they are left aside.
+        """
+        parts = np.split(np.arange(len(rows)), np.arange(CHUNK_RUNS, len(rows), CHUNK_RUNS))
+        return [self._judge(rows[p], None if moving is None else moving[p]) for p in parts]
+
+    def learn(self, found: Sequence[Judged], damping: float = 1.0) -> None:
+        """Take in what runs say: sites, where to search for them, scatter, rates.
+
+        Args:
+            found: What they say.
+            damping: Share of a new site that is taken.
+        """
+        for judged in found:
+            rows, covariance = judged.rows, self._covariance(judged)
+            site = self._site(judged, covariance)
+            old = Normal(self.sites.precision[rows], self.sites.shift[rows])
+            self.sites.precision[rows] += damping * (site.precision - old.precision)
+            self.sites.shift[rows] += damping * (site.shift - old.shift)
+            self.start[rows] = judged.best + self.here
+            if self.habits is not None:
+                covariance = covariance * np.outer(self.unit, self.unit)
+                given = self.given.model.imperfections
+                self.told.put(rows, judged.habits(given, covariance, self._log_scatter))
+        self.maximise()
+        self.here = self.belief.moments[0][0] * self.unit
+
+    def maximise(self) -> None:
+        """Take the scatter and the rates that explain the runs best."""
+        if self.habits is None:
+            return
+        given = self.given.model
+        told = self.habits.plus(self.told[np.flatnonzero(self.counted)])
+        known = told.most_probable(given.imperfections)
+        self.model = replace(given, imperfections=known)
+
+    @property
+    def _log_scatter(self) -> FloatArray:
+        """Logarithm of the scatter beside that given, (motor,)."""
+        now, given = (np.asarray(m.settling.scatter) for m in (self.model, self.given.model))
+        return np.asarray(np.log(now / given))
+
+    def _cavity(self, rows: IntArray) -> Belief:
+        """Return the belief without the sites of some runs, each without its own."""
+        whole, own = summed(self.sites, self.counted), self.counted[rows]
+        precision = whole.precision - own[:, None, None] * self.sites.precision[rows]
+        shift = whole.shift - own[:, None] * self.sites.shift[rows]
+        return self.base.times(Normal(precision, shift))
+
+    def _local(self, normal: Normal) -> Normal:
+        """Return normals of theta about where runs are expanded, no longer in units."""
+        precision = normal.precision / np.outer(self.unit, self.unit)
+        return Normal(precision, normal.shift / self.unit - precision @ self.here)
+
+    def _judge(self, rows: IntArray, moving: TransientSamples | None) -> Judged:
+        cavity, model = self._cavity(rows), self.at(self.here)
+        likelihood = RunLikelihood(self.given.evidence[rows], model, moving)
+        weighing = SharedWeighing(likelihood, self.hypotheses, self.priors, self.layout)
+        place = np.tile(self.here, (len(rows), 1))
+        place[:, REGISTRATION:] = 0.0
+        at = weighing.expand(np.arange(len(rows)), place)
+        starts = self._starts(weighing, rows, place, cavity)
+        asked = np.flatnonzero((cavity.weight > LEAST_SHARE).any(axis=0))
+        found = [self._search(weighing, at, self._local(cavity[int(c)]), starts) for c in asked]
+        candidates = [Candidate(0, np.arange(len(rows)), each) for each in found]
+        height = np.stack([each.log_evidence for each in found], axis=1)
+        height += cavity.log_weight[:, asked, None]
+        used = Belief(
+            cavity.log_weight[:, asked], cavity.precision[:, asked], cavity.shift[:, asked]
+        )
+        return Judged(rows, weighing, used, candidates, height)
+
+    @staticmethod
+    def _search(
+        weighing: SharedWeighing, at: Expansion, prior: Normal, starts: Sequence[FloatArray]
+    ) -> Weighed:
+        found = [weighing.search(at, prior, start) for start in starts]
+        return found[0] if len(found) == 1 else found[0].better(found[1])
+
+    def _starts(
+        self, weighing: SharedWeighing, rows: IntArray, place: FloatArray, cavity: Belief
+    ) -> list[FloatArray]:
+        """Return where to search: where it was found before, else where it is found coarsely."""
+        before = self.start[rows] - self.here
+        if np.isfinite(before).all():
+            return [before]
+        untold = COARSE_TO_FINE[1] * weighing.likelihood.model.twin.robot.reach
+        coarse = weighing.expand(np.arange(len(rows)), place, untold)
+        prior = self._local(cavity.matched())
+        return [weighing.search(coarse, prior, np.zeros_like(place)).theta]
+
+    def _covariance(self, judged: Judged) -> FloatArray:
+        """Return that of theta in units, (run, candidate, hypothesis, theta, theta)."""
+        information = np.stack([each.found.information for each in judged.candidates], axis=1)
+        units = np.outer(self.unit, self.unit)
+        precision = judged.cavity.precision[:, :, None] + information * units
+        return np.asarray(np.linalg.inv(precision))
+
+    def _site(self, judged: Judged, covariance: FloatArray) -> Normal:
+        """Return what each run says beside its cavity, in units."""
+        theta = np.stack([each.found.theta for each in judged.candidates], axis=1)
+        mean, spread = mixed(judged.share, (theta + self.here) / self.unit, covariance)
+        cavity = judged.cavity.matched()
+        site = positive(np.linalg.inv(spread) - cavity.precision, 0.0)
+        whole = ((cavity.precision + site) @ mean[..., None])[..., 0]
+        return Normal(site, whole - cavity.shift)
