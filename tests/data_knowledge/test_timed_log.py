@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.movements import find_movements, resolution, simplify
+from failuretwin.core.movements import find_movements
+from failuretwin.core.polyline import resolution, simplify
 from failuretwin.data_knowledge.timed_log import Samples, Targets, TimedLog, timed_run
 
 AT = np.arange(0.0, 6.0, 0.1)
