@@ -15,6 +15,7 @@ import numpy as np
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray
+from failuretwin.digital_model.arm_classes import class_of
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import FaultMode, Range, Signature
 from failuretwin.failure_behavior.registry import MODES
@@ -274,12 +275,23 @@ def visible_ranges(mode: FaultMode, model: HealthyModel, motor: int) -> tuple[Ra
     largest = LARGEST_ERROR_RAD if mode.sizes is None else mode.considered[1]
     if model.twin.robot.slides[motor]:
         largest *= (high - low) / np.pi
-    least = LEAST_ERROR * model.least_visible[motor]
+    least = max(LEAST_ERROR * model.least_visible[motor], _of_a_day(model, motor))
     if mode.signature is Signature.GROWING_OFFSET:
         least /= GROWN_S
     count = 1 + max(0, int(np.ceil(np.log(largest / WIDEST_ERROR / least) / np.log(LARGER))))
     lows = np.geomspace(least, max(least, largest / WIDEST_ERROR), count)
     return tuple((float(low), float(WIDEST_ERROR * low)) for low in lows)
+
+
+def _of_a_day(model: HealthyModel, motor: int) -> float:
+    """Return what a healthy motor differs by from day to day [rad]; a fault is larger.
+
+    Zero of a slide, and of a robot that is said to be ideal.
+    """
+    robot = model.twin.robot
+    if robot.slides[motor] or model.imperfections.settling is None:
+        return 0.0
+    return class_of(robot).session_rad
 
 
 MONITORING = Priors(healthy_odds=30.0)
