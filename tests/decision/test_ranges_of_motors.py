@@ -103,22 +103,22 @@ def test_sizes_of_errors_begin_at_what_a_motor_shows(gantry):
     model = HealthyModel(gantry, SHARP)
     noise = np.hypot(1e-4, 2e-4 * gantry.robot.reach)
     np.testing.assert_allclose(model.least_visible, np.hypot(SCATTER, noise), rtol=1e-6)
-    ranges = Priors().ranges_of(MODES["steady_state_error"], model, 0)
+    ranges = Priors().sizes_of(MODES["steady_state_error"], model, 0).ranges
     assert ranges[0][0] == pytest.approx(0.5 * model.least_visible[0])
     assert ranges[-1][1] == pytest.approx(0.9 * 0.92 / np.pi)
     for (low, high), (following, _) in pairwise(ranges):
         assert high == pytest.approx(5.0 * low)
         assert 1.0 < following / low <= 2.5
-    bias = Priors().ranges_of(MODES["encoder_bias"], model, 0)
+    bias = Priors().sizes_of(MODES["encoder_bias"], model, 0).ranges
     assert bias[0] == pytest.approx(ranges[0])
-    drift = Priors().ranges_of(MODES["drift"], model, 0)
+    drift = Priors().sizes_of(MODES["drift"], model, 0).ranges
     assert drift[0][0] == pytest.approx(0.1 * ranges[0][0])
-    assert Priors().ranges_of(MODES["encoder_scale"], model, 0) == ((0.03, 0.75),)
+    assert Priors().sizes_of(MODES["encoder_scale"], model, 0).ranges == ((0.03, 0.75),)
 
 
 @pytest.mark.parametrize("mode", ["encoder_bias", "drift", "backlash"])
 def test_the_bundled_arm_has_the_sizes_of_the_modes(twin, mode):
-    said = Priors().ranges_of(MODES[mode], HealthyModel.of(twin), 1)
+    said = Priors().sizes_of(MODES[mode], HealthyModel.of(twin), 1).ranges
     assert said == (MODES[mode].considered,)
 
 
@@ -138,7 +138,7 @@ def test_errors_of_slides_in_millimetres(gantry):
     assert found["motor_2"][0] == pytest.approx((0.0005, 0.002))
     model = HealthyModel(gantry, SHARP)
     priors = Priors(error_ranges=found)
-    assert priors.ranges_of(MODES["steady_state_error"], model, 1) == found["motor_2"]
+    assert priors.sizes_of(MODES["steady_state_error"], model, 1).ranges == found["motor_2"]
 
 
 @pytest.mark.parametrize(
