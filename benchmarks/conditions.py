@@ -2,11 +2,12 @@
 
     python benchmarks/conditions.py [--per-class 20] [--healthy 120] [--seed 0] [--only TEXT]
 
-Simulated runs (physics engine unless said; its stiffness and friction are its own) of the ArmPi FPV and of the three other bundled arms.
-The diagnoser keeps its bundled calibration, or none where the arm has none, and default priors. A
-line for each condition: runs right, log score, calibration error and how much of it is beyond
-chance (its mean over answers that mean what they say), coverage of 90 % intervals of held angle,
-onset of stuck motors and size of errors, and healthy runs called faulty.
+Simulated runs (physics engine unless said; its stiffness and friction are its own) of the ArmPi FPV
+and of the three other bundled arms. The diagnoser keeps its bundled calibration,
+or none where the arm has none, and default priors. A line for each condition: runs right, log
+score, calibration error and how much of it is beyond chance (its mean over answers that mean what
+they say), coverage of 90 % intervals of held angle, onset of stuck motors and size of errors, and
+healthy runs called faulty.
 """
 
 from __future__ import annotations
@@ -140,10 +141,14 @@ def paced(truth: Imperfections, period_s: float) -> Imperfections:
     return replace(truth, schedule=replace(truth.schedule, period_s=(period_s, 1.03 * period_s)))
 
 
-def sampled(truth: Imperfections, **changed: float) -> Imperfections:
-    """Return healthy behaviour before another sensor."""
-    assert truth.readings is not None
-    return replace(truth, readings=replace(truth.readings, **changed))
+def sampled(
+    truth: Imperfections, rate_hz: float | None = None, noise_m: float = 0.0
+) -> Imperfections:
+    """Return healthy behaviour before another sensor; None: as often as it is."""
+    old = truth.readings
+    assert old is not None
+    readings = replace(old, rate_hz=rate_hz or old.rate_hz, noise_m=noise_m)
+    return replace(truth, readings=readings)
 
 
 def turned(point: FloatArray) -> FloatArray:

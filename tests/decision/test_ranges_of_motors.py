@@ -17,6 +17,7 @@ from failuretwin.core.runs import RunTable
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Readings
 from failuretwin.digital_model.robot import shown_unit
 from failuretwin.digital_model.settling import Settling
+from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.explanation import size_words
 from failuretwin.inference.healthy_model import HealthyModel
@@ -114,6 +115,26 @@ def test_sizes_of_errors_begin_at_what_a_motor_shows(gantry):
     drift = Priors().sizes_of(MODES["drift"], model, 0).ranges
     assert drift[0][0] == pytest.approx(0.1 * ranges[0][0])
     assert Priors().sizes_of(MODES["encoder_scale"], model, 0).ranges == ((0.03, 0.75),)
+
+
+@pytest.mark.parametrize(("mode", "within"), [("steady_state_error", 1.0), ("drift", 0.1)])
+def test_sizes_within_what_a_day_changes_are_improbable(tmp_path, mode, within):
+    """An arm exact to 0.1 mrad whose class differs by 1 mrad from day to day."""
+    twin = small_twin(tmp_path, "scara", SCARA, "0.2 0 0")
+    profile = replace(twin.robot.profile, arm_class="industrial", inference={"least_noise_m": 2e-5})
+    exact = replace(SHARP.settling, scatter=(1e-5,) * 3)
+    sharp = replace(SHARP, settling=exact, readings=Readings(10.0, noise_m=2e-5))
+    model = HealthyModel(DigitalTwin(replace(twin.robot, profile=profile)), sharp)
+
+    sizes = Priors().sizes_of(MODES[mode], model, 1)
+
+    small = [low < 0.999e-3 * within for low, _ in sizes.ranges]
+    assert sizes.ranges[0][0] == pytest.approx(0.5 * within * model.least_visible[1])
+    assert sum(sizes.shares) == pytest.approx(1.0)
+    assert sum(np.array(sizes.shares)[small]) == pytest.approx(0.02)
+    assert min(low for low, _ in sizes.ranges if low >= 0.999e-3 * within) == pytest.approx(
+        1e-3 * within
+    )
 
 
 @pytest.mark.parametrize("mode", ["encoder_bias", "drift", "backlash"])

@@ -24,8 +24,6 @@ TURN_RAD = 1e-5
 REST_S = 0.3
 """A reference that a hand guides rests where no motor moves for this long [s]: twice the 0.15 s by
 which such an arm trails, so that it is seen at rest as well."""
-FINE = 0.1
-"""Share of the tolerance below which rounding leaves levels that can be told apart [-]."""
 CREEP = 10.0
 """What noise may add up to within a rest, in `TURN_RAD`."""
 
@@ -49,7 +47,7 @@ def simplify(
     known = np.isfinite(value)
     time, value = time[known], value[known].copy()
     quantum = resolution(value)
-    rests = _rests(time, value) if quantum < FINE * tolerance else []
+    rests = _rests(time, value) if quantum < tolerance else []
     for first, last in rests:
         value[first : last + 1] = np.median(value[first : last + 1])
     tolerance = max(tolerance, 0.75 * quantum)
