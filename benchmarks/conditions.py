@@ -31,6 +31,7 @@ from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import calibrated
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot, load_robot
+from failuretwin.failure_behavior.modes import SteadyStateError
 from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.failure_behavior.registry import MODES
 
@@ -100,8 +101,7 @@ class Condition:
     def _modes(self) -> dict[str, ft.FaultMode]:
         modes = dict(MODES)
         if self.errors is not None:
-            error = replace(modes["steady_state_error"], magnitude=self.errors)
-            modes["steady_state_error"] = error
+            modes["steady_state_error"] = SteadyStateError(magnitude=self.errors)
         if self.latest_s is not None:
             late = (0.0, self.latest_s)
             modes |= {n: replace(modes[n], onset_s=late) for n in ("stuck", "steady_state_error")}
@@ -111,12 +111,19 @@ class Condition:
 # What may be otherwise than the calibration says.
 
 
-def settled(truth: Imperfections, **factors: float) -> Imperfections:
-    """Return healthy behaviour with settling figures multiplied, by name."""
+def settled(
+    truth: Imperfections, compliance: float = 1.0, friction: float = 1.0, scatter: float = 1.0
+) -> Imperfections:
+    """Return healthy behaviour with settling figures multiplied."""
     old = truth.settling
     assert old is not None
-    values = {n: tuple(f * v for v in getattr(old, n)) for n, f in factors.items()}
-    return replace(truth, settling=replace(old, **values))
+    settling = replace(
+        old,
+        compliance=tuple(compliance * v for v in old.compliance),
+        friction=tuple(friction * v for v in old.friction),
+        scatter=tuple(scatter * v for v in old.scatter),
+    )
+    return replace(truth, settling=settling)
 
 
 def biased(truth: Imperfections, bias_rad: float) -> Imperfections:
