@@ -24,7 +24,7 @@ from failuretwin.inference.posterior import (
 )
 from failuretwin.inference.priors import OnsetPrior, Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.stuck import stuck_model
+from failuretwin.inference.stuck import _onsets, stuck_model
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 RANGES = ((0.02, 0.08), (0.04, 0.2))
@@ -111,6 +111,20 @@ def test_onsets_lie_in_the_run(likelihood, fault_model):
         np.testing.assert_allclose(share.sum(axis=-1)[chance], 1.0, atol=1e-9)
         assert onset.min() >= 0.0
         assert onset[possible & (share > 0.0)].max() <= last
+
+
+def test_onsets_on_a_ramp_hold_the_doubt_about_the_lag_of_one_motor(likelihood):
+    """Variances add: that of the start of the movement, which all share, and (0.03 s)^2."""
+    alone, usual = likelihood[3], likelihood.model.start_delay.punctual
+    chance = np.exp(usual.log_weight)
+    mean = chance @ usual.delay
+    onset, share = _onsets(alone, 1, np.array([0.1]))[1]
+    at, part = np.broadcast_arrays(onset[1, 0], share[1, 0])
+    early = at < at.min() + 0.4  # late starts come half a second later
+    weight = part[early] / part[early].sum()
+    middle = weight @ at[early]
+    expected = chance @ (usual.delay - mean) ** 2 + 0.03**2
+    assert weight @ (at[early] - middle) ** 2 == pytest.approx(expected, rel=0.15)
 
 
 @pytest.mark.parametrize(
