@@ -24,6 +24,8 @@ TURN_RAD = 1e-5
 REST_S = 0.3
 """A reference that a hand guides rests where no motor moves for this long [s]: twice the 0.15 s by
 which such an arm trails, so that it is seen at rest as well."""
+SAME = 1e-9
+"""What is as good as level, whatever the tolerance."""
 CREEP = 10.0
 """What noise may add up to within a rest, in `TURN_RAD`."""
 
@@ -136,11 +138,11 @@ def _level(value: FloatArray, fixed: BoolArray, tolerance: float) -> FloatArray:
 
     Args:
         value: Corner values, (corner,).
-        fixed: Corners that stay as they are, (corner,).
+        fixed: Corners that stay as they are, but for rounding, (corner,).
         tolerance: What is almost level, in the unit of `value`.
     """
     value = value.copy()
     for i in range(1, len(value)):
-        if not fixed[i] and abs(value[i] - value[i - 1]) <= tolerance:
+        if abs(value[i] - value[i - 1]) <= (SAME if fixed[i] else tolerance):
             value[i] = value[i - 1]
     return value
