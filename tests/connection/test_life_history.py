@@ -116,7 +116,10 @@ def test_a_writer_that_is_killed_does_no_harm(armpi, calibration):
 @pytest.mark.parametrize(
     ("spoil", "told"),
     [
-        (lambda text: text.replace(b'{"number": 2', b'["number": 2'), "line 3: cannot be read as JSON"),
+        (
+            lambda text: text.replace(b'{"number": 2', b'["number": 2'),
+            "line 3: cannot be read",
+        ),
         (lambda text: text[:-30], "is shorter than it was"),
         (lambda text: text.replace(b"history_of", b"story_of__"), "no history of a calibration"),
         (lambda text: b"\xff" + text[1:], "It is damaged"),

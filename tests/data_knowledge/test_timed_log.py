@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.movements import find_movements, resolution, simplify
+from failuretwin.core.movements import find_movements
+from failuretwin.core.polyline import resolution, simplify
 from failuretwin.data_knowledge.timed_log import STEP_S, Samples, Targets, TimedLog, timed_run
 
 AT = np.arange(0.0, 6.0, 0.1)
@@ -60,6 +61,33 @@ def test_few_lines_stay_near_the_samples():
 
     assert len(corner_time) < 40
     assert np.abs(np.interp(time, corner_time, corner_value) - value).max() < 6e-3
+
+
+@pytest.mark.parametrize("step", [1e-4, 1e-3, 3.5e-3])
+@pytest.mark.parametrize("digits", [9, 6])
+def test_small_steps_between_rests_are_movements(armpi, twin, step, digits):
+    """A motor told to go on by less than a quarter of a degree is off by nothing afterwards."""
+    time = np.arange(0.0, 9.0, 0.1)
+    angle = np.interp(time, [2.0, 3.0, 5.0, 6.0], [0.5, 0.5 + step, 0.5 + step, 0.5 - step])
+    other = np.interp(time, [2.0, 3.0, 5.0, 6.0], [0.0, 0.7, 0.7, 0.2])
+    command = np.round(np.stack([angle, other, other, other], axis=1), digits)
+
+    run = timed_run(log_of(twin, command, time), armpi)
+    found = find_movements(run.command, run.time)
+
+    assert found.start.shape[1] == 2
+    expected = [[0.5 + step, 0.7], [0.5 - step, 0.2]]
+    np.testing.assert_allclose(found.target[0, :, :2], expected, atol=1.1 * 10.0**-digits)
+
+
+def test_rests_of_a_smooth_command_are_where_they_were_told_to_be(armpi, twin):
+    time = np.arange(0.0, 6.0, 0.02)
+    angle = minimum_jerk(time, 0.5, 1.5, 0.8) + minimum_jerk(time, 3.0, 1.5, -0.5)
+
+    run = timed_run(log_of(twin, np.outer(angle, [1.0, 0.5, -0.5, 0.2]), time), armpi)
+    found = find_movements(run.command, run.time)
+
+    np.testing.assert_allclose(found.target[0, :, 0], [0.8, 0.3], atol=2e-5)
 
 
 def test_even_times_become_the_grid(armpi, twin):

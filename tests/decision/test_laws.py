@@ -17,14 +17,14 @@ from failuretwin.inference.fault_models import (
     redrawn_offset_model,
     transient_model,
 )
-from failuretwin.inference.fault_sizes import redrawn_nodes, size_nodes
+from failuretwin.inference.fault_sizes import SizePrior, redrawn_nodes, size_nodes
 from failuretwin.inference.posterior import (
     marginal_likelihood_of,
     marginal_likelihoods,
 )
 from failuretwin.inference.priors import OnsetPrior, Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.stuck import stuck_model
+from failuretwin.inference.stuck import _onsets, stuck_model
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 RANGES = ((0.02, 0.08), (0.04, 0.2))
@@ -35,20 +35,20 @@ FAULT_MODELS = {
         likelihood, 1, OnsetPrior(known_s=2.3)
     ),
     "steady_state_error": lambda likelihood, early: redrawn_offset_model(
-        likelihood, 1, MODES["steady_state_error"], RANGES, early
+        likelihood, 1, MODES["steady_state_error"], SizePrior.even(RANGES), early
     ),
     "drift": lambda likelihood, early: growing_offset_model(
-        likelihood, 1, MODES["drift"], [(0.005, 0.06)], early
+        likelihood, 1, MODES["drift"], SizePrior.even([(0.005, 0.06)]), early
     ),
     **{
         name: lambda likelihood, early, mode=MODES[name]: transient_model(
-            likelihood, 1, mode, [mode.considered], early
+            likelihood, 1, mode, SizePrior.even([mode.considered]), early
         )
         for name in ("lag", "slow")
     },
     **{
         name: lambda likelihood, early, mode=MODES[name]: offset_model(
-            likelihood, 1, mode, [mode.considered], early
+            likelihood, 1, mode, SizePrior.even([mode.considered]), early
         )
         for name in ("encoder_bias", "encoder_scale", "backlash", "torque_loss")
     },
@@ -111,6 +111,20 @@ def test_onsets_lie_in_the_run(likelihood, fault_model):
         np.testing.assert_allclose(share.sum(axis=-1)[chance], 1.0, atol=1e-9)
         assert onset.min() >= 0.0
         assert onset[possible & (share > 0.0)].max() <= last
+
+
+def test_onsets_on_a_ramp_hold_the_doubt_about_the_lag_of_one_motor(likelihood):
+    """Variances add: that of the start of the movement, which all share, and (0.03 s)^2."""
+    alone, usual = likelihood[3], likelihood.model.start_delay.punctual
+    chance = np.exp(usual.log_weight)
+    mean = chance @ usual.delay
+    onset, share = _onsets(alone, 1, np.array([0.1]))[1]
+    at, part = np.broadcast_arrays(onset[1, 0], share[1, 0])
+    early = at < at.min() + 0.4  # late starts come half a second later
+    weight = part[early] / part[early].sum()
+    middle = weight @ at[early]
+    expected = chance @ (usual.delay - mean) ** 2 + 0.03**2
+    assert weight @ (at[early] - middle) ** 2 == pytest.approx(expected, rel=0.15)
 
 
 @pytest.mark.parametrize(
@@ -180,7 +194,9 @@ def test_a_motor_that_lost_torque_sags_as_its_stiffness_is_left():
 
 
 def test_drifts_of_all_rates_and_both_signs_are_as_likely(likelihood):
-    fault_model = growing_offset_model(likelihood, 0, MODES["drift"], [(0.005, 0.06)], 0.6)
+    fault_model = growing_offset_model(
+        likelihood, 0, MODES["drift"], SizePrior.even([(0.005, 0.06)]), 0.6
+    )
     mass = np.exp(fault_model.log_prior[0]).sum(axis=0)
     low, high = 0.005, 0.06
     size = fault_model.size[0]
@@ -194,7 +210,7 @@ def test_drifts_of_all_rates_and_both_signs_are_as_likely(likelihood):
 def test_offsets_are_those_of_the_simulated_motion(likelihood, mode):
     """What a mode says of its offset is what its stages do to a motor that stands at its target."""
     said, alone = MODES[mode], likelihood[3]
-    sizes = [said.considered]
+    sizes = SizePrior.even([said.considered])
     found = type("Asked", (type(said),), {"settled_offset": FaultMode.settled_offset})()
     model = growing_offset_model if mode == "drift" else offset_model
     expected, asked = model(alone, 1, said, sizes, 0.3), model(alone, 1, found, sizes, 0.3)
@@ -211,7 +227,7 @@ def test_an_offset_that_bends_with_its_size_is_asked_at_every_node(likelihood):
 
     kind = {"mode": "end_stop", "on_reference": stops, "sizes": (0.3, 0.95)}
     stop = type("EndStop", (type(MODES["slow"]),), {**kind, "on_movements": FaultMode.on_movements})
-    found = offset_model(likelihood, 1, stop(), [stop().considered], 0.3)
+    found = offset_model(likelihood, 1, stop(), SizePrior.even([stop().considered]), 0.3)
     base = likelihood.outcomes.base[..., 1][:, :, None]
     limit = np.deg2rad(80.0) * (1.0 - found.size[:, None, :, None])
     settled = likelihood.profile(1).faulty_baseline[:, :, None]

@@ -30,6 +30,7 @@ from failuretwin.inference.fault_models import (
     redrawn_offset_model,
     transient_model,
 )
+from failuretwin.inference.fault_sizes import SizePrior
 from failuretwin.inference.marginal import marginal_likelihood
 from failuretwin.inference.missed_movements import missed_movements_likelihood
 
@@ -44,7 +45,7 @@ def test_a_healthy_slide_has_the_density_of_student(run_on):
 # Off by an amount of its own in each movement.
 
 COUNT_RAD = np.deg2rad(0.24)
-CONSIDERED = {name: [mode.considered] for name, mode in MODES.items()}
+CONSIDERED = {name: SizePrior.even([mode.considered]) for name, mode in MODES.items()}
 USUAL_RANGES = tuple((k * COUNT_RAD, 5 * k * COUNT_RAD) for k in (4, 7, 10))
 
 
@@ -73,7 +74,9 @@ def test_errors_drawn_anew_have_the_evidence_of_all_sizes(run_on, off):
     found = told(
         marginal_likelihood(
             likelihood,
-            redrawn_offset_model(likelihood, 0, MODES["steady_state_error"], USUAL_RANGES, 0.9),
+            redrawn_offset_model(
+                likelihood, 0, MODES["steady_state_error"], SizePrior.even(USUAL_RANGES), 0.9
+            ),
         )
     )
     assert found == pytest.approx(np.log(total), abs=0.05)
@@ -90,7 +93,9 @@ def test_the_size_of_errors_has_the_quantiles_of_their_rms(run_on, count):
     size = (
         marginal_likelihood(
             likelihood,
-            redrawn_offset_model(likelihood, 0, MODES["steady_state_error"], [(0.01, 0.12)], 1.0),
+            redrawn_offset_model(
+                likelihood, 0, MODES["steady_state_error"], SizePrior.even([(0.01, 0.12)]), 1.0
+            ),
         )
         .estimate(0)
         .size
@@ -138,7 +143,13 @@ def test_a_constant_error_has_the_evidence_of_all_sizes(run_on, bias, first):
     found = told(
         marginal_likelihood(
             likelihood,
-            offset_model(likelihood, 0, MODES["encoder_bias"], CONSIDERED["encoder_bias"], 0.9),
+            offset_model(
+                likelihood,
+                0,
+                MODES["encoder_bias"],
+                CONSIDERED["encoder_bias"],
+                0.9,
+            ),
         )
     )
     expected = lasting_by_force(brute, np.tile(size, (4, 1)), chance)
@@ -153,7 +164,13 @@ def test_a_wrong_scale_has_the_evidence_of_all_sizes(run_on, scale):
     found = told(
         marginal_likelihood(
             likelihood,
-            offset_model(likelihood, 0, MODES["encoder_scale"], CONSIDERED["encoder_scale"], 0.9),
+            offset_model(
+                likelihood,
+                0,
+                MODES["encoder_scale"],
+                CONSIDERED["encoder_scale"],
+                0.9,
+            ),
         )
     )
     assert found == pytest.approx(
@@ -170,7 +187,8 @@ def test_play_has_the_evidence_of_all_sizes(run_on, play):
     offsets = np.multiply.outer(-0.5 * direction, size)
     found = told(
         marginal_likelihood(
-            likelihood, offset_model(likelihood, 0, MODES["backlash"], CONSIDERED["backlash"], 0.9)
+            likelihood,
+            offset_model(likelihood, 0, MODES["backlash"], CONSIDERED["backlash"], 0.9),
         )
     )
     assert found == pytest.approx(lasting_by_force(brute, offsets, chance), abs=0.03)
@@ -229,7 +247,8 @@ def test_a_slow_motor_gets_as_far_as_its_time_goes(run_on, share, done):
     likelihood, brute = run_on(TARGETS, stands)
     size = (
         marginal_likelihood(
-            likelihood, transient_model(likelihood, 0, MODES["slow"], CONSIDERED["slow"], 0.9)
+            likelihood,
+            transient_model(likelihood, 0, MODES["slow"], CONSIDERED["slow"], 0.9),
         )
         .estimate(0)
         .size
@@ -246,7 +265,8 @@ def test_a_slow_motor_gets_as_far_as_its_time_goes(run_on, share, done):
             expected[k] += chance * brute.before(first) * brute.from_on(first, np.array(places))
     found = told(
         marginal_likelihood(
-            likelihood, transient_model(likelihood, 0, MODES["slow"], CONSIDERED["slow"], 0.9)
+            likelihood,
+            transient_model(likelihood, 0, MODES["slow"], CONSIDERED["slow"], 0.9),
         )
     )
     assert found == pytest.approx(np.log(expected.mean()), abs=1e-3)

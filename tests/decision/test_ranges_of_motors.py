@@ -17,6 +17,7 @@ from failuretwin.core.runs import RunTable
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Readings
 from failuretwin.digital_model.robot import shown_unit
 from failuretwin.digital_model.settling import Settling
+from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.explanation import size_words
 from failuretwin.inference.healthy_model import HealthyModel
@@ -103,22 +104,42 @@ def test_sizes_of_errors_begin_at_what_a_motor_shows(gantry):
     model = HealthyModel(gantry, SHARP)
     noise = np.hypot(1e-4, 2e-4 * gantry.robot.reach)
     np.testing.assert_allclose(model.least_visible, np.hypot(SCATTER, noise), rtol=1e-6)
-    ranges = Priors().ranges_of(MODES["steady_state_error"], model, 0)
+    ranges = Priors().sizes_of(MODES["steady_state_error"], model, 0).ranges
     assert ranges[0][0] == pytest.approx(0.5 * model.least_visible[0])
     assert ranges[-1][1] == pytest.approx(0.9 * 0.92 / np.pi)
     for (low, high), (following, _) in pairwise(ranges):
         assert high == pytest.approx(5.0 * low)
         assert 1.0 < following / low <= 2.5
-    bias = Priors().ranges_of(MODES["encoder_bias"], model, 0)
+    bias = Priors().sizes_of(MODES["encoder_bias"], model, 0).ranges
     assert bias[0] == pytest.approx(ranges[0])
-    drift = Priors().ranges_of(MODES["drift"], model, 0)
+    drift = Priors().sizes_of(MODES["drift"], model, 0).ranges
     assert drift[0][0] == pytest.approx(0.1 * ranges[0][0])
-    assert Priors().ranges_of(MODES["encoder_scale"], model, 0) == ((0.03, 0.75),)
+    assert Priors().sizes_of(MODES["encoder_scale"], model, 0).ranges == ((0.03, 0.75),)
+
+
+@pytest.mark.parametrize(("mode", "within"), [("steady_state_error", 1.0), ("drift", 0.1)])
+def test_sizes_within_what_a_day_changes_are_improbable(tmp_path, mode, within):
+    """An arm exact to 0.1 mrad whose class differs by 1 mrad from day to day."""
+    twin = small_twin(tmp_path, "scara", SCARA, "0.2 0 0")
+    profile = replace(twin.robot.profile, arm_class="industrial", inference={"least_noise_m": 2e-5})
+    exact = replace(SHARP.settling, scatter=(1e-5,) * 3)
+    sharp = replace(SHARP, settling=exact, readings=Readings(10.0, noise_m=2e-5))
+    model = HealthyModel(DigitalTwin(replace(twin.robot, profile=profile)), sharp)
+
+    sizes = Priors().sizes_of(MODES[mode], model, 1)
+
+    small = [low < 0.999e-3 * within for low, _ in sizes.ranges]
+    assert sizes.ranges[0][0] == pytest.approx(0.5 * within * model.least_visible[1])
+    assert sum(sizes.shares) == pytest.approx(1.0)
+    assert sum(np.array(sizes.shares)[small]) == pytest.approx(0.02)
+    assert min(low for low, _ in sizes.ranges if low >= 0.999e-3 * within) == pytest.approx(
+        1e-3 * within
+    )
 
 
 @pytest.mark.parametrize("mode", ["encoder_bias", "drift", "backlash"])
 def test_the_bundled_arm_has_the_sizes_of_the_modes(twin, mode):
-    said = Priors().ranges_of(MODES[mode], HealthyModel.of(twin), 1)
+    said = Priors().sizes_of(MODES[mode], HealthyModel.of(twin), 1).ranges
     assert said == (MODES[mode].considered,)
 
 
@@ -138,7 +159,7 @@ def test_errors_of_slides_in_millimetres(gantry):
     assert found["motor_2"][0] == pytest.approx((0.0005, 0.002))
     model = HealthyModel(gantry, SHARP)
     priors = Priors(error_ranges=found)
-    assert priors.ranges_of(MODES["steady_state_error"], model, 1) == found["motor_2"]
+    assert priors.sizes_of(MODES["steady_state_error"], model, 1).ranges == found["motor_2"]
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.movements import ROUNDING_RAD, Movements, simplify
+from failuretwin.core.movements import ROUNDING_RAD, Movements
+from failuretwin.core.polyline import simplify
 from failuretwin.core.runs import RunTable
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.robot import Robot

@@ -10,16 +10,14 @@ Section: docs/diagnosis.md#fault-models-where-each-fault-puts-its-motor
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from failuretwin.core.numerics import log_of, log_sum, weighted_quantiles
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.settling import sag
 from failuretwin.failure_behavior.fault import Arrival
-from failuretwin.failure_behavior.mode import FaultMode, Range, Signature
-from failuretwin.inference.fault_sizes import redrawn_nodes, size_nodes
+from failuretwin.failure_behavior.mode import FaultMode, Signature
+from failuretwin.inference.fault_sizes import SizePrior, redrawn_nodes, size_nodes
 from failuretwin.inference.joint_likelihood import JointLikelihood
 from failuretwin.inference.marginal import FaultModel
 from failuretwin.inference.priors import immediate, next_movement
@@ -45,7 +43,7 @@ def offset_model(
     likelihood: RunLikelihood,
     motor: int,
     mode: FaultMode,
-    ranges: Sequence[Range],
+    sizes: SizePrior,
     prior_before_run: float,
 ) -> FaultModel:
     """Return the fault model of a fault whose offset is decided by one size, from its onset on.
@@ -54,7 +52,7 @@ def offset_model(
         likelihood: The runs.
         motor: Index of the motor.
         mode: Its mode.
-        ranges: Ranges of the size, equally likely.
+        sizes: What is believed of the size.
         prior_before_run: Probability that the fault was there before the run.
     """
     profile = likelihood.profile(motor)
@@ -62,8 +60,8 @@ def offset_model(
     gain = _gain(mode, arrival)
     best, width = _best_sizes(mode, profile, gain[..., 0])
     usable = profile.usable & (np.abs(gain[..., 0]) > 1e-9)
-    size, log_size = size_nodes(best, width, usable, ranges, mode.signed)
-    log_size = log_sum(log_size, axis=1) - np.log(len(ranges))
+    size, log_size = size_nodes(best, width, usable, sizes.ranges, mode.signed)
+    log_size = log_sum(log_size + sizes.log_share[:, None], axis=1)
     stretches = immediate(likelihood.evidence)
     return FaultModel(
         motor=motor,
@@ -171,7 +169,7 @@ def growing_offset_model(
     likelihood: RunLikelihood,
     motor: int,
     mode: FaultMode,
-    ranges: Sequence[Range],
+    sizes: SizePrior,
     prior_before_run: float,
 ) -> FaultModel:
     """Return the fault model of a fault whose offset grows from an unknown onset on.
@@ -180,12 +178,12 @@ def growing_offset_model(
         likelihood: The runs.
         motor: Index of the motor.
         mode: Its mode.
-        ranges: Ranges of the rate, equally likely.
+        sizes: What is believed of the rate.
         prior_before_run: Probability that it grows from the start of the run.
     """
     middle = np.nan_to_num(0.5 * (likelihood.evidence.begin + likelihood.evidence.end))
     settled = likelihood.profile(motor).faulty_baseline
-    rate, log_rate = _rates(likelihood, motor, mode, ranges, middle)
+    rate, log_rate = _rates(likelihood, motor, mode, sizes, middle)
     stretches = immediate(likelihood.evidence)
     onset, share = stretches.samples(prior_before_run, ONSETS)  # (run, movement, onset)
     log_onset = log_of(stretches.weights(prior_before_run)[..., None] * share)
@@ -223,7 +221,7 @@ def _rates(
     likelihood: RunLikelihood,
     motor: int,
     mode: FaultMode,
-    ranges: Sequence[Range],
+    sizes: SizePrior,
     since: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Return rates, sorted, and the log of their prior, (run, rate) each.
@@ -234,7 +232,7 @@ def _rates(
         likelihood: The runs.
         motor: Index of the motor.
         mode: Its mode.
-        ranges: Ranges of the rate, equally likely.
+        sizes: What is believed of the rate.
         since: For how long it has grown then, (run, movement) [s].
     """
     profile = likelihood.profile(motor)
@@ -245,8 +243,8 @@ def _rates(
     some = np.asarray(total > 0.0)
     together = weighted_quantiles(best, weight, (0.5,))
     spread = 1.0 / np.sqrt(np.where(some, total, 1.0))
-    rates, log_rates = size_nodes(together, spread, some, ranges, mode.signed)
-    return rates, log_sum(log_rates, axis=1) - np.log(len(ranges))
+    rates, log_rates = size_nodes(together, spread, some, sizes.ranges, mode.signed)
+    return rates, log_sum(log_rates + sizes.log_share[:, None], axis=1)
 
 
 # Faults that show on the way: a motor that starts late, a motor that is slow.
@@ -259,7 +257,7 @@ def transient_model(
     likelihood: RunLikelihood,
     motor: int,
     mode: FaultMode,
-    ranges: Sequence[Range],
+    sizes: SizePrior,
     prior_before_run: float,
 ) -> FaultModel:
     """Return the fault model of a motor that starts late or has lost speed.
@@ -270,11 +268,10 @@ def transient_model(
         likelihood: The runs.
         motor: Index of the motor.
         mode: Its mode.
-        ranges: Ranges of the size; all between the lowest and the highest is as likely.
+        sizes: What is believed of the size; all between its ends is as likely.
         prior_before_run: Probability that the fault was there before the run.
     """
-    lows, highs = zip(*ranges, strict=True)
-    size = np.linspace(min(lows), max(highs), TIMED_NODES)
+    size = np.linspace(*sizes.ends, TIMED_NODES)
     factor, delay = mode.ramp_factor(size), mode.dead_time(size)
     angle, begin, way = likelihood.profile(motor).expected[:, :, None], None, None
     if (factor != 1.0).any():
@@ -324,7 +321,7 @@ def redrawn_offset_model(
     likelihood: RunLikelihood,
     motor: int,
     mode: FaultMode,
-    ranges: Sequence[Range],
+    sizes: SizePrior,
     prior_before_run: float,
 ) -> FaultModel:
     """Return the fault model of a fault whose size is drawn anew for each movement.
@@ -333,7 +330,7 @@ def redrawn_offset_model(
         likelihood: The runs.
         motor: Index of the motor.
         mode: Its mode.
-        ranges: Run-level ranges of the size, equally likely.
+        sizes: What is believed of the size; its range holds for the run.
         prior_before_run: Probability that it was there before the run.
     """
     profile = likelihood.profile(motor)
@@ -342,7 +339,7 @@ def redrawn_offset_model(
     best, width = _best_sizes(mode, profile, gain)
     usable = profile.usable & (np.abs(gain) > 1e-9)
     size, log_mass = redrawn_nodes(
-        best, width, usable, ranges, float(likelihood.model.scatter[motor])
+        best, width, usable, sizes.ranges, float(likelihood.model.scatter[motor])
     )
     stretches = next_movement(likelihood.evidence.movements)
     log_first = log_of(stretches.weights(prior_before_run))
@@ -351,7 +348,7 @@ def redrawn_offset_model(
         held=False,
         angle=profile.faulty_baseline[:, :, None]
         + mode.settled_offset(size[..., None], _by_node(arrival)),
-        log_prior=np.repeat(log_first[..., None] - np.log(len(ranges)), len(ranges), axis=2),
+        log_prior=log_first[..., None] + sizes.log_share,
         size=size,
         onsets=stretches.onsets(prior_before_run),
         redrawn=log_mass,

@@ -14,6 +14,7 @@ Section: docs/diagnosis.md#fault-models-where-each-fault-puts-its-motor
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,6 +37,34 @@ WIDE = 1.5
 """Step of the even nodes, in the least size, from which small sizes have nodes of their own."""
 SMALLEST = 1e-3
 """Sizes below so much of the largest are one: ranges may begin at nothing."""
+
+
+@dataclass(frozen=True)
+class SizePrior:
+    """What is believed of a fault's size: uniform within each of some ranges.
+
+    Attributes:
+        ranges: Lowest and highest size of each.
+        shares: How probable each range is; they sum to 1.
+    """
+
+    ranges: tuple[Range, ...]
+    shares: tuple[float, ...]
+
+    @classmethod
+    def even(cls, ranges: Sequence[Range]) -> SizePrior:
+        """Return the prior of ranges that are equally likely."""
+        return cls(tuple(ranges), (1.0 / len(ranges),) * len(ranges))
+
+    @property
+    def log_share(self) -> FloatArray:
+        """Log probability of each range, (range,)."""
+        return log_of(np.array(self.shares))
+
+    @property
+    def ends(self) -> Range:
+        """Smallest and largest size."""
+        return min(low for low, _ in self.ranges), max(high for _, high in self.ranges)
 
 
 def nodes_around(

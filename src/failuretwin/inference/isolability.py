@@ -301,8 +301,7 @@ def _sizes(hypothesis: Hypothesis, judge: ExpectedLogBayesFactor) -> tuple[float
         return np.nan, np.nan
     fault, model = hypothesis.faults[0], judge.model
     motor = model.motor_names.index(fault.motor)
-    lows, highs = zip(*judge.priors.ranges_of(MODES[fault.mode], model, motor), strict=True)
-    return min(lows), max(highs)
+    return judge.priors.sizes_of(MODES[fault.mode], model, motor).ends
 
 
 def _typical(low: float, high: float) -> float:

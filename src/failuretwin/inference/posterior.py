@@ -25,7 +25,7 @@ from failuretwin.core.hypothesis import (
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.digital_model.robot import Robot
-from failuretwin.failure_behavior.mode import FaultMode, Range, Signature
+from failuretwin.failure_behavior.mode import FaultMode, Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.double_faults import double_fault_likelihood
 from failuretwin.inference.evidence import SettledEvidence
@@ -36,7 +36,7 @@ from failuretwin.inference.fault_models import (
     redrawn_offset_model,
     transient_model,
 )
-from failuretwin.inference.fault_sizes import LOCAL_STEPS
+from failuretwin.inference.fault_sizes import LOCAL_STEPS, SizePrior
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.log_quality import LogQuality, commands_beyond, unused_movements
 from failuretwin.inference.marginal import (
@@ -150,7 +150,7 @@ def motor_of(likelihood: RunLikelihood, fault: Fault) -> int:
 
 
 MODELS: Mapping[
-    Signature, Callable[[RunLikelihood, int, FaultMode, Sequence[Range], float], FaultModel]
+    Signature, Callable[[RunLikelihood, int, FaultMode, SizePrior, float], FaultModel]
 ] = {
     Signature.OFFSET: offset_model,
     Signature.GROWING_OFFSET: growing_offset_model,
@@ -166,8 +166,8 @@ def fault_model_of(likelihood: RunLikelihood, fault: Fault, priors: Priors) -> F
     early = priors.onset.before_run(fault.mode)
     if mode.signature is Signature.HELD:
         return stuck_model(likelihood, motor, priors.onset)
-    ranges = priors.ranges_of(mode, likelihood.model, motor)
-    return MODELS[mode.signature](likelihood, motor, mode, ranges, early)
+    sizes = priors.sizes_of(mode, likelihood.model, motor)
+    return MODELS[mode.signature](likelihood, motor, mode, sizes, early)
 
 
 def _fault_models_of_two(

@@ -15,10 +15,12 @@ import numpy as np
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray
+from failuretwin.digital_model.arm_classes import class_of
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import FaultMode, Range, Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.evidence import SettledEvidence
+from failuretwin.inference.fault_sizes import SizePrior
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.settings import WIDEST_ERROR
 from failuretwin.inference.shared_unknowns import SetupPrior
@@ -228,8 +230,8 @@ class Priors:
             return tuple(self.error_ranges.values())
         return (self.error_ranges,)
 
-    def ranges_of(self, mode: FaultMode, model: HealthyModel, motor: int) -> Sequence[Range]:
-        """Return the ranges of sizes that are considered of a mode, equally likely.
+    def sizes_of(self, mode: FaultMode, model: HealthyModel, motor: int) -> SizePrior:
+        """Return what is believed of the size of a fault: ranges that are stated are as likely.
 
         Args:
             mode: The mode.
@@ -237,15 +239,16 @@ class Priors:
             motor: Index of the motor.
         """
         if not mode.down_to_visible:
-            return (mode.considered,)
+            return SizePrior.even([mode.considered])
         redrawn, told = mode.signature is Signature.REDRAWN_OFFSET, self.error_ranges
         if isinstance(told, Mapping):
             told = told.get(model.motor_names[motor])
         if redrawn and told is not None:
-            return told
+            return SizePrior.even(told)
         if model.settings.least_error_rad:
-            return model.settings.error_ranges if redrawn else (mode.considered,)
-        return visible_ranges(mode, model, motor)
+            ranges = model.settings.error_ranges if redrawn else (mode.considered,)
+            return SizePrior.even(ranges)
+        return visible_sizes(mode, model, motor)
 
 
 LARGEST_ERROR_RAD = 0.9
@@ -259,11 +262,17 @@ GROWN_S = 10.0
 """Time in which the slowest drift comes to what can be seen [s]: a run."""
 
 
-def visible_ranges(mode: FaultMode, model: HealthyModel, motor: int) -> tuple[Range, ...]:
-    """Return ranges of sizes of a motor, from what can be seen of it to the mode's largest.
+WITHIN_A_DAY = 0.02
+"""Probability that a fault is smaller than what healthy motors differ by from day to day, where so
+little shows: not none, lest "healthy" be surer than it can be; assumed."""
 
-    Each is as wide as the paper's, five times its least size, and begins at 2.5 times that of the
-    one before: all orders of magnitude are as likely.
+
+def visible_sizes(mode: FaultMode, model: HealthyModel, motor: int) -> SizePrior:
+    """Return sizes of a fault of a motor, from what can be seen of it to the mode's largest.
+
+    Each range is as wide as the paper's, five times its least size, and begins at 2.5 times that of
+    the one before: all orders of magnitude are as likely, but for those below what healthy motors
+    of the kind differ by from day to day.
 
     Args:
         mode: The mode; its sizes are offsets [rad], or grow with the time [rad/s].
@@ -274,12 +283,28 @@ def visible_ranges(mode: FaultMode, model: HealthyModel, motor: int) -> tuple[Ra
     largest = LARGEST_ERROR_RAD if mode.sizes is None else mode.considered[1]
     if model.twin.robot.slides[motor]:
         largest *= (high - low) / np.pi
-    least = LEAST_ERROR * model.least_visible[motor]
-    if mode.signature is Signature.GROWING_OFFSET:
-        least /= GROWN_S
+    within = 1.0 / GROWN_S if mode.signature is Signature.GROWING_OFFSET else 1.0
+    shown = within * LEAST_ERROR * model.least_visible[motor]
+    least = max(shown, within * _of_a_day(model, motor))
     count = 1 + max(0, int(np.ceil(np.log(largest / WIDEST_ERROR / least) / np.log(LARGER))))
-    lows = np.geomspace(least, max(least, largest / WIDEST_ERROR), count)
-    return tuple((float(low), float(WIDEST_ERROR * low)) for low in lows)
+    lows = np.geomspace(least, max(least, largest / WIDEST_ERROR), count).tolist()
+    fewer = int(np.ceil(np.log(least / shown) / np.log(LARGER)))
+    below = np.geomspace(shown, least, fewer, endpoint=False).tolist()
+    tiny = WITHIN_A_DAY if below else 0.0
+    shares = np.repeat([tiny / max(fewer, 1), (1.0 - tiny) / count], [fewer, count])
+    ranges = tuple((low, WIDEST_ERROR * low) for low in (*below, *lows))
+    return SizePrior(ranges, tuple(shares.tolist()))
+
+
+def _of_a_day(model: HealthyModel, motor: int) -> float:
+    """Return what a healthy motor differs by from day to day [rad]; a fault is larger.
+
+    Zero of a slide, and of a robot that is said to be ideal.
+    """
+    robot = model.twin.robot
+    if robot.slides[motor] or model.imperfections.settling is None:
+        return 0.0
+    return class_of(robot).session_rad
 
 
 MONITORING = Priors(healthy_odds=30.0)

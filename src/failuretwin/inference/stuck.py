@@ -197,6 +197,16 @@ def _intervals(likelihood: RunLikelihood, motor: int) -> OnsetIntervals:
     return plateau_or_ramp(start, start + ramp)
 
 
+LAG_DOUBT_S = 0.03
+"""Standard deviation of one motor's lag about the mean lag of the robot [s]: loads, gains and the
+clocks of sensors differ, and healthy logs tell the mean alone; half of the mean lag of the ArmPi
+FPV, assumed. It widens the interval of the onset; no probability depends on it."""
+LAG_STEPS = np.linspace(-2.0, 2.0, 9)
+"""Lags to sum over, in that deviation."""
+LAG_SHARES = np.exp(-0.5 * LAG_STEPS**2) / np.exp(-0.5 * LAG_STEPS**2).sum()
+"""How probable each is."""
+
+
 def _onsets(
     likelihood: RunLikelihood, motor: int, angle: FloatArray
 ) -> list[tuple[FloatArray, FloatArray]]:
@@ -223,7 +233,9 @@ def _onsets(
     ramp = np.nan_to_num(movements.ramp_duration[0, :, motor]) * (1.0 - model.shortening)
     reached = np.nan_to_num(movements.start[0])[:, None] + done * ramp[:, None]
     delay, chance = model.start_delay.nodes(likelihood.late[0])
-    moving = [reached[..., None] + delay, chance[:, None]]
+    delay = (delay[:, None] + LAG_DOUBT_S * LAG_STEPS).ravel()
+    chance = (chance[..., None] * LAG_SHARES).reshape(len(chance), -1)
+    moving = [np.maximum(reached[..., None] + delay, 0.0), chance[:, None]]
     return [_for_nodes(part, len(angle)) for part in (waiting, moving)]
 
 

@@ -10,11 +10,11 @@ import numpy as np
 from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.movements import (
     GRID_S,
-    TURN_RAD,
     Movements,
     find_movements,
     movements_of_samples,
 )
+from failuretwin.core.polyline import TURN_RAD
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.decision.streaming.window import MovementWindow, SampleBuffer
 from failuretwin.inference.evidence import (

@@ -1,0 +1,148 @@
+"""A sampled reference as few straight lines, with the levels at which it rests as they are.
+
+Lines between two rests may be off by a tolerance, which takes out rounding and curves; where a
+reference rests it says exactly what was commanded, however small the step from one rest to the
+next was.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
+
+Corner = tuple[float, float]
+"""Time and value."""
+
+LEAST_STEPS = 10
+"""Changes from which a quantum can be read; fewer may share one by chance."""
+
+TURN_RAD = 1e-5
+"""A reference that is further than this from where it stood moves [rad]; less is noise."""
+REST_S = 0.3
+"""A reference that a hand guides rests where no motor moves for this long [s]: twice the 0.15 s by
+which such an arm trails, so that it is seen at rest as well."""
+SAME = 1e-9
+"""What is as good as level, whatever the tolerance."""
+CREEP = 10.0
+"""What noise may add up to within a rest, in `TURN_RAD`."""
+
+
+def simplify(
+    time: FloatArray, value: FloatArray, tolerance: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the corners of a polyline that stays within `tolerance` of the samples.
+
+    Douglas and Peucker's algorithm (1973) between the rests, which stay as they are. Other lines
+    that rise by less than twice the tolerance are made level; rounding leaves no false corners.
+
+    Args:
+        time: Increasing times, (sample,) [s].
+        value: Samples, (sample,); NaN where there is none.
+        tolerance: Largest distance from the samples, in the unit of `value`.
+
+    Returns:
+        Times and values of the corners, (corner,).
+    """
+    known = np.isfinite(value)
+    time, value = time[known], value[known].copy()
+    quantum = resolution(value)
+    rests = _rests(time, value) if quantum < tolerance else []
+    for first, last in rests:
+        value[first : last + 1] = np.median(value[first : last + 1])
+    tolerance = max(tolerance, 0.75 * quantum)
+    fixed = np.zeros(len(time), dtype=bool)
+    fixed[[end for rest in rests for end in rest]] = True
+    kept = fixed.copy()
+    kept[[0, -1]] = True
+    stack = list(pairwise(np.flatnonzero(kept).tolist()))
+    while stack:
+        first, last = stack.pop()
+        inner = slice(first + 1, last)
+        line = np.interp(time[inner], time[[first, last]], value[[first, last]])
+        distance = np.abs(value[inner] - line)
+        if len(distance) and distance.max() > tolerance:
+            worst = first + 1 + int(np.argmax(distance))
+            kept[worst] = True
+            stack += [(first, worst), (worst, last)]
+    times, values, fixed = _sharpen(np.flatnonzero(kept), time, value, fixed)
+    return times, _level(values, fixed, 2.0 * tolerance)
+
+
+def _rests(time: FloatArray, value: FloatArray) -> list[tuple[int, int]]:
+    """Return first and last sample of every stretch of `REST_S` or more without a turn."""
+    moves = np.abs(np.diff(value)) > TURN_RAD
+    edges = [0, *(np.flatnonzero(moves) + 1).tolist(), len(value)]
+    stretches = [(first, stop - 1) for first, stop in pairwise(edges)]
+    return [
+        (first, last)
+        for first, last in stretches
+        if time[last] - time[first] >= REST_S
+        and np.ptp(value[first : last + 1]) <= CREEP * TURN_RAD
+    ]
+
+
+def resolution(value: FloatArray) -> float:
+    """Return the quantum that samples are rounded to, 0 if there is none to be seen."""
+    steps = np.abs(np.diff(value))
+    steps = steps[steps > 1e-9]
+    if len(steps) < LEAST_STEPS:
+        return 0.0
+    multiples = steps / steps.min()
+    return float(steps.min()) if np.all(np.abs(multiples - np.rint(multiples)) < 0.02) else 0.0
+
+
+def _sharpen(
+    kept: IntArray, time: FloatArray, value: FloatArray, fixed: BoolArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return the corners `kept` of samples, those between two samples where their lines meet.
+
+    Args:
+        kept: Samples that are corners, (corner,).
+        time: Times of all samples, (sample,) [s].
+        value: Samples, (sample,).
+        fixed: Begins and ends of rests, (sample,).
+
+    Returns:
+        Times and values of the corners, and which of them belong to rests.
+    """
+    corners = [(float(time[i]), float(value[i])) for i in kept]
+    sharp, rests, i = corners[:1], [bool(fixed[kept[0]])], 1
+    while i < len(corners):
+        between = i + 2 < len(corners) and kept[i + 1] - kept[i] == 1
+        met = _meet(sharp[-1], corners[i], corners[i + 1], corners[i + 2]) if between else None
+        sharp.append(met or corners[i])
+        rests.append(bool(fixed[kept[i]] or (met is not None and fixed[kept[i + 1]])))
+        i += 2 if met else 1
+    times, values = np.array(sharp).T
+    return times, values, np.array(rests)
+
+
+def _meet(a: Corner, b: Corner, c: Corner, d: Corner) -> Corner | None:
+    """Return where the lines a-b and c-d meet, None unless that is between b and c."""
+    before = (b[1] - a[1]) / (b[0] - a[0])
+    after = (d[1] - c[1]) / (d[0] - c[0])
+    if before == after:
+        return None
+    at = (c[1] - b[1] + before * b[0] - after * c[0]) / (before - after)
+    slack = 0.05 * (c[0] - b[0])
+    if not b[0] - slack <= at <= c[0] + slack:
+        return None
+    return at, b[1] + before * (at - b[0])
+
+
+def _level(value: FloatArray, fixed: BoolArray, tolerance: float) -> FloatArray:
+    """Return corner values with each almost level line made level, at the value it begins with.
+
+    Args:
+        value: Corner values, (corner,).
+        fixed: Corners that stay as they are, but for rounding, (corner,).
+        tolerance: What is almost level, in the unit of `value`.
+    """
+    value = value.copy()
+    for i in range(1, len(value)):
+        if abs(value[i] - value[i - 1]) <= (SAME if fixed[i] else tolerance):
+            value[i] = value[i - 1]
+    return value
