@@ -251,8 +251,6 @@ def _of_other_arms() -> Iterator[Condition]:
         truth = generic_imperfections(robot)
         base = Condition(f"{name} as its class", robot, truth, None)
         yield base
-        known = calibrated(robot).imperfections
-        yield replace(base, name=f"{name} as its profile says", truth=known)
         settling = truth.settling
         assert settling is not None
         exact = replace(settling, scatter=(0.004,) * len(settling.scatter))
