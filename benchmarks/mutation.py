@@ -90,7 +90,34 @@ AREAS: dict[str, tuple[str, ...]] = {
         "tests/decision/test_folder_posterior.py",
     ),
     "inference/shared_posterior.py": ("tests/decision/test_shared_posterior.py",),
+    "inference/shared_weighing.py": (
+        "tests/decision/test_shared_posterior.py",
+        "tests/decision/test_shared_likelihood.py",
+    ),
     "inference/folder_posterior.py": ("tests/decision/test_folder_posterior.py",),
+    "inference/shared_belief.py": (
+        "tests/decision/test_folder_posterior.py",
+        "tests/connection/test_life_filter.py",
+    ),
+    "inference/runs_together.py": (
+        "tests/decision/test_folder_posterior.py",
+        "tests/connection/test_life_filter.py",
+    ),
+    "inference/life_filter.py": ("tests/connection/test_life_filter.py",),
+    "inference/wear_limits.py": ("tests/connection/test_life_filter.py",),
+    "inference/fault_course.py": ("tests/decision/test_fault_course.py",),
+    "inference/mixed_runs.py": ("tests/decision/test_mixed_runs.py",),
+    "inference/wrong_setup.py": ("tests/decision/test_wrong_setup.py",),
+    "inference/registration.py": (
+        "tests/decision/test_wrong_setup.py",
+        "tests/connection/test_registration.py",
+    ),
+    "inference/sensors.py": ("tests/decision/test_sensing.py",),
+    "inference/path_likelihood.py": (
+        "tests/decision/test_likelihood_way.py",
+        "tests/decision/test_sensing.py",
+    ),
+    "inference/unknown.py": ("tests/decision/test_unknown.py",),
     "inference": (
         "tests/decision/test_start_delay.py",
         "tests/decision/test_inference_settings.py",
@@ -107,7 +134,6 @@ AREAS: dict[str, tuple[str, ...]] = {
     "connection/self_calibration.py": ("tests/connection/test_self_calibration.py",),
     "digital_model/arm_classes.py": ("tests/digital_model/test_arm_classes.py",),
     "connection/life_history.py": ("tests/connection/test_life_history.py",),
-    "inference/life_filter.py": ("tests/connection/test_life_filter.py",),
     "connection/calibration/step_*.py": ("tests/connection/test_step_fit.py",),
     "connection/calibration/servo_loops.py": ("tests/connection/test_step_fit.py",),
     "connection/calibration": (
