@@ -310,7 +310,7 @@ def run(
             if working[i]:
                 actor.see(points[i], start, world.time_s)
         windows = [actor.window if works else () for actor, works in zip(actors, working)]
-        judgements = judge(windows)
+        judgements = judge(windows, [actor.belief.believed for actor in actors])
         judged += time.process_time() - t
         tool = world.tool
         for i, actor in enumerate(actors):

@@ -25,7 +25,7 @@ from failuretwin.failure_behavior.reaction import Reaction
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.posterior import LEVELS, Posterior
+from failuretwin.inference.posterior import LEVELS, Posterior, compute_posterior
 from failuretwin.inference.priors import MONITORING, Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.shared_posterior import shared_posterior
@@ -96,17 +96,57 @@ class Judge:
             names = self.model.twin.robot.motor_names
             object.__setattr__(self, "hypotheses", single_faults(names, ACTED_ON))
 
-    def __call__(self, windows: Sequence[Sequence[Seen]]) -> list[Judgement | None]:
-        """Return what is believed of each arm; None where it has made no movement."""
+    def __call__(
+        self, windows: Sequence[Sequence[Seen]], believed: Sequence[BelievedFault | None]
+    ) -> list[Judgement | None]:
+        """Return what movements say of each arm; None where it has made none.
+
+        Doubts about an arm count as scatter first. Where that points to another fault than the one
+        believed, they are integrated out as common to all movements, which takes long.
+
+        Args:
+            windows: Movements of each arm.
+            believed: What each arm is taken to have.
+        """
         found: list[Judgement | None] = [None] * len(windows)
         for length in {len(window) for window in windows} - {0}:
             rows = [i for i, window in enumerate(windows) if len(window) == length]
             evidence = settled_evidence_of([windows[i] for i in rows])
             likelihood = RunLikelihood(evidence, self.model)
-            posterior = shared_posterior(likelihood, self.hypotheses, self.priors, False)
+            rough = compute_posterior(likelihood, self.hypotheses, self.priors)
+            judged = [Judgement(rough, at) for at in range(len(rows))]
+            news = [at for at, i in enumerate(rows) if self._is_news(judged[at], believed[i])]
+            if news:
+                some = likelihood[np.array(news)]
+                fine = shared_posterior(some, _left(rough, news), self.priors, False)
+                for at, row in enumerate(news):
+                    judged[row] = Judgement(fine, at)
             for at, i in enumerate(rows):
-                found[i] = Judgement(posterior, at)
+                found[i] = judged[at]
         return found
+
+    def _is_news(self, judgement: Judgement, believed: BelievedFault | None) -> bool:
+        """Return whether movements point to a fault that is not believed already."""
+        if self.model.imperfections.variation is None:
+            return False
+        best = judgement.best
+        if best.is_healthy or judgement.probability(best) < SUSPICIOUS:
+            return False
+        return believed is None or best.faults[0].motor != believed.fault.motor
+
+
+SUSPICIOUS = 0.3
+"""Probability of a fault from which it is looked at more closely."""
+RULED_OUT_NATS = 12.0
+"""What lies so far below the best of some arms is not looked at more closely [nats]."""
+
+
+def _left(posterior: Posterior, rows: Sequence[int]) -> list[Hypothesis]:
+    """Return healthy and the hypotheses that are not ruled out for some arms."""
+    log_posterior = posterior.log_posterior[np.array(rows)]
+    near = log_posterior > log_posterior.max(axis=1, keepdims=True) - RULED_OUT_NATS
+    kept = near.any(axis=0)
+    return [h for h, keep in zip(posterior.hypotheses, kept, strict=True) if keep or h.is_healthy]
 
 
 def settled_evidence_of(windows: Sequence[Sequence[Seen]]) -> SettledEvidence:
