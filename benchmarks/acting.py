@@ -25,12 +25,13 @@ from pathlib import Path
 
 import numpy as np
 
+from failuretwin.connection.links.commander import Order
 from failuretwin.core.hypothesis import Fault
-from failuretwin.decision.acting.actor import Actor, ActingSettings
+from failuretwin.decision.acting.actor import ActingSettings, Actor
 from failuretwin.decision.acting.belief import BeliefSettings, Judge, LatchedBelief, NoBelief
-from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault, Seen
+from failuretwin.decision.acting.believed_arm import BelievedFault, Seen
 from failuretwin.decision.acting.planner import Planner
-from failuretwin.decision.acting.safety import Order, SafetyGate
+from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.task import Task
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
@@ -84,6 +85,7 @@ class World:
     seed: int
     engine: str
     redrawn_at_rest: bool = False
+    onset: int = ONSET
     count: int = 0
     lost: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
@@ -132,11 +134,13 @@ class World:
         noise = np.zeros((len(target), 3))
         for i, (fault, rng) in enumerate(zip(self.faults, self.rngs, strict=True)):
             dof = self.settling[i].tail_dof
-            scatter[i] = rng.standard_normal(self.m) if np.isinf(dof) else rng.standard_t(dof, self.m)
+            scatter[i] = (
+                rng.standard_normal(self.m) if np.isinf(dof) else rng.standard_t(dof, self.m)
+            )
             self._lose(i, rng.random())
             noise[i] = rng.standard_normal(3)
             luck = rng.random(3)
-            if self.count > ONSET:
+            if self.count > self.onset:
                 self._strike(i, fault, luck, aim, held, weak, still)
         scatter *= self.scatter
         friction = 0.0 if self.engine == "physics" else self.friction
@@ -227,7 +231,7 @@ class Told:
 
     def add(self, seen: Seen) -> None:
         fault = self.world.faults[self.arm]
-        if self.world.count >= ONSET and fault.kind != "healthy":
+        if self.world.count >= self.world.onset and fault.kind != "healthy":
             held = self.world.held[self.arm]
             angle = held if np.isfinite(held) else self.world.angle[self.arm, fault.motor]
             rests = self.believed.angle if self.believed is not None else np.nan
@@ -269,10 +273,11 @@ def run(
     wrong: Sequence[BelievedFault | None] | None = None,
     redrawn_at_rest: bool = False,
     new_diagnoses: bool = True,
+    onset: int = ONSET,
 ) -> Outcome:
     """Carry out a task on each arm."""
     began = time.monotonic()
-    world = World(known, faults, seed, engine, redrawn_at_rest)
+    world = World(known, faults, seed, engine, redrawn_at_rest, onset)
     model = HealthyModel.of(known.twin, known.imperfections)
     planner = Planner(SafetyGate(known.robot))
     judge = Judge(model)
@@ -318,9 +323,9 @@ def run(
                 continue
             actor.learn(judgements[i])
             believed, fault = actor.belief.believed, faults[i]
-            if np.isnan(latched[i]) and believed is not None and world.count > ONSET:
+            if np.isnan(latched[i]) and believed is not None and world.count > onset:
                 if believed.motor == fault.motor and believed.fault.mode == MODES[fault.kind]:
-                    latched[i] = world.count - ONSET
+                    latched[i] = world.count - onset
             if len(actor.results) > done[i]:
                 error = float(np.linalg.norm(tool[i] - actor.results[-1].target.point))
                 rows.append(_row(actor.results[-1], world, i, latched[i], error))
@@ -427,6 +432,59 @@ def faults_of(kind: str, robot: Robot, arms: int, seed: int) -> list[TrueFault]:
     return found
 
 
+def forced(known: CalibratedRobot, arms: int, targets: int, seed: int, engine: str) -> dict:
+    """Return shares reached by truth and wrong belief of the nine classes, and by feedback alone.
+
+    The belief is there from the start, and so is the fault. `checked`: it may be let go of, but no
+    other is taken up; `diagnosed`: the product as it is.
+    """
+    robot = known.robot
+    kinds = [
+        ("healthy", 0),
+        *((k, m) for k in ("stuck", "random") for m in range(len(robot.motors))),
+    ]
+    truths, beliefs, rng = [], [], np.random.default_rng([seed, 9])
+    for truth in kinds:
+        for belief in kinds[1:]:
+            if belief == truth:
+                continue
+            for _ in range(arms):
+                truths.append(TrueFault(*truth))
+                low, high = robot.travel[belief[1]]
+                angle = float(rng.uniform(low, high)) if belief[0] == "stuck" else np.nan
+                fault = Fault(robot.motor_names[belief[1]], MODES[belief[0]])
+                beliefs.append(BelievedFault(fault, belief[1], angle, 0.02, 0.0, angle))
+    tasks = tasks_of(robot, len(truths), targets, seed)
+    found: dict[str, dict[str, float]] = {}
+    for name, strategy, wrong, new in (
+        ("feedback", "feedback", None, True),
+        ("checked", "diagnose", beliefs, False),
+        ("diagnosed", "diagnose", beliefs, True),
+    ):
+        outcome = run(
+            known, truths, tasks, strategy, seed, engine,
+            wrong=wrong, new_diagnoses=new, onset=0,
+        )  # fmt: skip
+        print(f"{name}: {outcome.wall_s:.0f} s", flush=True)
+        for row in outcome.rows:
+            if "said" in row:
+                continue
+            belief, truth = beliefs[row["arm"]], truths[row["arm"]]
+            sort = "healthy" if truth.kind == "healthy" else (
+                "same motor" if truth.motor == belief.motor else "another motor"
+            )  # fmt: skip
+            pair = f"{truth.kind}, believed {belief.fault.mode} ({sort})"
+            cell = found.setdefault(pair, {})
+            cell[name] = cell.get(name, 0) + (row["error_m"] <= TOLERANCE_M)
+            cell[f"n {name}"] = cell.get(f"n {name}", 0) + 1
+    for pair, cell in found.items():
+        shares = [
+            f"{n} {cell[n] / cell[f'n {n}']:.3f}" for n in ("feedback", "checked", "diagnosed")
+        ]
+        print(f"  {pair:60s} {'  '.join(shares)}  n {cell['n feedback']}", flush=True)
+    return found
+
+
 def main() -> None:
     """Run one robot and kind of fault and print a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -438,9 +496,15 @@ def main() -> None:
     parser.add_argument("--targets", type=int, default=8)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--redrawn-at-rest", action="store_true")
+    parser.add_argument("--forced", action="store_true", help="wrong beliefs from the start")
     parser.add_argument("--json", type=Path)
     told = parser.parse_args()
     known = load_calibration(None, told.robot)
+    if told.forced:
+        cells = forced(known, told.arms, told.targets, told.seed, told.engine)
+        if told.json:
+            told.json.write_text(json.dumps(cells))
+        return
     faults = faults_of(told.fault, known.robot, told.arms, told.seed)
     tasks = tasks_of(known.robot, len(faults), told.targets, told.seed)
     found = {}
@@ -450,7 +514,7 @@ def main() -> None:
             redrawn_at_rest=told.redrawn_at_rest,
         )  # fmt: skip
         found[strategy] = {"cells": summary(known.robot, outcome), "rows": outcome.rows}
-        moves = sum("said" not in r and r["movements"] or 0 for r in outcome.rows)
+        moves = sum(("said" not in r and r["movements"]) or 0 for r in outcome.rows)
         print(
             f"{told.robot} {told.fault} {strategy}: {outcome.wall_s:.0f} s, judging "
             f"{1e3 * outcome.judged_s / max(moves, 1):.1f} ms, planning "

@@ -13,6 +13,7 @@ import sys
 import click
 
 from failuretwin import __version__
+from failuretwin.app.commands.act import act, stop
 from failuretwin.app.commands.data import import_, robot, simulate
 from failuretwin.app.commands.diagnose import diagnose, evaluate
 from failuretwin.app.commands.learn import calibrate, study, train
@@ -30,7 +31,7 @@ def cli() -> None:
 
 for command in (
     *(import_, simulate, diagnose, evaluate, calibrate),
-    *(train, study, emulate, watch, robot),
+    *(train, study, emulate, watch, act, stop, robot),
 ):
     cli.add_command(command)
 

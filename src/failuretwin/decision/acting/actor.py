@@ -14,12 +14,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from failuretwin.connection.links.commander import Order
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.belief import Belief, Judgement
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault, Seen
 from failuretwin.decision.acting.planner import Plan, Planner, Standing
 from failuretwin.decision.acting.reactions import lost_command, probing, told
-from failuretwin.decision.acting.safety import Order
 from failuretwin.decision.acting.task import Target, Task
 from failuretwin.failure_behavior.reaction import Reaction
 from failuretwin.inference.healthy_model import HealthyModel

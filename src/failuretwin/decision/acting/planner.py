@@ -14,9 +14,10 @@ from functools import cached_property
 
 import numpy as np
 
+from failuretwin.connection.links.commander import Order
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.believed_arm import BelievedArm
-from failuretwin.decision.acting.safety import Order, SafetyGate
+from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, Target
 from failuretwin.digital_model.inverse_kinematics import STARTS, InverseKinematics, Poses
 from failuretwin.digital_model.settling import largest_load

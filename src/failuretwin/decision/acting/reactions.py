@@ -8,8 +8,9 @@ import numpy as np
 
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault, Seen
-from failuretwin.digital_model.robot import Robot, shown_unit
+from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.reaction import Reaction
+from failuretwin.inference.explanation import size_words
 
 LEAST_LOSS_RATE = 0.01
 """Share of commands taken to get lost at least, of arms whose losses are not known [-]."""
@@ -23,14 +24,11 @@ PROBE_RAD = 0.15
 
 def told(believed: BelievedFault, robot: Robot) -> str:
     """Return in words what is done about a fault, before it is done."""
-    name = believed.mode.plain_name(believed.fault.motor)
+    unit = robot.own_unit(believed.fault.motor, believed.mode.unit)
     size = ""
     if np.isfinite(believed.size):
-        factor, unit = shown_unit(believed.mode.unit, robot, believed.fault.motor)
-        share = believed.mode.unit == "ratio"
-        value = believed.size * (100.0 if share else factor)
-        size = believed.mode.size_words.format(size=value, unit="%" if share else unit)
-    return f"{name}{size}: {believed.reaction.value}"
+        size = size_words(believed.fault, believed.size, unit)
+    return f"{believed.mode.plain_name(believed.fault.motor)}{size}: {believed.reaction.value}"
 
 
 def lost_command(arm: BelievedArm, seen: Seen) -> str:

@@ -15,6 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
+from failuretwin.connection.links.commander import Order
 from failuretwin.core.errors import FailureTwinError, InputError
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.clearance import Clearance
@@ -31,19 +32,6 @@ Way = tuple[FloatArray, FloatArray]
 
 class UnsafeOrderError(FailureTwinError):
     """An order that must not be sent; nothing was sent."""
-
-
-@dataclass(frozen=True)
-class Order:
-    """One movement: every motor ramps to its target, all starting together.
-
-    Attributes:
-        target: Where to, in the sense of commands, (motor,) [rad].
-        duration: Time to get there, (motor,) [s].
-    """
-
-    target: FloatArray
-    duration: FloatArray
 
 
 @dataclass(frozen=True)
