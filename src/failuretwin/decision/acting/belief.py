@@ -360,21 +360,20 @@ class LatchedBelief:
         return said
 
     def _replaced(self, judgement: Judgement) -> str:
-        """Take another fault in place of the one believed where it explains far better."""
+        """Give a belief up that another fault explains far better; take that if it is sure."""
         believed, best = self.believed, judgement.best
         if believed is None or not best.known or not best.faults:
             return ""
         other = best.faults[0]
-        if other == believed.fault or judgement.probability(best) < self.settings.latch:
-            return ""
-        if other.motor == believed.fault.motor and believed.rests:
+        if other == believed.fault or (other.motor == believed.fault.motor and believed.rests):
             return ""  # a motor that is not told to move is not stuck by that
         ahead = judgement.log_evidence(best) - judgement.log_evidence(HEALTHY)
         if ahead - self._own_lead() < -self.settings.let_go:
             return ""
-        said = f"{self._name} given up for {best}, {judgement.probability(best):.0%} sure"
-        self._believe(best, judgement)
-        return said
+        said = f"{self._name} given up: {best} explains far better what the arm does"
+        self.believed, self.lead = None, self.settings.start_lead
+        taken = self._taken_up(judgement)
+        return f"{said}; {taken}" if taken else said
 
     def _own_lead(self) -> float:
         """Return the log Bayes factor of the belief against healthy over the latest movements.

@@ -162,14 +162,20 @@ def first_standing(commander: Commander) -> FloatArray:
         event = commander.poll(POLL_S)
         if commander.standing is not None:
             return commander.standing
-        if isinstance(event, Reading) and event.position is not None:
-            if np.isfinite(event.position).all():
-                return event.position
+        if (angles := _angles(event)) is not None:
+            return angles
     raise InputError(
         f"{commander.name}: neither a command nor the angles of the motors are heard within "
         f"{FIRST_WAIT_S:g} s, so it is not known where the arm stands. Move it once by hand or by "
         "its own programs, or let it publish its joint states."
     )
+
+
+def _angles(event: Reading | CommandSent | None) -> FloatArray | None:
+    """Return the angles that a reading tells of all motors, (motor,) [rad]; None: it does not."""
+    if not isinstance(event, Reading) or event.position is None:
+        return None
+    return event.position if np.isfinite(event.position).all() else None
 
 
 def where_it_stands(commander: Commander) -> FloatArray:
@@ -183,9 +189,8 @@ def where_it_stands(commander: Commander) -> FloatArray:
     until = time.monotonic() + FIRST_WAIT_S
     while time.monotonic() < until:
         event = commander.poll(POLL_S)
-        if isinstance(event, Reading) and event.position is not None:
-            if np.isfinite(event.position).all():
-                return event.position
+        if (angles := _angles(event)) is not None:
+            return angles
     if commander.standing is not None:
         return commander.standing
     raise InputError(f"{commander.name}: it is not known where the arm stands; nothing was sent.")
