@@ -192,7 +192,8 @@ class LiveArm:
         Raises:
             InputError: If the simulation becomes unstable.
         """
-        brake, weak = (None if each is None else each[None] for each in (held, weakness))
+        brake = None if held is None else held[None]
+        weak = None if weakness is None else weakness[None]
         return np.asarray(self._arms.follow(reference[None], brake, weak)[0])
 
 

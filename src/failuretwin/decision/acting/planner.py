@@ -24,7 +24,8 @@ from failuretwin.digital_model.settling import largest_load
 from failuretwin.failure_behavior.reaction import Reaction
 
 NEAR_ENOUGH = 0.6
-"""A plan may use up this share of the tolerance; the rest is for how the arm settles."""
+"""A plan that uses up no more of the tolerance is not looked for any further; the rest is for how
+the arm settles."""
 MISS_S_PER_M = 1e3
 """What a metre off the target costs beside the time of the way [s/m]."""
 SPARED_S = 1.0
@@ -67,6 +68,13 @@ class Plan:
     miss_m: float
     reachable: bool
     why: str = ""
+
+
+def _is_better(plan: Plan, other: Plan) -> bool:
+    """Return whether a plan is the better one: safe, then near."""
+    if (plan.order is None) != (other.order is None):
+        return plan.order is not None
+    return plan.miss_m < other.miss_m
 
 
 @dataclass(frozen=True)
@@ -113,9 +121,9 @@ class Planner:
         for kinematics in (self.usual, self.whole):
             found = self._poses(kinematics, target, arm, at)
             plan = self._cheapest_safe(found, target, arm, at)
-            if best is None or (plan.order is not None and plan.miss_m < best.miss_m):
+            if best is None or _is_better(plan, best):
                 best = plan
-            if best.order is not None and best.reachable:
+            if best.order is not None and best.miss_m <= NEAR_ENOUGH * target.tolerance_m:
                 break
         assert best is not None
         return best
@@ -134,7 +142,7 @@ class Planner:
         cost = self.cost(found.pose[0], arm, at)
         cost = cost + MISS_S_PER_M * np.maximum(found.miss_m[0] - ROUGH_M, 0.0)
         cost = cost + np.maximum(found.miss_rad[0] - 0.1 * DIRECTION_TOLERANCE_RAD, 0.0) * 100.0
-        near = found.miss_m[0] <= NEAR_ENOUGH * target.tolerance_m
+        near = found.miss_m[0] <= target.tolerance_m
         near &= found.miss_rad[0] <= DIRECTION_TOLERANCE_RAD
         order = np.argsort(cost)
         why = ""

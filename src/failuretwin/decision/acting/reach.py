@@ -164,7 +164,7 @@ def reach_by_motor(
     factor = np.median(feedback_factor(kinematics.tool(pose)[1]), axis=0)
     found = []
     for k, name in enumerate(robot.motor_names):
-        angle = np.linspace(*robot.travel[k], ANGLES)
+        angle = np.linspace(float(robot.travel[k, 0]), float(robot.travel[k, 1]), ANGLES)
         share = [reach(gate, points, (name, float(a)), seed).share for a in angle]
         found.append(MotorReach(name, angle, np.array(share), float(factor[k])))
     return found

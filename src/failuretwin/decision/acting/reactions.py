@@ -60,7 +60,7 @@ def lost_command(arm: BelievedArm, seen: Seen) -> str:
 def _loss_sets(arm: BelievedArm) -> list[tuple[list[int], float]]:
     """Return sets of motors that may lose a command together, and how often."""
     names = arm.robot.motor_names
-    found = {(k,): LEAST_LOSS_RATE for k in range(len(names))}
+    found: dict[tuple[int, ...], float] = {(k,): LEAST_LOSS_RATE for k in range(len(names))}
     for entry in arm.model.imperfections.lost_commands:
         motors = tuple(names.index(motor) for motor in entry.motors)
         found[motors] = max(entry.rate, LEAST_LOSS_RATE)

@@ -17,7 +17,7 @@ import numpy as np
 
 from failuretwin.connection.links.commander import Order
 from failuretwin.core.errors import FailureTwinError, InputError
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.clearance import Clearance
 from failuretwin.digital_model.inverse_kinematics import usable_limits
 from failuretwin.digital_model.robot import Robot
@@ -144,7 +144,7 @@ class SafetyGate:
                 return f"the arm would come within {1e3 * self.margin_m:.0f} mm of {what}"
         return ""
 
-    def _names(self, which: FloatArray) -> str:
+    def _names(self, which: BoolArray) -> str:
         names = self.robot.motor_names
         return ", ".join(names[k] for k in np.flatnonzero(which))
 

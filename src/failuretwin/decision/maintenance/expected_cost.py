@@ -212,7 +212,8 @@ def advise(posterior: Mapping[str, float], costs: Costs) -> Advice:
     probability = np.array(list(posterior.values()))
     expected = table @ probability
     order = np.argsort(expected, kind="stable")
-    options = [Option(*actions[i], float(expected[i])) for i in order]
+    ranked = [(*actions[int(i)], float(expected[i])) for i in order]
+    options = [Option(action, motor, cost) for action, motor, cost in ranked]
     hinge, at = _hinge(table[order[0]] - table[order[1]], probability)
     name = str(hypotheses[hinge]) if hinge >= 0 else ""
     return Advice(options, name, at, costs.currency)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import FloatArray, IntArray
 
 POWERS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 """Exponents of t that wear may follow."""
@@ -161,7 +161,7 @@ class _Filters:
         last: Time of the last block.
     """
 
-    shape: np.ndarray
+    shape: IntArray
     diffusion: FloatArray
     level: FloatArray
     rate: FloatArray
@@ -180,9 +180,8 @@ class _Filters:
         count = len(shapes)
         step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
         scale = float(np.median(variance)) / step
-        shape, q = (x.ravel() for x in np.meshgrid(
-            np.arange(count), np.array(DIFFUSIONS) * scale, indexing="ij"
-        ))  # fmt: skip
+        shape = np.repeat(np.arange(count), len(DIFFUSIONS))
+        q = np.tile(np.array(DIFFUSIONS) * scale, count)
         level, rate, a, b = (np.zeros(len(q)) for _ in range(4))
         c = np.full(len(q), (FASTEST * limit / now) ** 2)
         log_evidence = np.zeros(len(q))
