@@ -294,9 +294,12 @@ class LatchedBelief:
         if judgement is None or seen.point is None:
             return ""
         if self.believed is not None:
-            self._follow_size(judgement)
-            said = self._doubt(seen, judgement)
-            return said or self._replaced(judgement)
+            if not self.believed.rests:
+                self._follow_size(judgement)
+            said = self._doubt(seen) or self._replaced(judgement)
+            if self.believed is not None and self.believed.rests:
+                self._follow_size(judgement)  # a held angle must not follow a motor that moves
+            return said
         return self._taken_up(judgement)
 
     def stands_at(self, angle: float, spread: float) -> None:
@@ -348,7 +351,7 @@ class LatchedBelief:
 
     # Letting go.
 
-    def _doubt(self, seen: Seen, judgement: Judgement) -> str:
+    def _doubt(self, seen: Seen) -> str:
         """Let go of a belief that the arm contradicts; return so in words."""
         arm, healthy = BelievedArm(self.model, self.believed), BelievedArm(self.model)
         gain = arm.log_density(seen) - healthy.log_density(seen)

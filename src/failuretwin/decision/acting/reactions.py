@@ -44,8 +44,8 @@ def lost_command(arm: BelievedArm, seen: Seen) -> str:
     """
     arrived, best, names = arm.log_density(seen), -np.inf, ""
     for motors, rate in _loss_sets(arm):
-        told_to = np.abs(seen.command - seen.previous)[motors]
-        if not (told_to > MOVED_RAD).all() or arm.locked[motors].any():
+        moved = np.abs(seen.command - seen.previous) > MOVED_RAD
+        if not moved[motors].any() or (len(motors) == 1 and arm.locked[motors].any()):
             continue
         command = seen.command.copy()
         command[motors] = seen.previous[motors]
@@ -61,6 +61,7 @@ def _loss_sets(arm: BelievedArm) -> list[tuple[list[int], float]]:
     """Return sets of motors that may lose a command together, and how often."""
     names = arm.robot.motor_names
     found: dict[tuple[int, ...], float] = {(k,): LEAST_LOSS_RATE for k in range(len(names))}
+    found[tuple(range(len(names)))] = LEAST_LOSS_RATE
     for entry in arm.model.imperfections.lost_commands:
         motors = tuple(names.index(motor) for motor in entry.motors)
         found[motors] = max(entry.rate, LEAST_LOSS_RATE)
