@@ -10,7 +10,7 @@ if there were none.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -318,13 +318,13 @@ class Actor:
         return self._fed_back(seen)
 
     def _again(self) -> Order | None:
-        """Return the last order once more."""
+        """Return the last order once more, with the time that it needs from where it began."""
         assert self._order is not None
         order, wrong = self._planner.checked(self._order.target, self.arm, self.standing())
         if wrong:
             self._conclude(f"no safe way: {wrong}")
             return None
-        return order
+        return replace(order, duration=np.maximum(order.duration, self._order.duration))
 
     def _parked(self, seen: Seen) -> Order | None:
         """Return the order that works round a motor that is at rest now; None: there is none."""
