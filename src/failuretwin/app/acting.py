@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,27 +14,18 @@ from typing import Any
 import numpy as np
 
 from failuretwin.app.live import EMULATED, ROS1, ROSBRIDGE, address_of, topics_of
-from failuretwin.connection.links.commander import Commander, Order
+from failuretwin.connection.links.commander import Commander
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.actor import ActingSettings, Actor, TargetResult
-from failuretwin.decision.acting.belief import Belief, Judge, LatchedBelief, NoBelief
-from failuretwin.decision.acting.believed_arm import BelievedArm
-from failuretwin.decision.acting.planner import Planner, Standing
-from failuretwin.decision.acting.safety import SafetyGate
-from failuretwin.decision.acting.task import Task
-from failuretwin.decision.acting.work import Work, first_standing
+from failuretwin.decision.acting.actor import TargetResult
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.injection import ScheduledFault
 from failuretwin.failure_behavior.mode import FaultMode, SizedMode
 from failuretwin.failure_behavior.modes import SteadyStateError, Stuck
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.healthy_model import HealthyModel
 
-STRATEGIES = ("diagnose", "feedback", "open")
-"""With a diagnosis, with the nominal Jacobian alone, or one movement a target."""
 PLACES = f"{EMULATED}, {ROS1} or {ROSBRIDGE}://HOST[:PORT]"
 
 # The arm.
@@ -141,83 +132,6 @@ def commander_of(
         made = rosbridge.RosbridgeCommander(known.robot, topics_of(topics), ros)
         return stack.enter_context(made)
     raise InputError(f"--on is {place!r}, expected {PLACES}.")
-
-
-# The work.
-
-
-@dataclass(frozen=True)
-class Acting:
-    """What acts: planner, belief and judge of one arm.
-
-    Attributes:
-        known: The arm.
-        gate: What is safe.
-        strategy: One of `STRATEGIES`.
-        settings: How the task is carried out.
-        spared: Weight of each worn motor, (motor,); None: all are sound.
-        seed: Seed of the poses that are tried.
-    """
-
-    known: CalibratedRobot
-    gate: SafetyGate
-    strategy: str
-    settings: ActingSettings
-    spared: FloatArray | None = None
-    seed: int = 0
-
-    @property
-    def model(self) -> HealthyModel:
-        """The healthy arm."""
-        return HealthyModel.of(self.known.twin, self.known.imperfections)
-
-    @property
-    def planner(self) -> Planner:
-        """What plans."""
-        return Planner(self.gate, self.spared, self.seed)
-
-    def actor(self, task: Task, standing: FloatArray) -> Actor:
-        """Return what carries out a task on an arm that stands somewhere, (motor,) [rad]."""
-        model = self.model
-        belief: Belief = LatchedBelief(model) if self.strategy == "diagnose" else NoBelief()
-        settings = replace(self.settings, feedback=self.strategy != "open")
-        return Actor(self.planner, model, task, belief, standing, settings)
-
-    def work(
-        self, task: Task, commander: Commander, tell: Callable[[str], None]
-    ) -> Sequence[TargetResult]:
-        """Carry a task out on an arm and return what became of each target."""
-        standing = first_standing(commander)
-        actor = self.actor(task, standing)
-        judge = Judge(self.model) if self.strategy == "diagnose" else None
-        Work(actor, judge, self.gate, commander, standing, tell).carry_out()
-        return actor.results
-
-    def dry_run(
-        self, task: Task, standing: FloatArray, tell: Callable[[str], None]
-    ) -> Sequence[TargetResult]:
-        """Tell what would be ordered if every target were reached at once; nothing is sent."""
-        arm, planner = BelievedArm(self.model), self.planner
-        results, command = [], standing
-        for number, target in enumerate(task.targets, start=1):
-            pose = arm.settle(command, command, 0.0)
-            plan = planner.plan(target, arm, Standing(pose, command, 0.0))
-            results.append(
-                TargetResult(target, False, math.nan, math.nan, 0, plan.reachable, "", "dry run")
-            )
-            tell(f"target {number}: {_planned(plan.order, plan.reachable, plan.why, plan.miss_m)}")
-            if plan.order is not None and plan.reachable:
-                command = plan.order.target
-        return results
-
-
-def _planned(order: Order | None, reachable: bool, why: str, miss_m: float) -> str:
-    if order is None:
-        return f"no safe way: {why}"
-    if not reachable:
-        return f"out of reach by {1e3 * miss_m:.0f} mm"
-    angles = " ".join(f"{angle:.1f}" for angle in np.rad2deg(order.target))
-    return f"would order {angles} deg in {order.duration.max():.2f} s"
 
 
 # What is told.

@@ -70,9 +70,7 @@ def carry_out(world, belief, task, settings=None, steps=200, each=None):
     """Return the actor after the task; `each` is called with the number of every movement."""
     robot = world.model.twin.robot
     planner = Planner(SafetyGate(robot))
-    actor = Actor(
-        planner, world.model, task, belief, world.command, settings or ActingSettings()
-    )
+    actor = Actor(planner, world.model, task, belief, world.command, settings or ActingSettings())
     judge = Judge(world.model)
     for number in range(steps):
         order = actor.next()

@@ -71,7 +71,11 @@ def test_a_repair_is_noticed_by_probing(model, armpi):
             world.truth = None
 
     actor = carry_out(
-        world, LatchedBelief(model), task_of(armpi, 30, 4), ActingSettings(probe_every=4), each=repair
+        world,
+        LatchedBelief(model),
+        task_of(armpi, 30, 4),
+        ActingSettings(probe_every=4),
+        each=repair,
     )
     assert any("taken for motor_3:stuck" in text for text in actor.said)
     assert any("let go of motor_3:stuck" in text for text in actor.said)
@@ -156,7 +160,9 @@ def test_a_command_undoes_what_the_fault_does(model, armpi, mode, size):
     wanted, previous = np.array([0.3, -0.4, 0.5, 0.2]), np.array([-0.2, 0.3, 0.0, -0.5])
     command = arm.command_for(wanted, previous, 3.0)
     settled = arm.settle(command, previous, 3.0)
-    np.testing.assert_allclose(settled, wanted, atol=np.deg2rad(0.24) * 0.5 * (1.0 + abs(size)) + 1e-3)
+    np.testing.assert_allclose(
+        settled, wanted, atol=np.deg2rad(0.24) * 0.5 * (1.0 + abs(size)) + 1e-3
+    )
     healthy = BelievedArm(model).command_for(wanted, previous, 3.0)
     assert abs(command[1] - healthy[1]) > 0.01
 

@@ -81,7 +81,9 @@ def random_case(model, gate, rng):
     point = rng.uniform([-scale, -scale, -0.1 * scale], [scale, scale, scale])
     planner = Planner(gate, rng.random(len(low)) if rng.random() < 0.3 else None)
     plan = planner.plan(
-        Task.of_points(point[None]).targets[0], arm, Standing(pose, command, float(rng.uniform(0.0, 9.0)))
+        Task.of_points(point[None]).targets[0],
+        arm,
+        Standing(pose, command, float(rng.uniform(0.0, 9.0))),
     )
     return command, plan
 

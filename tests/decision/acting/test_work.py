@@ -14,6 +14,7 @@ from failuretwin.connection.commanded_arm import CommandedArm
 from failuretwin.connection.emulated_arm import Emulation
 from failuretwin.connection.links.base import CommandSent, LinkCounts, Reading
 from failuretwin.connection.links.commander import Order
+from failuretwin.core.errors import InputError
 from failuretwin.decision.acting import work as work_module
 from failuretwin.decision.acting.actor import Actor
 from failuretwin.decision.acting.belief import Judge, LatchedBelief, NoBelief
@@ -22,7 +23,6 @@ from failuretwin.decision.acting.rest import RestWatch
 from failuretwin.decision.acting.safety import SafetyGate, UnsafeOrderError
 from failuretwin.decision.acting.task import Target, Task, read_task
 from failuretwin.decision.acting.work import Halted, Work, first_standing, where_it_stands
-from failuretwin.core.errors import InputError
 from failuretwin.failure_behavior.injection import ScheduledFault
 
 

@@ -101,16 +101,11 @@ def act(
     What is wrong with the arm is found out on the way, told, and worked round. Every order passes a
     gate: limits, speed, floor, the arm's own links. Stop with Ctrl-C, or `failuretwin stop`.
     """
-    from failuretwin.app.acting import (
-        Acting,
-        commander_of,
-        spared_of,
-        table_lines,
-        write_results,
-    )
+    from failuretwin.app.acting import commander_of, spared_of, table_lines, write_results
     from failuretwin.app.live import EMULATED
     from failuretwin.decision.acting.actor import ActingSettings
     from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
+    from failuretwin.decision.acting.session import Acting
     from failuretwin.decision.acting.task import read_task
     from failuretwin.decision.acting.work import first_standing
     from failuretwin.digital_model.calibrated_robot import load_calibration

@@ -56,7 +56,7 @@ class Work:
         self._now = 0.0
         self._heard = time.monotonic()
         self._point: FloatArray | None = None
-        self._sent: list[FloatArray] = []
+        self._sent: list[tuple[FloatArray, FloatArray]] = []
         self._told = 0
 
     def carry_out(self) -> None:
@@ -94,7 +94,7 @@ class Work:
         if wrong:
             raise UnsafeOrderError(f"{wrong}; nothing was sent.")
         self._await_reading()
-        self._sent.append(order.target)
+        self._sent.append((self.standing, order.target))
         self.commander.send(order)
         self.standing = order.target
 
@@ -146,7 +146,12 @@ class Work:
         return event
 
     def _is_ours(self, command: CommandSent) -> bool:
-        return any(np.abs(command.target - sent).max() < OURS_RAD for sent in self._sent[-3:])
+        """Return whether a command is one of the latest orders, or lies on the way of one."""
+        for start, end in self._sent[-3:]:
+            low, high = np.minimum(start, end) - OURS_RAD, np.maximum(start, end) + OURS_RAD
+            if np.all((command.target >= low) & (command.target <= high)):
+                return True
+        return False
 
 
 def first_standing(commander: Commander) -> FloatArray:
