@@ -1,4 +1,4 @@
-"""Not one order outside: limits, speed, floor, own links, whatever is wrong and whatever believed."""
+"""Not one order outside: limits, speed, floor, own links, whatever is wrong or believed."""
 
 from __future__ import annotations
 
