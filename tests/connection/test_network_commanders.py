@@ -13,6 +13,7 @@ from failuretwin.connection.links.network_commander import Orders
 from failuretwin.connection.links.ros_messages import RosTopics
 from failuretwin.core.errors import InputError
 from fake_rosbridge import FakeRosbridge
+from ros_peer import RosPeer
 from roscores import free_port
 from waiting import WAIT_S, wait_for
 
@@ -97,22 +98,29 @@ def test_orders_over_rosbridge(armpi):
         server.stop()
 
 
-def test_orders_over_ros1(armpi, roscore):
-    from failuretwin.connection.links.ros1 import Ros1Commander, Ros1Robot
-
-    with Ros1Commander(armpi, STANDARD) as arm, Ros1Robot(armpi, STANDARD) as robot:
-        until = time.monotonic() + WAIT_S
-        heard = None
-        while heard is None and time.monotonic() < until:
-            robot.put(Reading(50.0, np.zeros(3), np.full(4, 0.1)))
-            heard = arm.poll(0.1)
-        np.testing.assert_allclose(heard.position, np.full(4, 0.1))
-        assert arm.standing is None
-
-
 def test_an_order_that_nobody_would_hear_is_not_sent(monkeypatch, armpi, roscore):
     from failuretwin.connection.links import ros1
 
     monkeypatch.setattr(ros1, "LISTENER_S", 0.3)
-    with ros1.Ros1Commander(armpi, STANDARD) as arm, pytest.raises(InputError, match="nobody"):
-        arm.send(order())
+    with ros1.Ros1Commander(armpi, STANDARD) as arm:
+        with pytest.raises(InputError, match="nobody listens"):
+            arm.send(order())
+        assert arm.standing is None
+
+
+def test_orders_over_ros1(armpi, roscore):
+    from failuretwin.connection.links.ros1 import Ros1Commander
+
+    peer = RosPeer(roscore.environment)
+    try:
+        peer.ask(op="listen", topic="/arm/command", type="trajectory_msgs/JointTrajectory")
+        with Ros1Commander(armpi, STANDARD) as arm:
+            arm.send(order())
+            np.testing.assert_array_equal(arm.standing, TARGET)
+            until, heard = time.monotonic() + WAIT_S, None
+            while heard is None and time.monotonic() < until:
+                heard = arm.poll(0.1)
+        assert isinstance(heard, CommandSent)
+        np.testing.assert_allclose(heard.target, TARGET, atol=1e-12)
+    finally:
+        peer.close()
