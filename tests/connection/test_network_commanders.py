@@ -31,6 +31,8 @@ def order(target=TARGET, duration=0.8):
 def test_an_order_is_a_trajectory_by_the_robots_clock(armpi):
     sent = []
     orders = Orders(armpi, STANDARD, sent.append)
+    orders.send(order())  # nothing heard yet: by our own clock
+    assert sent.pop().content["header"]["stamp"]["secs"] == pytest.approx(time.time(), abs=2.0)
     orders.hear(Reading(1000.0, np.zeros(3), np.zeros(4)))
     orders.send(order())
     message = sent[0]

@@ -29,7 +29,7 @@ class Orders:
     ) -> None:
         self._writer = RosWriter(robot, topics)
         self._publish = publish
-        self._ahead_s = 0.0
+        self._ahead_s = time.time() - time.monotonic()  # until the robot's clock has been heard
         self.topic = topics.command, topics.command_type
         self.standing: FloatArray | None = None
 
