@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from failuretwin.connection.calibration.calibrate import calibrate
     from failuretwin.connection.calibration.result import Calibration, save_calibration
     from failuretwin.connection.links.base import Sink, Source
+    from failuretwin.connection.links.commander import Commander
     from failuretwin.connection.population import Population
     from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
     from failuretwin.core.errors import InputError
@@ -21,9 +22,14 @@ if TYPE_CHECKING:
     from failuretwin.core.runs import run_set
     from failuretwin.data_knowledge.generate import Plan, iterate, simulate
     from failuretwin.data_knowledge.read import ReadOptions, read_runs
+    from failuretwin.decision.acting.reach import reach
+    from failuretwin.decision.acting.session import act
+    from failuretwin.decision.acting.task import Target, Task
     from failuretwin.decision.evaluation import compare, evaluate
     from failuretwin.decision.learned.log_pool import HybridDiagnoser
     from failuretwin.decision.learned.storage import load_network
+    from failuretwin.decision.maintenance.expected_cost import advise
+    from failuretwin.decision.maintenance.remaining_life import remaining_life
     from failuretwin.decision.results import read_results
     from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser, monitor
     from failuretwin.decision.streaming.fleet import StreamingFleet
@@ -43,6 +49,7 @@ __version__ = "0.1.0"
 _HOME = {
     "BayesDiagnoser": "inference.diagnoser",
     "Calibration": "connection.calibration.result",
+    "Commander": "connection.links.commander",
     "Diagnoser": "inference.diagnoser",
     "Diagnosis": "core.hypothesis",
     "DigitalTwin": "digital_model.twin",
@@ -65,6 +72,10 @@ _HOME = {
     "Source": "connection.links.base",
     "StreamingDiagnoser": "decision.streaming.diagnoser",
     "StreamingFleet": "decision.streaming.fleet",
+    "Target": "decision.acting.task",
+    "Task": "decision.acting.task",
+    "act": "decision.acting.session",
+    "advise": "decision.maintenance.expected_cost",
     "calibrate": "connection.calibration.calibrate",
     "compare": "decision.evaluation",
     "diagnose": "inference.diagnoser",
@@ -75,9 +86,11 @@ _HOME = {
     "load_network": "decision.learned.storage",
     "load_robot": "digital_model.robot",
     "monitor": "decision.streaming.diagnoser",
+    "reach": "decision.acting.reach",
     "read_results": "decision.results",
     "read_runs": "data_knowledge.read",
     "register_mode": "failure_behavior.registry",
+    "remaining_life": "decision.maintenance.remaining_life",
     "run_figure": "app.plots",
     "run_set": "core.runs",
     "save_calibration": "connection.calibration.result",
@@ -88,6 +101,7 @@ _HOME = {
 __all__ = [
     "BayesDiagnoser",
     "Calibration",
+    "Commander",
     "Diagnoser",
     "Diagnosis",
     "DigitalTwin",
@@ -110,7 +124,11 @@ __all__ = [
     "Source",
     "StreamingDiagnoser",
     "StreamingFleet",
+    "Target",
+    "Task",
     "__version__",
+    "act",
+    "advise",
     "calibrate",
     "compare",
     "diagnose",
@@ -121,9 +139,11 @@ __all__ = [
     "load_network",
     "load_robot",
     "monitor",
+    "reach",
     "read_results",
     "read_runs",
     "register_mode",
+    "remaining_life",
     "run_figure",
     "run_set",
     "save_calibration",

@@ -279,3 +279,17 @@ def test_going_on_from_arrays_is_going_on(armpi):
     assert there.keys() == here.keys()
     for name, array in there.items():
         np.testing.assert_array_equal(array, here[name], err_msg=name)
+
+
+def test_a_run_says_by_itself_what_each_bias_is(armpi):
+    """A count of wear, which the belief of before takes for unlikely, comes back from each run."""
+    told = []
+    for seed in range(6):
+        found = life(armpi, calibration=normal(), limits=STATIC)
+        found.follow(seen(armpi, truth(BATCH, motor_2(1.0)), seed, normal()))
+        told.append(found.bias_by_run(BATCH))
+    mean, deviation = (np.concatenate(part) for part in zip(*told, strict=True))
+    assert np.isfinite(mean[:, 1]).mean() > 0.5
+    np.testing.assert_allclose(np.nanmean(mean, axis=0) / COUNT, [0, 1, 0, 0], atol=0.5)
+    off = (mean - motor_2(1.0)) / deviation
+    np.testing.assert_allclose(np.nanstd(off, axis=0), 1.0, atol=0.4)

@@ -114,11 +114,12 @@ def _ros1(robot: Robot, topics: RosTopics, stack: ExitStack) -> tuple[Source, li
     return source, [stack.enter_context(Ros1Diagnostics(robot, topics))]
 
 
-def _rosbridge(
-    text: str, robot: Robot, topics: RosTopics, stack: ExitStack
-) -> tuple[Source, list[Sink]]:
-    from failuretwin.connection.links import rosbridge
+def address_of(text: str) -> tuple[str, int]:
+    """Return host and port of a rosbridge server, such as ``rosbridge://HOST[:PORT]``.
 
+    Raises:
+        InputError: If it is no such address.
+    """
     try:
         address = urlsplit(text)
         host, port = address.hostname, address.port or ROSBRIDGE_PORT
@@ -126,7 +127,15 @@ def _rosbridge(
         host, port = None, 0
     if not host:
         raise InputError(f"{text!r} is no address. Expected {ROSBRIDGE}://HOST[:PORT].")
-    ros = rosbridge.connect(host, port)
+    return host, port
+
+
+def _rosbridge(
+    text: str, robot: Robot, topics: RosTopics, stack: ExitStack
+) -> tuple[Source, list[Sink]]:
+    from failuretwin.connection.links import rosbridge
+
+    ros = rosbridge.connect(*address_of(text))
     stack.callback(rosbridge.disconnect, ros)
     source = stack.enter_context(rosbridge.RosbridgeSource(robot, topics, ros))
     sink = stack.enter_context(rosbridge.RosbridgeDiagnostics(robot, topics, ros))

@@ -56,6 +56,7 @@ class Emulation:
         schedule: Faults that come and go.
         seed: Seed of all chance.
         modes: Fault modes with their distributions, by id.
+        start: Where the motors are told to stand at first [rad]; empty: at zero.
     """
 
     robot: Robot
@@ -63,6 +64,7 @@ class Emulation:
     schedule: tuple[ScheduledFault, ...] = ()
     seed: int = 0
     modes: Mapping[str, FaultMode] = field(default_factory=lambda: MODES)
+    start: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         for scheduled in self.schedule:
@@ -117,8 +119,8 @@ class EmulatedArm:
         self._start = FIRST_COMMAND_S
         self._next_reading = 0.0
         motors = len(emulation.robot.motors)
-        self._commanded = np.zeros(motors)
-        self._told = (self._self.bias + self._self.scatter[0])[None]
+        self._commanded = np.zeros(motors) + np.asarray(emulation.start or 0.0)
+        self._told = (self._commanded + self._self.bias + self._self.scatter[0])[None]
         engine = PhysicsEngine(emulation.robot)
         self._arm = LiveArm(engine, self._told[0], STEP_S, float(self._self.payload))
 
@@ -224,16 +226,29 @@ class EmulatedArm:
         faulty, lost = leg.faults.on_movements(leg.movement, leg.chance.lost)
         told = actual_movements(faulty, replace(leg.chance, lost=lost)).reference(leg.time)[0]
         self._commanded = np.where(lost[0, 0], self._commanded, faulty.target[0, 0])
-        self._index += len(leg.time) - 1
+        return self._follow(told, leg.time, leg.chance.lag, leg.faults)
+
+    def _follow(
+        self, told: FloatArray, time: FloatArray, lag: FloatArray, faults: Injection
+    ) -> FloatArray:
+        """Return the angles that follow from references (time, motor) [rad], and stand there.
+
+        Args:
+            told: Where the motors are told to be, from where they stand on, (time, motor) [rad].
+            time: Grid, (time,) [s].
+            lag: First-order lag, (1,) [s].
+            faults: The faults that act.
+        """
+        self._index += len(time) - 1
         self._told = np.concatenate([self._told, told[1:]])[-round(MEMORY_S / STEP_S) :]
-        grid = leg.time[-1] - np.arange(len(self._told))[::-1] * STEP_S
-        followed = lagged(self._told[None], grid, leg.chance.lag)
-        followed = leg.faults.on_reference(followed, as_floats(grid))[0]
-        held: BoolArray | None = leg.faults.held(leg.time)
-        weakness = leg.faults.weakness(leg.time)
+        grid = time[-1] - np.arange(len(self._told))[::-1] * STEP_S
+        followed = lagged(self._told[None], grid, lag)
+        followed = faults.on_reference(followed, as_floats(grid))[0]
+        held: BoolArray | None = faults.held(time)
+        weakness = faults.weakness(time)
         before = self._arm.angle
         angles = self._arm.follow(
-            followed[-(len(leg.time) - 1) :],
+            followed[-(len(time) - 1) :],
             None if held is None else held[0, :-1],
             None if weakness is None else weakness[0, 1:],
         )

@@ -20,7 +20,7 @@ import numpy as np
 
 from failuretwin.core.config import fingerprint
 from failuretwin.core.errors import InputError, OutputError
-from failuretwin.core.foreign import reading
+from failuretwin.core.foreign import read_text, reading
 from failuretwin.data_knowledge.file_claims import check_npz
 from failuretwin.data_knowledge.store import check_writable, replacing
 from failuretwin.inference.life_filter import LifeFilter
@@ -83,6 +83,24 @@ def open_history(calibration: Path, start: LifeFilter, cold: bool) -> History:
         rows = [_object(line, f"{path}: line {n}") for n, line in enumerate(lines, start=1)]
         _check_head(rows[0], path, start)
         return History(start.resumed(arrays), cold, path, size, tuple(r["key"] for r in rows[1:]))
+
+
+def read_rows(path: Path, robot: str) -> list[dict[str, Any]]:
+    """Return the lines of a history, one a run, as `keep_history` was given them.
+
+    Args:
+        path: CAL.history.jsonl.
+        robot: Name of the robot that it must be of.
+
+    Raises:
+        InputError: If it cannot be read, is damaged, or is of another robot.
+    """
+    text = read_text(path, "a history")
+    rows = [_object(line, f"{path}: line {n}") for n, line in enumerate(text.splitlines(), start=1)]
+    of = rows[0].get("history_of") if rows else None
+    if of != robot:
+        raise InputError(f"{path}: is the history of {of or 'no robot'}, expected {robot!r}.")
+    return rows[1:]
 
 
 def keep_history(history: History, life: LifeFilter, rows: Sequence[dict[str, Any]]) -> None:

@@ -22,7 +22,7 @@ from failuretwin.connection.self_calibration import as_calibration, more_when_la
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.runs import truth_of
-from failuretwin.core.types import IntArray
+from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.inference.diagnoser import BayesDiagnoser
@@ -130,10 +130,12 @@ def diagnose_tracked(
     rows: list[dict[str, Any]] = []
     for batch in _batches(runs, seen.keys, known, history.cold, life):
         told = seen.diagnose(batch, life, history.cold)
-        for run, diagnosis in zip(batch.tolist(), told, strict=True):
+        said = zip(*life.bias_by_run(len(batch)), strict=True)
+        for run, diagnosis, alone in zip(batch.tolist(), told, said, strict=True):
             diagnoses[run] = diagnosis
             known.add(seen.keys[run])
-            rows.append(_row(len(history.keys) + len(rows) + 1, seen.keys[run], diagnosis, life))
+            number = len(history.keys) + len(rows) + 1
+            rows.append(_row(number, seen.keys[run], diagnosis, life, alone))
         advance(len(batch))
     again = [run for run, diagnosis in enumerate(diagnoses) if diagnosis is None]
     for first in range(0, len(again), BATCH):
@@ -162,8 +164,17 @@ def _batches(
         yield np.array(batch)
 
 
-def _row(number: int, key: str, diagnosis: Diagnosis, life: LifeFilter) -> dict[str, Any]:
-    """Return what is kept of a run: what it was taken for, what is believed after it."""
+def _row(
+    number: int,
+    key: str,
+    diagnosis: Diagnosis,
+    life: LifeFilter,
+    alone: tuple[FloatArray, FloatArray],
+) -> dict[str, Any]:
+    """Return what is kept of a run: what it was taken for, what is believed after it.
+
+    And what it says by itself of each bias, beside what was given (`LifeFilter.bias_by_run`).
+    """
     mean, deviation = life.offsets
     faulty = None if diagnosis.undecided else 1.0 - diagnosis.posterior.get("healthy", 0.0)
     named = dict(zip(("bias", "compliance", "friction"), mean.tolist(), strict=True))
@@ -175,7 +186,11 @@ def _row(number: int, key: str, diagnosis: Diagnosis, life: LifeFilter) -> dict[
         )
     )
     told = {"number": number, "run": diagnosis.run, "key": key, "probability_faulty": faulty}
-    return {**told, "alarm": life.alarm, **named, **doubts}
+    own = {
+        name: [value if np.isfinite(value) else None for value in part.tolist()]
+        for name, part in zip(("bias_alone", "bias_alone_deviation"), alone, strict=True)
+    }
+    return {**told, "alarm": life.alarm, **named, **doubts, **own}
 
 
 @dataclass(frozen=True)

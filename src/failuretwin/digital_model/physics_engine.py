@@ -108,11 +108,56 @@ class PhysicsEngine:
         return out * self.robot.sense
 
 
-class LiveArm:
-    """An arm at rest that then follows whatever it is told next.
+class LiveArms:
+    """Arms at rest that then follow whatever they are told next, all in step.
 
     Stretches that follow each other give what one run of the engine would give. Angles are in the
     log's sense.
+
+    Args:
+        engine: The engine; it simulates on one thread.
+        reference: Where each arm stands, (arm, motor) [rad].
+        step_s: Step of the references to come [s].
+        payload: Mass at the tool points, (arm,) [kg].
+
+    Raises:
+        InputError: If mujoco is missing.
+    """
+
+    def __init__(
+        self, engine: PhysicsEngine, reference: FloatArray, step_s: float, payload: FloatArray
+    ) -> None:
+        self._sense = engine.robot.sense
+        pool = load_mujoco().rollout.Rollout(nthread=0)
+        alone, stand = replace(engine, threads=1), reference * self._sense
+        self._arms = _Arms(alone, step_s, stand, np.ones_like(stand), payload, pool)
+
+    @property
+    def angle(self) -> FloatArray:
+        """Where the arms stand, (arm, motor) [rad]."""
+        return self._arms.angle * self._sense
+
+    def follow(
+        self, reference: FloatArray, held: BoolArray | None, weakness: FloatArray | None
+    ) -> FloatArray:
+        """Move on and return the angles at the same instants, (arm, time, motor) [rad].
+
+        Args:
+            reference: What the servos are told, one step after where the arms stand and so on,
+                (arm, time, motor) [rad].
+            held: Whether the gears are held, (arm, time, motor); None: never.
+            weakness: Share of its stiffness that each motor has lost, (arm, time, motor); None:
+                none.
+
+        Raises:
+            InputError: If the simulation becomes unstable.
+        """
+        strength = _strength(Drive(reference, weakness=weakness))
+        return self._arms.follow(reference * self._sense, held, strength) * self._sense
+
+
+class LiveArm:
+    """One arm at rest that then follows whatever it is told next; see `LiveArms`.
 
     Args:
         engine: The engine; its threads are not used.
@@ -127,16 +172,12 @@ class LiveArm:
     def __init__(
         self, engine: PhysicsEngine, reference: FloatArray, step_s: float, payload: float = 0.0
     ) -> None:
-        self._sense = engine.robot.sense
-        stand, whole = (reference * self._sense)[None], np.ones((1, len(reference)))
-        pool = load_mujoco().rollout.Rollout(nthread=0)
-        alone = replace(engine, threads=1)
-        self._arms = _Arms(alone, step_s, stand, whole, np.array([payload]), pool)
+        self._arms = LiveArms(engine, reference[None], step_s, np.array([payload]))
 
     @property
     def angle(self) -> FloatArray:
         """Where the arm stands, (motor,) [rad]."""
-        return self._arms.angle[0] * self._sense
+        return np.asarray(self._arms.angle[0])
 
     def follow(
         self, reference: FloatArray, held: BoolArray | None, weakness: FloatArray | None
@@ -144,17 +185,16 @@ class LiveArm:
         """Move on and return the angles at the same instants, (time, motor) [rad].
 
         Args:
-            reference: What the servos are told, one step after where the arm stands and so on,
-                (time, motor) [rad].
+            reference: What the servos are told, (time, motor) [rad].
             held: Whether the gears are held, (time, motor); None: never.
             weakness: Share of its stiffness that each motor has lost, (time, motor); None: none.
 
         Raises:
             InputError: If the simulation becomes unstable.
         """
-        strength = _strength(Drive(reference, weakness=weakness))[None]
         brake = None if held is None else held[None]
-        return self._arms.follow((reference * self._sense)[None], brake, strength)[0] * self._sense
+        weak = None if weakness is None else weakness[None]
+        return np.asarray(self._arms.follow(reference[None], brake, weak)[0])
 
 
 class _Arms:

@@ -33,6 +33,7 @@ from failuretwin.failure_behavior.fault import (
     PerMovement,
     draw_episodes,
 )
+from failuretwin.failure_behavior.reaction import Reaction
 
 Range = tuple[float, float]
 
@@ -46,6 +47,17 @@ class Signature(Enum):
     HELD = "an angle that the motor keeps"
     TRANSIENT = "a way that takes longer or begins later"
     MISSED = "single movements that are not made"
+
+
+USUAL_REACTION = {
+    Signature.OFFSET: Reaction.INVERT,
+    Signature.GROWING_OFFSET: Reaction.INVERT,
+    Signature.REDRAWN_OFFSET: Reaction.PARK,
+    Signature.HELD: Reaction.LOCK,
+    Signature.TRANSIENT: Reaction.WAIT,
+    Signature.MISSED: Reaction.REPEAT,
+}
+"""What is done about a fault that shows in such a way."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +110,8 @@ class FaultMode(ABC):
     """What to do now."""
     allowed_profiles: ClassVar[tuple[str, ...]] = PROFILES
     """Time profiles that make sense for it."""
+    own_reaction: ClassVar[Reaction | None] = None
+    """What to do about it; None: what is usual for how it shows."""
     needs_compliance: ClassVar[bool] = False
     """Whether it shows only at a motor that gives way under load."""
 
@@ -209,6 +223,11 @@ class FaultMode(ABC):
         """Lowest and highest magnitude that diagnosis considers; NaN where it has none."""
         drawn: Range = getattr(self, "magnitude", (math.nan, math.nan))
         return self.sizes or drawn
+
+    @property
+    def reaction(self) -> Reaction:
+        """What an arm does about it that has to go on working."""
+        return self.own_reaction or USUAL_REACTION[self.signature]
 
     def plain_name(self, motor: str) -> str:
         """Return what a person calls the fault of a motor."""

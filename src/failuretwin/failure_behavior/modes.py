@@ -25,6 +25,7 @@ from failuretwin.failure_behavior.fault import (
     draw_episodes,
 )
 from failuretwin.failure_behavior.mode import FaultMode, Range, Signature, SignedMode, SizedMode
+from failuretwin.failure_behavior.reaction import Reaction
 
 # Modes in which the gear holds the motor: stuck, intermittent.
 
@@ -83,6 +84,7 @@ class Intermittent(SizedMode):
     # to 1.0 s, a held motor was on the plateau when the episode began in 6 of 10 cases, on the
     # ramp in 3, not yet on its way in 1.
     misses = (0.1, 0.3)
+    own_reaction = Reaction.PARK  # while it still moves, before it stops where that helps least
     sizes = (0.1, 0.9)
     name = "{motor} sticks now and then"
     size_words = " ({size:.0f} {unit} of the time)"
@@ -414,6 +416,7 @@ class TorqueLoss(SizedMode):
     advice = "Take off the payload and repeat; measure voltage and temperature of the servo."
     highest: ClassVar[float] = 0.99
     needs_compliance: ClassVar[bool] = True
+    own_reaction = Reaction.SPARE
 
     magnitude: Range = (0.3, 0.7)
     profiles: tuple[str, ...] = (STEP, RAMP)

@@ -53,6 +53,8 @@ ANYWHERE = 30.0
 """How far a sudden change may go, a standard deviation in scatters: as good as anywhere."""
 LEAST_SPREAD = 1e-6
 """The same of an offset that wear does not change, in units."""
+LEAST_SHARE = 0.5
+"""A run that says less of a bias by itself, beside a prior that is all but none, says nothing."""
 REMEMBERED = 200.0
 """Runs by which scatter and loss rates are known at most: older ones fade."""
 OFFSETS = ("bias", "compliance", "friction")
@@ -171,6 +173,30 @@ class LifeFilter:
         given = np.stack([getattr(self.model.settling, name) for name in OFFSETS])
         mean, deviation = _state(self.belief, self.unit).reshape(2, *given.shape)
         return given + mean, deviation
+
+    def bias_by_run(self, latest: int) -> tuple[FloatArray, FloatArray]:
+        """Return what each of the latest runs says by itself of the biases, beside those given.
+
+        Compliance, friction and frame are believed to be what all runs say of them.
+
+        Args:
+            latest: How many of them, at most as many as are judged again.
+
+        Returns:
+            Mean and deviation, (run, motor) [rad]; NaN where a run says little.
+        """
+        window, motors = self.window, len(self.model.scatter)
+        if window is None:
+            return np.zeros((0, motors)), np.zeros((0, motors))
+        wide = ANYWHERE * wear_unit(self.model)[:motors]
+        prior = self._anywhere(slice(REGISTRATION, REGISTRATION + motors), wide)
+        rows = range(window.runs - latest, window.runs)
+        said = [prior.times(summed(window.sites, slice(row, row + 1))) for row in rows]
+        states = np.array([_state(belief, self.unit)[:, :motors] for belief in said])
+        mean, deviation = np.moveaxis(states, 1, 0)
+        told = 1.0 - (deviation / wide) ** 2
+        told = np.where(told > LEAST_SHARE, told, np.nan)
+        return mean / told, deviation / np.sqrt(told)
 
     @property
     def learned(self) -> Imperfections:
@@ -379,14 +405,19 @@ class LifeFilter:
 
     def _by_itself(self, window: RunsTogether, wear: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return offsets that the latest runs have if any are as good, and their deviation."""
-        (mean,), (covariance,) = self.base.moments
-        frame, offsets = slice(0, REGISTRATION), slice(REGISTRATION, None)
-        precision = np.zeros_like(covariance)
-        precision[frame, frame] = np.linalg.inv(covariance[frame, frame])
-        spread = np.maximum(ANYWHERE * wear / self.unit[offsets], LEAST_SPREAD)
-        precision[offsets, offsets] = np.diag(spread**-2.0)
-        anywhere = Belief(np.zeros((1, 1)), precision[None, None], (precision @ mean)[None, None])
+        anywhere = self._anywhere(slice(REGISTRATION, None), ANYWHERE * wear)
         return tuple(_state(anywhere.times(summed(window.sites)), self.unit))
+
+    def _anywhere(self, free: slice, spread: FloatArray) -> Belief:
+        """Return what is believed without the latest runs, but some of theta is anywhere."""
+        (mean,), (covariance,) = self.base.moments
+        loose = np.zeros(len(self.unit), dtype=bool)
+        loose[free] = True
+        precision, rest = np.zeros_like(covariance), np.ix_(~loose, ~loose)
+        precision[rest] = np.linalg.inv(covariance[rest])
+        of_each = np.maximum(spread / self.unit[free], LEAST_SPREAD)
+        precision[loose, loose] = of_each**-2.0
+        return Belief(np.zeros((1, 1)), precision[None, None], (precision @ mean)[None, None])
 
 
 def _state(belief: Belief, unit: FloatArray) -> FloatArray:

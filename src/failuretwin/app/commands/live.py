@@ -112,11 +112,18 @@ the last fault has begun or been repaired [s]."""
     help="Publish as a ROS 1 node until interrupted, or write a recording at once: one minute, or "
     "until 20 s after the last fault has begun or been repaired, unless --duration says otherwise.",
 )
+@click.option(
+    "--obey",
+    is_flag=True,
+    help="Do what the topic of commands says, such as what `failuretwin act` orders, instead of "
+    "moving at random.",
+)
 @live_options
 @plugin_option
 @common_options
 def emulate(
     target: str,
+    obey: bool,
     live: LiveOptions,
     robot: str,
     seed: int,
@@ -125,6 +132,26 @@ def emulate(
 
     Needs no robot. Watch it with `failuretwin watch ros1`.
     """
+    if obey:
+        _obey(target, live, robot, seed)
+    else:
+        _play(target, live, robot, seed)
+
+
+def _obey(target: str, live: LiveOptions, robot: str, seed: int) -> None:
+    """Play a robot that does what it is told."""
+    from failuretwin.core.errors import InputError
+
+    if target != "ros1":
+        raise InputError(f"--obey needs a network to obey, but --to is {target!r}.")
+    from failuretwin.app.obeying import obey_commands
+    from failuretwin.digital_model.robot import load_robot
+
+    obey_commands(load_robot(robot), live, seed, tell)
+
+
+def _play(target: str, live: LiveOptions, robot: str, seed: int) -> None:
+    """Play a robot that moves at random."""
     from failuretwin.app.live import emulated_robot, schedule_of, topics_of
     from failuretwin.connection.links.base import AS_FAST_AS_POSSIBLE, Pace, Sink
     from failuretwin.connection.links.recording import Recorder

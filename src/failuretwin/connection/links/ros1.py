@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import threading
+import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from http.client import HTTPConnection, HTTPException
@@ -19,11 +20,14 @@ from xmlrpc.client import Error, ServerProxy, Transport
 from failuretwin.connection.links.base import (
     Answer,
     CommandSent,
+    Event,
     EventQueue,
     Item,
     Reading,
 )
+from failuretwin.connection.links.commander import Order
 from failuretwin.connection.links.live_events import NetworkSource
+from failuretwin.connection.links.network_commander import Orders
 from failuretwin.connection.links.ros1_import import Decoder, load_rospy, message_class
 from failuretwin.connection.links.ros_messages import (
     DIAGNOSTICS_TYPE,
@@ -33,6 +37,7 @@ from failuretwin.connection.links.ros_messages import (
     RosWriter,
 )
 from failuretwin.core.errors import InputError
+from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.bag_messages import Role
 from failuretwin.digital_model.robot import Robot
 
@@ -220,6 +225,18 @@ QUEUE = 100
 """Messages that wait for a slow listener at most; rospy drops the oldest."""
 
 
+LISTENER_S = 5.0
+"""Longest wait for somebody who listens to the topic of commands [s]."""
+
+
+def _listeners(publisher: Any) -> int:
+    """Return how many nodes besides this one take what is published."""
+    import rospy
+
+    others = [link for link in publisher.impl.connections if link.endpoint_id != rospy.get_name()]
+    return len(others)
+
+
 class _Publishers:
     """Publishers that are registered again when the master comes back.
 
@@ -248,6 +265,22 @@ class _Publishers:
             self._publishers[message.topic].publish(content)
         except self._rospy.ROSException:  # it is just being registered again
             return
+
+    def await_listener(self, topic: str) -> None:
+        """Wait until somebody else than this process listens to a topic.
+
+        Raises:
+            InputError: If nobody does within `LISTENER_S`.
+        """
+        until = time.monotonic() + LISTENER_S
+        while time.monotonic() < until:
+            if _listeners(self._publishers[topic]) > 0:
+                return
+            time.sleep(0.05)
+        raise InputError(
+            f"nobody listens to topic {topic}: the order would reach no robot. Start its driver, "
+            "or name the topic of commands in a file for --topics."
+        )
 
     def close(self) -> None:
         self._registration.stop()
@@ -337,4 +370,46 @@ class Ros1Diagnostics:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._publishers.close()
+
+
+class Ros1Commander(Ros1Source):
+    """Listens to a robot and tells it to move: a trajectory or command out for each order.
+
+    Args:
+        robot: The robot.
+        topics: Its topics.
+
+    Raises:
+        InputError: If rospy is missing, no master answers, or the robot does not fit the topics.
+    """
+
+    def __init__(self, robot: Robot, topics: RosTopics) -> None:
+        self._orders = Orders(robot, topics, lambda message: self._publishers.send(message))
+        super().__init__(robot, topics)
+        self._publishers = _Publishers([self._orders.topic])
+
+    @property
+    def standing(self) -> FloatArray | None:
+        """What the motors were told last, (motor,) [rad]; None: not known."""
+        return self._orders.standing
+
+    def poll(self, timeout_s: float) -> Event | None:
+        """Return the next reading or command; None if none came within `timeout_s` [s]."""
+        event = super().poll(timeout_s)
+        self._orders.hear(event)
+        return event
+
+    def send(self, order: Order) -> None:
+        """Tell the motors to move.
+
+        Raises:
+            InputError: If nobody listens to the topic of commands.
+        """
+        self._publishers.await_listener(self._orders.topic[0])
+        self._orders.send(order)
+
+    def close(self) -> None:
+        """Stop listening and sending."""
+        super().close()
         self._publishers.close()

@@ -197,6 +197,10 @@ class RosWriter:
         self._topics = topics
         self._origin = np.zeros(len(robot.motors))
 
+    def start_at(self, angle: FloatArray) -> None:
+        """Take the angles (motor,) [rad] that the next command starts from."""
+        self._origin = angle
+
     @property
     def topics(self) -> list[tuple[str, str]]:
         """Name and type of every topic that may be written to."""

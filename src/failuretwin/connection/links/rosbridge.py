@@ -7,14 +7,18 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any, Self
 
-from failuretwin.connection.links.base import Answer, EventQueue, Item
+from failuretwin.connection.links.base import Answer, Event, EventQueue, Item
+from failuretwin.connection.links.commander import Order
 from failuretwin.connection.links.live_events import NetworkSource
+from failuretwin.connection.links.network_commander import Orders
 from failuretwin.connection.links.ros_messages import (
     DIAGNOSTICS_TYPE,
     DiagnosticsPublisher,
+    Outgoing,
     RosTopics,
 )
 from failuretwin.core.errors import InputError
+from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.bag_messages import Kind, Role, kind_of_type
 from failuretwin.digital_model.robot import Robot
 
@@ -110,6 +114,56 @@ class RosbridgeSource(NetworkSource):
 
     def _take(self, role: Role, kind: Kind, message: Any) -> None:
         self.take(role, lambda: (_as_object(message), kind))
+
+
+class RosbridgeCommander(RosbridgeSource):
+    """Listens to a robot and tells it to move, by a message for each order.
+
+    Args:
+        robot: The robot.
+        topics: Its topics, with their types.
+        ros: The connection, see `connect`.
+    """
+
+    def __init__(self, robot: Robot, topics: RosTopics, ros: Any) -> None:
+        import roslibpy
+
+        self._orders = Orders(robot, topics, self._publish)
+        super().__init__(robot, topics, ros)
+        self._command = roslibpy.Topic(ros, *self._orders.topic)
+        self._command.advertise()
+
+    @property
+    def standing(self) -> FloatArray | None:
+        """What the motors were told last, (motor,) [rad]; None: not known."""
+        return self._orders.standing
+
+    def poll(self, timeout_s: float) -> Event | None:
+        """Return the next reading or command; None if none came within `timeout_s` [s]."""
+        event = super().poll(timeout_s)
+        self._orders.hear(event)
+        return event
+
+    def send(self, order: Order) -> None:
+        """Tell the motors to move.
+
+        Raises:
+            InputError: If the server has gone.
+        """
+        if not self._ros.is_connected:
+            raise InputError("the rosbridge server is gone; nothing was sent.")
+        self._orders.send(order)
+
+    def close(self) -> None:
+        """Stop listening and sending."""
+        super().close()
+        if self._ros.is_connected:
+            self._command.unadvertise()
+
+    def _publish(self, message: Outgoing) -> None:
+        import roslibpy
+
+        self._command.publish(roslibpy.Message(message.content))
 
 
 class RosbridgeDiagnostics:

@@ -1,0 +1,197 @@
+"""From the command line to an arm that acts, and what is told of it."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from failuretwin.app.live import EMULATED, ROS1, ROSBRIDGE, address_of, topics_of
+from failuretwin.connection.links.commander import Commander
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.types import FloatArray
+from failuretwin.decision.acting.actor import TargetResult
+from failuretwin.digital_model.calibrated_robot import CalibratedRobot
+from failuretwin.digital_model.robot import Robot
+from failuretwin.failure_behavior.injection import ScheduledFault
+from failuretwin.failure_behavior.mode import FaultMode, SizedMode
+from failuretwin.failure_behavior.modes import SteadyStateError, Stuck
+from failuretwin.failure_behavior.registry import MODES
+
+PLACES = f"{EMULATED}, {ROS1} or {ROSBRIDGE}://HOST[:PORT]"
+
+# The arm.
+
+
+@dataclass(frozen=True)
+class EmulatedFaults:
+    """Faults that an emulated arm has: when, how large, and where it stands at first.
+
+    Attributes:
+        schedule: What comes when.
+        modes: Fault modes with the sizes that were asked for.
+        start: Where the motors stand at first, (motor,) [rad].
+    """
+
+    schedule: tuple[ScheduledFault, ...]
+    modes: dict[str, FaultMode]
+    start: tuple[float, ...]
+
+
+def emulated_faults(texts: Sequence[str], robot: Robot) -> EmulatedFaults:
+    """Read faults such as ``motor_3:stuck``, ``motor_3:stuck=-0.4@20`` or ``motor_2:slow=0.5``.
+
+    Args:
+        texts: MOTOR:MODE[=SIZE][@START[-END]], the size in the unit of the mode; of a stuck motor
+            it is where it stands. Without a start it is there from the beginning.
+        robot: The robot.
+
+    Raises:
+        InputError: If one cannot be read, or its mode has no size to choose.
+    """
+    schedule, modes = [], dict(MODES)
+    start = [float(np.clip(0.0, *motor.movement_range)) for motor in robot.motors]
+    for text in texts:
+        name, _, when = text.partition("@")
+        kind, _, size = name.partition("=")
+        scheduled = ScheduledFault.parse(f"{kind}@{when or '0'}", robot.motor_names)
+        schedule.append(scheduled)
+        if size:
+            value = _number(size, text)
+            mode = modes[scheduled.fault.mode]
+            if isinstance(mode, Stuck):
+                start[robot.motor_names.index(scheduled.fault.motor)] = value
+            else:
+                modes[mode.mode] = _of_size(mode, value, text)
+    return EmulatedFaults(tuple(schedule), modes, tuple(start))
+
+
+def _of_size(mode: FaultMode, size: float, text: str) -> FaultMode:
+    if isinstance(mode, SteadyStateError):
+        return replace(mode, magnitude=(size, size))
+    if not isinstance(mode, SizedMode):
+        raise InputError(f"fault {text!r}: mode {mode.mode!r} has no size to choose. Leave it out.")
+    signs: dict[str, Any] = {"both_signs": False} if mode.signed else {}
+    return replace(mode, magnitude=(size, size), **signs)
+
+
+def _number(value: str, text: str) -> float:
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError(f"fault {text!r}: size is {value!r}, expected a number.")
+    return number
+
+
+def commander_of(
+    place: str,
+    known: CalibratedRobot,
+    faults: Sequence[str],
+    seed: int,
+    topics: Path | None,
+    stack: ExitStack,
+) -> Commander:
+    """Return the arm that stands for a place on the command line.
+
+    Raises:
+        InputError: If it cannot be reached or is none of `PLACES`.
+    """
+    if place == EMULATED:
+        from failuretwin.connection.commanded_arm import CommandedArm
+        from failuretwin.connection.emulated_arm import Emulation
+
+        own = emulated_faults(faults, known.robot)
+        emulation = Emulation(
+            known.robot, known.imperfections, own.schedule, seed, own.modes, own.start
+        )
+        return stack.enter_context(CommandedArm(emulation))
+    if faults:
+        raise InputError(
+            f"--fault is of an emulated arm, but --on is {place!r}. Leave it out, or act on "
+            f"{EMULATED!r}."
+        )
+    if place == ROS1:
+        from failuretwin.connection.links.ros1 import Ros1Commander
+
+        return stack.enter_context(Ros1Commander(known.robot, topics_of(topics)))
+    if place.startswith(f"{ROSBRIDGE}://"):
+        from failuretwin.connection.links import rosbridge
+
+        ros = rosbridge.connect(*address_of(place))
+        stack.callback(rosbridge.disconnect, ros)
+        made = rosbridge.RosbridgeCommander(known.robot, topics_of(topics), ros)
+        return stack.enter_context(made)
+    raise InputError(f"--on is {place!r}, expected {PLACES}.")
+
+
+# What is told.
+
+
+def record(number: int, result: TargetResult) -> dict[str, Any]:
+    """Return what became of a target as a JSON object."""
+    return {
+        "target": number,
+        "position": list(result.target.position),
+        "reached": result.reached,
+        "error_m": None if math.isnan(result.error_m) else result.error_m,
+        "movements": result.movements,
+        "reachable": result.reachable,
+        "believed": result.believed or None,
+        "why": result.why,
+    }
+
+
+def write_results(results: Sequence[TargetResult], path: Path) -> None:
+    """Write an object a line, a line a target.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    from failuretwin.data_knowledge.store import replacing
+
+    lines = [json.dumps(record(i + 1, result)) for i, result in enumerate(results)]
+    with replacing(path) as partial:
+        partial.write_text("\n".join(lines) + "\n")
+
+
+def table_lines(results: Sequence[TargetResult]) -> list[str]:
+    """Return a line for each target, and one for all."""
+    lines = []
+    for number, result in enumerate(results, start=1):
+        error = "not seen" if math.isnan(result.error_m) else f"{1e3 * result.error_m:5.1f} mm"
+        state = "reached" if result.reached else result.why
+        lines.append(f"{number:4d}  {error:>9s}  {result.movements:2d} movements  {state}")
+    reached = sum(result.reached for result in results)
+    moves = sum(result.movements for result in results)
+    lines.append(f"{reached} of {len(results)} targets reached in {moves} movements")
+    return lines
+
+
+def spared_of(texts: Sequence[str], robot: Robot) -> FloatArray | None:
+    """Return the weight of each motor that is to be spared, (motor,); None: of none.
+
+    Args:
+        texts: MOTOR or MOTOR=WEIGHT.
+        robot: The robot.
+
+    Raises:
+        InputError: If a motor is unknown or a weight is no number.
+    """
+    weight = np.zeros(len(robot.motors))
+    for text in texts:
+        match = re.fullmatch(r"([^=]+)(?:=([\d.]+))?", text)
+        if match is None:
+            raise InputError(f"--spare {text!r} is not of the form MOTOR[=WEIGHT].")
+        Hypothesis.parse(f"{match[1]}:stuck", robot.motor_names)
+        weight[robot.motor_names.index(match[1])] = float(match[2] or 1.0)
+    return weight if weight.any() else None

@@ -1,0 +1,164 @@
+"""`failuretwin act`: a task carried out on an arm, whatever is wrong with it."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+
+import click
+
+from failuretwin.app.commands.options import (
+    PATH,
+    calibration_option,
+    common_options,
+    plugin_option,
+)
+from failuretwin.app.terminal import tell
+
+
+@click.command()
+@click.argument("task", metavar="TASK.csv", type=PATH)
+@click.option(
+    "--on",
+    "place",
+    default="emulated",
+    metavar="emulated|ros1|rosbridge://HOST[:PORT]",
+    help="The arm.",
+)
+@click.option(
+    "--fault",
+    "faults",
+    multiple=True,
+    metavar="MOTOR:MODE[=SIZE][@START]",
+    help="A fault of an emulated arm, such as motor_3:stuck, motor_3:stuck=-0.4 or "
+    "motor_2:encoder_bias=0.1@20. Can be given several times.",
+)
+@click.option(
+    "--strategy",
+    type=click.Choice(["diagnose", "feedback", "open"]),
+    default="diagnose",
+    help="React to what is wrong; correct what the tool misses as if nothing were; or send each "
+    "target once.",
+)
+@click.option(
+    "--move",
+    is_flag=True,
+    help="Really send orders. Without it a real arm is only listened to and what would be ordered "
+    "is told. An emulated arm needs no --move.",
+)
+@click.option(
+    "--most-movements",
+    type=click.IntRange(min=1),
+    default=6,
+    help="Give a target up after so many.",
+)
+@click.option(
+    "--speed-share",
+    type=click.FloatRange(min=0.0, max=1.0, min_open=True),
+    default=0.5,
+    help="Share of each motor's speed limit that may be used.",
+)
+@click.option(
+    "--floor", type=float, metavar="METRES", help="Height of the floor. Default: the base."
+)
+@click.option(
+    "--radius",
+    type=click.FloatRange(min=0.0),
+    metavar="METRES",
+    help="Radius of the links, for the distance that they keep. Default: by the arm's reach.",
+)
+@click.option(
+    "--spare",
+    multiple=True,
+    metavar="MOTOR[=WEIGHT]",
+    help="A worn motor that poses shall load and move little. Can be given several times.",
+)
+@click.option(
+    "--json", "json_file", type=PATH, metavar="FILE", help="Write a line for each target."
+)
+@click.option("--topics", type=PATH, metavar="FILE.toml", help="Names and types of ROS topics.")
+@calibration_option
+@plugin_option
+@common_options
+def act(
+    task: Path,
+    place: str,
+    faults: tuple[str, ...],
+    strategy: str,
+    move: bool,
+    most_movements: int,
+    speed_share: float,
+    floor: float | None,
+    radius: float | None,
+    spare: tuple[str, ...],
+    json_file: Path | None,
+    topics: Path | None,
+    calibration: Path | None,
+    robot: str,
+    seed: int,
+) -> None:
+    """Bring the tool to the targets of TASK.csv (columns x, y, z in metres; see docs/acting.md).
+
+    What is wrong with the arm is found out on the way, told, and worked round. Every order passes a
+    gate: limits, speed, floor, the arm's own links. Stop with Ctrl-C, or `failuretwin stop`.
+    """
+    from failuretwin.app.acting import commander_of, spared_of, table_lines, write_results
+    from failuretwin.app.live import EMULATED
+    from failuretwin.decision.acting.actor import ActingSettings
+    from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
+    from failuretwin.decision.acting.session import Acting
+    from failuretwin.decision.acting.task import read_task
+    from failuretwin.decision.acting.work import first_standing
+    from failuretwin.digital_model.calibrated_robot import load_calibration
+
+    known, wanted = load_calibration(calibration, robot), read_task(task)
+    limits = SafetyLimits(speed_share=speed_share, floor_m=floor, radius_m=radius)
+    acting = Acting(
+        known,
+        SafetyGate(known.robot, limits),
+        strategy,
+        ActingSettings(most_movements=most_movements),
+        spared_of(spare, known.robot),
+        seed,
+    )
+    with ExitStack() as stack:
+        arm = commander_of(place, known, faults, seed, topics, stack)
+        if move or place == EMULATED:
+            results = acting.work(wanted, arm, tell)
+        else:
+            tell("nothing moves without --move; this is what would be ordered")
+            results = acting.dry_run(wanted, first_standing(arm), tell)
+    for line in table_lines(results):
+        tell(line)
+    if json_file is not None:
+        write_results(results, json_file)
+
+
+@click.command()
+@click.option(
+    "--on", "place", default="ros1", metavar="ros1|rosbridge://HOST[:PORT]", help="The arm."
+)
+@click.option("--topics", type=PATH, metavar="FILE.toml", help="Names and types of ROS topics.")
+@common_options
+def stop(place: str, topics: Path | None, robot: str, seed: int) -> None:
+    """Order an arm to stay where it is; an `act` that works on it hears that and ends.
+
+    This is no emergency stop: it takes the way that every order takes. Keep the real one in reach.
+    """
+    import numpy as np
+
+    from failuretwin.app.acting import commander_of
+    from failuretwin.app.live import EMULATED
+    from failuretwin.connection.links.commander import Order
+    from failuretwin.core.errors import InputError
+    from failuretwin.decision.acting.work import where_it_stands
+    from failuretwin.digital_model.calibrated_robot import load_calibration
+
+    if place == EMULATED:
+        raise InputError("an emulated arm ends with its process. Name ros1 or rosbridge://HOST.")
+    known = load_calibration("none", robot)
+    with ExitStack() as stack:
+        arm = commander_of(place, known, (), seed, topics, stack)
+        target = where_it_stands(arm)
+        arm.send(Order(target, np.full(len(target), 0.1)))
+        tell("told to stay where it is")

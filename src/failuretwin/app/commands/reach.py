@@ -1,0 +1,69 @@
+"""`failuretwin reach`: what an arm can still reach with a motor held."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from failuretwin.app.commands.options import PATH, common_options
+from failuretwin.app.terminal import tell
+
+
+@click.command()
+@click.argument("task", metavar="[TASK.csv]", type=PATH, required=False)
+@click.option(
+    "--held",
+    metavar="MOTOR=DEGREES",
+    help="The motor that is held, and where. Default: every motor in turn, all over its travel.",
+)
+@click.option("--floor", type=float, metavar="METRES", help="Height of the floor. Default: base.")
+@click.option(
+    "--radius", type=click.FloatRange(min=0.0), metavar="METRES", help="Radius of the links."
+)
+@click.option("--plot", type=PATH, metavar="FILE.png", help="Draw a map of the workspace.")
+@click.option("--json", "json_file", type=PATH, metavar="FILE", help="Write all points.")
+@common_options
+def reach(
+    task: Path | None,
+    held: str | None,
+    floor: float | None,
+    radius: float | None,
+    plot: Path | None,
+    json_file: Path | None,
+    robot: str,
+    seed: int,
+) -> None:
+    """Say what an arm can still reach: of TASK.csv, or of where its usual movements bring the tool.
+
+    Poses that touch the floor or the arm's own links do not count.
+    """
+    from failuretwin.app.reach_report import (
+        by_motor_lines,
+        held_of,
+        map_lines,
+        save_map,
+        write_json,
+    )
+    from failuretwin.decision.acting.reach import reach as reach_of
+    from failuretwin.decision.acting.reach import reach_by_motor, workspace
+    from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
+    from failuretwin.decision.acting.task import read_task
+    from failuretwin.digital_model.robot import load_robot
+
+    model = load_robot(robot)
+    gate = SafetyGate(model, SafetyLimits(floor_m=floor, radius_m=radius))
+    points = workspace(model, seed=seed) if task is None else read_task(task)
+    if held is None:
+        motors = reach_by_motor(gate, points, seed)
+        lines, records = by_motor_lines(motors), [motor.record() for motor in motors]
+        maps = [reach_of(gate, points, (m.motor, m.best_angle), seed) for m in motors]
+    else:
+        maps = [reach_of(gate, points, held_of(held, model), seed)]
+        lines, records = map_lines(maps[0], per_point=task is not None), [maps[0].record()]
+    for line in lines:
+        tell(line)
+    if json_file is not None:
+        write_json(records, json_file)
+    if plot is not None:
+        save_map(maps, plot)

@@ -1,0 +1,53 @@
+"""An emulated robot on a ROS network that does what it is told."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+from failuretwin.app.acting import emulated_faults
+from failuretwin.app.commands.options import LiveOptions
+from failuretwin.app.live import topics_of
+from failuretwin.connection.commanded_arm import CommandedArm
+from failuretwin.connection.emulated_arm import Emulation
+from failuretwin.connection.links.base import CommandSent, Pace, Reading
+from failuretwin.connection.links.commander import Order
+from failuretwin.connection.links.ros1 import Ros1Robot, Ros1Source
+from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.robot import Robot
+
+
+def obey_commands(robot: Robot, live: LiveOptions, seed: int, tell: Callable[[str], None]) -> None:
+    """Publish readings and do what the topic of commands says, until interrupted.
+
+    Args:
+        robot: The robot.
+        live: Topics, faults, pace and length.
+        seed: Seed of all chance.
+        tell: Called with what happens.
+    """
+    own = "none" if robot.imperfections_file is None else robot.name
+    known = load_calibration(live.imperfections or own, robot)
+    faults = emulated_faults(live.faults, robot)
+    emulation = Emulation(
+        known.robot, known.imperfections, faults.schedule, seed, faults.modes, faults.start
+    )
+    topics, zero = topics_of(live.topics), time.time()
+    arm = CommandedArm(emulation, Pace(live.speed))
+    length = live.duration or math.inf
+    with Ros1Robot(robot, topics) as sink, Ros1Source(robot, topics) as ears:
+        tell("an emulated robot obeys; stop with Ctrl-C")
+        try:
+            now = 0.0
+            while now < length:
+                event = arm.poll(0.02)
+                if isinstance(event, Reading):
+                    now = event.time
+                    sink.put(replace(event, time=event.time + zero))
+                while (heard := ears.poll(0.0)) is not None:
+                    if isinstance(heard, CommandSent):
+                        arm.send(Order(heard.target, heard.duration))
+        except KeyboardInterrupt:
+            tell("stopped")

@@ -1,0 +1,386 @@
+"""The closed loop of one arm and one task, without clock or robot: what to order next.
+
+    plan with the believed arm -> order -> tool at rest -> belief -> reached? correct, or plan anew
+
+Every reaction stands on feedback: whatever is believed, what the tool misses is taken off its
+commands by the Jacobian of the believed arm, and what is out of reach under the belief is done as
+if there were none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from failuretwin.connection.links.commander import Order
+from failuretwin.core.types import FloatArray
+from failuretwin.decision.acting.belief import Belief, Judgement
+from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault, Seen
+from failuretwin.decision.acting.planner import Plan, Planner, Standing
+from failuretwin.decision.acting.reactions import lost_command, probing, told
+from failuretwin.decision.acting.task import Target, Task
+from failuretwin.failure_behavior.reaction import Reaction
+from failuretwin.inference.healthy_model import HealthyModel
+
+SMALLEST_NEWS_RAD = 0.02
+"""A held angle that is believed to lie so far from where it was planned with calls for a new plan
+[rad]."""
+HALVINGS = 3
+"""A correction that is not safe is tried at half, a quarter and an eighth."""
+
+
+@dataclass(frozen=True)
+class ActingSettings:
+    """How a task is carried out.
+
+    Attributes:
+        most_movements: After so many a target is given up.
+        feedback: Whether what the tool misses is corrected; else each target has one movement.
+        first_gain: Share of the error that the first correction takes off.
+        later_gain: The same of those that follow.
+        most_repeats: So often a command that seems lost is sent again for one target.
+        probe_every: A motor that is held is told to move once in so many targets, so that a
+            repair is noticed.
+    """
+
+    most_movements: int = 6
+    feedback: bool = True
+    first_gain: float = 1.0
+    later_gain: float = 0.7
+    most_repeats: int = 1
+    probe_every: int = 8
+
+
+@dataclass(frozen=True)
+class TargetResult:
+    """What became of a target.
+
+    Attributes:
+        target: The target.
+        reached: Whether the tool was seen within its tolerance.
+        error_m: How far it was from it in the end [m]; NaN: it was not seen.
+        first_error_m: The same after the first movement [m].
+        movements: Movements made.
+        reachable: Whether the last plan could reach it on the arm as it was believed to be.
+        believed: What was believed in the end; empty: no fault.
+        why: Why it was given up, empty if it was reached.
+    """
+
+    target: Target
+    reached: bool
+    error_m: float
+    first_error_m: float
+    movements: int
+    reachable: bool
+    believed: str
+    why: str = ""
+
+
+@dataclass
+class _Attempt:
+    """What was tried for the present target."""
+
+    movements: int = 0
+    corrections: int = 0
+    repeats: int = 0
+    reachable: bool = True
+    as_healthy: bool = False
+    planned_with: BelievedFault | None = None
+    first_error_m: float = np.nan
+    pose: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+
+class Actor:
+    """Carries out a task on one arm.
+
+    Args:
+        planner: Plans movements.
+        model: The healthy arm.
+        task: The task.
+        belief: What the arm is taken to be.
+        command: What the motors were told last, (motor,) [rad].
+        settings: How it is carried out.
+    """
+
+    def __init__(
+        self,
+        planner: Planner,
+        model: HealthyModel,
+        task: Task,
+        belief: Belief,
+        command: FloatArray,
+        settings: ActingSettings = ActingSettings(),
+    ) -> None:
+        self._planner, self._model, self._task = planner, model, task
+        self.belief, self._settings = belief, settings
+        self.results: list[TargetResult] = []
+        self.said: list[str] = []
+        self._command = self._previous = command
+        self._order: Order | None = None
+        self._time_s = 0.0
+        self._seen: Seen | None = None
+        self._attempt = _Attempt()
+        self._since_probe = 0
+
+    # What is known.
+
+    @property
+    def done(self) -> bool:
+        """Whether every target was reached or given up."""
+        return len(self.results) == len(self._task.targets)
+
+    @property
+    def target(self) -> Target:
+        """The target that is worked on."""
+        return self._task.targets[len(self.results)]
+
+    @property
+    def arm(self) -> BelievedArm:
+        """The arm as it is worked with: as it is believed to be, or as if it were healthy."""
+        fault = None if self._attempt.as_healthy else self.belief.believed
+        return BelievedArm(self._model, fault)
+
+    @property
+    def window(self) -> Sequence[Seen]:
+        """Movements that are to be weighed before `learn`."""
+        return self.belief.window
+
+    def standing(self) -> Standing:
+        """Return where the arm stands as far as is believed."""
+        arm = BelievedArm(self._model, self.belief.believed)
+        pose = arm.settle(self._command, self._previous, self._time_s)
+        return Standing(pose, self._command, self._time_s)
+
+    # What was seen.
+
+    def see(self, point: FloatArray | None, start_s: float, rest_s: float) -> None:
+        """Take where the tool came to rest after the last order.
+
+        Args:
+            point: Where, (3,) [m]; None: it was not seen at rest.
+            start_s: When it was ordered, by the robot's clock [s].
+            rest_s: When it was seen at rest [s].
+        """
+        if self._order is None:
+            return
+        self._time_s = rest_s
+        self._seen = Seen(
+            self._command, self._previous, self._order.duration, start_s, rest_s, point
+        )
+        self.belief.add(self._seen)
+        self._attempt.movements += 1
+
+    def learn(self, judgement: Judgement | None) -> None:
+        """Learn from the movement that was seen, and conclude the target if it is time to.
+
+        Args:
+            judgement: What the movements of `window` say; None: they were not weighed.
+        """
+        seen = self._seen
+        if seen is None or self.done:
+            return
+        news = self.belief.take(seen, judgement)
+        if news:
+            self._say(news)
+            self._tell_reaction()
+        error = self._error_m(seen)
+        if self._attempt.movements == 1:
+            self._attempt.first_error_m = error
+        if error <= self.target.tolerance_m:
+            self._conclude("")
+        elif self._attempt.movements >= self._most_movements:
+            self._conclude(f"not reached in {self._attempt.movements} movements")
+        elif self._tried_in_vain():
+            self._conclude("out of reach, tried once as if the arm were healthy")
+
+    def _tried_in_vain(self) -> bool:
+        return self._attempt.as_healthy and self.belief.confirmed and not self._attempt.repeats
+
+    @property
+    def _most_movements(self) -> int:
+        return self._settings.most_movements if self._settings.feedback else 1
+
+    def _error_m(self, seen: Seen) -> float:
+        if seen.point is None:
+            return np.nan
+        return float(np.linalg.norm(seen.point - self.target.point))
+
+    def _conclude(self, why: str) -> None:
+        seen, attempt = self._seen, self._attempt
+        error = np.nan if seen is None or attempt.movements == 0 else self._error_m(seen)
+        believed = self.belief.believed
+        self.results.append(
+            TargetResult(
+                self.target,
+                not why,
+                error,
+                attempt.first_error_m,
+                attempt.movements,
+                attempt.reachable,
+                "" if believed is None else str(believed.fault),
+                why,
+            )
+        )
+        if why:
+            self._say(f"target {len(self.results)}: {why}")
+        self._since_probe += 1
+        self._attempt = _Attempt()
+
+    # What to do next.
+
+    def next(self) -> Order | None:
+        """Return the next order; None: the task is over."""
+        while not self.done:
+            order = self._begin() if self._plans_anew() else self._corrected()
+            if order is not None:
+                self._previous, self._command = self._command, order.target
+                self._order = order
+                return order
+        return None
+
+    def _plans_anew(self) -> bool:
+        """Return whether the target is new, or is looked at with other eyes than before."""
+        attempt, believed = self._attempt, self.belief.believed
+        if attempt.movements == 0:
+            return True
+        before = attempt.planned_with
+        if believed is None or before is None:
+            return believed is not before and not attempt.as_healthy
+        if believed.fault != before.fault:
+            attempt.as_healthy = False
+            return True
+        if attempt.as_healthy or believed.reaction is not Reaction.LOCK:
+            return False
+        return abs(believed.angle - before.angle) > SMALLEST_NEWS_RAD
+
+    def _begin(self) -> Order | None:
+        """Return the order that a new plan begins with; None where the target is given up."""
+        attempt, at = self._attempt, self.standing()
+        attempt.planned_with, attempt.corrections = self.belief.believed, 0
+        if attempt.planned_with is None:
+            attempt.as_healthy = False
+        plan = self._planner.plan(self.target, self.arm, at)
+        attempt.reachable = plan.reachable
+        if not plan.reachable and self.arm.locked.any():
+            plan = self._out_of_reach(plan, at)
+        if plan.order is None:
+            self._conclude(f"no safe way: {plan.why}")
+            return None
+        if plan.miss_m > self.target.tolerance_m:
+            self._conclude(f"out of reach by {1e3 * plan.miss_m:.0f} mm")
+            return None
+        attempt.pose = plan.pose
+        return self._probed(plan.order, at)
+
+    def _out_of_reach(self, plan: Plan, at: Standing) -> Plan:
+        """Return what to do where the motor that rests keeps the tool from its target."""
+        believed = self.belief.believed
+        assert believed is not None
+        if believed.reaction is Reaction.PARK:
+            self.belief.stands_at(np.nan, 0.0)
+        else:
+            self._attempt.as_healthy = True
+            self._say(
+                f"target {len(self.results) + 1} is out of reach with {believed.fault}, "
+                f"{1e3 * plan.miss_m:.0f} mm at the nearest; tried as if it were not there"
+            )
+        return self._planner.plan(self.target, self.arm, at)
+
+    def _probed(self, order: Order, at: Standing) -> Order:
+        """Return an order that also asks whether a motor that is held has been repaired."""
+        if self._since_probe < self._settings.probe_every or not self._settings.feedback:
+            return order
+        command = probing(self.arm, order.target)
+        if command is None:
+            return order
+        self._since_probe = 0
+        probed, wrong = self._planner.checked(command, self.arm, at)
+        return order if wrong else probed
+
+    def _corrected(self) -> Order | None:
+        """Return the next order for a target that was missed; None where it is given up."""
+        seen, attempt = self._seen, self._attempt
+        assert seen is not None and self._order is not None
+        if attempt.repeats < self._settings.most_repeats:
+            lost = "the tool was not seen" if seen.point is None else lost_command(self.arm, seen)
+            if lost:
+                attempt.repeats += 1
+                self._say(f"{lost}: sent again")
+                return self._again()
+        if seen.point is None:
+            self._conclude("the tool is not seen at rest")
+            return None
+        parked = self._parked(seen)
+        if parked is not None:
+            return parked
+        return self._fed_back(seen)
+
+    def _again(self) -> Order | None:
+        """Return the last order once more, with the time that it needs from where it began."""
+        assert self._order is not None
+        order, wrong = self._planner.checked(self._order.target, self.arm, self.standing())
+        if wrong:
+            self._conclude(f"no safe way: {wrong}")
+            return None
+        return replace(order, duration=np.maximum(order.duration, self._order.duration))
+
+    def _parked(self, seen: Seen) -> Order | None:
+        """Return the order that works round a motor that is at rest now; None: there is none."""
+        believed = self.belief.believed
+        if believed is None or believed.reaction is not Reaction.PARK or self._attempt.as_healthy:
+            return None
+        arm = self.arm
+        pose = arm.most_probable_pose(seen)
+        angle = float(pose[believed.motor])
+        self.belief.stands_at(angle, float(self._model.scatter[believed.motor]))
+        at = Standing(pose, self._command, self._time_s)
+        plan = self._planner.plan(self.target, self.arm, at)
+        if not plan.reachable or plan.order is None:
+            self.belief.stands_at(np.nan, 0.0)
+            return None
+        self._attempt.pose, self._attempt.reachable = plan.pose, True
+        return plan.order
+
+    def _fed_back(self, seen: Seen) -> Order | None:
+        """Return the correction of what the tool misses, by the Jacobian of the believed arm."""
+        attempt, arm = self._attempt, self.arm
+        assert seen.point is not None
+        first = attempt.corrections == 0
+        attempt.corrections += 1
+        gain = self._settings.first_gain if first else self._settings.later_gain
+        wrong, low_high = "", arm.limits
+        for share in 0.5 ** np.arange(HALVINGS + 1):
+            step = self._step(arm, attempt.pose, gain * share * (self.target.point - seen.point))
+            command = np.clip(self._command + step / arm.gain(seen), *low_high)
+            command = arm.rounded(arm.with_rest(command, self._command))
+            order, wrong = self._planner.checked(command, arm, self.standing())
+            if not wrong:
+                attempt.pose = attempt.pose + step
+                return order
+        self._conclude(f"no safe correction: {wrong}")
+        return None
+
+    def _step(self, arm: BelievedArm, pose: FloatArray, miss: FloatArray) -> FloatArray:
+        """Return by how much the motors must turn to move the tool by `miss` (3,) [m]."""
+        point, _ = self._planner.whole.tool(pose[None])
+        found = self._planner.whole.solve(point + miss, pose[None], arm.locked)
+        return np.asarray(found.pose[0, 0] - pose)
+
+    # What is told.
+
+    def _say(self, text: str) -> None:
+        self.said.append(text)
+
+    def _tell_reaction(self) -> None:
+        believed = self.belief.believed
+        if believed is None:
+            return
+        self._say(told(believed, self._model.twin.robot))
+        if not believed.rests:
+            return
+        left = self._task.targets[len(self.results) :]
+        at, arm = self.standing(), self.arm
+        near = [self._planner.plan(target, arm, at).reachable for target in left]
+        self._say(f"{sum(near)} of {len(left)} targets left can be reached")

@@ -1,0 +1,264 @@
+"""The arm as it is believed to be: where commands bring it, and which command brings it where.
+
+    pose = settle(command) = healthy settling + what the fault adds
+    command = settle^-1(pose)
+
+The fault itself says where it makes its motor settle (`FaultMode.settled_offset`); a motor that is
+held, or that rests, stays where it is whatever it is told.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from failuretwin.core.hypothesis import Fault
+from failuretwin.core.numerics import Ellipsoid
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.digital_model.inverse_kinematics import usable_limits
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.settling import sag
+from failuretwin.failure_behavior.fault import Arrival
+from failuretwin.failure_behavior.mode import FaultMode, Signature
+from failuretwin.failure_behavior.reaction import Reaction
+from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.healthy_model import HealthyModel
+
+UNMOVED_RAD = 1e-9
+"""Commands nearer than this are the same [rad]."""
+NEWTON_STEPS = 5
+PROBE_RAD = 0.01
+"""Step by which it is asked how far the faulty motor follows its command [rad]."""
+LEAST_GAIN = 0.1
+"""A motor that follows less than this share of its command is not inverted any further."""
+OUTLIER_RATE = 1e-3
+"""Share of movements after which the tool is anywhere, in what movements say of an arm [-]."""
+HALF_90 = 1.645
+"""Half of a 90 % interval in standard deviations."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One movement as it was ordered, and where the tool came to rest.
+
+    Attributes:
+        command: What the motors were told, (motor,) [rad].
+        previous: What they had been told before, (motor,) [rad].
+        duration: Time that they were given, (motor,) [s].
+        start_s: When it was ordered, by the robot's clock [s].
+        rest_s: When the tool was seen at rest [s].
+        point: Where, (3,) [m]; None: it was not seen at rest.
+    """
+
+    command: FloatArray
+    previous: FloatArray
+    duration: FloatArray
+    start_s: float
+    rest_s: float
+    point: FloatArray | None
+
+
+@dataclass(frozen=True)
+class BelievedFault:
+    """One fault that an arm is taken to have.
+
+    Attributes:
+        fault: Motor and mode.
+        motor: Index of the motor.
+        size: In the mode's unit; NaN where it has none.
+        spread: Half of the 90 % interval of the size, or of the angle of a motor at rest.
+        since_s: When it began [s].
+        angle: Where the motor stands if it is held or rests [rad]; NaN: not known, or it moves.
+        probability: When it was taken up.
+    """
+
+    fault: Fault
+    motor: int
+    size: float = np.nan
+    spread: float = 0.0
+    since_s: float = 0.0
+    angle: float = np.nan
+    probability: float = 1.0
+
+    @property
+    def mode(self) -> FaultMode:
+        """Its mode."""
+        return MODES[self.fault.mode]
+
+    @property
+    def reaction(self) -> Reaction:
+        """What is done about it."""
+        return self.mode.reaction
+
+    @property
+    def rests(self) -> bool:
+        """Whether the motor stays where it is: held, or at rest and told nothing new."""
+        at_rest = self.reaction in (Reaction.LOCK, Reaction.PARK)
+        return at_rest and bool(np.isfinite(self.angle))
+
+    @property
+    def inverted(self) -> bool:
+        """Whether a known offset is taken off its commands."""
+        offset = self.reaction in (Reaction.INVERT, Reaction.SPARE)
+        return offset and bool(np.isfinite(self.size))
+
+
+@dataclass(frozen=True)
+class BelievedArm:
+    """A robot with at most one fault.
+
+    Attributes:
+        model: The robot without it.
+        fault: The fault; None: healthy.
+    """
+
+    model: HealthyModel
+    fault: BelievedFault | None = None
+
+    @property
+    def robot(self) -> Robot:
+        """The robot."""
+        return self.model.twin.robot
+
+    @cached_property
+    def limits(self) -> tuple[FloatArray, FloatArray]:
+        """Lowest and highest command of each motor, (motor,) [rad]."""
+        return usable_limits(self.robot)
+
+    @cached_property
+    def locked(self) -> BoolArray:
+        """Motors that stay where they are, (motor,)."""
+        mask = np.zeros(len(self.robot.motors), dtype=bool)
+        if self.fault is not None and self.fault.rests:
+            mask[self.fault.motor] = True
+        return mask
+
+    def settle(self, command: FloatArray, previous: FloatArray, time_s: float) -> FloatArray:
+        """Return the pose that a command leads to, (motor,) [rad].
+
+        Args:
+            command: What the motors are told, (motor,) [rad].
+            previous: What they were told before, (motor,) [rad].
+            time_s: When they arrive [s]; counts for faults that grow.
+        """
+        travel = command - previous
+        direction = np.where(np.abs(travel) > UNMOVED_RAD, np.sign(travel), 0.0)
+        fault, base = self.fault, command
+        if fault is not None and fault.rests:
+            base = np.where(self.locked, fault.angle, command)
+        pose = self.model.settle(base, direction, self.locked)
+        if fault is None or not fault.inverted:
+            return pose
+        k, load = fault.motor, 0.0
+        if fault.mode.needs_compliance:
+            settling = self.model.settling
+            give = sag(self.robot, pose, np.asarray(settling.compliance), settling.payload)
+            load = float(give[k])
+        since = max(time_s - fault.since_s, 0.0)
+        told = (previous[k], command[k], direction[k], since, load)
+        arrival = Arrival(*(np.array(value) for value in told))
+        found = pose.copy()
+        found[k] += float(fault.mode.settled_offset(np.array(fault.size), arrival))
+        return found
+
+    def command_for(self, pose: FloatArray, previous: FloatArray, time_s: float) -> FloatArray:
+        """Return the command that leads to a pose, (motor,) [rad], within limits, in whole counts.
+
+        A motor that is held is told to stay where it stands: if it is not held after all, it goes
+        there, and the plan is still right; if it is, it does not push against its gear.
+
+        Args:
+            pose: Where the motors shall settle, (motor,) [rad].
+            previous: What they were told before, (motor,) [rad].
+            time_s: When they will arrive [s].
+        """
+        command = pose.copy()
+        for _ in range(NEWTON_STEPS):
+            settled = self.settle(command, previous, time_s)
+            gain = self._gain(command, previous, time_s, settled)
+            step = np.where(self.locked, 0.0, (pose - settled) / gain)
+            command = command + step
+            if np.abs(step).max() < 1e-3 * PROBE_RAD:
+                break
+        return self.rounded(self.with_rest(command, previous))
+
+    def gain(self, seen: Seen) -> FloatArray:
+        """Return how far each motor follows a change of its command, (motor,) [-]."""
+        settled = self.settle(seen.command, seen.previous, seen.rest_s)
+        return self._gain(seen.command, seen.previous, seen.rest_s, settled)
+
+    def _gain(
+        self, command: FloatArray, previous: FloatArray, time_s: float, settled: FloatArray
+    ) -> FloatArray:
+        gain, fault = np.ones_like(command), self.fault
+        if fault is not None and fault.inverted:
+            probed = command.copy()
+            probed[fault.motor] += PROBE_RAD
+            moved = (self.settle(probed, previous, time_s) - settled)[fault.motor]
+            gain[fault.motor] = max(moved / PROBE_RAD, LEAST_GAIN)
+        return gain
+
+    def with_rest(self, command: FloatArray, previous: FloatArray) -> FloatArray:
+        """Return a command that leaves a motor at rest alone.
+
+        One that is held is told to be where it stands; one that is parked is told nothing new.
+        """
+        fault = self.fault
+        if fault is None or not fault.rests:
+            return command
+        left = previous[fault.motor] if fault.reaction is Reaction.PARK else fault.angle
+        return np.where(self.locked, left, command)
+
+    def rounded(self, command: FloatArray) -> FloatArray:
+        """Return a command as it can be sent: within limits, and in whole counts of the servos."""
+        low, high = self.limits
+        command = np.clip(command, low, high)
+        units = self.robot.profile.servo_units
+        if units is None:
+            return command
+        ends = np.sort(units.to_counts(np.array([low, high])), axis=0)
+        least, most = np.ceil(ends[0] - 1e-9), np.floor(ends[1] + 1e-9)
+        return np.asarray(units.to_rad(np.clip(np.round(units.to_counts(command)), least, most)))
+
+    # What a movement says of the arm.
+
+    def log_density(self, seen: Seen) -> float:
+        """Return the log density of a settled tool position [log 1/m3]; 0 if it was not seen."""
+        if seen.point is None:
+            return 0.0
+        pose = self.settle(seen.command, seen.previous, seen.rest_s)
+        error, _, spread = self.model.residual(seen.point, pose, self.scatter(seen.command))
+        found = float(spread.log_student(error, self.model.settling.tail_dof))
+        sure, odd = np.log1p(-OUTLIER_RATE), np.log(OUTLIER_RATE)
+        return float(np.logaddexp(sure + found, odd + self.model.anywhere_log_density))
+
+    def scatter(self, command: FloatArray) -> FloatArray:
+        """Return by how much each motor settles beside `settle`, (motor,) [rad]."""
+        scatter, fault = self.model.scatter.copy(), self.fault
+        if fault is None:
+            return scatter
+        k, mode = fault.motor, fault.mode
+        if fault.rests:
+            scatter[k] = np.hypot(fault.spread / HALF_90, self.model.held_scatter[k])
+        elif mode.signature is Signature.REDRAWN_OFFSET:
+            size = fault.size if np.isfinite(fault.size) else 0.5 * sum(mode.considered)
+            scatter[k] = np.hypot(scatter[k], size)
+        elif fault.inverted:
+            angle = fault.spread / HALF_90 * (1.0 if mode.unit == "rad" else abs(command[k]))
+            scatter[k] = np.hypot(scatter[k], angle)
+        return scatter
+
+    def most_probable_pose(self, seen: Seen) -> FloatArray:
+        """Return the pose that explains best where the tool was seen, (motor,) [rad]."""
+        expected = self.settle(seen.command, seen.previous, seen.rest_s)
+        if seen.point is None:
+            return expected
+        scatter, pose = self.scatter(seen.command), expected
+        for _ in range(3):
+            error, jacobian, _ = self.model.residual(seen.point, pose, scatter)
+            spread = Ellipsoid.of(jacobian * scatter, self.model.path_noise**2)
+            pull = spread.solve(error + jacobian @ (pose - expected))
+            pose = expected + scatter**2 * (jacobian.T @ pull)
+        return np.asarray(pose)

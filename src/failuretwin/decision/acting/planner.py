@@ -1,0 +1,200 @@
+"""Which pose to bring a target about with, on the arm as it is believed to be.
+
+    cost = time of the way + what worn and weak motors are spared + 1000 times what misses [s]
+
+Poses come from many starts at once. Those in the ranges of the arm's usual movements come first,
+for there it is known best; what is out of reach there is looked for within the limits of its
+joints. The cheapest that has a safe way is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from failuretwin.connection.links.commander import Order
+from failuretwin.core.types import FloatArray
+from failuretwin.decision.acting.believed_arm import BelievedArm
+from failuretwin.decision.acting.safety import SafetyGate
+from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, Target
+from failuretwin.digital_model.inverse_kinematics import STARTS, InverseKinematics, Poses
+from failuretwin.digital_model.settling import largest_load
+from failuretwin.failure_behavior.reaction import Reaction
+
+NEAR_ENOUGH = 0.6
+"""A plan that uses up no more of the tolerance is not looked for any further; the rest is for how
+the arm settles."""
+MISS_S_PER_M = 1e3
+"""What a metre off the target costs beside the time of the way [s/m]."""
+SPARED_S = 1.0
+"""What full load of a weak or worn motor costs beside the time of the way [s]."""
+TRIED = 6
+"""So many poses are looked at for a safe way, the cheapest first."""
+ROUGH_M = 1e-4
+"""Misses below this do not count [m]."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where an arm stands.
+
+    Attributes:
+        pose: Where its motors are believed to be, (motor,) [rad].
+        command: What they were told last, (motor,) [rad].
+        time_s: By its clock [s].
+    """
+
+    pose: FloatArray
+    command: FloatArray
+    time_s: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to do about a target.
+
+    Attributes:
+        order: The movement; None: none is safe.
+        pose: Where the arm shall settle, (motor,) [rad].
+        miss_m: How far the tool will be from the target at least [m].
+        reachable: Whether that is within its tolerance.
+        why: What stands in the way of a plan, empty if nothing does.
+    """
+
+    order: Order | None
+    pose: FloatArray
+    miss_m: float
+    reachable: bool
+    why: str = ""
+
+
+def _is_better(plan: Plan, other: Plan) -> bool:
+    """Return whether a plan is the better one: safe, then near."""
+    if (plan.order is None) != (other.order is None):
+        return plan.order is not None
+    return plan.miss_m < other.miss_m
+
+
+@dataclass(frozen=True)
+class Planner:
+    """Plans movements.
+
+    Attributes:
+        gate: What is safe.
+        spared: Weight of each motor that is worn, (motor,) [-]; 0: sound. None: all are sound.
+        seed: Seed of the poses that are tried.
+    """
+
+    gate: SafetyGate
+    spared: FloatArray | None = None
+    seed: int = 0
+
+    @cached_property
+    def _rng(self) -> np.random.Generator:
+        return np.random.default_rng(self.seed)
+
+    @cached_property
+    def whole(self) -> InverseKinematics:
+        """Poses within the limits of the joints."""
+        return InverseKinematics.of(self.gate.robot)
+
+    @cached_property
+    def usual(self) -> InverseKinematics:
+        """Poses within the ranges of usual movements."""
+        low, high = np.array([motor.movement_range for motor in self.gate.robot.motors]).T
+        whole = self.whole
+        return InverseKinematics(
+            self.gate.robot, np.maximum(low, whole.low), np.minimum(high, whole.high)
+        )
+
+    def plan(self, target: Target, arm: BelievedArm, at: Standing) -> Plan:
+        """Return the best plan for a target.
+
+        Args:
+            target: Where to.
+            arm: The arm as it is believed to be.
+            at: Where it stands.
+        """
+        best: Plan | None = None
+        for kinematics in (self.usual, self.whole):
+            found = self._poses(kinematics, target, arm, at)
+            plan = self._cheapest_safe(found, target, arm, at)
+            if best is None or _is_better(plan, best):
+                best = plan
+            if best.order is not None and best.miss_m <= NEAR_ENOUGH * target.tolerance_m:
+                break
+        assert best is not None
+        return best
+
+    def _poses(
+        self, kinematics: InverseKinematics, target: Target, arm: BelievedArm, at: Standing
+    ) -> Poses:
+        """Return poses that bring the tool near to a target."""
+        start = kinematics.starts(STARTS, self._rng, at.pose)
+        if arm.fault is not None and arm.fault.rests:
+            start[:, arm.fault.motor] = arm.fault.angle
+        axis = None if target.axis is None else target.axis[None]
+        return kinematics.solve(target.point[None], start, arm.locked, axis)
+
+    def _cheapest_safe(self, found: Poses, target: Target, arm: BelievedArm, at: Standing) -> Plan:
+        cost = self.cost(found.pose[0], arm, at)
+        cost = cost + MISS_S_PER_M * np.maximum(found.miss_m[0] - ROUGH_M, 0.0)
+        cost = cost + np.maximum(found.miss_rad[0] - 0.1 * DIRECTION_TOLERANCE_RAD, 0.0) * 100.0
+        near = found.miss_m[0] <= target.tolerance_m
+        near &= found.miss_rad[0] <= DIRECTION_TOLERANCE_RAD
+        order = np.argsort(cost)
+        why = ""
+        for i in order[:TRIED]:
+            pose = found.pose[0, i]
+            ordered, wrong = self.order_for(pose, arm, at)
+            if not wrong:
+                return Plan(ordered, pose, float(found.miss_m[0, i]), bool(near[i]))
+            why = why or wrong
+        best = order[0]
+        return Plan(None, found.pose[0, best], float(found.miss_m[0, best]), bool(near[best]), why)
+
+    def order_for(self, pose: FloatArray, arm: BelievedArm, at: Standing) -> tuple[Order, str]:
+        """Return the order that brings the arm to a pose, and why it must not be sent."""
+        command = arm.command_for(pose, at.command, at.time_s)
+        return self.checked(command, arm, at)
+
+    def checked(self, command: FloatArray, arm: BelievedArm, at: Standing) -> tuple[Order, str]:
+        """Return the order of a command (motor,) [rad], and why it must not be sent."""
+        duration = np.full(len(command), self.gate.least_duration(command - at.command))
+        order = Order(command, self._in_time(duration, arm))
+        settled = arm.settle(command, at.command, at.time_s)
+        return order, self.gate.wrong(order, [(at.command, command), (at.pose, settled)])
+
+    def _in_time(self, duration: FloatArray, arm: BelievedArm) -> FloatArray:
+        """Return ramps that arrive together where one motor is slow."""
+        fault = arm.fault
+        if fault is None or fault.reaction is not Reaction.WAIT or np.isnan(fault.size):
+            return duration
+        longer = duration * float(fault.mode.ramp_factor(np.array([fault.size]))[0])
+        longer[fault.motor] = duration[fault.motor]
+        return longer
+
+    def cost(self, pose: FloatArray, arm: BelievedArm, at: Standing) -> FloatArray:
+        """Return what poses cost, (pose,) [s]: time of the way, and load and travel of the weak.
+
+        Args:
+            pose: (pose, motor) [rad].
+            arm: The arm as it is believed to be.
+            at: Where it stands.
+        """
+        away = np.abs(pose - at.pose)
+        cost = np.max(away / self.gate.speed, axis=-1)
+        weight = np.zeros(pose.shape[-1]) if self.spared is None else self.spared.copy()
+        if arm.fault is not None and arm.fault.reaction is Reaction.SPARE:
+            weight[arm.fault.motor] += 1.0
+        if not weight.any():
+            return np.asarray(cost)
+        robot = self.gate.robot
+        load = np.abs(robot.loads.torque(pose * robot.sense)) / self._largest_load
+        return np.asarray(cost + SPARED_S * ((load + away / np.pi) @ weight))
+
+    @cached_property
+    def _largest_load(self) -> FloatArray:
+        return np.maximum(largest_load(self.gate.robot, 0.0), 1e-9)

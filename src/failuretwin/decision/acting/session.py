@@ -1,0 +1,142 @@
+"""What acts on one arm, put together: planner, belief, judge and gate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from failuretwin.connection.links.commander import Commander, Order
+from failuretwin.core.errors import unknown_name
+from failuretwin.core.types import FloatArray
+from failuretwin.decision.acting.actor import ActingSettings, Actor, TargetResult
+from failuretwin.decision.acting.belief import Belief, Judge, LatchedBelief, NoBelief
+from failuretwin.decision.acting.believed_arm import BelievedArm
+from failuretwin.decision.acting.planner import Planner, Standing
+from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
+from failuretwin.decision.acting.task import Task
+from failuretwin.decision.acting.work import Work, first_standing
+from failuretwin.digital_model.calibrated_robot import (
+    CalibratedRobot,
+    HealthyLike,
+    RobotLike,
+    calibrated,
+)
+from failuretwin.inference.healthy_model import HealthyModel
+
+DIAGNOSE, FEEDBACK, OPEN = STRATEGIES = ("diagnose", "feedback", "open")
+"""With a diagnosis, with the nominal Jacobian alone, or one movement a target."""
+
+
+@dataclass(frozen=True)
+class Acting:
+    """What acts: planner, belief and judge of one arm.
+
+    Attributes:
+        known: The arm.
+        gate: What is safe.
+        strategy: One of `STRATEGIES`.
+        settings: How the task is carried out.
+        spared: Weight of each worn motor, (motor,); None: all are sound.
+        seed: Seed of the poses that are tried.
+    """
+
+    known: CalibratedRobot
+    gate: SafetyGate
+    strategy: str
+    settings: ActingSettings
+    spared: FloatArray | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.strategy not in STRATEGIES:
+            raise unknown_name("strategy", self.strategy, STRATEGIES)
+
+    @cached_property
+    def model(self) -> HealthyModel:
+        """The healthy arm."""
+        return HealthyModel.of(self.known.twin, self.known.imperfections)
+
+    @property
+    def planner(self) -> Planner:
+        """What plans."""
+        return Planner(self.gate, self.spared, self.seed)
+
+    def actor(self, task: Task, standing: FloatArray) -> Actor:
+        """Return what carries out a task on an arm that stands somewhere, (motor,) [rad]."""
+        model = self.model
+        belief: Belief = LatchedBelief(model) if self.strategy == DIAGNOSE else NoBelief()
+        settings = replace(self.settings, feedback=self.strategy != OPEN)
+        return Actor(self.planner, model, task, belief, standing, settings)
+
+    def work(
+        self, task: Task, commander: Commander, tell: Callable[[str], None]
+    ) -> Sequence[TargetResult]:
+        """Carry a task out on an arm and return what became of each target."""
+        standing = first_standing(commander)
+        actor = self.actor(task, standing)
+        judge = Judge(self.model) if self.strategy == DIAGNOSE else None
+        Work(actor, judge, self.gate, commander, standing, tell).carry_out()
+        return actor.results
+
+    def dry_run(
+        self, task: Task, standing: FloatArray, tell: Callable[[str], None]
+    ) -> Sequence[TargetResult]:
+        """Tell what would be ordered if every target were reached at once; nothing is sent."""
+        arm, planner = BelievedArm(self.model), self.planner
+        results, command = [], standing
+        for number, target in enumerate(task.targets, start=1):
+            pose = arm.settle(command, command, 0.0)
+            plan = planner.plan(target, arm, Standing(pose, command, 0.0))
+            results.append(
+                TargetResult(target, False, math.nan, math.nan, 0, plan.reachable, "", "dry run")
+            )
+            tell(f"target {number}: {_planned(plan.order, plan.reachable, plan.why, plan.miss_m)}")
+            if plan.order is not None and plan.reachable:
+                command = plan.order.target
+        return results
+
+
+def _planned(order: Order | None, reachable: bool, why: str, miss_m: float) -> str:
+    if order is None:
+        return f"no safe way: {why}"
+    if not reachable:
+        return f"out of reach by {1e3 * miss_m:.0f} mm"
+    angles = " ".join(f"{angle:.1f}" for angle in np.rad2deg(order.target))
+    return f"would order {angles} deg in {order.duration.max():.2f} s"
+
+
+def act(
+    task: Task,
+    commander: Commander,
+    robot: RobotLike = "armpi_fpv",
+    calibration: HealthyLike = None,
+    strategy: str = DIAGNOSE,
+    limits: SafetyLimits | None = None,
+    tell: Callable[[str], None] = print,
+) -> Sequence[TargetResult]:
+    """Carry a task out on an arm, whatever is wrong with it; the arm moves.
+
+    Args:
+        task: Where the tool shall go.
+        commander: The arm.
+        robot: The robot, its name or its profile.
+        calibration: What `calibrate` learned of it, by name or path; None: what its profile names.
+        strategy: ``diagnose``, ``feedback`` or ``open``.
+        limits: What orders must keep to; None: the usual limits.
+        tell: Called with what is found out and done, as it happens.
+
+    Returns:
+        What became of each target.
+
+    Raises:
+        InputError: If something cannot be read, or it is not known where the arm stands.
+        Halted: If somebody else commands the arm, or it falls silent.
+        UnsafeOrderError: If an order must not be sent.
+    """
+    known = calibrated(robot, calibration)
+    gate = SafetyGate(known.robot, limits or SafetyLimits())
+    return Acting(known, gate, strategy, ActingSettings()).work(task, commander, tell)

@@ -1,0 +1,201 @@
+"""A task carried out on an arm: orders out, readings in, a gate and a dead man between."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from failuretwin.connection.links.base import CommandSent, Reading
+from failuretwin.connection.links.commander import Commander, Order
+from failuretwin.core.errors import InputError
+from failuretwin.core.types import FloatArray
+from failuretwin.decision.acting.actor import Actor
+from failuretwin.decision.acting.belief import Judge, Judgement
+from failuretwin.decision.acting.rest import RestWatch
+from failuretwin.decision.acting.safety import SafetyGate, UnsafeOrderError
+
+FIRST_WAIT_S = 10.0
+"""Longest wait for the first reading, by our clock [s]."""
+PATIENCE_S = 12.0
+"""A tool that has not come to rest so long after a ramp is not seen at rest, by its clock [s]."""
+SILENCE_S = 15.0
+"""An arm that says nothing for so long, by our clock, is given up [s]."""
+OURS_RAD = 1e-3
+"""A command that differs by more from ours is somebody else's [rad]."""
+POLL_S = 0.1
+
+
+class Halted(InputError):  # noqa: N818 - it is no error of the user
+    """Work was stopped before the task was over; nothing more is sent."""
+
+
+@dataclass
+class Work:
+    """One task on one arm.
+
+    Attributes:
+        actor: Says what to do next.
+        judge: Weighs movements; None: nothing is diagnosed.
+        gate: Looks at each order again before it is sent.
+        commander: The arm.
+        standing: What its motors were told last, (motor,) [rad].
+        tell: Called with what is said, as it happens.
+    """
+
+    actor: Actor
+    judge: Judge | None
+    gate: SafetyGate
+    commander: Commander
+    standing: FloatArray
+    tell: Callable[[str], None]
+
+    def __post_init__(self) -> None:
+        self._now = 0.0
+        self._heard = time.monotonic()
+        self._point: FloatArray | None = None
+        self._sent: list[tuple[FloatArray, FloatArray]] = []
+        self._told = 0
+
+    def carry_out(self) -> None:
+        """Carry the task out.
+
+        Raises:
+            Halted: If somebody else commands the arm, or it falls silent.
+            UnsafeOrderError: If an order must not be sent.
+        """
+        while (order := self.actor.next()) is not None:
+            self._report()
+            start = self._now
+            self._send(order)
+            point = self._rest(order, start)
+            self.actor.see(point, start, self._now)
+            self.actor.learn(self._judgement())
+            self._report()
+        self._report()
+
+    def _judgement(self) -> Judgement | None:
+        if self.judge is None:
+            return None
+        return self.judge([self.actor.window], [self.actor.belief.believed])[0]
+
+    def _report(self) -> None:
+        for text in self.actor.said[self._told :]:
+            self.tell(text)
+        self._told = len(self.actor.said)
+
+    # Sending.
+
+    def _send(self, order: Order) -> None:
+        """Send an order once the arm has been heard lately and the gate lets it through."""
+        wrong = self.gate.wrong(order, [(self.standing, order.target)])
+        if wrong:
+            raise UnsafeOrderError(f"{wrong}; nothing was sent.")
+        self._await_reading()
+        self._sent.append((self.standing, order.target))
+        self.commander.send(order)
+        self.standing = order.target
+
+    def _await_reading(self) -> None:
+        """Wait until the tool has just been read: the dead man."""
+        silent_since = self._now
+        while True:
+            event = self._next_event()
+            if isinstance(event, Reading) and np.isfinite(event.tool).all():
+                return
+            if self._now - silent_since > PATIENCE_S:
+                raise Halted(f"the tool is not read for {PATIENCE_S:g} s; nothing more is sent.")
+
+    # Listening.
+
+    def _rest(self, order: Order, start: float) -> FloatArray | None:
+        """Return where the tool comes to rest after an order, (3,) [m]; None: it is not seen to."""
+        actor, ramp = self.actor, float(order.duration.max())
+        expected = actor.arm.model.twin.path(actor.standing().pose)
+        travel = 0.0 if self._point is None else float(np.linalg.norm(expected - self._point))
+        watch = RestWatch(actor.arm.model, start, ramp, self._point, travel)
+        while self._now - start < ramp + PATIENCE_S:
+            event = self._next_event()
+            if not isinstance(event, Reading):
+                continue
+            point = watch.take(event)
+            if point is not None:
+                self._point = point
+                return point
+        return None
+
+    def _next_event(self) -> Reading | CommandSent | None:
+        """Return what the arm says next; None: nothing just now.
+
+        Raises:
+            Halted: If it has ended or fallen silent, or somebody else commands it.
+        """
+        event = self.commander.poll(POLL_S)
+        if event is None:
+            if self.commander.ended:
+                raise Halted("the arm has ended; nothing more is sent.")
+            if time.monotonic() - self._heard > SILENCE_S:
+                raise Halted(f"the arm says nothing for {SILENCE_S:g} s; nothing more is sent.")
+            return None
+        self._heard = time.monotonic()
+        self._now = max(self._now, event.time)
+        if isinstance(event, CommandSent) and not self._is_ours(event):
+            raise Halted("somebody else commands the arm; nothing more is sent.")
+        return event
+
+    def _is_ours(self, command: CommandSent) -> bool:
+        """Return whether a command is one of the latest orders, or lies on the way of one."""
+        for start, end in self._sent[-3:]:
+            low, high = np.minimum(start, end) - OURS_RAD, np.maximum(start, end) + OURS_RAD
+            if np.all((command.target >= low) & (command.target <= high)):
+                return True
+        return False
+
+
+def first_standing(commander: Commander) -> FloatArray:
+    """Return what the motors of an arm were told last, (motor,) [rad].
+
+    Where no command has been heard, where they are read to stand.
+
+    Raises:
+        InputError: If neither is heard within `FIRST_WAIT_S`.
+    """
+    until = time.monotonic() + FIRST_WAIT_S
+    while time.monotonic() < until:
+        event = commander.poll(POLL_S)
+        if commander.standing is not None:
+            return commander.standing
+        if (angles := _angles(event)) is not None:
+            return angles
+    raise InputError(
+        f"{commander.name}: neither a command nor the angles of the motors are heard within "
+        f"{FIRST_WAIT_S:g} s, so it is not known where the arm stands. Move it once by hand or by "
+        "its own programs, or let it publish its joint states."
+    )
+
+
+def _angles(event: Reading | CommandSent | None) -> FloatArray | None:
+    """Return the angles that a reading tells of all motors, (motor,) [rad]; None: it does not."""
+    if not isinstance(event, Reading) or event.position is None:
+        return None
+    return event.position if np.isfinite(event.position).all() else None
+
+
+def where_it_stands(commander: Commander) -> FloatArray:
+    """Return where the motors of an arm are read to stand, (motor,) [rad], to stop it there.
+
+    Where they are not read, what they were told last.
+
+    Raises:
+        InputError: If neither is heard within `FIRST_WAIT_S`.
+    """
+    until = time.monotonic() + FIRST_WAIT_S
+    while time.monotonic() < until:
+        event = commander.poll(POLL_S)
+        if (angles := _angles(event)) is not None:
+            return angles
+    if commander.standing is not None:
+        return commander.standing
+    raise InputError(f"{commander.name}: it is not known where the arm stands; nothing was sent.")

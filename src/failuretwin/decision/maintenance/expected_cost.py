@@ -1,0 +1,278 @@
+"""What to do about an arm: the action of least expected cost, with the user's own costs.
+
+    choose argmin over a of E[C(a)] = sum over h of p(h) C(a, h)
+    C(a, h) = price(a) + targets * missed_target * share missed(a, h)
+    C(inspect, h) = price(inspect) + min over the other a of C(a, h)
+
+An inspection tells which hypothesis is true, so that what follows it is the best for that one.
+Replacing a motor makes it as good as new; a fault of another one stays. No cost is ours: a file of
+the user says them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+
+from failuretwin.core.config import AtLeastZero, Bounded, Bounds, Share, from_table, read_toml
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import HEALTHY, Fault, Hypothesis
+from failuretwin.core.types import FloatArray
+
+CONTINUE, COMPENSATE, SLOW_DOWN, INSPECT, REPLACE, STOP = (
+    *("continue", "compensate", "slow down"),
+    *("inspect", "replace", "stop"),
+)
+ANY = "any"
+"""Name of the row that stands for modes without one of their own."""
+
+
+@dataclass(frozen=True)
+class Missed(Bounded):
+    """Share of targets that an arm with a fault misses, by what is done.
+
+    Attributes:
+        going_on: As if nothing were wrong.
+        compensating: With `failuretwin act`.
+        slowly: Slowed down.
+    """
+
+    going_on: Share
+    compensating: Share
+    slowly: Share
+
+
+@dataclass(frozen=True)
+class Costs(Bounded):
+    """What things cost, in a currency of the user's.
+
+    Attributes:
+        targets: Targets until something else can be decided.
+        missed_target: Cost of a target that is missed.
+        compensate: Price of working round a fault: it is slower, and somebody watches.
+        slow_down: Price of working slowly.
+        inspect: Price of finding out for sure.
+        replace: Price of a new motor, built in.
+        stop: Price of standing still until then.
+        missed: Shares of missed targets by fault mode; `any` for modes that are not named.
+        healthy: The same of a healthy arm.
+        currency: What costs are told in.
+    """
+
+    targets: Annotated[float, Bounds(0.0, 1e12)]
+    missed_target: AtLeastZero
+    compensate: AtLeastZero
+    slow_down: AtLeastZero
+    inspect: AtLeastZero
+    replace: AtLeastZero
+    stop: AtLeastZero
+    missed: dict[str, dict[str, float]] = field(default_factory=dict)
+    healthy: Missed = Missed(0.0, 0.0, 0.0)
+    currency: str = ""
+
+    @cached_property
+    def rows(self) -> Mapping[str, Missed]:
+        """Shares by mode."""
+        return {
+            mode: from_table(Missed, row, f"missed.{mode}") for mode, row in self.missed.items()
+        }
+
+    def missed_by(self, fault: Fault) -> Missed:
+        """Return the shares of a fault.
+
+        Raises:
+            InputError: If neither its mode nor `any` has a row.
+        """
+        row = self.rows.get(fault.mode, self.rows.get(ANY))
+        if row is None:
+            raise InputError(
+                f"costs: no shares of missed targets for mode {fault.mode!r}. Add a table "
+                f"[missed.{fault.mode}], or [missed.any]."
+            )
+        return row
+
+
+def load_costs(path: str | Path) -> Costs:
+    """Load the user's costs from a TOML file; see `TEMPLATE`.
+
+    Raises:
+        InputError: If it cannot be read, lacks a figure or holds one that makes no sense.
+    """
+    costs = from_table(Costs, read_toml(Path(path)), str(path))
+    _ = costs.rows  # are checked with the file
+    return costs
+
+
+@dataclass(frozen=True)
+class Option:
+    """One thing that can be done.
+
+    Attributes:
+        action: What.
+        motor: Which motor, where one is replaced.
+        cost: Expected cost.
+    """
+
+    action: str
+    motor: str
+    cost: float
+
+    def __str__(self) -> str:
+        return f"{self.action} {self.motor}".strip()
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What can be done about an arm, the cheapest first.
+
+    Attributes:
+        options: All of them.
+        hinge: Hypothesis whose probability decides between the first two; empty: none does.
+        hinge_probability: Probability of it at which they change places.
+        currency: What costs are told in.
+    """
+
+    options: Sequence[Option]
+    hinge: str
+    hinge_probability: float
+    currency: str
+
+    @property
+    def best(self) -> Option:
+        """What to do."""
+        return self.options[0]
+
+    @property
+    def verdict(self) -> str:
+        """One plain sentence or two."""
+        first, second = self.options[:2]
+        money = f" {self.currency}" if self.currency else ""
+        said = (
+            f"{first}: expected cost {first.cost:.3g}{money}; next best {second}, "
+            f"{second.cost:.3g}{money}"
+        )
+        if not self.hinge:
+            return f"{said}. No single probability changes that"
+        return (
+            f"{said}. It hinges on {self.hinge}: at {self.hinge_probability:.0%} they change places"
+        )
+
+
+def cost_of(action: str, motor: str, hypothesis: Hypothesis, costs: Costs) -> float:
+    """Return C(a, h) of an action other than inspecting."""
+    faults = hypothesis.faults
+    if action == STOP:
+        return costs.stop
+    if action == REPLACE:
+        faults = tuple(fault for fault in faults if fault.motor != motor)
+    rows = [costs.missed_by(fault) for fault in faults] or [costs.healthy]
+    if not hypothesis.known:
+        rows = [costs.missed_by(Fault("", ANY))]
+    share = {
+        COMPENSATE: max(row.compensating for row in rows),
+        SLOW_DOWN: max(row.slowly for row in rows),
+    }.get(action, max(row.going_on for row in rows))
+    price = {COMPENSATE: costs.compensate, SLOW_DOWN: costs.slow_down, REPLACE: costs.replace}
+    return price.get(action, 0.0) + costs.targets * costs.missed_target * share
+
+
+def cost_table(
+    hypotheses: Sequence[Hypothesis], costs: Costs
+) -> tuple[list[tuple[str, str]], FloatArray]:
+    """Return all actions and C(a, h), (action, hypothesis)."""
+    motors = sorted({fault.motor for h in hypotheses for fault in h.faults})
+    actions = [(CONTINUE, ""), (COMPENSATE, ""), (SLOW_DOWN, ""), (STOP, "")]
+    actions += [(REPLACE, motor) for motor in motors]
+    table = np.array(
+        [[cost_of(action, motor, h, costs) for h in hypotheses] for action, motor in actions]
+    )
+    known = costs.inspect + table.min(axis=0)
+    return [*actions, (INSPECT, "")], np.vstack([table, known])
+
+
+def advise(posterior: Mapping[str, float], costs: Costs) -> Advice:
+    """Return what to do about an arm.
+
+    Args:
+        posterior: Probability of each hypothesis, by its text; they sum to 1.
+        costs: What things cost.
+
+    Raises:
+        InputError: If a mode has no share of missed targets.
+    """
+    hypotheses = [Hypothesis.parse(name) for name in posterior]
+    if HEALTHY not in hypotheses:
+        raise InputError("the posterior does not say how probable it is that the arm is healthy.")
+    actions, table = cost_table(hypotheses, costs)
+    probability = np.array(list(posterior.values()))
+    expected = table @ probability
+    order = np.argsort(expected, kind="stable")
+    ranked = [(*actions[int(i)], float(expected[i])) for i in order]
+    options = [Option(action, motor, cost) for action, motor, cost in ranked]
+    hinge, at = _hinge(table[order[0]] - table[order[1]], probability)
+    name = str(hypotheses[hinge]) if hinge >= 0 else ""
+    return Advice(options, name, at, costs.currency)
+
+
+def _hinge(difference: FloatArray, probability: FloatArray) -> tuple[int, float]:
+    """Return the hypothesis whose probability must change least for the best to change.
+
+    With its probability at t and the others in proportion, the difference of two costs is
+    t d_h + (1 - t) sum over others of p d / (1 - p_h): a line in t, which is 0 at one place.
+
+    Args:
+        difference: Cost of the best less that of the second, by hypothesis.
+        probability: Of each hypothesis.
+
+    Returns:
+        Its index, -1 if none, and the probability.
+    """
+    best, where, nearest = -1, np.nan, np.inf
+    for h, (own, p) in enumerate(zip(difference, probability, strict=True)):
+        rest = 1.0 - p
+        others = float(difference @ probability - own * p) / rest if rest > 1e-12 else 0.0
+        if own == others:
+            continue
+        t = others / (others - own)
+        if 0.0 <= t <= 1.0 and abs(t - p) < nearest:
+            best, where, nearest = h, float(t), abs(t - p)
+    return best, where
+
+
+TEMPLATE = """\
+# What things cost you, in any currency. Every number here is a blank to be filled in, not a fact.
+
+currency = "EUR"
+targets = 100          # targets until the next time that something can be decided
+missed_target = 1.0    # cost of one target that is missed
+compensate = 5.0       # price of working on with `failuretwin act`: slower, watched
+slow_down = 5.0        # price of working on slowly
+inspect = 10.0         # price of finding out for sure
+replace = 40.0         # price of a new motor, built in
+stop = 60.0            # price of standing still until then
+
+[healthy]              # share of targets that a healthy arm misses, 0 to 1
+going_on = 0.0
+compensating = 0.0
+slowly = 0.0
+
+# Share of targets missed with a fault: as if nothing were wrong, with `act`, slowly.
+# `failuretwin reach` says for a held motor what `act` can reach; docs/acting.md has more figures.
+# [missed.any] is for every mode that has no table of its own.
+
+[missed.any]
+going_on = 0.5
+compensating = 0.2
+slowly = 0.5
+
+[missed.stuck]
+going_on = 0.9
+compensating = 0.4
+slowly = 0.9
+"""
+"""A file of costs to be filled in; none is shipped as truth."""

@@ -1,0 +1,246 @@
+"""How long a worn motor lasts: when its wear passes a limit, as a distribution.
+
+    x(t) = v phi(t) + sqrt(q) W(t),    phi in t^1/2 .. t^3, exponential,    y_i = x(t_i) + noise
+    T = first t with |x(t)| >= limit
+
+Averaged over shapes phi and diffusions q by how well each predicted every run from those before
+(a Kalman filter each). A straight line without diffusion is sure and wrong as soon as wear speeds
+up. Between two steps the limit is crossed unseen with the probability of a Brownian bridge.
+
+Section: docs/acting.md#remaining-life
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.types import FloatArray, IntArray
+
+POWERS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
+"""Exponents of t that wear may follow."""
+RATES = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0)
+"""Growths exp(rate t / t_now) that wear may follow."""
+DIFFUSIONS = (0.0, 1e-3, 1e-2, 3e-2, 1e-1, 3e-1, 1.0, 3.0)
+"""Variance of the random walk in one step, in variances of one reading."""
+BLOCKS = 100
+"""Runs are averaged to so many at most: more say nothing new of shapes."""
+FASTEST = 3.0
+"""By now a motor may have worn by so many limits, one standard deviation of the prior."""
+LEAST_RUNS = 20
+"""Of fewer runs nothing is said of the time to come."""
+SAMPLES = 2000
+STEPS = 160
+LONGEST = 20.0
+"""The time to come that is looked at, in times that were seen."""
+LARGEST = 1e12
+IN_SIGHT, AHEAD = 0.05, 0.5
+"""An end is in sight if its probability within so many times the runs that were seen exceeds this:
+a growth that nothing shows yet can always begin."""
+
+
+@dataclass(frozen=True)
+class RemainingLife:
+    """How many runs a motor has left.
+
+    Attributes:
+        runs: Equally likely numbers of runs, sorted, (sample,); infinite: beyond what is looked at.
+        seen: Runs that were seen.
+        level: Wear now, in the unit of the limit.
+        limit: Wear at which life ends.
+    """
+
+    runs: FloatArray
+    seen: int
+    level: float
+    limit: float
+
+    def quantile(self, share: float) -> float:
+        """Return the number of runs by which life has ended with a probability."""
+        at = min(int(np.ceil(share * len(self.runs))) - 1, len(self.runs) - 1)
+        return float(self.runs[max(at, 0)])
+
+    def ended_within(self, runs: float) -> float:
+        """Return the probability that life ends within so many runs."""
+        return float(np.mean(self.runs <= runs))
+
+    @property
+    def in_sight(self) -> bool:
+        """Whether an end may come within half as many runs as were seen."""
+        return self.ended_within(AHEAD * self.seen) > IN_SIGHT
+
+    @property
+    def verdict(self) -> str:
+        """One plain sentence."""
+        if not self.in_sight:
+            return (
+                f"no end in sight: {self.ended_within(AHEAD * self.seen):.1%} that it comes within "
+                f"the next {AHEAD * self.seen:.0f} runs"
+            )
+        low, middle, high = (self.quantile(share) for share in (0.05, 0.5, 0.95))
+        late = f"{high:.0f}" if np.isfinite(high) else "never"
+        half = f"{middle:.0f}" if np.isfinite(middle) else "never"
+        return f"about {half} runs left (90 %: {low:.0f} to {late})"
+
+    def to_progpy(self, event: str = "worn out") -> list[dict[str, float]]:
+        """Return samples of the time of event, as ``progpy.uncertain_data.UnweightedSamples`` take.
+
+        Args:
+            event: What to call the end of life.
+        """
+        return [{event: float(value)} for value in self.runs]
+
+
+def remaining_life(
+    wear: FloatArray, variance: FloatArray | float, limit: float, rng: np.random.Generator
+) -> RemainingLife:
+    """Return how long a motor lasts.
+
+    Args:
+        wear: What each run says of it by itself, from new on, (run,); NaN: a run that says nothing.
+        variance: Variance of each, (run,) or one for all.
+        limit: Wear at which life ends, either way, in the same unit.
+        rng: Source of chance.
+
+    Raises:
+        InputError: If there are too few runs, or the limit or a variance is not above 0.
+    """
+    wear = np.asarray(wear, dtype=np.float64)
+    variance = np.broadcast_to(np.asarray(variance, dtype=np.float64), wear.shape)
+    known = np.isfinite(wear)
+    if known.sum() < LEAST_RUNS:
+        raise InputError(
+            f"{int(known.sum())} runs say something of the wear, expected {LEAST_RUNS} at least."
+        )
+    if not (limit > 0.0 and np.all(variance[known] > 0.0)):
+        raise InputError("the limit and all variances must lie above 0.")
+    time, mean, spread = _blocks(wear, variance)
+    bank = _Filters.of(time, mean, spread, limit, float(len(wear)))
+    runs, level = bank.lifetimes(limit, float(len(wear)), rng)
+    return RemainingLife(np.sort(runs), len(wear), level, limit)
+
+
+def _blocks(wear: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return middle, mean and variance of blocks of runs, (block,); the level is of the middle."""
+    size = max(1, int(np.ceil(len(wear) / BLOCKS)))
+    time, mean, spread = [], [], []
+    for first in range(0, len(wear), size):
+        rows = np.flatnonzero(np.isfinite(wear[first : first + size])) + first
+        if len(rows):
+            weight = 1.0 / variance[rows]
+            time.append(np.sum(weight * (rows + 0.5)) / weight.sum())
+            mean.append(np.sum(weight * wear[rows]) / weight.sum())
+            spread.append(1.0 / weight.sum())
+    return np.array(time), np.array(mean), np.array(spread)
+
+
+def _shapes(time: FloatArray, now: float) -> FloatArray:
+    """Return phi of every shape, (shape, time); all are 0 at first and `now` now."""
+    share = np.asarray(time) / now
+    powers = [share**power for power in POWERS]
+    with np.errstate(over="ignore"):
+        growths = [np.expm1(rate * share) / np.expm1(rate) for rate in RATES]
+    return np.minimum(now * np.array(powers + growths), LARGEST)
+
+
+@dataclass(frozen=True)
+class _Filters:
+    """Kalman filters of level and rate, one for each shape and diffusion, (filter,) each.
+
+    Attributes:
+        shape: Which shape.
+        diffusion: q, variance of the random walk in one run.
+        level: Mean of x at the last block.
+        rate: Mean of v.
+        a: Variance of x.
+        b: Covariance of x and v.
+        c: Variance of v.
+        log_evidence: Log density of all runs.
+        last: Time of the last block.
+    """
+
+    shape: IntArray
+    diffusion: FloatArray
+    level: FloatArray
+    rate: FloatArray
+    a: FloatArray
+    b: FloatArray
+    c: FloatArray
+    log_evidence: FloatArray
+    last: float
+
+    @classmethod
+    def of(
+        cls, time: FloatArray, mean: FloatArray, variance: FloatArray, limit: float, now: float
+    ) -> _Filters:
+        """Return the filters after all blocks; a new motor begins with level 0."""
+        shapes = _shapes(np.concatenate([[0.0], time]), now)
+        count = len(shapes)
+        step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+        scale = float(np.median(variance)) / step
+        shape = np.repeat(np.arange(count), len(DIFFUSIONS))
+        q = np.tile(np.array(DIFFUSIONS) * scale, count)
+        level, rate, a, b = (np.zeros(len(q)) for _ in range(4))
+        c = np.full(len(q), (FASTEST * limit / now) ** 2)
+        log_evidence = np.zeros(len(q))
+        before = np.concatenate([[0.0], time])
+        for i in range(len(time)):
+            h = shapes[shape, i + 1] - shapes[shape, i]
+            level = level + h * rate
+            a = a + 2.0 * h * b + h * h * c + q * (before[i + 1] - before[i])
+            b = b + h * c
+            total = a + variance[i]
+            off = mean[i] - level
+            log_evidence += -0.5 * (np.log(2.0 * np.pi * total) + off**2 / total)
+            gain, gain_rate = a / total, b / total
+            level, rate = level + gain * off, rate + gain_rate * off
+            c, b, a = c - gain_rate * b, b - gain * b, a - gain * a
+        return cls(shape, q, level, rate, a, b, c, log_evidence, float(time[-1]))
+
+    def lifetimes(
+        self, limit: float, now: float, rng: np.random.Generator
+    ) -> tuple[FloatArray, float]:
+        """Return numbers of runs left, (sample,), and the level now."""
+        weight = np.exp(self.log_evidence - self.log_evidence.max())
+        weight /= weight.sum()
+        pick = rng.choice(len(weight), SAMPLES, p=weight)
+        q, shape = self.diffusion[pick], self.shape[pick]
+        root = np.sqrt(np.maximum(self.a[pick], 1e-300))
+        cross = self.b[pick] / root
+        rest = np.sqrt(np.maximum(self.c[pick] - cross**2, 0.0))
+        z = rng.standard_normal((2, SAMPLES))
+        x = self.level[pick] + root * z[0]
+        v = self.rate[pick] + cross * z[0] + rest * z[1]
+        level = float(weight @ self.level)
+        ahead = np.geomspace(1.0, LONGEST * now, STEPS)
+        time = np.concatenate([[self.last], now + ahead])
+        shapes = _shapes(time, now)
+        ended = np.where(np.abs(x) >= limit, 0.0, np.inf)
+        for i in range(STEPS):
+            dt = time[i + 1] - time[i]
+            drift = v * (shapes[shape, i + 1] - shapes[shape, i])
+            after = x + drift + np.sqrt(q * dt) * rng.standard_normal(SAMPLES)
+            hit = np.isinf(ended) & (rng.random(SAMPLES) < _crossed(x, after, limit, q * dt))
+            at = time[i] + dt * rng.random(SAMPLES) - now
+            ended[hit] = np.maximum(at[hit], 0.0)
+            x = after
+        return ended, level
+
+
+def _crossed(
+    before: FloatArray, after: FloatArray, limit: float, variance: FloatArray
+) -> FloatArray:
+    """Return the probability that either limit was passed between two times.
+
+    1 beyond it, else exp(-2 (D - x) (D - x') / variance), of the nearer side.
+    """
+    chance = np.zeros_like(before)
+    for side in (1.0, -1.0):
+        room, left = limit - side * before, limit - side * after
+        product = 2.0 * np.maximum(room, 0.0) * np.maximum(left, 0.0)
+        away = np.divide(product, variance, out=np.full_like(product, np.inf), where=variance > 0.0)
+        inside = np.exp(-away)
+        chance = np.maximum(chance, np.where((room <= 0.0) | (left <= 0.0), 1.0, inside))
+    return chance

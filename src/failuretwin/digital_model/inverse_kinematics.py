@@ -1,0 +1,251 @@
+"""Poses that bring the tool to a point: damped least squares with limits and locked joints.
+
+    dq = J^T (J J^T + lambda I)^-1 r,    r = goal - tool(q)
+
+Joints at a limit that dq would leave, and joints that are locked, have no column in J; a step that
+does not bring the tool nearer is not taken and raises lambda (Levenberg-Marquardt). Every goal is
+tried from many poses at once, for a single start misses poses at limits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.digital_model.frames import ChainFrames
+from failuretwin.digital_model.robot import Robot
+
+POINTER_M = 0.1
+"""An approach direction is two tool points so far apart [m]: 1 mm between them is 0.6 deg."""
+CLOSE_M = 1e-5
+"""A pose that brings the tool so near to its goal is good enough [m]."""
+MOST_STEPS = 60
+SLOWEST = 0.9
+"""A search whose error has not fallen to this share in `PATIENCE` steps is stuck in a corner."""
+PATIENCE = 5
+ENOUGH = 0.5
+"""A goal that so many of its starts have come to is not searched for any longer."""
+LONGEST_STEP = 0.5
+"""Longest step of a joint at a time [rad or m]."""
+DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-9, 10.0
+"""lambda at the start and its bounds [m2]."""
+EASED, RAISED = 0.2, 5.0
+"""Factors on lambda after a step that helps and after one that does not."""
+AT_LIMIT = 1e-9
+STARTS = 10
+"""Poses that a search begins with, unless told otherwise."""
+UNLIMITED = np.pi
+"""Range tried on either side of zero for a joint without limits [rad or m]."""
+
+
+@dataclass(frozen=True)
+class Poses:
+    """What was found for each goal from each start.
+
+    Attributes:
+        pose: Angles in the log's sense, (goal, start, motor) [rad].
+        miss_m: How far the tool then is from the goal, (goal, start) [m].
+        miss_rad: Angle between tool axis and approach direction, (goal, start) [rad]; 0 where none
+            was asked for.
+    """
+
+    pose: FloatArray
+    miss_m: FloatArray
+    miss_rad: FloatArray
+
+
+@dataclass(frozen=True)
+class InverseKinematics:
+    """Finds poses of a robot, in the log's sense and in the frame of its tool sensor.
+
+    Attributes:
+        robot: The robot.
+        low: Lowest angle of each motor, (motor,) [rad].
+        high: Highest angle, (motor,) [rad].
+    """
+
+    robot: Robot
+    low: FloatArray
+    high: FloatArray
+
+    def __post_init__(self) -> None:
+        motors = len(self.robot.motors)
+        if np.shape(self.low) != (motors,) or np.shape(self.high) != (motors,):
+            raise InputError(f"limits have no value for each of the {motors} motors.")
+        if not np.all(self.low <= self.high):
+            raise InputError("a lowest angle lies above the highest. Expected them in order.")
+
+    @classmethod
+    def of(cls, robot: Robot) -> InverseKinematics:
+        """Return that of a robot with the limits of its joints."""
+        low, high = usable_limits(robot)
+        return cls(robot, low, high)
+
+    @cached_property
+    def _points(self) -> ChainFrames:
+        return ChainFrames(self.robot.chain)
+
+    @cached_property
+    def _pointers(self) -> ChainFrames:
+        return ChainFrames(self.robot.chain, POINTER_M)
+
+    def starts(
+        self, count: int, rng: np.random.Generator, first: FloatArray | None = None
+    ) -> FloatArray:
+        """Return poses to begin with, (start, motor) [rad]: one that is given, then any.
+
+        Args:
+            count: How many.
+            rng: Source of chance.
+            first: Where the arm stands, (motor,) [rad].
+        """
+        drawn = rng.uniform(self.low, self.high, (count, len(self.low)))
+        if first is not None:
+            drawn[0] = np.clip(first, self.low, self.high)
+        return drawn
+
+    def tool(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return tool points (..., 3) [m] and Jacobians (..., 3, motor) [m/rad] of poses."""
+        return self._tool(self._points, pose)
+
+    def _tool(self, points: ChainFrames, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        sense = self.robot.sensor_sense
+        point, jacobian = points.tool_points(pose * sense)
+        return point, jacobian * sense
+
+    def solve(
+        self,
+        position: FloatArray,
+        start: FloatArray,
+        locked: BoolArray | None = None,
+        direction: FloatArray | None = None,
+    ) -> Poses:
+        """Return the poses that bring the tool nearest to some goals.
+
+        Args:
+            position: Where the tool shall be, (goal, 3) [m].
+            start: Poses to begin with, (goal, start, motor) or (start, motor) [rad].
+            locked: Motors that stay where `start` has them, even beyond their limits, (motor,).
+            direction: Unit vectors along which z of the tool frame shall point, (goal, 3); None:
+                any.
+        """
+        seen = self._points if direction is None else self._pointers
+        goal = position
+        if direction is not None:
+            goal = np.concatenate([position, position + POINTER_M * direction], axis=-1)
+        shape = (len(goal), *start.shape[-2:])
+        begin = np.broadcast_to(start, shape).reshape(-1, shape[-1])
+        wanted = np.repeat(goal, shape[1], axis=0)
+        free = np.ones(shape[-1], dtype=bool) if locked is None else ~locked
+        pose = self._search(seen, wanted, begin, free, shape[1])
+        point, _ = self._tool(seen, pose)
+        miss_m = np.linalg.norm(wanted[:, :3] - point[:, :3], axis=-1)
+        miss_rad = np.zeros(len(pose))
+        if direction is not None:
+            axis, asked = point[:, 3:] - point[:, :3], wanted[:, 3:] - wanted[:, :3]
+            cosine = np.sum(axis * asked, axis=-1) / POINTER_M**2
+            miss_rad = np.arccos(np.clip(cosine, -1.0, 1.0))
+        by_goal = shape[:2]
+        return Poses(pose.reshape(shape), miss_m.reshape(by_goal), miss_rad.reshape(by_goal))
+
+    def _search(
+        self,
+        seen: ChainFrames,
+        goal: FloatArray,
+        begin: FloatArray,
+        free: BoolArray,
+        starts: int,
+    ) -> FloatArray:
+        """Return the nearest poses (case, motor) for goals (case, 3 or 6), each with its starts."""
+        pose = np.where(free, np.clip(begin, self.low, self.high), begin)
+        damping = np.full(len(pose), DAMPING)
+        point, jacobian = self._tool(seen, pose)
+        residual = goal - point
+        square = np.sum(residual**2, axis=-1)
+        checked = square.copy()
+        for step in range(1, MOST_STEPS + 1):
+            tried = pose + self._step(jacobian, residual, damping, pose, free)
+            tried = np.where(free, np.clip(tried, self.low, self.high), pose)
+            point, slope = self._tool(seen, tried)
+            left = goal - point
+            error = np.sum(left**2, axis=-1)
+            better = error < square
+            pose = np.where(better[:, None], tried, pose)
+            residual = np.where(better[:, None], left, residual)
+            jacobian = np.where(better[:, None, None], slope, jacobian)
+            square = np.where(better, error, square)
+            damping = np.where(better, EASED * damping, RAISED * damping)
+            damping = np.clip(damping, LEAST_DAMPING, MOST_DAMPING)
+            going = _unfinished(square, starts)
+            if step % PATIENCE == 0:
+                going &= square < SLOWEST**2 * checked
+                checked = square.copy()
+            if not going.any():
+                break
+        return pose
+
+    def _step(
+        self,
+        jacobian: FloatArray,
+        residual: FloatArray,
+        damping: FloatArray,
+        pose: FloatArray,
+        free: BoolArray,
+    ) -> FloatArray:
+        """Return the damped step of each case, (case, motor); none leaves its limits at one."""
+        step = _damped(jacobian * free, residual, damping)
+        outward = (step > 0.0) & (pose >= self.high - AT_LIMIT)
+        outward |= (step < 0.0) & (pose <= self.low + AT_LIMIT)
+        if (outward & free).any():
+            step = _damped(jacobian * (free & ~outward)[:, None, :], residual, damping)
+        largest = np.abs(step).max(axis=-1, keepdims=True)
+        return np.asarray(step * np.minimum(1.0, LONGEST_STEP / np.maximum(largest, 1e-12)))
+
+
+def _unfinished(square: FloatArray, starts: int) -> BoolArray:
+    """Return which cases are still looked at, (case,), by their squared errors [m2]."""
+    close = (square <= CLOSE_M**2).reshape(-1, starts)
+    enough = close.mean(axis=1, keepdims=True) >= ENOUGH
+    return np.asarray((~close & ~enough).ravel())
+
+
+def _damped(jacobian: FloatArray, residual: FloatArray, damping: FloatArray) -> FloatArray:
+    """Return J^T (J J^T + lambda I)^-1 r, (case, motor)."""
+    turned = np.swapaxes(jacobian, -1, -2)
+    square = jacobian @ turned
+    diagonal = np.arange(square.shape[-1])
+    square[:, diagonal, diagonal] += damping[:, None]
+    return np.asarray((turned @ np.linalg.solve(square, residual[..., None]))[..., 0])
+
+
+def usable_limits(robot: Robot) -> tuple[FloatArray, FloatArray]:
+    """Return lowest and highest angle of each motor, (motor,) [rad]; half a turn where unlimited.
+
+    Where commands are servo counts, no more than these can say.
+    """
+    low, high = robot.limits.T.copy()
+    low[~np.isfinite(low)], high[~np.isfinite(high)] = -UNLIMITED, UNLIMITED
+    units = robot.profile.servo_units
+    if units is not None:
+        ends = np.sort(units.to_rad([units.low, units.high]))
+        low, high = np.maximum(low, ends[0]), np.minimum(high, ends[1])
+    return low, high
+
+
+def feedback_factor(jacobian: FloatArray) -> FloatArray:
+    """Return by what a correction shrinks the error if motor k does not move, (..., motor).
+
+        rho_k = (J+)_k J_k
+
+    With motor k held, nominal corrections dq = J+ r leave J_k (J+)_k r, a matrix of rank one: each
+    leaves rho_k of the last error. Near 1 feedback alone never gets there.
+
+    Args:
+        jacobian: Of the tool position, (..., 3, motor) [m/rad].
+    """
+    inverse = np.linalg.pinv(jacobian)
+    return np.asarray(np.einsum("...ka,...ak->...k", inverse, jacobian))

@@ -1,0 +1,85 @@
+"""An arm at rest only: where it settles after each order, faults and losses included."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from failuretwin.core.hypothesis import Fault
+from failuretwin.decision.acting.actor import ActingSettings, Actor
+from failuretwin.decision.acting.belief import Judge
+from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault
+from failuretwin.decision.acting.planner import Planner
+from failuretwin.decision.acting.safety import SafetyGate
+from failuretwin.decision.acting.task import Task
+from failuretwin.digital_model.inverse_kinematics import InverseKinematics
+
+PERIOD_S = 1.5
+
+
+def believed(robot, motor, mode, size=np.nan, angle=np.nan, spread=0.01):
+    fault = Fault(robot.motor_names[motor], mode)
+    return BelievedFault(fault, motor, size, spread, 0.0, angle)
+
+
+def task_of(robot, count, seed=0, tolerance_m=0.005):
+    low, high = np.array([motor.movement_range for motor in robot.motors]).T
+    pose = np.random.default_rng(seed).uniform(low, high, (count, len(low)))
+    return Task.of_points(InverseKinematics.of(robot).tool(pose)[0], tolerance_m)
+
+
+@dataclass
+class SmallWorld:
+    """One arm, told where to go; `truth` may be exchanged at any time."""
+
+    model: object
+    seed: int = 0
+    truth: BelievedFault | None = None
+    lost: set = field(default_factory=set)
+    orders: list = field(default_factory=list)
+
+    def __post_init__(self):
+        self.rng = np.random.default_rng(self.seed)
+        robot = self.model.twin.robot
+        self.command = np.array([np.clip(0.0, *motor.movement_range) for motor in robot.motors])
+        self.time_s = 0.0
+        self.error = 0.0
+
+    def move(self, order):
+        self.orders.append((self.command, order))
+        previous, target = self.command, order.target.copy()
+        if len(self.orders) in self.lost:
+            target = previous.copy()
+        arm = BelievedArm(self.model, self.truth)
+        pose = arm.settle(target, previous, self.time_s)
+        scatter = np.asarray(self.model.settling.scatter) * self.rng.standard_normal(len(pose))
+        pose = pose + np.where(arm.locked | (target == previous), 0.0, scatter)
+        truth = self.truth
+        if truth is not None and truth.fault.mode == "steady_state_error":
+            if target[truth.motor] != previous[truth.motor]:
+                sign = 1.0 if self.rng.random() < 0.5 else -1.0
+                self.error = sign * self.rng.uniform(0.05, 0.2)
+            pose[truth.motor] += self.error
+        self.command = target
+        self.time_s += PERIOD_S
+        return self.model.twin.path(pose)
+
+
+def carry_out(world, belief, task, settings=None, steps=200, each=None):
+    """Return the actor after the task; `each` is called with the number of every movement."""
+    robot = world.model.twin.robot
+    planner = Planner(SafetyGate(robot))
+    actor = Actor(planner, world.model, task, belief, world.command, settings or ActingSettings())
+    judge = Judge(world.model)
+    for number in range(steps):
+        order = actor.next()
+        if order is None:
+            break
+        if each is not None:
+            each(number)
+        start = world.time_s
+        point = world.move(order)
+        actor.see(point, start, world.time_s)
+        actor.learn(judge([actor.window], [actor.belief.believed])[0])
+    return actor
