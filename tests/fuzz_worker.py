@@ -7,10 +7,11 @@ import os
 import resource
 import shutil
 import signal
+import subprocess
 import sys
 import traceback
 import warnings
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from fuzz_seeds import SEEDS, bag_entries, trajectory_entries
 
 LIMIT_BYTES = 2 * 10**9
 SECONDS = 20
-"""Longest time for a case: more is taken to have no end."""
+"""Longest processor time for a case [s]: more is taken to have no end."""
 RECORDINGS = {
     "ros1": ("ros1", bag_entries),
     "ros2": ("ros2", bag_entries),
@@ -87,7 +88,7 @@ def run_cases(chosen: list[Case], sound: Path, scratch: Path) -> dict[Case, str]
     found: dict[Case, str] = {}
     while len(found) < len(chosen):
         left = [case for case in chosen if case not in found]
-        lines, status = _forked(left, sound, scratch)
+        lines, status = _spawned(left, sound, scratch)
         for case, line in zip(left, lines, strict=False):
             found[case] = line
         if len(lines) < len(left):
@@ -95,21 +96,35 @@ def run_cases(chosen: list[Case], sound: Path, scratch: Path) -> dict[Case, str]
     return found
 
 
-def _forked(chosen: list[Case], sound: Path, scratch: Path) -> tuple[list[str], int]:
-    into, out = os.pipe()
-    child = os.fork()
-    if child == 0:
-        os.close(into)
-        try:
-            _work(chosen, sound, scratch, out)
-        except BaseException:  # a fault of the fuzzer itself
-            traceback.print_exc()
-            os._exit(1)
-        os._exit(0)
-    os.close(out)
-    with os.fdopen(into, encoding="utf-8", errors="replace") as pipe:
-        lines = [json.loads(line) for line in pipe if line.endswith("\n")]
-    return lines, os.waitpid(child, 0)[1]
+def _spawned(chosen: list[Case], sound: Path, scratch: Path) -> tuple[list[str], int]:
+    """Return what came of the first cases, as many as there are, and how the process ended.
+
+    A process of its own from the start: a fork has the locks of libraries, not their threads.
+    """
+    call = {
+        "cases": [asdict(case) for case in chosen],
+        "sound": str(sound),
+        "scratch": str(scratch),
+    }
+    done = subprocess.run(
+        [sys.executable, __file__],
+        input=json.dumps(call),
+        stdout=subprocess.PIPE,
+        text=True,
+        errors="replace",
+        check=False,
+    )
+    lines = [json.loads(line) for line in done.stdout.splitlines(True) if line.endswith("\n")]
+    return lines, done.returncode
+
+
+def main() -> None:
+    """Work on the cases that are told, and print a line for each."""
+    call = json.loads(sys.stdin.read())
+    out = os.dup(1)
+    os.dup2(2, 1)  # what libraries print is no answer
+    cases = [Case(**case) for case in call["cases"]]
+    _work(cases, Path(call["sound"]), Path(call["scratch"]), out)
 
 
 def _work(chosen: list[Case], sound: Path, scratch: Path, out: int) -> None:
@@ -118,7 +133,7 @@ def _work(chosen: list[Case], sound: Path, scratch: Path, out: int) -> None:
     warnings.simplefilter("ignore")
     late: list[str] = []
     sys.unraisablehook = lambda what: late.append(f"{what.exc_type.__name__}: {what.exc_value}")
-    signal.signal(signal.SIGALRM, _too_long)
+    signal.signal(signal.SIGPROF, _too_long)
     for case in chosen:
         folder = scratch / f"{case.kind}_{case.number}"
         shutil.rmtree(folder, ignore_errors=True)
@@ -140,7 +155,7 @@ def _too_long(*_):
 
 def _outcome(case: Case, sound: Path, folder: Path) -> str:
     path = make_case(case, sound / case.kind, folder)
-    signal.alarm(SECONDS)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:
         SEEDS[case.kind].read(path)
     except FailureTwinError as error:
@@ -155,4 +170,8 @@ def _outcome(case: Case, sound: Path, folder: Path) -> str:
     else:
         return "read"
     finally:
-        signal.alarm(0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
+
+
+if __name__ == "__main__":
+    main()

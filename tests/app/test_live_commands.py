@@ -158,6 +158,7 @@ def test_an_interrupt_ends_the_watch_and_the_recording(recording, tmp_path, how)
     path = tmp_path / "live.mcap"
     command = [sys.executable, "-m", "failuretwin", "watch", recording, "--record", path]
     shadow = subprocess.Popen([*command, "--speed", "2"], stdout=subprocess.PIPE, text=True)
+    assert "healthy behaviour: armpi_fpv" in shadow.stdout.readline()
     assert "healthy" in shadow.stdout.readline()  # the first answer
     shadow.send_signal(how)
     said, _ = shadow.communicate(timeout=WAIT_S)

@@ -117,8 +117,8 @@ def test_without_losses_scatter_alone_counts(twin, armpi, imperfect):
     sound = expected_log_bayes_factors(
         twin, stuck, dataclasses.replace(known, lost_commands=())
     ).nats[:, 0]
-    # What healthy had set aside for losses now speaks for it: a few tenths of a nat.
-    assert (sound >= lossy - 0.5).all()
+    # What healthy had set aside for losses, also in rows, now speaks for it: less than a nat.
+    assert (sound >= lossy - 1.0).all()
     assert sound.mean() > 1.1 * lossy.mean()
 
 
