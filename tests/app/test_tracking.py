@@ -10,6 +10,8 @@ from failuretwin import load_robot
 from failuretwin.core.runs import concatenate
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
 from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.inference.life_filter import WINDOW
+from failuretwin.inference.wear_limits import WearLimits
 
 RUNS = 32
 
@@ -68,7 +70,37 @@ def test_runs_are_tracked_and_the_history_kept(track, calibration, healthy, tmp_
     assert [record["protocol"] for record in records[:10]] == ["P0c"] * 10
     assert records[-1]["protocol"] == "P1"
     assert records[-1]["method"].endswith("armpi_fpv, tracked")
-    assert rows[-1]["bias_deviation"][0] < rows[0]["bias_deviation"][0]
+    # Runs that are judged again only narrow it; each that leaves them adds a step of wear.
+    known = load_calibration(None, load_robot("armpi_fpv")).imperfections
+    first, later, last = (np.array(rows[k]["bias_deviation"]) for k in (0, 19, -1))
+    assert (first < known.variation.bias).all()
+    assert (later < first).all()
+    walk = WearLimits().rate * np.sqrt(RUNS - WINDOW) * np.array(known.settling.scatter)
+    assert (last < np.hypot(known.variation.bias, walk)).all()
+
+
+def test_advice_of_a_history(track, failuretwin, calibration, healthy, few, tmp_path):
+    """Of six runs nothing is said; healthy ones show no wear beyond their doubt."""
+    history = calibration.with_suffix(".history.jsonl")
+    assert track(few).returncode == 0
+    answer = failuretwin("advise", history, "--calibration", calibration)
+    assert answer.returncode == 0, answer.stderr
+    for k, line in enumerate(answer.stdout.splitlines()[:4], 1):
+        assert line == f"motor_{k}: fewer than 20 runs say something of its wear"
+    assert track(healthy).returncode == 0
+    answer = failuretwin(
+        *("advise", history, "--calibration", calibration, "--json", tmp_path / "advice.json")
+    )
+    assert answer.returncode == 0, answer.stderr
+    motors = json.loads((tmp_path / "advice.json").read_text())["motors"]
+    assert {"motor_1", "motor_2"} <= {motor["motor"] for motor in motors}
+    assert "motor_1: worn by " in answer.stdout
+    assert all(abs(motor["level_scatters"]) < 2.0 for motor in motors)
+    told = [np.array([row[key] for row in rows_of(calibration)], dtype=float)
+            for key in ("bias_alone", "bias_alone_deviation")]  # fmt: skip
+    weight = told[1] ** -2.0
+    chance = np.nansum(weight, axis=0) ** -0.5
+    assert (np.abs(np.nansum(weight * told[0], axis=0)) * chance**2 < 4.0 * chance).all()
 
 
 def test_a_session_at_a_time_is_as_good_as_all_at_once(track, calibration, healthy, tmp_path):

@@ -130,7 +130,7 @@ def diagnose_tracked(
     rows: list[dict[str, Any]] = []
     for batch in _batches(runs, seen.keys, known, history.cold, life):
         told = seen.diagnose(batch, life, history.cold)
-        said = zip(*life.bias_by_run(len(batch)), strict=True)
+        said = zip(*life.bias_by_run(), strict=True)
         for run, diagnosis, alone in zip(batch.tolist(), told, said, strict=True):
             diagnoses[run] = diagnosis
             known.add(seen.keys[run])

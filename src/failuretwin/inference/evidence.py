@@ -174,6 +174,14 @@ class SettledEvidence(ArrayStruct):
         """Until when readings are on the way, (run, movement) [s]."""
         return np.where(self.usable, self.begin, self.end)
 
+    def followed_by(self, evidence: SettledEvidence) -> SettledEvidence:
+        """Return these runs with others behind them; shorter ones are padded."""
+        (runs, here), (new, there) = self.usable.shape, evidence.usable.shape
+        both = self.blank(runs + new, max(here, there))
+        both.put((slice(0, runs), slice(0, here)), self)
+        both.put((slice(runs, None), slice(0, there)), evidence)
+        return both
+
     def settle(self, item: tuple[IntArray, ...], rest: Rest) -> None:
         """Write down where tools rest after some movements, given by run and movement."""
         self.point[item], self.usable[item], self.moving[item] = (

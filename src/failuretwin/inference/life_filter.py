@@ -53,8 +53,9 @@ ANYWHERE = 30.0
 """How far a sudden change may go, a standard deviation in scatters: as good as anywhere."""
 LEAST_SPREAD = 1e-6
 """The same of an offset that wear does not change, in units."""
-LEAST_SHARE = 0.5
-"""A run that says less of a bias by itself, beside a prior that is all but none, says nothing."""
+MOST_DOUBT = 5.0
+"""A run that leaves a bias open by more scatters says nothing of it by itself: `ANYWHERE` draws the
+others by less than a 36th."""
 REMEMBERED = 200.0
 """Runs by which scatter and loss rates are known at most: older ones fade."""
 OFFSETS = ("bias", "compliance", "friction")
@@ -80,6 +81,8 @@ class LifeFilter:
         due: Runs at which those of the window are judged again.
         alarm: What changes as no wear does, or empty.
         moved: Whether the sensor was found not to stand where the profile says.
+        alone: What each of the runs followed last says without any belief, in units; it is not
+            kept. None before them.
         begun: What was believed of the healthy robot at the beginning.
     """
 
@@ -97,6 +100,7 @@ class LifeFilter:
     movements: int = 0
     alarm: str = ""
     moved: bool = False
+    alone: Normal | None = None
     begun: Imperfections = field(init=False)
 
     def __post_init__(self) -> None:
@@ -147,6 +151,7 @@ class LifeFilter:
             self._look_for_sensor(window)
         self.movements += int(evidence.usable.sum())
         (found,) = window.judge(np.arange(first, window.runs), moving)
+        self.alone = window.alone(found)
         window.learn([found])
         if again:
             self._judge_again(window)
@@ -174,29 +179,27 @@ class LifeFilter:
         mean, deviation = _state(self.belief, self.unit).reshape(2, *given.shape)
         return given + mean, deviation
 
-    def bias_by_run(self, latest: int) -> tuple[FloatArray, FloatArray]:
-        """Return what each of the latest runs says by itself of the biases, beside those given.
+    def bias_by_run(self) -> tuple[FloatArray, FloatArray]:
+        """Return what each of the runs followed last says by itself of the biases.
 
-        Compliance, friction and frame are believed to be what all runs say of them.
-
-        Args:
-            latest: How many of them, at most as many as are judged again.
+        They are beside those given. Compliance, friction and frame are believed to be what the
+        runs behind the latest ones say of them.
 
         Returns:
-            Mean and deviation, (run, motor) [rad]; NaN where a run says little.
+            Mean and deviation, (run, motor) [rad]; NaN where a run leaves more open than
+            `MOST_DOUBT` scatters.
         """
-        window, motors = self.window, len(self.model.scatter)
-        if window is None:
+        alone, motors = self.alone, len(self.model.scatter)
+        if alone is None:
             return np.zeros((0, motors)), np.zeros((0, motors))
-        wide = ANYWHERE * wear_unit(self.model)[:motors]
-        prior = self._anywhere(slice(REGISTRATION, REGISTRATION + motors), wide)
-        rows = range(window.runs - latest, window.runs)
-        said = [prior.times(summed(window.sites, slice(row, row + 1))) for row in rows]
-        states = np.array([_state(belief, self.unit)[:, :motors] for belief in said])
-        mean, deviation = np.moveaxis(states, 1, 0)
-        told = 1.0 - (deviation / wide) ** 2
-        told = np.where(told > LEAST_SHARE, told, np.nan)
-        return mean / told, deviation / np.sqrt(told)
+        scatter = wear_unit(self.model)[:motors]
+        free = slice(REGISTRATION, REGISTRATION + motors)
+        prior = self._anywhere(free, ANYWHERE * scatter)
+        mean, covariance = prior.times(alone).moments
+        deviation = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        mean, deviation = ((part * self.unit)[:, free] for part in (mean, deviation))
+        told = deviation < MOST_DOUBT * scatter
+        return np.where(told, mean, np.nan), np.where(told, deviation, np.nan)
 
     @property
     def learned(self) -> Imperfections:
@@ -296,7 +299,7 @@ class LifeFilter:
 
     def joined_evidence(self, evidence: SettledEvidence) -> SettledEvidence:
         """Return the settled positions of the latest runs with new ones behind them."""
-        return evidence if self.window is None else _behind(self.window.given.evidence, evidence)
+        return evidence if self.window is None else self.window.given.evidence.followed_by(evidence)
 
     def _joined(self, evidence: SettledEvidence) -> RunsTogether:
         """Return the latest runs with new ones behind them."""
@@ -435,16 +438,6 @@ def _fields(name: str, value: Belief | Normal | Habits) -> dict[str, FloatArray]
 def _read(kind: type[Habits], name: str, arrays: Mapping[str, FloatArray]) -> Habits:
     """Return a value from its arrays."""
     return kind(*(arrays[f"{name}/{f.name}"] for f in fields(kind)))
-
-
-def _behind(before: SettledEvidence, evidence: SettledEvidence) -> SettledEvidence:
-    """Return runs with others behind them; shorter ones are padded."""
-    runs, new = len(before.usable), len(evidence.usable)
-    movements = max(before.usable.shape[1], evidence.usable.shape[1])
-    both = before.blank(runs + new, movements)
-    both.put((slice(0, runs), slice(0, before.usable.shape[1])), before)
-    both.put((slice(runs, None), slice(0, evidence.usable.shape[1])), evidence)
-    return both
 
 
 def _take(after: RunsTogether, rows: slice, before: RunsTogether, kept: slice) -> None:

@@ -325,6 +325,27 @@ class RunsTogether:
         self.maximise()
         self.here = self.belief.moments[0][0] * self.unit
 
+    def alone(self, judged: Judged) -> Normal:
+        """Return what each run says without any belief, in units; before it is learned.
+
+        The normal likelihoods Lambda, eta of all hypotheses, each about its best theta:
+
+            Lambda theta + Lambda_c theta = eta + eta_c,    sum over c, h of p(c, h) (Lambda, eta)
+
+        with Lambda_c, eta_c those of the cavity. A site is less apt: it also says which component
+        of the belief is true, which narrows what a run by itself leaves open.
+        """
+        found = [each.found for each in judged.candidates]
+        told = np.stack([each.information for each in found], axis=1)
+        told = told * np.outer(self.unit, self.unit)
+        theta = (np.stack([each.theta for each in found], axis=1) + self.here) / self.unit
+        whole = told + judged.cavity.precision[:, :, None]
+        shift = (whole @ theta[..., None])[..., 0] - judged.cavity.shift[:, :, None]
+        share = judged.share
+        return Normal(
+            np.einsum("rch,rchtu->rtu", share, told), np.einsum("rch,rcht->rt", share, shift)
+        )
+
     def maximise(self) -> None:
         """Take the scatter and the rates that explain the runs best."""
         if self.habits is None:

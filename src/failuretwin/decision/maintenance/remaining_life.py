@@ -40,6 +40,10 @@ IN_SIGHT, AHEAD = 0.05, 0.5
 """An end is in sight if its probability within so many times the runs that were seen exceeds this:
 a growth that nothing shows yet can always begin."""
 
+VAGUE = 10.0
+"""If the last of the likely ends lies so many times as far as the first, and is not in sight, it
+cannot be told when."""
+
 
 @dataclass(frozen=True)
 class RemainingLife:
@@ -81,6 +85,8 @@ class RemainingLife:
             )
         low, middle, high = (self.quantile(share) for share in (0.05, 0.5, 0.95))
         late = f"{high:.0f}" if np.isfinite(high) else "never"
+        if high > max(VAGUE * low, AHEAD * self.seen):
+            return f"cannot tell when it ends: {low:.0f} to {late} runs left (90 %)"
         half = f"{middle:.0f}" if np.isfinite(middle) else "never"
         return f"about {half} runs left (90 %: {low:.0f} to {late})"
 
