@@ -301,8 +301,8 @@ def test_faulty_runs_say_of_scatter_what_healthy_ones_do(twin, armpi):
     known = replace(KNOWN, settling=SETTLING)
     wide = tuple(1.6 * np.array(SETTLING.scatter))
     learned = []
-    for truths in (["healthy"] * 3, TRUTHS[1:]):
-        runs = runs_of(armpi, list(truths), 8, known=known, scatter=wide)
+    for truths, each in ((["healthy"], 24), (TRUTHS[1:], 8)):
+        runs = runs_of(armpi, truths, each, known=known, scatter=wide)
         theta, *_ = judged(twin, runs, priors=SURE, known=known)
         learned.append(np.array(theta.model.settling.scatter) / wide)
     healthy, faulty = learned
