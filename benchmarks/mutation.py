@@ -85,6 +85,10 @@ AREAS: dict[str, tuple[str, ...]] = {
         "tests/decision/test_linear_response.py",
         "tests/decision/test_shared_likelihood.py",
     ),
+    "inference/scatter_score.py": (
+        "tests/decision/test_shared_likelihood.py",
+        "tests/decision/test_folder_posterior.py",
+    ),
     "inference/shared_likelihood.py": (
         "tests/decision/test_shared_likelihood.py",
         "tests/decision/test_folder_posterior.py",

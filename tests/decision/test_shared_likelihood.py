@@ -122,34 +122,95 @@ def test_information_is_the_covariance_of_the_score(twin, dof):
 # What else is told.
 
 
-def test_squared_distances_and_scatter_of_runs_that_the_model_draws(twin):
-    """Three axes give three; how far motors have scattered is what they do scatter."""
+def test_squared_distances_and_outcomes_of_runs_that_the_model_draws(twin):
+    """Three axes give three."""
     one = drawn_from_its_model(scene(twin, "healthy", runs=300))
     found = told_of(one.response(), one.hypothesis, np.zeros((300, 19)))
     assert found.misfit.mean() == pytest.approx(3.0, rel=0.04)
-    squares, times = found.scattered.sum(axis=0)
-    np.testing.assert_allclose(times, 1800.0, rtol=0.02)
-    np.testing.assert_allclose(
-        np.sqrt(squares / times), [0.004, 0.005, 0.006, 0.007], rtol=0.04, atol=0.0
-    )
     np.testing.assert_allclose(found.outcomes.sum(axis=2), 1.0, atol=0.02)
 
 
-def test_scatter_is_the_posterior_of_a_linear_gaussian(twin):
-    """s^2 J^T S^-1 r squared, and what is left, s^2 - s^4 J^T S^-1 J, of each movement."""
+@pytest.mark.parametrize("dof", [5.0, np.inf])
+def test_scatter_of_runs_that_the_model_draws(twin, dof):
+    """The score is 0 on average and as wide as the information; a step from a fifth off is back."""
+    one = drawn_from_its_model(scene(twin, "healthy", runs=300, dof=dof))
+    found = told_of(one.response(), one.hypothesis, np.zeros((300, 19)))
+    information = found.scatter_information.mean(axis=0)
+    root = np.linalg.inv(np.linalg.cholesky(information))
+    white = found.scatter_score @ root.T
+    np.testing.assert_allclose(white.mean(axis=0), 0.0, atol=0.2)
+    np.testing.assert_allclose(np.cov(white.T), np.eye(4), atol=0.35)
+    assert np.trace(np.cov(white.T)) == pytest.approx(4.0, rel=0.15)
+    wider = told_of(with_scatter(one, 1.2 * np.ones(4)).response(), one.hypothesis, found.theta)
+    step = np.linalg.solve(wider.scatter_information.sum(axis=0), wider.scatter_score.sum(axis=0))
+    np.testing.assert_allclose(step[:3], -np.log(1.2), atol=0.12)
+
+
+def with_scatter(one, factor):
+    """Return a scene that is judged with some times the scatter of each motor."""
+    known = one.model.imperfections
+    scatter = tuple((np.array(known.settling.scatter) * factor).tolist())
+    known = replace(known, settling=replace(known.settling, scatter=scatter))
+    return replace(one, model=replace(one.model, imperfections=known))
+
+
+def test_scatter_of_a_linear_gaussian(twin):
+    """With S the covariance of a movement: tr(S^-1 dS (S^-1 r r^T - 1)) / 2, and its mean fall.
+
+    What a covariance C of theta adds is by how much it widens r, G C G^T.
+    """
     one = drawn_from_its_model(scene(twin, "healthy", runs=1, count=3))
     model, evidence = one.model.without_doubt, one.evidence
     target = evidence.movements.target[0]
     before = np.concatenate([evidence.movements.initial, target[:-1]])
-    pose = model.settle(target, np.sign(target - before), model.none_held)
+    direction = np.sign(target - before)
+    pose = model.settle(target, direction, model.none_held)
     path, jacobian = model.twin.path_and_jacobian(pose)
-    variance = np.diag(np.array([0.004, 0.005, 0.006, 0.007]) ** 2)
-    expected = np.zeros(4)
-    for J, r in zip(jacobian, evidence.point[0] - path, strict=True):
-        gain = variance @ J.T @ np.linalg.inv(J @ variance @ J.T + model.path_noise**2 * np.eye(3))
-        expected += (gain @ r) ** 2 + np.diag(variance - gain @ J @ variance)
+    scatter = np.array([0.004, 0.005, 0.006, 0.007])
+    bias, friction = jacobian, -jacobian * direction[:, None]
+    score, information = np.zeros(4), np.zeros((4, 4))
+    width = np.array([*[0.01] * 4, *[0.004] * 4])
+    added = np.zeros(4)
+    for J, r, *g in zip(jacobian, evidence.point[0] - path, bias, friction, strict=True):
+        S = J @ np.diag(scatter**2) @ J.T + model.path_noise**2 * np.eye(3)
+        wide = np.hstack(g) * width
+        by = [
+            np.linalg.solve(S, 2.0 * scatter[k] ** 2 * np.outer(J[:, k], J[:, k]))
+            for k in (0, 1, 2, 3)
+        ]
+        score += [0.5 * np.trace(d @ (np.linalg.solve(S, np.outer(r, r)) - np.eye(3))) for d in by]
+        information += [[0.5 * np.trace(one @ two) for two in by] for one in by]
+        added += [0.5 * np.trace(d @ np.linalg.solve(S, wide @ wide.T)) for d in by]
     found = told_of(one.response(), one.hypothesis, np.zeros((1, 19)))
-    np.testing.assert_allclose(found.scattered[0, 0], expected, rtol=1e-4)
+    np.testing.assert_allclose(found.scatter_score[0], score, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(found.scatter_information[0], information, rtol=1e-4, atol=1e-6)
+    covariance = np.zeros(19)
+    covariance[[7, 8, 9, 10, 15, 16, 17, 18]] = width**2
+    slack = np.einsum("ntt,t->n", found.scatter_slack[0], covariance)
+    np.testing.assert_allclose(slack, added, rtol=0.02)
+
+
+@pytest.mark.parametrize("dof", [5.0, np.inf])
+@pytest.mark.parametrize("name", FAULTS)
+def test_scatter_of_the_other_motors_is_a_derivative_when_one_is_faulty(twin, name, dof):
+    """Where its angle is known from the other movements, what is off it tells of their scatter."""
+    one, step, faulty = scene(twin, name, dof=dof), 1e-3, int(name[6]) - 1
+    here = told_of(one.response(), one.hypothesis, np.zeros((2, 19)))
+    slopes = []
+    for k in range(4):
+        more, less = (
+            told_of(
+                with_scatter(one, np.exp(s * np.eye(4)[k])).response(), one.hypothesis, here.theta
+            ).log_likelihood
+            for s in (step, -step)
+        )
+        slopes.append((more - less) / (2.0 * step))
+    others = np.arange(4) != faulty
+    slope = np.stack(slopes, axis=1)[:, others]
+    close = 0.05 if np.isinf(dof) else 0.55
+    assert np.abs(slope).max() > 1.0
+    np.testing.assert_allclose(here.scatter_score[:, others], slope, rtol=0.0, atol=close)
+    assert np.linalg.eigvalsh(here.scatter_information).min() > -1e-6
 
 
 def test_a_tool_that_is_nowhere_near_fits_ill(twin):
@@ -245,7 +306,12 @@ def quadratic(top, slope, curvature, theta):
     value = top + slope @ theta - 0.5 * theta @ fall
     none = np.zeros((1, 1))
     return LocalLikelihood(
-        theta[None], np.array([value]), (slope - fall)[None], curvature[None], none[0], none, none
+        theta[None],
+        np.array([value]),
+        (slope - fall)[None],
+        curvature[None],
+        none[0],
+        *(none,) * 4,
     )
 
 

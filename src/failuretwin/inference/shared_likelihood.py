@@ -36,6 +36,7 @@ from failuretwin.inference.marginal import (
 from failuretwin.inference.posterior import fault_model_of
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood, share_of
+from failuretwin.inference.scatter_score import mean_pull, pull_of, scatter_sums, with_own
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,9 @@ def _healthy_sums(
     off = seen.off(theta)
     square = np.einsum("...k,...k->...", off, off)
     weight = likelihood.outcome_probability * share[..., None]
-    return _sums(seen, off, square, weight, model.scatter, model.settling.tail_dof)
+    nu, known = model.settling.tail_dof, np.zeros_like(off)
+    spread = scatter_sums(seen, off, known, square, weight, model.scatter, nu)
+    return _sums(seen, off, square, weight, nu, spread)
 
 
 def _sums(
@@ -156,57 +159,30 @@ def _sums(
     off: FloatArray,
     square: FloatArray,
     weight: FloatArray,
-    scatter: FloatArray,
     nu: float,
+    spread: tuple[FloatArray, FloatArray, FloatArray],
 ) -> _Sums:
     """Return the sums of some movements.
 
-    With a = s^2 lambda^T lambda, p = 3 axes, and u as of `_pull`, the logarithm of a scatter has
-
-        score = sum w (u s^2 (lambda^T rho)^2 - a)
-        information = sum w 2 ((nu + p) (s_k s_l lambda_k^T lambda_l)^2 - a_k a_l) / (nu + p + 2)
-
-    (Lange, Little and Taylor, JASA 84 (1989) 881, for a multivariate t).
-
     Args:
-        seen: Residuals, columns and levers.
+        seen: Residuals and columns.
         off: Residuals at theta, (..., 3).
         square: D^2, (...).
         weight: How much each counts, (...).
-        scatter: Scale of each motor's scatter, (motor,) [rad]; 0: it tells nothing.
         nu: Degrees of freedom of the scatter.
+        spread: Those of the scatter, see `scatter_sums`.
     """
-    runs, size, motors = len(off), seen.gamma.shape[-1], len(scatter)
-    u = _pull(square, nu, seen.dims)
+    runs, size = len(off), seen.gamma.shape[-1]
+    u = pull_of(square, nu, seen.dims)
     score = np.matmul(
         np.reshape((u * weight)[..., None] * off, (runs, 1, -1)),
         np.reshape(seen.gamma, (runs, -1, size)),
     )
-    scaled = seen.gamma * np.sqrt(_mean_pull(nu, seen.dims) * weight)[..., None, None]
+    scaled = seen.gamma * np.sqrt(mean_pull(nu, seen.dims) * weight)[..., None, None]
     scaled = np.reshape(scaled, (runs, -1, size))
-    levers = seen.levers * scatter
-    transposed = np.swapaxes(levers, -1, -2)
-    moved = np.matmul(transposed, off[..., None])[..., 0]
-    gram = np.matmul(transposed, levers)
-    own = np.diagonal(gram, axis1=-2, axis2=-1)
+    information = np.matmul(np.swapaxes(scaled, 1, 2), scaled)
     lead = tuple(range(1, weight.ndim))
-    weighted = weight[..., None]
-    spread = ((u[..., None] * moved**2 - own) * weighted).sum(lead)
-    flat = np.reshape(own * np.sqrt(weighted), (runs, -1, motors))
-    inert = 0.0 if np.isinf(nu) else 2.0 / (nu + seen.dims + 2.0)
-    information = 2.0 * _mean_pull(nu, seen.dims) * (gram**2 * weighted[..., None]).sum(lead)
-    information -= inert * np.matmul(np.swapaxes(flat, 1, 2), flat)
-    along = np.matmul(transposed, seen.gamma) * np.sqrt(u * weight)[..., None, None]
-    along = np.moveaxis(np.reshape(along, (runs, -1, motors, size)), 2, 1)
-    return _Sums(
-        score[:, 0],
-        np.matmul(np.swapaxes(scaled, 1, 2), scaled),
-        (square * weight).sum(lead),
-        spread,
-        information,
-        np.matmul(np.swapaxes(along, -1, -2), along),
-        weight,
-    )
+    return _Sums(score[:, 0], information, (square * weight).sum(lead), *spread, weight)
 
 
 def _faulty_sums(
@@ -232,9 +208,9 @@ def _faulty_sums(
     profile = likelihood.profile(fault_model.motor)
     if fault_model.redrawn is not None:
         log_share = by_node[:, :, None] + fault_model.redrawn
-        angle, spread = _redrawn_angle(fault_model, log_share, active, profile.mode.shape)
+        angle, variance = _redrawn_angle(fault_model, log_share, active, profile.mode.shape)
     else:
-        angle, spread = _common_angle(fault_model, active, profile.mode.shape)
+        angle, variance, slope = _common_angle(fault_model, active, profile.mode.shape)
     precision = np.maximum(profile.precision, LEAST_PRECISION)
     loose = 1.0 / profile.inflation(fault_model.held)
     terms = profile.log_terms(angle, fault_model.held)
@@ -245,28 +221,35 @@ def _faulty_sums(
     others = np.where(
         np.arange(response.layout.motors) == fault_model.motor, 0.0, response.model.scatter
     )
-    sums = _sums(motor.seen, off, square, weight, others, nu)
     dims = motor.seen.dims
-    pull = _pull(square, nu, dims) * weight * loose
-    mean = _mean_pull(nu, dims) * weight * loose
-    score = sums.score - np.einsum("rma,rmat->rt", pull * beyond, motor.lever)
+    pull = pull_of(square, nu, dims) * weight * loose
+    mean = mean_pull(nu, dims) * weight * loose
     if fault_model.redrawn is None:
-        along = _along_lever(motor, mean, precision, spread)
+        left = _left_along(motor, mean, precision, slope)
+        along = np.einsum("rma,rmat,rmau->rtu", mean * precision, left, left, optimize=True)
     else:
-        known = np.clip(1.0 - loose * precision * spread, 0.0, 1.0)
+        known = np.clip(1.0 - loose * precision * variance, 0.0, 1.0)
+        left = motor.lever * (known / precision)[..., None]
         scaled = motor.lever * np.sqrt(mean * known / precision)[..., None]
         along = np.einsum("rmat,rmau->rtu", scaled, scaled, optimize=True)
+    own = motor.seen.levers[..., fault_model.motor] * np.sqrt(loose)[..., None]
+    turned = off - own * beyond[..., None]
+    unknown = own * np.sqrt(variance)[..., None]
+    whole = with_own(motor.seen, fault_model.motor, own, precision, left)
+    told = scatter_sums(whole, turned, unknown, square, weight, others, nu)
+    sums = _sums(motor.seen, off, square, weight, nu, told)
+    score = sums.score - np.einsum("rma,rmat->rt", pull * beyond, motor.lever)
     return replace(sums, score=score, information=sums.information + along)
 
 
-def _along_lever(
+def _left_along(
     motor: MotorResponse, weight: FloatArray, precision: FloatArray, gain: FloatArray
 ) -> FloatArray:
-    """Return the information along the lever of a motor that one common amount puts off.
+    """Return by how much a motor's angles are off for each theta, where one amount is common.
 
     With c = lambda^T Gamma and slopes s of the angle by the amount,
 
-        A = sum w c c^T / P - (sum w s c)(sum w s c)^T / sum w P s^2
+        left = c / P - s (sum w s c) / sum w P s^2
 
     Args:
         motor: The motor.
@@ -275,20 +258,18 @@ def _along_lever(
         gain: s, same axes.
 
     Returns:
-        (run, theta, theta).
+        (run, movement, outcome, theta).
     """
-    scaled = motor.lever * np.sqrt(weight / precision)[..., None]
-    along = np.einsum("rmat,rmau->rtu", scaled, scaled, optimize=True)
     common = np.einsum("rma,rmat->rt", weight * gain, motor.lever)
     total = np.einsum("rma,rma->r", weight * precision, gain**2)
-    missing = common[:, :, None] * common[:, None, :] / np.maximum(total, 1e-12)[:, None, None]
-    return np.asarray(along - missing)
+    shift = common / np.maximum(total, 1e-12)[:, None]
+    return np.asarray(motor.lever / precision[..., None] - gain[..., None] * shift[:, None, None])
 
 
 def _common_angle(
     fault_model: FaultModel, active: FloatArray, shape: tuple[int, ...]
-) -> tuple[FloatArray, FloatArray]:
-    """Return the mean angle of each movement and its slope by what is common, (..., outcome).
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return mean and variance of each angle and its slope by what is common, (..., outcome).
 
     The slope is that of the regression of the angle on the size over the nodes.
 
@@ -303,13 +284,14 @@ def _common_angle(
     size = np.broadcast_to(fault_model.size, (len(active), active.shape[-1]))
     angle = np.broadcast_to(fault_model.angle, (*shape[:2], active.shape[-1], shape[2]))
     mean = np.einsum("rmn,rmna->rma", share, angle)
+    spread = np.einsum("rmn,rmna->rma", share, (angle - mean[:, :, None]) ** 2)
     if fault_model.held:
-        return mean, np.ones_like(mean)
+        return mean, spread, np.ones_like(mean)
     centre = np.einsum("rmn,rn->rm", share, size)
     away = size[:, None] - centre[..., None]
     covariance = np.einsum("rmn,rmna->rma", share * away, angle)
     variance = np.maximum(np.einsum("rmn,rmn->rm", share, away**2), 1e-18)
-    return mean, covariance / variance[..., None]
+    return mean, spread, covariance / variance[..., None]
 
 
 def _redrawn_angle(
@@ -330,16 +312,6 @@ def _redrawn_angle(
     angle = np.broadcast_to(fault_model.angle, (*shape[:2], share.shape[-1], shape[2]))
     mean = np.einsum("rmn,rmna->rma", share, angle)
     return mean, np.einsum("rmn,rmna->rma", share, (angle - mean[:, :, None]) ** 2)
-
-
-def _pull(square: FloatArray, nu: float, dims: int) -> FloatArray:
-    """Return u, the weight that a Student t gives a deviation of squared distance D^2."""
-    return np.ones_like(square) if np.isinf(nu) else (nu + dims) / (nu + square)
-
-
-def _mean_pull(nu: float, dims: int) -> float:
-    """Return what the information of a Student t is of that of a normal with its scale."""
-    return 1.0 if np.isinf(nu) else (nu + dims) / (nu + dims + 2.0)
 
 
 # A normal distribution of theta times a local likelihood: its integral and what is left of it.
