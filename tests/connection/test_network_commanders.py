@@ -17,6 +17,11 @@ from ros_peer import RosPeer
 from roscores import free_port
 from waiting import WAIT_S, wait_for
 
+pytestmark = [
+    # rospy of Debian 12 leaves sockets to the collector and calls what Python 3.11 deprecates.
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+]
 STANDARD = RosTopics(
     command="/arm/command", command_type="trajectory_msgs/JointTrajectory",
     position="/joint_states", position_type="sensor_msgs/JointState",
