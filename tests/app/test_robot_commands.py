@@ -213,7 +213,7 @@ def test_init_centres_random_movements_on_the_pose_at_rest(arm, run, tmp_path):
 
 @pytest.mark.parametrize(
     ("home", "message"),
-    [("1,2", "home has 2 values, expected 1"), ("a", "expected numbers separated by commas")],
+    [("1,2", "2 values, expected 1"), ("a", "expected numbers separated by commas")],
 )
 def test_init_refuses_a_pose_at_rest_of_another_arm(arm, run, tmp_path, home, message):
     code, _, err = run("robot", "init", arm(), "--home", home, "--out", tmp_path / "mine.toml")

@@ -112,3 +112,11 @@ def test_other_hypotheses_in_between_are_refused():
         FaultCourse.of(mixed)
     with pytest.raises(InputError, match="one run at least"):
         FaultCourse.of([])
+
+
+def test_runs_that_say_nothing_are_no_healthy_robot():
+    """Even odds of three states: healthy is the likeliest way to go on, and yet one in three."""
+    third = np.full(3, 1.0 / 3.0)
+    silent = FaultCourse.of(judged(*[third] * 4, undecided=range(4)), third)
+    (said,) = silent.verdict
+    assert said.startswith("cannot tell, because healthy in all runs is only")

@@ -198,8 +198,9 @@ def _group(name: str, members: Sequence[Parameter], robot: Robot) -> Group:
     ends = scale * np.array([(p.low, p.value, p.high) for p in members])
     known = ends[[p.identified for p in members]]
     low, high = _span(known if len(known) else ends)
-    at = np.clip(100.0 * (ends - low) / (high - low), 0.0, 100.0)
-    zero = -100.0 * low / (high - low)
+    width = high - low if high > low else 1.0  # all of them exactly the same
+    at = np.clip(100.0 * (ends - low) / width, 0.0, 100.0)
+    zero = -100.0 * low / width
     return Group(
         title=TITLES.get(name, name),
         meaning=MEANING.get(name, ""),

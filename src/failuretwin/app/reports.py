@@ -26,8 +26,10 @@ from failuretwin.decision.evaluation import (
     score_line,
 )
 from failuretwin.digital_model.kinematics import has_range
+from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.urdf import UrdfJoint
 from failuretwin.digital_model.urdf_check import JointReport, UrdfReport
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.explanation import plain_name, size_words
 from failuretwin.inference.isolability import IsolabilityReport, isolability
@@ -274,7 +276,8 @@ def isolability_summary(runs: xr.Dataset, diagnoser: BayesDiagnoser) -> list[str
         priors=diagnoser.priors,
         onset_s=diagnoser.priors.onset.known_s or 0.0,
     )
-    return group_lines(found) + size_lines(found) + left_out
+    robot = diagnoser.twin.robot
+    return group_lines(found, robot) + size_lines(found, robot) + left_out
 
 
 def _left_out_lines(others: Sequence[Hypothesis]) -> list[str]:
@@ -286,17 +289,19 @@ def _left_out_lines(others: Sequence[Hypothesis]) -> list[str]:
     return [said + " and ".join(names)] * bool(names)
 
 
-def group_lines(found: IsolabilityReport) -> list[str]:
+def group_lines(found: IsolabilityReport, robot: Robot) -> list[str]:
     """Return the groups, with the sizes at which their faults look alike."""
     if not found.groups:
         return []
-    groups = (" or ".join(_name(n, found.typical.get(n)) for n in group) for group in found.groups)
+    groups = (
+        " or ".join(_name(n, robot, found.typical.get(n)) for n in group) for group in found.groups
+    )
     sized = any(name in found.typical for group in found.groups for name in group)
     when = " when faults are as large as this" if sized else ""
     return [f"cannot be told apart by such motions{when}: {'; '.join(groups)}"]
 
 
-def size_lines(found: IsolabilityReport) -> list[str]:
+def size_lines(found: IsolabilityReport, robot: Robot) -> list[str]:
     """Return the smallest sizes that are found, and what is known of faults never found."""
     hidden = [name for name, size in found.isolated.items() if size is None]
     lines = {
@@ -307,18 +312,20 @@ def size_lines(found: IsolabilityReport) -> list[str]:
         },
     }
     return [
-        f"{what}: {', '.join(_name(name, size) for name, size in sizes.items() if size)}"
+        f"{what}: {', '.join(_name(name, robot, size) for name, size in sizes.items() if size)}"
         for what, sizes in lines.items()
         if any(sizes.values())
     ]
 
 
-def _name(hypothesis: str, size: float | None = None) -> str:
+def _name(hypothesis: str, robot: Robot, size: float | None = None) -> str:
     """Return a hypothesis as a person would say it, with the size of its fault if it has one."""
     parsed = Hypothesis.parse(hypothesis)
     if size is None:
         return plain_name(parsed)
-    return plain_name(parsed) + size_words(parsed.faults[0], size).replace("+", "")  # either sign
+    fault = parsed.faults[0]
+    unit = robot.own_unit(fault.motor, MODES[fault.mode].unit)
+    return plain_name(parsed) + size_words(fault, size, unit).replace("+", "")  # either sign
 
 
 # What `robot check` prints: the joints of a URDF and what was found.

@@ -235,7 +235,7 @@ def _fitted(known: Sequence[CalibratedRobot], robot: Robot) -> Population:
         source=source,
         payload=float(np.mean([settling.payload for settling in settlings])),
     )
-    profile = [m.imperfections for m in known if m.robot == robot]
+    profile = [m.imperfections for m in known if m.robot.name == robot.name]
     imperfections = Imperfections(
         name=name,
         source=source,

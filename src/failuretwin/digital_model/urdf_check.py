@@ -164,6 +164,7 @@ def _with_chain(
     path = urdf.path(base_link, tool_link)
     report = replace(report, base_link=base_link, tool_link=tool_link).with_findings(
         [
+            *_base_findings(urdf, base_link),
             *_loop_findings(urdf, path),
             *_tool_findings(choice),
             *_joint_findings(urdf, path),
@@ -258,6 +259,15 @@ def _name_findings(urdf: Urdf) -> Iterator[Finding]:
 
 def _repeated(names: Iterable[str]) -> list[str]:
     return [name for name, count in Counter(names).items() if count > 1]
+
+
+def _base_findings(urdf: Urdf, base_link: str) -> Iterator[Finding]:
+    if base_link in urdf.roots or not urdf.roots:
+        return
+    moving = [joint.name for joint in urdf.path(urdf.roots[0], base_link) if joint.type != "fixed"]
+    if moving:
+        text = f"the base {base_link!r} moves with {', '.join(moving)}, which are then no motors. "
+        yield Finding("warning", text + "Name a link that is fixed to the foot.")
 
 
 def _root_findings(urdf: Urdf, base: str | None) -> Iterator[Finding]:

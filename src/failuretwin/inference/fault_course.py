@@ -32,6 +32,10 @@ LEAST = 1e-300
 """Probability that stands for none, so that no run forbids a state for ever."""
 
 
+EVEN = 0.5
+"""A course that is less probable than its opposite is no verdict."""
+
+
 @dataclass(frozen=True)
 class Episode:
     """Some runs in a row in which one hypothesis holds.
@@ -177,7 +181,10 @@ class FaultCourse:
         if faulty:
             return tuple(self._sentence(episode) for episode in faulty)
         healthy = self.path[0]
-        sure = percent(float(self.posterior[:, healthy].min()))
+        least = float(self.posterior[:, healthy].min())
+        sure = percent(least)
+        if least < EVEN:
+            return (f"cannot tell, because healthy in all runs is only {sure} sure",)
         return (f"healthy in all {counted(len(self.runs), 'run')}, {sure} sure",)
 
     def _sentence(self, episode: Episode) -> str:

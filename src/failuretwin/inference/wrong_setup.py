@@ -59,8 +59,8 @@ def nowhere_near(twin: DigitalTwin, target: FloatArray, point: FloatArray) -> st
     if setup is not None:
         return setup.told
     return (
-        "no unit, axis, frame, sense or exchange of columns explains it; a spoilt sensor, another "
-        "robot, or a fault of another kind"
+        "in this run alone no unit, axis, frame, sense or exchange of columns explains it; a "
+        "spoilt sensor, another robot, or a fault beside a wrong set-up may"
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -271,8 +270,14 @@ def _home(text: str | None, report: UrdfReport) -> list[float]:
         values = [float(part) for part in text.split(",")]
     except ValueError:
         raise InputError(f"--home {text}: expected numbers separated by commas.") from None
+    if len(values) != len(report.motors):
+        names = ", ".join(motor.joint.name for motor in report.motors)
+        raise InputError(
+            f"--home {text}: {counted(len(values), 'value')}, expected {len(report.motors)}, "
+            f"one for each motor: {names}."
+        )
     units = [1e-3 if m.joint.type == "prismatic" else math.pi / 180.0 for m in report.motors]
-    return [value * unit for value, unit in zip_longest(values, units, fillvalue=1.0)]
+    return [value * unit for value, unit in zip(values, units, strict=True)]
 
 
 @robot.command("fit")

@@ -220,7 +220,7 @@ def _check_together(
 
     if out is not None and not (self_calibrate or track):
         raise InputError("--out is for what is learned: add --self-calibrate or --track.")
-    if out is not None and track and calibration is not None:
+    if out is not None and track and _is_file(calibration):
         raise InputError(
             "--track keeps what it learns beside the calibration that it began with. Leave out "
             "--out, or --calibration to begin with what the kind of arm is like."
@@ -238,14 +238,21 @@ def _check_together(
         )
 
 
+def _is_file(calibration: Path | None) -> bool:
+    """Return whether a calibration is a file, beside which a history may be kept."""
+    from failuretwin.digital_model.calibrated_robot import GENERIC
+
+    return calibration is not None and calibration != Path(GENERIC)
+
+
 def _history(bayes: BayesDiagnoser, calibration: Path | None, out: Path | None) -> History:
     """Return what has been seen of a robot before; nothing is kept where no file is named."""
     from failuretwin.connection.calibration.result import check_calibration_file
     from failuretwin.connection.life_history import History, open_history
     from failuretwin.connection.tracked_diagnosis import begin
 
-    cold = calibration is None
-    start, beside = begin(bayes, cold), calibration or out
+    cold = not _is_file(calibration)
+    start, beside = begin(bayes, cold), out if cold else calibration
     if out is not None:
         check_calibration_file(out)
     return History(start, cold) if beside is None else open_history(beside, start, cold)
