@@ -286,7 +286,9 @@ def test_base_and_tool_can_be_named(arm):
     assert (report.base_link, report.tool_link) == ("upper", "hand")
     assert [motor.joint.name for motor in report.motors] == ["lift"]
     assert report.having("warning") == [
-        "2 links hang from no joint: 'base', 'table'. A URDF has one root. The base is 'upper'."
+        "2 links hang from no joint: 'base', 'table'. A URDF has one root. The base is 'upper'.",
+        "the base 'upper' moves with turn, which are then no motors. Name a link that is fixed to "
+        "the foot.",
     ]
 
 

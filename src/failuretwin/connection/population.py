@@ -235,7 +235,7 @@ def _fitted(known: Sequence[CalibratedRobot], robot: Robot) -> Population:
         source=source,
         payload=float(np.mean([settling.payload for settling in settlings])),
     )
-    profile = [m.imperfections for m in known if m.robot.name == robot.name]
+    profile = [m.imperfections for m in known if m.robot.motors == robot.motors]
     imperfections = Imperfections(
         name=name,
         source=source,
