@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from failuretwin.inference.healthy_model import StartDelay
+from failuretwin.inference.start_delay import StartDelay
 
 
 def moments(delay, share):

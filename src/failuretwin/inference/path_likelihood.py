@@ -20,8 +20,9 @@ import numpy as np
 from failuretwin.core.numerics import along_polyline, log_fall, log_norm, log_of, log_sum
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.inference.evidence import SettledEvidence, TransientSamples
-from failuretwin.inference.healthy_model import HealthyModel, StartNodes
+from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.sensors import SensorStack
+from failuretwin.inference.start_delay import StartNodes
 
 KNOTS = 11
 """Instants of a ramp at which the path is computed; between them it is a straight line."""

@@ -52,3 +52,23 @@ class Orders:
         for message in self._writer.command(command):
             self._publish(message)
         self.standing = order.target
+
+
+class Commanding:
+    """What a source that also sends orders adds to it: it hears what the motors were told.
+
+    Stands before the source among the bases of a commander.
+    """
+
+    _orders: Orders
+
+    @property
+    def standing(self) -> FloatArray | None:
+        """What the motors were told last, (motor,) [rad]; None: not known."""
+        return self._orders.standing
+
+    def poll(self, timeout_s: float) -> Event | None:
+        """Return the next reading or command; None if none came within `timeout_s` [s]."""
+        event: Event | None = super().poll(timeout_s)  # type: ignore[misc]
+        self._orders.hear(event)
+        return event

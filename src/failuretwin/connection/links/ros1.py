@@ -20,14 +20,13 @@ from xmlrpc.client import Error, ServerProxy, Transport
 from failuretwin.connection.links.base import (
     Answer,
     CommandSent,
-    Event,
     EventQueue,
     Item,
     Reading,
 )
 from failuretwin.connection.links.commander import Order
 from failuretwin.connection.links.live_events import NetworkSource
-from failuretwin.connection.links.network_commander import Orders
+from failuretwin.connection.links.network_commander import Commanding, Orders
 from failuretwin.connection.links.ros1_import import Decoder, load_rospy, message_class
 from failuretwin.connection.links.ros_messages import (
     DIAGNOSTICS_TYPE,
@@ -37,7 +36,6 @@ from failuretwin.connection.links.ros_messages import (
     RosWriter,
 )
 from failuretwin.core.errors import InputError
-from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.bag_messages import Role
 from failuretwin.digital_model.robot import Robot
 
@@ -373,7 +371,7 @@ class Ros1Diagnostics:
         self._publishers.close()
 
 
-class Ros1Commander(Ros1Source):
+class Ros1Commander(Commanding, Ros1Source):
     """Listens to a robot and tells it to move: a trajectory or command out for each order.
 
     Args:
@@ -388,17 +386,6 @@ class Ros1Commander(Ros1Source):
         self._orders = Orders(robot, topics, lambda message: self._publishers.send(message))
         super().__init__(robot, topics)
         self._publishers = _Publishers([self._orders.topic])
-
-    @property
-    def standing(self) -> FloatArray | None:
-        """What the motors were told last, (motor,) [rad]; None: not known."""
-        return self._orders.standing
-
-    def poll(self, timeout_s: float) -> Event | None:
-        """Return the next reading or command; None if none came within `timeout_s` [s]."""
-        event = super().poll(timeout_s)
-        self._orders.hear(event)
-        return event
 
     def send(self, order: Order) -> None:
         """Tell the motors to move.

@@ -7,10 +7,10 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any, Self
 
-from failuretwin.connection.links.base import Answer, Event, EventQueue, Item
+from failuretwin.connection.links.base import Answer, EventQueue, Item
 from failuretwin.connection.links.commander import Order
 from failuretwin.connection.links.live_events import NetworkSource
-from failuretwin.connection.links.network_commander import Orders
+from failuretwin.connection.links.network_commander import Commanding, Orders
 from failuretwin.connection.links.ros_messages import (
     DIAGNOSTICS_TYPE,
     DiagnosticsPublisher,
@@ -18,7 +18,6 @@ from failuretwin.connection.links.ros_messages import (
     RosTopics,
 )
 from failuretwin.core.errors import InputError
-from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.bag_messages import Kind, Role, kind_of_type
 from failuretwin.digital_model.robot import Robot
 
@@ -116,7 +115,7 @@ class RosbridgeSource(NetworkSource):
         self.take(role, lambda: (_as_object(message), kind))
 
 
-class RosbridgeCommander(RosbridgeSource):
+class RosbridgeCommander(Commanding, RosbridgeSource):
     """Listens to a robot and tells it to move, by a message for each order.
 
     Args:
@@ -132,17 +131,6 @@ class RosbridgeCommander(RosbridgeSource):
         super().__init__(robot, topics, ros)
         self._command = roslibpy.Topic(ros, *self._orders.topic)
         self._command.advertise()
-
-    @property
-    def standing(self) -> FloatArray | None:
-        """What the motors were told last, (motor,) [rad]; None: not known."""
-        return self._orders.standing
-
-    def poll(self, timeout_s: float) -> Event | None:
-        """Return the next reading or command; None if none came within `timeout_s` [s]."""
-        event = super().poll(timeout_s)
-        self._orders.hear(event)
-        return event
 
     def send(self, order: Order) -> None:
         """Tell the motors to move.
