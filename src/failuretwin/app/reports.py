@@ -28,7 +28,7 @@ from failuretwin.decision.evaluation import (
 from failuretwin.digital_model.kinematics import has_range
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.urdf import UrdfJoint
-from failuretwin.digital_model.urdf_check import JointReport, UrdfReport
+from failuretwin.digital_model.urdf_report import JointReport, UrdfReport
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.explanation import plain_name, size_words

@@ -23,7 +23,7 @@ from failuretwin.digital_model.geometry import Geometry, JointCorrection
 from failuretwin.digital_model.kinematics import has_range
 from failuretwin.digital_model.robot import Profile, bundled_folder
 from failuretwin.digital_model.urdf import UrdfJoint
-from failuretwin.digital_model.urdf_check import JointReport, UrdfReport
+from failuretwin.digital_model.urdf_report import JointReport, UrdfReport
 
 Numbers = TypeVar("Numbers", bound=tuple[float, ...])
 

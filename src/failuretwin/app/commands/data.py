@@ -21,7 +21,7 @@ from failuretwin.app.terminal import tell
 from failuretwin.core.errors import counted
 
 if TYPE_CHECKING:
-    from failuretwin.digital_model.urdf_check import UrdfReport
+    from failuretwin.digital_model.urdf_report import UrdfReport
 
 
 @click.command("import")
