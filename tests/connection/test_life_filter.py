@@ -94,10 +94,14 @@ def test_a_random_walk_adds_its_variance(belief):
 
 
 def said_of_scatter(robot, evidence, factor=1.0, motor=0):
-    """Return what runs say as healthy ones, with the scatter of one motor some times as large."""
-    scatter = np.array(SETTLING.scatter)
-    scatter[motor] *= factor
-    settling = replace(SETTLING, scatter=tuple(scatter.tolist()))
+    """Return what runs say as healthy ones, with the scatter of one motor some times as large.
+
+    Motor 4, which there is not, stands for the degrees of freedom.
+    """
+    figures = np.array([*SETTLING.scatter, SETTLING.tail_dof])
+    figures[motor] *= factor
+    *scatter, dof = figures.tolist()
+    settling = replace(SETTLING, scatter=tuple(scatter), tail_dof=dof)
     sharp = replace(CALIBRATION, settling=settling, variation=None)
     model = HealthyModel(DigitalTwin(robot), sharp)
     response = LinearResponse.of(evidence, model, SharedLayout(4, offsets=True))
@@ -105,7 +109,7 @@ def said_of_scatter(robot, evidence, factor=1.0, motor=0):
     return local_likelihood(response, healthy, KNOWN, np.zeros((len(evidence.usable), 19)))
 
 
-@pytest.mark.parametrize("motor", [0, 1, 3])
+@pytest.mark.parametrize("motor", [0, 1, 3, 4])
 def test_the_score_of_the_scatter_is_a_derivative(armpi, motor):
     evidence, step = seen(armpi, truth(12), 8), 1e-4
     here = said_of_scatter(armpi, evidence)

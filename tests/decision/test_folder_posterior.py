@@ -118,7 +118,7 @@ def test_early_ones_do(twin, mixed, monkeypatch):
         monkeypatch.setattr(folder, "PASSES", passes)
         found[passes], *_ = judged(twin, mixed, priors=SURE)
     off = {n: np.abs((found[n].mean - found[10].mean) / found[10].deviation)[7:] for n in (2, 4)}
-    assert off[4].max() < 0.1
+    assert off[4].max() < 0.13
     assert off[2].max() > 0.15
 
 
@@ -297,16 +297,18 @@ def scatter_height(one, theta):
 
 
 def test_faulty_runs_say_of_scatter_what_healthy_ones_do(twin, armpi):
-    """Of the motors that work; that an angle is common to all movements takes nothing away."""
+    """Of the motors that work; a motor that is held says nothing of the others."""
     known = replace(KNOWN, settling=SETTLING)
     wide = tuple(1.6 * np.array(SETTLING.scatter))
+    errors = [f"motor_{k}:steady_state_error" for k in (2, 3, 4)]
     learned = []
-    for truths, each in ((["healthy"], 24), (TRUTHS[1:], 8)):
+    for truths, each in ((["healthy"], 24), (errors, 16), (TRUTHS[1::2], 12)):
         runs = runs_of(armpi, truths, each, known=known, scatter=wide)
         theta, *_ = judged(twin, runs, priors=SURE, known=known)
         learned.append(np.array(theta.model.settling.scatter) / wide)
-    healthy, faulty = learned
+    healthy, faulty, held = learned
     np.testing.assert_allclose(faulty[:3], healthy[:3], rtol=0.25)
+    np.testing.assert_allclose(1.6 * held, 1.0, rtol=0.05)
 
 
 def test_runs_that_scatter_more_say_so(twin, armpi):

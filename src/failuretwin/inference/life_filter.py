@@ -376,7 +376,9 @@ class LifeFilter:
         """Return what has changed more than wear can make it, or nothing.
 
         The latest runs by themselves are compared with what is behind them and with what that was a
-        horizon ago: a fault that grows slowly drags the belief along before it shows.
+        horizon ago: a fault that grows slowly drags the belief along before it shows. Of a robot
+        that nothing was known of, fewer runs than these are no measure: a start that was judged
+        wrongly is outweighed, not defended.
         """
         if window.runs < FEWEST:
             return ""
@@ -387,8 +389,9 @@ class LifeFilter:
             """Return by how much each offset lies off beyond `most` and chance."""
             return np.abs(now - known[0]) - most * wear - CHANCE * np.hypot(chance, known[1])
 
-        behind = (_state(self.base, self.unit), self.past[0])
-        fast = np.max([off(known, self.limits.reach) for known in behind], axis=0)
+        measured = self.habits is None or self.arrived >= 2 * WINDOW
+        behind = (_state(self.base, self.unit), self.past[0]) if measured else ()
+        fast = np.max([np.full_like(now, -np.inf), *(off(k, self.limits.reach) for k in behind)], 0)
         begun = np.stack([np.zeros_like(wear), self._begun_deviation])
         excess = np.maximum(fast, off(begun, self.limits.limit))
         over = np.divide(excess, wear, out=np.zeros_like(wear), where=wear > 0.0)

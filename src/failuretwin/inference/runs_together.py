@@ -25,6 +25,8 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.nonidealities import Imperfections, LostCommand
+from failuretwin.failure_behavior.mode import Signature
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.evidence import TransientSamples
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
@@ -44,6 +46,10 @@ from failuretwin.inference.shared_weighing import (
 
 SCATTER_SPREAD = 0.3
 """Deviation of the logarithm of the scatter within a class; assumed."""
+TAIL_SPREAD = 0.6
+"""The same of its degrees of freedom; assumed, a factor of two, as loss rates."""
+HEAVIEST, LIGHTEST = 1.0, 50.0
+"""Degrees of freedom that scatter may have; from 50 on it counts as normal."""
 RATE_COUNT = 30.0
 """Movements that the prior of a loss rate counts for."""
 LEAST_SHARE = 1e-3
@@ -57,9 +63,9 @@ class Habits:
     """What movements say of scatter and lost commands, sums over them.
 
     Attributes:
-        precision: Information about the logarithm of each motor's scatter beside that of the model
-            that was given, (..., motor, motor).
-        shift: That times the logarithm that is most probable, (..., motor).
+        precision: Information about the logarithms of each motor's scatter and of its degrees of
+            freedom, beside those of the model that was given, (..., motor + 1, motor + 1).
+        shift: That times the logarithms that are most probable, (..., motor + 1).
         losses: How often each set of motors has lost a command, of how many movements; punctual
             and late ones, (..., entry, 2, 2).
     """
@@ -74,7 +80,8 @@ class Habits:
         motors = 0 if given.settling is None else len(given.settling.scatter)
         rate = np.array([[e.rate, e.rate_when_late] for e in given.lost_commands]).reshape(-1, 2)
         losses = RATE_COUNT * np.stack([rate, np.ones_like(rate)], axis=-1)
-        return cls(SCATTER_SPREAD**-2.0 * np.eye(motors), np.zeros(motors), losses)
+        spread = np.array([*[SCATTER_SPREAD] * motors, TAIL_SPREAD])
+        return cls(np.diag(spread**-2.0), np.zeros(motors + 1), losses)
 
     @classmethod
     def none(cls, runs: int, given: Imperfections) -> Habits:
@@ -111,20 +118,24 @@ class Habits:
 
     @property
     def log_scatter(self) -> FloatArray:
-        """Most probable logarithm of the scatter beside that given, (motor,)."""
+        """Most probable logarithms of scatter and tail beside those given, (motor + 1,)."""
         return np.asarray(np.linalg.solve(self.precision, self.shift))
 
     def most_probable(self, given: Imperfections) -> Imperfections:
         """Return the imperfections with the scatter and the rates that are most probable."""
         if given.settling is None:
             return given
-        scatter = np.asarray(given.settling.scatter) * np.exp(self.log_scatter)
+        factor = np.exp(self.log_scatter)
+        scatter = np.asarray(given.settling.scatter) * factor[:-1]
+        dof = given.settling.tail_dof
+        if np.isfinite(dof):
+            dof = float(np.clip(dof * factor[-1], HEAVIEST, LIGHTEST))
         rates = self.losses[..., 0] / self.losses[..., 1]
         lost = tuple(
             replace(entry, rate=float(rate), rate_when_late=float(when_late))
             for entry, (rate, when_late) in zip(given.lost_commands, rates, strict=True)
         )
-        settling = replace(given.settling, scatter=tuple(scatter.tolist()))
+        settling = replace(given.settling, scatter=tuple(scatter.tolist()), tail_dof=dof)
         return replace(given, settling=settling, lost_commands=lost)
 
 
@@ -170,18 +181,22 @@ class Judged:
     def habits(self, given: Imperfections, covariance: FloatArray, at: FloatArray) -> Habits:
         """Return what the runs say of scatter and losses, (run, ...); faulty motors left out.
 
+        A motor that is held takes the others where healthy runs do not go, under loads that their
+        compliance is stretched to: what is left of those movements is not taken for scatter.
+
         Args:
             given: What was given of the robot.
             covariance: Of theta under each hypothesis, (run, candidate, hypothesis, theta, theta).
-            at: Logarithm of the scatter that the runs were weighed with, (motor,).
+            at: Logarithms of scatter and tail that the runs were weighed with, (motor + 1,).
         """
         share, found = self.share, [each.found for each in self.candidates]
         score = np.stack([each.scatter_score for each in found], axis=1)
         slack = np.stack([each.scatter_slack for each in found], axis=1)
-        score = score + np.einsum("rchntu,rchtu->rchn", slack, covariance, optimize=True)
+        score[..., :-1] += np.einsum("rchntu,rchtu->rchn", slack, covariance, optimize=True)
         told = np.stack([each.scatter_information for each in found], axis=1)
-        precision = np.einsum("rch,rchnk->rnk", share, told)
-        shift = np.einsum("rch,rchn->rn", share, score) + precision @ at
+        free = share * [not _holds(hypothesis) for hypothesis in self.weighing.hypotheses]
+        precision = np.einsum("rch,rchnk->rnk", free, told)
+        shift = np.einsum("rch,rchn->rn", free, score) + precision @ at
         outcomes = sum(share[:, c, :, None, None] * each.outcomes for c, each in enumerate(found))
         losses = [self._losses(entry, np.asarray(outcomes)) for entry in given.lost_commands]
         shape = (len(share), len(losses), 2, 2)
@@ -204,6 +219,10 @@ class Judged:
                 told[:, k, 0] += (outcomes[:, h][..., hit].sum(axis=-1) * kind).sum(axis=1)
                 told[:, k, 1] += (outcomes[:, h].sum(axis=-1) * kind).sum(axis=1)
         return told
+
+
+def _holds(hypothesis: Hypothesis) -> bool:
+    return any(MODES[fault.mode].signature is Signature.HELD for fault in hypothesis.faults)
 
 
 @dataclass
@@ -291,7 +310,9 @@ class RunsTogether:
         if len(theta) == REGISTRATION:
             return self.model
         imperfections, given = self.model.imperfections, self.given.model.settling
-        settling = offsets_of(theta, replace(given, scatter=self.model.settling.scatter))
+        now = self.model.settling
+        given = replace(given, scatter=now.scatter, tail_dof=now.tail_dof)
+        settling = offsets_of(theta, given)
         return replace(self.model, imperfections=replace(imperfections, settling=settling))
 
     def judge(self, rows: IntArray, moving: TransientSamples | None = None) -> list[Judged]:
@@ -357,9 +378,10 @@ class RunsTogether:
 
     @property
     def _log_scatter(self) -> FloatArray:
-        """Logarithm of the scatter beside that given, (motor,)."""
-        now, given = (np.asarray(m.settling.scatter) for m in (self.model, self.given.model))
-        return np.asarray(np.log(now / given))
+        """Logarithms of scatter and tail beside those given, (motor + 1,)."""
+        now, given = (m.settling for m in (self.model, self.given.model))
+        tail = np.log(now.tail_dof / given.tail_dof) if np.isfinite(given.tail_dof) else 0.0
+        return np.append(np.log(np.divide(now.scatter, given.scatter)), tail)
 
     def _cavity(self, rows: IntArray) -> Belief:
         """Return the belief without the sites of some runs, each without its own."""

@@ -49,10 +49,10 @@ class LocalLikelihood:
         score: b, (run, theta).
         information: A, (run, theta, theta).
         misfit: Mean D^2 of what is explained, (run,); 3 if all is well.
-        scatter_score: Derivative of L by the logarithm of the scatter of each motor, (run, motor);
-            a faulty motor says nothing of its own.
-        scatter_information: Expected information about that, (run, motor, motor).
-        scatter_slack: What a covariance C of theta adds to the score, tr(slack C),
+        scatter_score: Derivative of L by the logarithms of the scatter of each motor and of its
+            degrees of freedom, (run, motor + 1); a faulty motor says nothing of its own.
+        scatter_information: Expected information about these, (run, motor + 1, motor + 1).
+        scatter_slack: What a covariance C of theta adds to the score of scatters, tr(slack C),
             (run, motor, theta, theta): theta was fitted to the same movements.
         outcomes: Expected share of each outcome of each movement, (run, movement, outcome).
     """

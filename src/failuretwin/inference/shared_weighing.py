@@ -98,8 +98,8 @@ class Weighed:
         log_evidence: (run, hypothesis).
         misfit: Mean D^2 there, (run, hypothesis).
         information: A there, (run, hypothesis, theta, theta).
-        scatter_score: As of `LocalLikelihood`, (run, hypothesis, motor).
-        scatter_information: As there, (run, hypothesis, motor, motor).
+        scatter_score: As of `LocalLikelihood`, (run, hypothesis, motor + 1).
+        scatter_information: As there, (run, hypothesis, motor + 1, motor + 1).
         scatter_slack: As there, (run, hypothesis, motor, theta, theta).
         outcomes: As of `LocalLikelihood`, (run, hypothesis, movement, outcome).
     """
