@@ -74,8 +74,10 @@ class ConsecutiveLossHmm:
         chances = np.empty((runs, count, len(self.missed)))
         state = np.zeros((runs, len(self.missed)))
         state[:, 0] = 1.0
+        follows = self.transition.reshape(-1, self.transition.shape[-1])
         for m in range(count):
-            chances[:, m] = state = np.einsum("rl,rd,lds->rs", rates[:, m], state, self.transition)
+            pairs = rates[:, m, :, None] * state[:, None]
+            chances[:, m] = state = pairs.reshape(runs, len(follows)) @ follows
             if log_likelihood is not None:
                 says = np.where(state > 0.0, log_likelihood[:, m], -np.inf)
                 state = state * np.exp(says - says.max(axis=-1, keepdims=True))

@@ -57,16 +57,20 @@ class Whitened(ArrayStruct):
     dims: int = 3
 
     def off(self, delta: FloatArray) -> FloatArray:
-        """Return rho - Gamma delta, (run, movement, outcome, channel).
+        """Return rho - Gamma delta, (..., channel).
+
+        Args:
+            delta: Change of theta, as many axes as rho, (..., theta).
+        """
+        return np.asarray(self.rho - np.matmul(self.gamma, delta[..., None])[..., 0])
+
+    def square(self, delta: FloatArray) -> FloatArray:
+        """Return D^2 at theta + delta, (run, movement, outcome).
 
         Args:
             delta: Change of theta, (run, theta).
         """
-        return np.asarray(self.rho - np.matmul(self.gamma, delta[:, None, None, :, None])[..., 0])
-
-    def square(self, delta: FloatArray) -> FloatArray:
-        """Return D^2 at theta + delta, (run, movement, outcome); `delta` as for `off`."""
-        off = self.off(delta)
+        off = self.off(delta[:, None, None])
         return np.einsum("...k,...k->...", off, off)
 
 

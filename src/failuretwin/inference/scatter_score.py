@@ -13,10 +13,12 @@ import numpy as np
 from scipy.special import digamma, polygamma
 
 from failuretwin.core.types import FloatArray
+from failuretwin.inference.counted_outcomes import CountedOutcomes
 from failuretwin.inference.linear_response import Whitened
 
 
 def scatter_sums(
+    counted: CountedOutcomes,
     seen: Whitened,
     off: FloatArray,
     unknown: FloatArray,
@@ -42,66 +44,52 @@ def scatter_sums(
     and column are those of nu; with nu infinite they are 0. Slack is that of the scatter alone.
 
     Args:
-        seen: Columns and levers.
-        off: rho, (..., 3).
+        counted: The outcomes that count.
+        seen: Their columns and levers.
+        off: rho, (counted, 3).
         unknown: d, same shape: what is not known of them.
-        square: |rho|^2, (...).
-        weight: How much each counts, (...).
+        square: |rho|^2, (counted,).
+        weight: How much each counts, (counted,).
         scatter: Scale of each motor's scatter, (motor,) [rad]; 0: it tells nothing.
         nu: Degrees of freedom of the scatter.
     """
-    runs, size, motors = len(off), seen.gamma.shape[-1], len(scatter)
-    square = square + np.einsum("...k,...k->...", unknown, unknown)
-    u = pull_of(square, nu, seen.dims)
-    weighted = weight[..., None]
+    motors, dims = len(scatter), seen.dims
+    square = square + np.einsum("ck,ck->c", unknown, unknown)
+    u = pull_of(square, nu, dims)
     levers = seen.levers * scatter
     transposed = np.swapaxes(levers, -1, -2)
     moved = np.matmul(transposed, off[..., None])[..., 0]
     doubt = np.matmul(transposed, unknown[..., None])[..., 0]
     gram = np.matmul(transposed, levers)
     own = np.diagonal(gram, axis1=-2, axis2=-1)
-    lead = tuple(range(1, weight.ndim))
-    score = ((u[..., None] * (moved**2 + doubt**2) - own) * weighted).sum(lead)
+    score = (u[:, None] * (moved**2 + doubt**2) - own) * weight[:, None]
     doubt = doubt / np.maximum(np.linalg.norm(unknown, axis=-1, keepdims=True), 1.0)
     gram = gram - doubt[..., :, None] * doubt[..., None, :]
     own = np.diagonal(gram, axis1=-2, axis2=-1)
-    flat = np.reshape(own * np.sqrt(weighted), (runs, -1, motors))
-    inert = 0.0 if np.isinf(nu) else 2.0 / (nu + seen.dims + 2.0)
-    information = 2.0 * mean_pull(nu, seen.dims) * (gram**2 * weighted[..., None]).sum(lead)
-    information -= inert * np.matmul(np.swapaxes(flat, 1, 2), flat)
-    along = np.matmul(transposed, seen.gamma) * np.sqrt(u * weight)[..., None, None]
-    along = np.moveaxis(np.reshape(along, (runs, -1, motors, size)), 2, 1)
-    slack = np.matmul(np.swapaxes(along, -1, -2), along)
-    whole = np.zeros((runs, motors + 1, motors + 1))
-    whole[:, :motors, :motors] = information
-    if np.isinf(nu):
-        return np.pad(score, ((0, 0), (0, 1))), whole, slack
-    tail, told, crossed = _tail_sums(square, weight, (own * weighted).sum(lead), nu, seen.dims)
-    whole[:, motors, motors], whole[:, :motors, motors] = told, crossed
-    whole[:, motors, :motors] = crossed
-    return np.concatenate([score, tail[:, None]], axis=1), whole, slack
+    inert = 0.0 if np.isinf(nu) else 2.0 / (nu + dims + 2.0)
+    told = 2.0 * mean_pull(nu, dims) * gram**2 - inert * own[:, :, None] * own[:, None]
+    information = np.zeros((counted.runs, motors + 1, motors + 1))
+    information[:, :motors, :motors] = counted.total(told * weight[:, None, None])
+    along = np.matmul(transposed, seen.gamma) * np.sqrt(u * weight)[:, None, None]
+    slack = counted.total(along[..., :, None] * along[..., None, :])
+    tail = np.zeros_like(square)
+    if np.isfinite(nu):
+        tail, each = _tail_score(square, nu, dims)
+        crossed = -2.0 * nu / ((nu + dims) * (nu + dims + 2.0)) * own
+        information[:, motors, motors] = counted.total(each * weight)
+        information[:, :motors, motors] = counted.total(crossed * weight[:, None])
+        information[:, motors, :motors] = information[:, :motors, motors]
+    whole = np.concatenate([score, (tail * weight)[:, None]], axis=1)
+    return counted.total(whole), information, slack
 
 
-def _tail_sums(
-    square: FloatArray, weight: FloatArray, own: FloatArray, nu: float, dims: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return score and information of log nu, (run,), and that with each scatter, (run, motor).
-
-    Args:
-        square: D^2, (run, ...).
-        weight: How much each counts, same shape.
-        own: Sum of w G_kk, (run, motor).
-        nu: Degrees of freedom.
-        dims: p.
-    """
+def _tail_score(square: FloatArray, nu: float, dims: int) -> tuple[FloatArray, float]:
+    """Return the score of log nu of each D^2, same shape, and the information of one."""
     whole, half = nu + dims, 0.5 * nu
     middle = digamma(0.5 * whole) - digamma(half) - dims / nu
     slope = middle - np.log1p(square / nu) + whole * square / (nu * (nu + square))
     each = half**2 * (polygamma(1, half) - polygamma(1, 0.5 * whole))
-    each -= dims * (whole + 4.0) * nu / (2.0 * whole * (whole + 2.0))
-    lead = tuple(range(1, weight.ndim))
-    score = half * (slope * weight).sum(lead)
-    return score, each * weight.sum(lead), -2.0 * nu * own / (whole * (whole + 2.0))
+    return half * slope, float(each - dims * (whole + 4.0) * nu / (2.0 * whole * (whole + 2.0)))
 
 
 def with_own(

@@ -16,7 +16,7 @@ Section: docs/shared_unknowns.md
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -25,8 +25,9 @@ from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.counted_outcomes import CountedOutcomes
 from failuretwin.inference.joint_likelihood import LEAST_PRECISION
-from failuretwin.inference.linear_response import LinearResponse, MotorResponse, Whitened
+from failuretwin.inference.linear_response import LinearResponse, Whitened
 from failuretwin.inference.marginal import (
     ChangePointPosterior,
     FaultModel,
@@ -145,44 +146,41 @@ def _healthy_sums(
     response: LinearResponse, likelihood: RunLikelihood, theta: FloatArray, share: FloatArray
 ) -> _Sums:
     """Return the sums of movements that are healthy with some probability, (run, movement)."""
-    seen, model = response.healthy, response.model
-    off = seen.off(theta)
-    square = np.einsum("...k,...k->...", off, off)
+    model = response.model
     weight = likelihood.outcome_probability * share[..., None]
-    nu, known = model.settling.tail_dof, np.zeros_like(off)
-    spread = scatter_sums(seen, off, known, square, weight, model.scatter, nu)
-    return _sums(seen, off, square, weight, nu, spread)
+    counted = CountedOutcomes.of(weight)
+    seen = counted.seen(response.healthy)
+    off = seen.off(theta[counted.run])
+    square, nu = np.einsum("ck,ck->c", off, off), model.settling.tail_dof
+    known, shares = np.zeros_like(off), counted(weight)
+    spread = scatter_sums(counted, seen, off, known, square, shares, model.scatter, nu)
+    told = _theta_sums(counted, seen, off, square, shares, nu)
+    return _Sums(*told, counted.total(square * shares), *spread, weight)
 
 
-def _sums(
+def _theta_sums(
+    counted: CountedOutcomes,
     seen: Whitened,
     off: FloatArray,
     square: FloatArray,
     weight: FloatArray,
     nu: float,
-    spread: tuple[FloatArray, FloatArray, FloatArray],
-) -> _Sums:
-    """Return the sums of some movements.
+) -> tuple[FloatArray, FloatArray]:
+    """Return score (run, theta) and information (run, theta, theta) of some movements.
 
     Args:
-        seen: Residuals and columns.
-        off: Residuals at theta, (..., 3).
-        square: D^2, (...).
-        weight: How much each counts, (...).
+        counted: The outcomes that count.
+        seen: Their residuals and columns.
+        off: Residuals at theta, (counted, 3).
+        square: D^2, (counted,).
+        weight: How much each counts, (counted,).
         nu: Degrees of freedom of the scatter.
-        spread: Those of the scatter, see `scatter_sums`.
     """
-    runs, size = len(off), seen.gamma.shape[-1]
-    u = pull_of(square, nu, seen.dims)
-    score = np.matmul(
-        np.reshape((u * weight)[..., None] * off, (runs, 1, -1)),
-        np.reshape(seen.gamma, (runs, -1, size)),
-    )
-    scaled = seen.gamma * np.sqrt(mean_pull(nu, seen.dims) * weight)[..., None, None]
-    scaled = np.reshape(scaled, (runs, -1, size))
-    information = np.matmul(np.swapaxes(scaled, 1, 2), scaled)
-    lead = tuple(range(1, weight.ndim))
-    return _Sums(score[:, 0], information, (square * weight).sum(lead), *spread, weight)
+    pulled = (pull_of(square, nu, seen.dims) * weight)[:, None] * off
+    score = np.matmul(pulled[:, None], seen.gamma)[:, 0]
+    scaled = seen.gamma * np.sqrt(mean_pull(nu, seen.dims) * weight)[:, None, None]
+    information = np.matmul(np.swapaxes(scaled, -1, -2), scaled)
+    return counted.total(score), counted.total(information)
 
 
 def _faulty_sums(
@@ -216,34 +214,41 @@ def _faulty_sums(
     terms = profile.log_terms(angle, fault_model.held)
     weight = share_of(terms, profile.outlier, profile.usable)
     weight = weight * np.clip(active.sum(axis=-1), 0.0, 1.0)[..., None]
-    beyond, off = profile.turned(angle - profile.mode), motor.seen.off(theta)
-    square = np.einsum("...k,...k->...", off, off) + loose * precision * beyond**2
+    counted = CountedOutcomes.of(weight)
+    seen, shares = counted.seen(motor.seen), counted(weight)
+    precision, loose, lever = counted(precision), counted(loose), counted(motor.lever)
+    beyond = counted(profile.turned(angle - profile.mode))
+    off, doubt = seen.off(theta[counted.run]), counted(variance)
+    square = np.einsum("ck,ck->c", off, off) + loose * precision * beyond**2
     others = np.where(
         np.arange(response.layout.motors) == fault_model.motor, 0.0, response.model.scatter
     )
-    dims = motor.seen.dims
-    pull = pull_of(square, nu, dims) * weight * loose
-    mean = mean_pull(nu, dims) * weight * loose
+    pull = pull_of(square, nu, seen.dims) * shares * loose
+    mean = mean_pull(nu, seen.dims) * shares * loose
     if fault_model.redrawn is None:
-        left = _left_along(motor, mean, precision, slope)
-        along = np.einsum("rma,rmat,rmau->rtu", mean * precision, left, left, optimize=True)
+        left = _left_along(counted, lever, mean, precision, counted(slope))
+        scaled = left * np.sqrt(mean * precision)[:, None]
     else:
-        known = np.clip(1.0 - loose * precision * variance, 0.0, 1.0)
-        left = motor.lever * (known / precision)[..., None]
-        scaled = motor.lever * np.sqrt(mean * known / precision)[..., None]
-        along = np.einsum("rmat,rmau->rtu", scaled, scaled, optimize=True)
-    own = motor.seen.levers[..., fault_model.motor] * np.sqrt(loose)[..., None]
-    turned = off - own * beyond[..., None]
-    unknown = own * np.sqrt(variance)[..., None]
-    whole = with_own(motor.seen, fault_model.motor, own, precision, left)
-    told = scatter_sums(whole, turned, unknown, square, weight, others, nu)
-    sums = _sums(motor.seen, off, square, weight, nu, told)
-    score = sums.score - np.einsum("rma,rmat->rt", pull * beyond, motor.lever)
-    return replace(sums, score=score, information=sums.information + along)
+        known = np.clip(1.0 - loose * precision * doubt, 0.0, 1.0)
+        left = lever * (known / precision)[:, None]
+        scaled = lever * np.sqrt(mean * known / precision)[:, None]
+    own = seen.levers[..., fault_model.motor] * np.sqrt(loose)[:, None]
+    turned = off - own * beyond[:, None]
+    unknown = own * np.sqrt(doubt)[:, None]
+    whole = with_own(seen, fault_model.motor, own, precision, left)
+    spread = scatter_sums(counted, whole, turned, unknown, square, shares, others, nu)
+    score, information = _theta_sums(counted, seen, off, square, shares, nu)
+    score = score - counted.total((pull * beyond)[:, None] * lever)
+    information = information + counted.total(scaled[:, :, None] * scaled[:, None])
+    return _Sums(score, information, counted.total(square * shares), *spread, weight)
 
 
 def _left_along(
-    motor: MotorResponse, weight: FloatArray, precision: FloatArray, gain: FloatArray
+    counted: CountedOutcomes,
+    lever: FloatArray,
+    weight: FloatArray,
+    precision: FloatArray,
+    gain: FloatArray,
 ) -> FloatArray:
     """Return by how much a motor's angles are off for each theta, where one amount is common.
 
@@ -252,18 +257,19 @@ def _left_along(
         left = c / P - s (sum w s c) / sum w P s^2
 
     Args:
-        motor: The motor.
-        weight: w, (run, movement, outcome).
-        precision: P, same axes [1/rad2].
-        gain: s, same axes.
+        counted: The outcomes that count.
+        lever: c, (counted, theta).
+        weight: w, (counted,).
+        precision: P, (counted,) [1/rad2].
+        gain: s, (counted,).
 
     Returns:
-        (run, movement, outcome, theta).
+        (counted, theta).
     """
-    common = np.einsum("rma,rmat->rt", weight * gain, motor.lever)
-    total = np.einsum("rma,rma->r", weight * precision, gain**2)
+    common = counted.total((weight * gain)[:, None] * lever)
+    total = counted.total(weight * precision * gain**2)
     shift = common / np.maximum(total, 1e-12)[:, None]
-    return np.asarray(motor.lever / precision[..., None] - gain[..., None] * shift[:, None, None])
+    return np.asarray(lever / precision[:, None] - gain[:, None] * shift[counted.run])
 
 
 def _common_angle(
