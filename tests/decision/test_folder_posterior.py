@@ -342,3 +342,16 @@ def test_eigenvalues_below_the_least_are_raised():
     matrix = root @ np.diag([-2.0, 0.5, 3.0]) @ root.T
     found = positive(matrix[None], 0.1)[0]
     np.testing.assert_allclose(found, root @ np.diag([0.1, 0.5, 3.0]) @ root.T, atol=1e-12)
+
+
+def test_a_run_moves_nothing_that_it_leaves_open(twin, armpi):
+    """Where a run makes the belief wider its site has no precision, so it may have no shift."""
+    odd = tuple(np.array(KNOWN.settling.bias) + 4.0 * WIDTH[7:11])
+    found, *_ = judged(twin, runs_of(armpi, TRUTHS[1:], 1, bias=odd), priors=SURE)
+    cut = 0
+    for precision, shift in zip(found.sites.precision, found.sites.shift, strict=True):
+        values, vectors = np.linalg.eigh(precision)
+        none = values < 1e-9 * values.max()
+        cut += int(none.sum())
+        assert np.abs(vectors[:, none].T @ shift).max(initial=0.0) < 1e-5 * np.abs(shift).max()
+    assert cut > 0

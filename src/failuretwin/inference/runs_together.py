@@ -32,7 +32,7 @@ from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.shared_belief import Belief, mixed, positive, summed
+from failuretwin.inference.shared_belief import Belief, mixed, summed
 from failuretwin.inference.shared_likelihood import Normal
 from failuretwin.inference.shared_posterior import Mixture
 from failuretwin.inference.shared_unknowns import REGISTRATION, SharedLayout, offsets_of
@@ -440,10 +440,16 @@ class RunsTogether:
         return np.asarray(np.linalg.inv(precision))
 
     def _site(self, judged: Judged, covariance: FloatArray) -> Normal:
-        """Return what each run says beside its cavity, in units."""
+        """Return what each run says beside its cavity, in units.
+
+        A direction in which a run leaves more open than was believed before tells nothing.
+        """
         theta = np.stack([each.found.theta for each in judged.candidates], axis=1)
         mean, spread = mixed(judged.share, (theta + self.here) / self.unit, covariance)
-        cavity = judged.cavity.matched()
-        site = positive(np.linalg.inv(spread) - cavity.precision, 0.0)
-        whole = ((cavity.precision + site) @ mean[..., None])[..., 0]
-        return Normal(site, whole - cavity.shift)
+        cavity, precision = judged.cavity.matched(), np.linalg.inv(spread)
+        shift = (precision @ mean[..., None])[..., 0] - cavity.shift
+        values, vectors = np.linalg.eigh(precision - cavity.precision)
+        told = np.swapaxes(vectors, -1, -2) * (values > 0.0)[..., None]
+        site = np.swapaxes(told, -1, -2) @ (told * values[..., None])
+        along = np.swapaxes(told, -1, -2) @ (told @ shift[..., None])
+        return Normal(site, along[..., 0])
