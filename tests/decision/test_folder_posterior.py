@@ -346,7 +346,7 @@ def test_eigenvalues_below_the_least_are_raised():
 
 def test_a_run_moves_nothing_that_it_leaves_open(twin, armpi):
     """Where a run makes the belief wider its site has no precision, so it may have no shift."""
-    odd = tuple((np.array(KNOWN.settling.bias) + [0.0, 0.0, 8.0 * WIDTH[9], 0.0]).tolist())
+    odd = tuple(np.add(KNOWN.settling.bias, (0.0, 0.0, 8.0 * WIDTH[9], 0.0)).tolist())
     found, *_ = judged(twin, runs_of(armpi, ["motor_2:stuck"], 1, bias=odd), priors=SURE)
     (precision,), (shift,) = found.sites.precision, found.sites.shift
     values, vectors = np.linalg.eigh(precision)
