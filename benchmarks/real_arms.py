@@ -1,7 +1,7 @@
 """Diagnosis of real arms that nobody has tuned anything for: relabelled runs of UR10 and UR5.
 
     FAILURETWIN_DATA=DATA python benchmarks/real_arms.py [--arms ur10 ur5] [--seeds 0]
-        [--per-cell 6] [--healthy 60]
+        [--per-cell 6] [--healthy 60] [--raw]
 
 DATA/real_arms holds measured poses of healthy arms, DATA/../real_arms/relabel.py makes runs with
 known faults of them ("relabelled real": the measurements stay, the claimed commands change). Each
@@ -9,7 +9,8 @@ arm has the profile that `failuretwin robot init` writes, untouched. Its runs ar
 calibration, in folders of fifty that calibrate themselves, with the calibration that `failuretwin
 calibrate` learns from other poses, and with the one that it learns with the geometry that
 `failuretwin robot fit` finds from those poses; the UR10 also judges healthy runs of the same robot
-four months before.
+four months before. With --raw positions stay in the frame of the tracker, and `failuretwin robot
+fit` on 40 poses comes first.
 """
 
 from __future__ import annotations
@@ -44,6 +45,8 @@ EARLIER = {"ur10": "ur10_series_a.csv"}
 """Poses of the same robot at another time and place."""
 SURE = 0.99
 FOLDER_RUNS = 50
+FIRST_RUNS = 8
+"""Runs of five poses from which the frame of a tracker is found."""
 
 
 @dataclass(frozen=True)
@@ -81,13 +84,17 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--per-cell", type=int, default=6, help="runs a motor and size")
     parser.add_argument("--healthy", type=int, default=60, help="healthy runs")
+    parser.add_argument("--raw", action="store_true", help="positions in the tracker's own frame")
     options = parser.parse_args()
     script, poses = _data()
     for arm in options.arms:
         for seed in options.seeds:
             with tempfile.TemporaryDirectory() as folder:
-                counts = (options.per_cell, options.healthy)
-                _arm(script, poses, arm, seed, counts, Path(folder))
+                out, counts = Path(folder), (options.per_cell, options.healthy)
+                if options.raw:
+                    _raw_arm(script, poses, arm, seed, counts, out)
+                else:
+                    _arm(script, poses, arm, seed, counts, out)
 
 
 def _data() -> tuple[Path, Path]:
@@ -108,9 +115,7 @@ def _arm(
 ) -> None:
     """Judge the runs of one arm and print the tables."""
     runs = _relabelled(script, poses / POSES[arm], arm, seed, counts, folder / "runs")
-    profile = runs / "arm.toml"
-    profile.write_text(profile_text(check_urdf(runs / "arm.urdf"), profile), encoding="utf-8")
-    robot = load_robot(profile)
+    robot = _initial(runs)
     _table(f"{arm}, seed {seed}, plain", _judged(runs, robot, None))
     _table(f"{arm}, seed {seed}, self-calibrated by {FOLDER_RUNS} runs", _together(runs, robot))
     known = _calibrated(runs, robot)
@@ -128,13 +133,42 @@ def _arm(
         _table(title, _judged(older, placed, exact))
 
 
+def _raw_arm(
+    script: Path, poses: Path, arm: str, seed: int, counts: tuple[int, int], folder: Path
+) -> None:
+    """Judge the runs of one arm in the frame of the tracker and print the tables."""
+    runs = _relabelled(script, poses / POSES[arm], arm, seed, counts, folder / "runs", "--raw")
+    placed = _fitted(runs, _initial(runs), "placed.toml", FIRST_RUNS)
+    _table(f"{arm}, seed {seed}, raw, fitted to 40 poses", _judged(runs, placed, None))
+    known = _calibrated(runs, placed)
+    _table(f"{arm}, seed {seed}, raw, fitted, calibrated", _judged(runs, placed, known))
+    exact = _fitted(runs, placed, "exact.toml")
+    title = f"{arm}, seed {seed}, raw, calibrated with geometry"
+    _table(title, _judged(runs, exact, _calibrated(runs, exact)))
+
+
+def _initial(runs: Path) -> Robot:
+    """Return the robot by the profile that `failuretwin robot init` writes."""
+    profile = runs / "arm.toml"
+    profile.write_text(profile_text(check_urdf(runs / "arm.urdf"), profile), encoding="utf-8")
+    return load_robot(profile)
+
+
 def _calibrated(runs: Path, robot: Robot) -> Imperfections:
     return ft.calibrate(_healthy_logs(runs, robot), robot).imperfections
 
 
-def _fitted(runs: Path, robot: Robot, name: str) -> Robot:
-    """Return the robot by the profile that `failuretwin robot fit` writes from healthy logs."""
-    found = fit_registration(_healthy_logs(runs, robot), robot).profile
+def _fitted(runs: Path, robot: Robot, name: str, count: int | None = None) -> Robot:
+    """Return the robot by the profile that `failuretwin robot fit` writes from healthy logs.
+
+    Args:
+        runs: Their folder.
+        robot: The robot before.
+        name: Name of the profile.
+        count: How many of the runs are used; None: all.
+    """
+    healthy = _healthy_logs(runs, robot).isel(run=slice(count))
+    found = fit_registration(healthy, robot).profile
     text = robot.source.read_text(encoding="utf-8")
     profile = robot.folder / name
     profile.write_text(fitted_text(text, robot.source, profile, found), encoding="utf-8")
@@ -166,7 +200,13 @@ def _together(runs: Path, robot: Robot) -> list[Scored]:
 
 
 def _relabelled(
-    script: Path, poses: Path, arm: str, seed: int, counts: tuple[int, int], out: Path
+    script: Path,
+    poses: Path,
+    arm: str,
+    seed: int,
+    counts: tuple[int, int],
+    out: Path,
+    *more: str,
 ) -> Path:
     """Return the folder of runs made of measured poses.
 
@@ -177,9 +217,10 @@ def _relabelled(
         seed: Seed of what is drawn.
         counts: Runs of each motor and size, healthy runs.
         out: That folder.
+        more: Further options.
     """
     per_cell, healthy = (str(count) for count in counts)
-    options = ["--seed", str(seed), "--per-cell", per_cell, "--healthy", healthy]
+    options = ["--seed", str(seed), "--per-cell", per_cell, "--healthy", healthy, *more]
     command = [sys.executable, str(script), str(poses), arm, str(out), *options]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     return out

@@ -198,3 +198,10 @@ def test_sections_named_by_docstrings_exist():
     for page, anchor in found:
         assert not anchor or anchor in anchors(ROOT / "docs" / page), (page, anchor)
         assert (ROOT / "docs" / page).exists()
+
+
+def test_the_first_snippet_of_the_readme_prints_what_stands_below_it(capsys):
+    text = (ROOT / "README.md").read_text("utf-8")
+    code, printed = re.search(r"```python\n(.*?)```\n\n```\n(.*?)```", text, re.DOTALL).groups()
+    exec(compile(code, "README.md", "exec"), {})
+    assert capsys.readouterr().out == printed

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from failuretwin.core.runs import run_set
     from failuretwin.data_knowledge.generate import Plan, iterate, simulate
     from failuretwin.data_knowledge.read import ReadOptions, read_runs
+    from failuretwin.data_knowledge.sample_log import sample_log
     from failuretwin.decision.acting.reach import reach
     from failuretwin.decision.acting.session import act
     from failuretwin.decision.acting.task import Target, Task
@@ -93,6 +94,7 @@ _HOME = {
     "remaining_life": "decision.maintenance.remaining_life",
     "run_figure": "app.plots",
     "run_set": "core.runs",
+    "sample_log": "data_knowledge.sample_log",
     "save_calibration": "connection.calibration.result",
     "simulate": "data_knowledge.generate",
     "train": "decision.training",
@@ -146,6 +148,7 @@ __all__ = [
     "remaining_life",
     "run_figure",
     "run_set",
+    "sample_log",
     "save_calibration",
     "simulate",
     "train",

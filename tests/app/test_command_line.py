@@ -64,6 +64,13 @@ def results(failuretwin, simulated, tmp_path_factory):
     return answer, read_lines(folder / "x.jsonl"), folder
 
 
+def test_demo_diagnoses_the_runs_that_come_with_the_package(failuretwin):
+    told = failuretwin("demo").stdout
+    assert re.search(r"run_1 +healthy, ", told)
+    assert re.search(r"run_2 +motor 3 stuck at -7 deg since 0.5 s, ", told)
+    assert re.search(r"run_3 +motor 2 misses its targets by about 7.2 deg, ", told)
+
+
 def test_version_and_help(failuretwin):
     assert package.__version__ in failuretwin("--version").stdout
     text = failuretwin("--help").stdout

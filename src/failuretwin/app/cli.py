@@ -16,6 +16,7 @@ from failuretwin import __version__
 from failuretwin.app.commands.act import act, stop
 from failuretwin.app.commands.advise import advise
 from failuretwin.app.commands.data import import_, robot, simulate
+from failuretwin.app.commands.demo import demo
 from failuretwin.app.commands.diagnose import diagnose, evaluate
 from failuretwin.app.commands.learn import calibrate, study, train
 from failuretwin.app.commands.live import emulate, watch
@@ -33,7 +34,7 @@ def cli() -> None:
 
 
 for command in (
-    *(import_, simulate, diagnose, evaluate, calibrate),
+    *(demo, import_, simulate, diagnose, evaluate, calibrate),
     *(train, study, emulate, watch, act, stop, reach, advise, robot),
 ):
     cli.add_command(command)

@@ -1,0 +1,30 @@
+"""`failuretwin demo`: the runs that come with the package, diagnosed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from failuretwin.app.commands.diagnose import diagnose
+from failuretwin.app.commands.options import PATH
+from failuretwin.app.terminal import tell
+
+
+@click.command()
+@click.option(
+    "--plot",
+    type=PATH,
+    metavar="DIR",
+    help="Also write a page with pictures there (needs the extra `plots`).",
+)
+def demo(plot: Path | None) -> None:
+    """Diagnose three simulated runs that come with the package, as `diagnose LOG` would.
+
+    One is healthy, one has a stuck motor, one a motor that misses its targets.
+    """
+    from failuretwin.data_knowledge.sample_log import sample_log
+
+    words = [str(sample_log()), *([] if plot is None else ["--plot", str(plot)])]
+    tell(f"failuretwin diagnose {' '.join(words)}\n")
+    diagnose.main(words, prog_name="failuretwin diagnose", standalone_mode=False)
