@@ -131,6 +131,22 @@ def test_constant_errors_are_taken_off_the_commands(model, armpi, mode, size):
     assert reached(ours) >= reached(alone)
 
 
+def test_a_constant_error_is_taken_off_before_it_is_told_from_one_drawn_anew(model, armpi):
+    """After two movements an error that was the same twice may still be drawn anew each time."""
+    truth = believed(armpi, 2, "encoder_bias", 0.15)
+    first = []
+    for seed in range(5):
+        world = SmallWorld(model, seed, truth)
+        actor = carry_out(world, LatchedBelief(model), task_of(armpi, 3, seed))
+        taken = [text for text in actor.said if text.startswith("taken for")]
+        assert taken
+        assert "motor_3" in taken[0]
+        first.append(taken[0])
+    early = [text for text in first if "that it is this motor" in text]
+    assert len(early) >= 2
+    assert all("encoder" in text for text in early)
+
+
 def test_a_lost_command_is_sent_again_not_corrected_twice(model, armpi):
     world = SmallWorld(model, 3, lost={3})
     actor = carry_out(world, NoBelief(), task_of(armpi, 5, 9))

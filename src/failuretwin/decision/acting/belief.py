@@ -61,6 +61,25 @@ class Judgement:
         """The most probable hypothesis."""
         return self.posterior.hypotheses[int(np.argmax(self.posterior.log_posterior[self.row]))]
 
+    @property
+    def constant(self) -> tuple[Hypothesis, float]:
+        """The most probable constant error, and how probable an error of its motor is.
+
+        Whether an error is constant or drawn anew takes several movements to tell, which motor it
+        is of far fewer.
+        """
+        shares = {
+            hypothesis: self.probability(hypothesis)
+            for hypothesis in self.posterior.hypotheses
+            if _reaction(hypothesis) in (Reaction.INVERT, Reaction.PARK)
+        }
+        constant = [each for each in shares if _reaction(each) is Reaction.INVERT]
+        best = max(constant, key=shares.__getitem__, default=HEALTHY)
+        alike = [
+            each for each in shares if best.faults and each.faults[0].motor == best.faults[0].motor
+        ]
+        return best, sum(shares[each] for each in alike)
+
     def log_evidence(self, hypothesis: Hypothesis) -> float:
         """Return log p(movements | hypothesis)."""
         at = self.posterior.hypotheses.index(hypothesis)
@@ -75,6 +94,13 @@ class Judgement:
             return np.nan, 0.0
         low, middle, high = size.quantiles(LEVELS).tolist()
         return middle, 0.5 * (high - low)
+
+
+def _reaction(hypothesis: Hypothesis) -> Reaction | None:
+    """Return what is done about one fault; None: healthy, unknown, or several faults."""
+    if not hypothesis.known or len(hypothesis.faults) != 1:
+        return None
+    return MODES[hypothesis.faults[0].mode].reaction
 
 
 @dataclass(frozen=True)
@@ -188,6 +214,8 @@ class BeliefSettings:
 
     Attributes:
         latch: Probability from which a fault is believed.
+        constant: A constant error is believed from this probability on if an error of its motor is
+            as probable as `latch`: were it drawn anew, feedback would do no better.
         movements: Latest movements that are weighed together.
         least_movements: No fault is believed after fewer.
         start_lead: Log Bayes factor with which a belief begins.
@@ -196,6 +224,7 @@ class BeliefSettings:
     """
 
     latch: float = 0.95
+    constant: float = 0.3
     movements: int = 5
     least_movements: int = 2
     start_lead: float = 4.0
@@ -310,13 +339,24 @@ class LatchedBelief:
     # Taking up.
 
     def _taken_up(self, judgement: Judgement) -> str:
-        best = judgement.best
-        sure = judgement.probability(best) >= self.settings.latch
+        best, sure = judgement.best, judgement.probability(judgement.best)
+        if sure < self.settings.latch:
+            best, sure = judgement.constant
+            if judgement.probability(best) < self.settings.constant:
+                return ""
         enough = sum(seen.point is not None for seen in self.window)
-        if not (best.known and best.faults and sure and enough >= self.settings.least_movements):
+        if not (
+            best.known
+            and best.faults
+            and sure >= self.settings.latch
+            and enough >= self.settings.least_movements
+        ):
             return ""
         self._believe(best, judgement)
-        return f"taken for {best}, {judgement.probability(best):.0%} sure"
+        said = f"taken for {best}, {judgement.probability(best):.0%} sure"
+        if judgement.probability(best) < self.settings.latch:
+            said += f", {sure:.0%} that it is this motor; what it is off by is taken off"
+        return said
 
     def _believe(self, hypothesis: Hypothesis, judgement: Judgement) -> None:
         fault = hypothesis.faults[0]
