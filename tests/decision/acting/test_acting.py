@@ -156,6 +156,33 @@ def test_a_lost_command_is_sent_again_not_corrected_twice(model, armpi):
     np.testing.assert_array_equal(world.orders[3][1].target, world.orders[2][1].target)
 
 
+def test_a_drift_is_followed_and_taken_off_ahead(model, armpi):
+    """What has slipped is many times what the latest movements show; the rate is what counts."""
+    truth = believed(armpi, 1, "drift", 0.015)
+    task = task_of(armpi, 14, 9)
+    world = SmallWorld(model, 1, truth)
+    ours = carry_out(world, LatchedBelief(model), task)
+    alone = carry_out(SmallWorld(model, 1, truth), NoBelief(), task)
+    drift = ours.belief.believed
+    assert str(drift.fault) == "motor_2:drift"
+    assert drift.size == pytest.approx(0.015, rel=0.2)
+    assert drift.size * (world.time_s - drift.since_s) == pytest.approx(
+        0.015 * world.time_s, abs=0.03
+    )
+    assert reached(ours) >= reached(alone) + 4
+    assert moves(ours) < 0.8 * moves(alone)
+
+
+def test_commands_of_a_motor_that_loses_them_are_sent_again_and_again(model, armpi):
+    truth = believed(armpi, 1, "lost_commands", 0.5)
+    for belief, times in ((NoBelief(), 1), (NoBelief(truth), 3)):
+        world = SmallWorld(model, 3, lost={3, 4, 5})
+        carry_out(world, belief, task_of(armpi, 5, 9))
+        orders = [order.target for _, order in world.orders]
+        again = [bool(np.array_equal(order, orders[2])) for order in orders[3:]]
+        assert again.index(False) == times
+
+
 def test_open_loop_moves_once_for_each_target(model, armpi):
     truth = believed(armpi, 1, "stuck", 0.5, 0.5)
     world = SmallWorld(model, 3, truth)

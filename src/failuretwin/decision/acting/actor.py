@@ -124,12 +124,11 @@ class Actor:
         self.said: list[str] = []
         self._command = self._previous = command
         self._order: Order | None = None
-        self._time_s = 0.0
+        self._time_s = self._pace_s = 0.0
         self._seen: Seen | None = None
         self._attempt = _Attempt()
         self._since_probe = 0
-        self.ways: list[tuple[Effort, Effort]] = []
-        """Each planned way as it was taken, and as it would be if no worn motor were spared."""
+        self.ways: list[tuple[Effort, ...]] = []  # as taken, and as if no motor were spared
 
     # What is known.
 
@@ -158,7 +157,8 @@ class Actor:
         """Return where the arm stands as far as is believed."""
         arm = BelievedArm(self._model, self.belief.believed)
         pose = arm.settle(self._command, self._previous, self._time_s)
-        return Standing(pose, self._command, self._time_s, self._command - self._previous)
+        travel = self._command - self._previous
+        return Standing(pose, self._command, self._time_s + self._pace_s, travel)
 
     # What was seen.
 
@@ -172,7 +172,7 @@ class Actor:
         """
         if self._order is None:
             return
-        self._time_s = rest_s
+        self._time_s, self._pace_s = rest_s, rest_s - start_s
         self._seen = Seen(
             self._command, self._previous, self._order.duration, start_s, rest_s, point
         )
@@ -208,6 +208,13 @@ class Actor:
     @property
     def _most_movements(self) -> int:
         return self._settings.most_movements if self._settings.feedback else 1
+
+    @property
+    def _most_repeats(self) -> int:
+        """How often a command may be sent again: as often as wanted where many get lost."""
+        believed = self.belief.believed
+        loses = believed is not None and believed.reaction is Reaction.REPEAT
+        return self._most_movements if loses else self._settings.most_repeats
 
     def _error_m(self, seen: Seen) -> float:
         if seen.point is None:
@@ -294,8 +301,8 @@ class Actor:
             return None
         attempt.pose = plan.pose
         if plan.unspared is not None:
-            way, plain = (Effort.of(self._planner, pose, at) for pose in (plan.pose, plan.unspared))
-            self.ways.append((way, plain))
+            poses = plan.pose, plan.unspared
+            self.ways.append(tuple(Effort.of(self._planner, pose, at) for pose in poses))
         return self._probed(plan.order, at)
 
     def _out_of_reach(self, plan: Plan, at: Standing) -> Plan:
@@ -329,12 +336,14 @@ class Actor:
         """Return the next order for a target that was missed; None where it is given up."""
         seen, attempt = self._seen, self._attempt
         assert seen is not None and self._order is not None
-        if attempt.repeats < self._settings.most_repeats:
-            lost = "the tool was not seen" if seen.point is None else lost_command(self.arm, seen)
-            if lost:
+        if attempt.repeats < self._most_repeats:
+            lost = [] if seen.point is None else lost_command(self.arm, seen)
+            if lost or seen.point is None:
                 attempt.repeats += 1
-                self._say(f"{lost}: sent again")
-                return self._again()
+                names = ", ".join(self._model.motor_names[k] for k in lost)
+                why = f"the command of {names} seems lost" if lost else "the tool was not seen"
+                self._say(f"{why}: sent again")
+                return self._again(lost)
         if seen.point is None:
             self._conclude("the tool is not seen at rest")
             return None
@@ -343,9 +352,14 @@ class Actor:
             return parked
         return self._fed_back(seen)
 
-    def _again(self) -> Order | None:
-        """Return the last order once more, with the time that it needs from where it began."""
+    def _again(self, lost: Sequence[int]) -> Order | None:
+        """Return the last order once more, with the time that it needs from where it began.
+
+        Motors that have lost it stand where they were told to be before.
+        """
         assert self._order is not None
+        self._command = self._command.copy()
+        self._command[lost] = self._previous[lost]
         order, wrong = self._planner.checked(self._order.target, self.arm, self.standing())
         if wrong:
             self._conclude(f"no safe way: {wrong}")
@@ -376,11 +390,13 @@ class Actor:
         first = attempt.corrections == 0
         attempt.corrections += 1
         gain = self._settings.first_gain if first else self._settings.later_gain
-        wrong, low_high = "", arm.limits
+        wrong = ""
         miss, turn = self.target.point - seen.point, self._turn(seen)
+        then = arm.settle(seen.command, seen.previous, self._time_s + self._pace_s)
+        slips = then - arm.settle(seen.command, seen.previous, seen.rest_s)
         for share in gain * 0.5 ** np.arange(HALVINGS + 1):
             step = self._step(arm, attempt.pose, share * miss, share * turn)
-            command = np.clip(self._command + step / arm.gain(seen), *low_high)
+            command = np.clip(self._command + (step - slips) / arm.gain(seen), *arm.limits)
             command = arm.rounded(arm.with_rest(command, self._command))
             order, wrong = self._planner.checked(command, arm, self.standing())
             if not wrong:

@@ -21,6 +21,8 @@ from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault, Seen
+from failuretwin.decision.acting.drifting import followed
+from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.reaction import Reaction
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.evidence import SettledEvidence
@@ -30,9 +32,12 @@ from failuretwin.inference.priors import MONITORING, Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.shared_posterior import shared_posterior
 
-ACTED_ON = ("stuck", "steady_state_error", "encoder_bias", "encoder_scale")
-"""Modes that are told from settled positions and call for another plan; of the others, feedback,
-waiting and sending again are the whole answer, whatever they are called."""
+ACTED_ON = (
+    *("stuck", "steady_state_error", "encoder_bias", "encoder_scale"),
+    *("drift", "torque_loss", "lost_commands"),
+)
+"""Modes that are told from settled positions and answered; of the others feedback and waiting are
+the whole answer, whatever they are called."""
 
 # What the latest movements of some arms say.
 
@@ -94,6 +99,12 @@ class Judgement:
             return np.nan, 0.0
         low, middle, high = size.quantiles(LEVELS).tolist()
         return middle, 0.5 * (high - low)
+
+    def onset_s(self, hypothesis: Hypothesis) -> float:
+        """Return when a fault most probably began, since the first of the movements began [s]."""
+        at = self.posterior.hypotheses.index(hypothesis)
+        onset = self.posterior.weights[at].estimate(self.row).onset
+        return 0.0 if onset is None else float(onset.quantiles((0.5,))[0])
 
 
 def _reaction(hypothesis: Hypothesis) -> Reaction | None:
@@ -367,7 +378,7 @@ class LatchedBelief:
             motor=self.model.motor_names.index(fault.motor),
             size=size,
             spread=spread,
-            since_s=self.history[-1].start_s,
+            since_s=self.window[0].start_s + judgement.onset_s(hypothesis),
             angle=size if held else np.nan,
             probability=judgement.probability(hypothesis),
         )
@@ -377,6 +388,9 @@ class LatchedBelief:
         """Take over what the latest movements say of the size where that is sharper."""
         believed = self.believed
         if believed is None or believed.reaction is Reaction.PARK:
+            return
+        if believed.mode.signature is Signature.GROWING_OFFSET:
+            self.believed = followed(self.model, believed, self.history)
             return
         hypothesis = Hypothesis((believed.fault,))
         if hypothesis not in judgement.posterior.hypotheses:

@@ -48,7 +48,7 @@ class Standing:
     Attributes:
         pose: Where its motors are believed to be, (motor,) [rad].
         command: What they were told last, (motor,) [rad].
-        time_s: By its clock [s].
+        time_s: When the next movement will be over, by its clock [s].
         travel: How far they went last, (motor,) [rad]; None: not known.
     """
 

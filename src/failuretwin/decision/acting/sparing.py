@@ -88,7 +88,7 @@ class Effort:
 
 
 def sparing_lines(
-    names: Sequence[str], spared: FloatArray, ways: Sequence[tuple[Effort, Effort]]
+    names: Sequence[str], spared: FloatArray, ways: Sequence[tuple[Effort, ...]]
 ) -> list[str]:
     """Return in words what sparing has changed.
 
