@@ -37,12 +37,11 @@ from failuretwin.decision.acting.actor import ActingSettings, Actor, TargetResul
 from failuretwin.decision.acting.belief import (
     Belief,
     BeliefSettings,
-    Judge,
-    Judgement,
     LatchedBelief,
     NoBelief,
 )
 from failuretwin.decision.acting.believed_arm import BelievedFault, Seen
+from failuretwin.decision.acting.judging import Judge, Judgement
 from failuretwin.decision.acting.planner import Planner
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.task import Task

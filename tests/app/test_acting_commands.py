@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+import failuretwin as ft
 from failuretwin import DigitalTwin, InputError, load_robot
 from failuretwin.app.acting import emulated_faults, spared_of
 from failuretwin.app.reach_report import held_of
@@ -138,3 +139,12 @@ def test_held_motors_in_words(armpi):
         held_of("motor_9=1", load_robot("armpi_fpv"))
     with pytest.raises(InputError, match="MOTOR=DEGREES"):
         held_of("motor_2", armpi)
+
+
+def test_a_task_in_python():
+    said = []
+    task = ft.Task((ft.Target((0.10, 0.10, 0.20)), ft.Target((0.0, 0.12, 0.25))))
+    with ft.emulated_arm("armpi_fpv", ["motor_3:stuck=0.3"], 1) as arm:
+        results = ft.act(task, arm, tell=said.append)
+    assert [result.reached for result in results] == [True, True]
+    assert any("motor_3" in text for text in said)

@@ -19,7 +19,7 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.actor import TargetResult
 from failuretwin.decision.acting.sparing import wear_weights
-from failuretwin.digital_model.calibrated_robot import CalibratedRobot
+from failuretwin.digital_model.calibrated_robot import CalibratedRobot, RobotLike, calibrated
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.injection import ScheduledFault
 from failuretwin.failure_behavior.mode import FaultMode, SizedMode
@@ -94,6 +94,31 @@ def _number(value: str, what: str) -> float:
     return number
 
 
+def emulated_arm(
+    robot: RobotLike = "armpi_fpv", faults: Sequence[str] = (), seed: int = 0
+) -> Commander:
+    """Return an arm that exists only as physics and does what it is told, as `act` takes it.
+
+    Args:
+        robot: The robot, its name or its profile, as it is known.
+        faults: What is wrong with it, such as ``motor_3:stuck=-0.4`` or
+            ``motor_2:encoder_bias=0.1@20``: MOTOR:MODE[=SIZE][@START[-END]], the size in the unit
+            of the mode [rad], times in seconds.
+        seed: Seed of all chance.
+
+    Raises:
+        InputError: If a fault cannot be read, or mujoco is missing.
+    """
+    from failuretwin.connection.commanded_arm import CommandedArm
+    from failuretwin.connection.emulated_arm import Emulation
+
+    known = calibrated(robot)
+    own = emulated_faults(faults, known.robot)
+    return CommandedArm(
+        Emulation(known.robot, known.imperfections, own.schedule, seed, own.modes, own.start)
+    )
+
+
 def commander_of(
     place: str,
     known: CalibratedRobot,
@@ -108,14 +133,7 @@ def commander_of(
         InputError: If it cannot be reached or is none of `PLACES`.
     """
     if place == EMULATED:
-        from failuretwin.connection.commanded_arm import CommandedArm
-        from failuretwin.connection.emulated_arm import Emulation
-
-        own = emulated_faults(faults, known.robot)
-        emulation = Emulation(
-            known.robot, known.imperfections, own.schedule, seed, own.modes, own.start
-        )
-        return stack.enter_context(CommandedArm(emulation))
+        return stack.enter_context(emulated_arm(known, faults, seed))
     if faults:
         raise InputError(
             f"--fault is of an emulated arm, but --on is {place!r}. Leave it out, or act on "

@@ -89,6 +89,7 @@ def test_reach_counts_directions(armpi):
     gate = SafetyGate(armpi)
     assert reach(gate, points).reached.sum() >= reach(gate, task).reached.sum() >= 8
     assert reach(gate, across).reached.sum() == 0
+    assert reach("armpi_fpv", across).reached.sum() == 0
     assert reach(gate, mixed).reached.tolist()[6:] == [False] * 6
     assert reach(gate, mixed).reached[:6].sum() >= 4
     assert None in reach(gate, across).record()["miss_m"]

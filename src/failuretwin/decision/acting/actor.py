@@ -16,8 +16,9 @@ import numpy as np
 
 from failuretwin.connection.links.commander import Order
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.belief import Belief, Judgement
+from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault, Seen
+from failuretwin.decision.acting.judging import Judgement
 from failuretwin.decision.acting.planner import Plan, Planner, Standing
 from failuretwin.decision.acting.reactions import lost_command, probing, told
 from failuretwin.decision.acting.sparing import Effort
@@ -51,7 +52,7 @@ class ActingSettings:
     feedback: bool = True
     first_gain: float = 1.0
     later_gain: float = 0.7
-    most_repeats: int = 1
+    most_repeats: int = 2
     probe_every: int = 8
 
 
@@ -209,13 +210,6 @@ class Actor:
     def _most_movements(self) -> int:
         return self._settings.most_movements if self._settings.feedback else 1
 
-    @property
-    def _most_repeats(self) -> int:
-        """How often a command may be sent again: as often as wanted where many get lost."""
-        believed = self.belief.believed
-        loses = believed is not None and believed.reaction is Reaction.REPEAT
-        return self._most_movements if loses else self._settings.most_repeats
-
     def _error_m(self, seen: Seen) -> float:
         if seen.point is None:
             return np.nan
@@ -336,7 +330,7 @@ class Actor:
         """Return the next order for a target that was missed; None where it is given up."""
         seen, attempt = self._seen, self._attempt
         assert seen is not None and self._order is not None
-        if attempt.repeats < self._most_repeats:
+        if attempt.repeats < self._settings.most_repeats:
             lost = [] if seen.point is None else lost_command(self.arm, seen)
             if lost or seen.point is None:
                 attempt.repeats += 1

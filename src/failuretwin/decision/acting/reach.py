@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from failuretwin.digital_model.inverse_kinematics import (
     InverseKinematics,
     feedback_factor,
 )
-from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.robot import Robot, load_robot
 
 POINTS = 300
 """Points of a workspace, unless told otherwise."""
@@ -111,7 +112,7 @@ def workspace(robot: Robot, count: int = POINTS, seed: int = 0) -> FloatArray:
 
 
 def reach(
-    gate: SafetyGate,
+    arm: SafetyGate | Robot | str | Path,
     points: FloatArray | Task,
     held: tuple[str, float] | None = None,
     seed: int = 0,
@@ -119,7 +120,7 @@ def reach(
     """Return which points an arm can reach in poses that keep off the floor and its own links.
 
     Args:
-        gate: The arm, and what is safe.
+        arm: The arm and what is safe; or a robot, its name or its profile, with the usual limits.
         points: (point, 3) [m], or a task, whose tolerances and directions then count.
         held: Name of a motor that is held, and its angle [rad]; None: none is.
         seed: Seed of the poses that a search begins with.
@@ -127,6 +128,7 @@ def reach(
     Raises:
         InputError: If the robot has no such motor.
     """
+    gate = arm if isinstance(arm, SafetyGate) else SafetyGate(load_robot(arm))
     robot = gate.robot
     kinematics, rng = InverseKinematics.of(robot), np.random.default_rng(seed)
     if isinstance(points, Task):

@@ -63,9 +63,6 @@ def _loss_sets(arm: BelievedArm) -> list[tuple[list[int], float]]:
     for entry in arm.model.imperfections.lost_commands:
         motors = tuple(names.index(motor) for motor in entry.motors)
         found[motors] = max(entry.rate, LEAST_LOSS_RATE)
-    fault = arm.fault
-    if fault is not None and fault.reaction is Reaction.REPEAT and np.isfinite(fault.size):
-        found[(fault.motor,)] = max(found[(fault.motor,)], fault.size)
     return [(list(motors), rate) for motors, rate in found.items()]
 
 
