@@ -177,7 +177,7 @@ class LatchedBelief:
         self._believe(best, judgement)
         said = f"taken for {best}, {judgement.probability(best):.0%} sure"
         if judgement.probability(best) < self.settings.latch:
-            said += f", {sure:.0%} that it is this motor; what it is off by is taken off"
+            said += f", {sure:.0%} with what looks alike at first"
         return said
 
     def _believe(self, hypothesis: Hypothesis, judgement: Judgement) -> None:
