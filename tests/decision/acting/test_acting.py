@@ -175,7 +175,8 @@ def test_a_drift_is_followed_and_taken_off_ahead(model, armpi):
 
 def test_commands_that_get_lost_again_are_sent_again(model, armpi):
     world = SmallWorld(model, 3, lost={3, 4})
-    actor = carry_out(world, NoBelief(), task_of(armpi, 5, 9))
+    twice = ActingSettings(most_repeats=2)
+    actor = carry_out(world, NoBelief(), task_of(armpi, 5, 9), twice)
     orders = [order.target for _, order in world.orders]
     again = [bool(np.array_equal(order, orders[2])) for order in orders[3:]]
     assert again.index(False) == 2

@@ -52,7 +52,7 @@ class ActingSettings:
     feedback: bool = True
     first_gain: float = 1.0
     later_gain: float = 0.7
-    most_repeats: int = 2
+    most_repeats: int = 1
     probe_every: int = 8
 
 
