@@ -37,12 +37,11 @@ from failuretwin.decision.acting.actor import ActingSettings, Actor, TargetResul
 from failuretwin.decision.acting.belief import (
     Belief,
     BeliefSettings,
-    Judge,
-    Judgement,
     LatchedBelief,
     NoBelief,
 )
 from failuretwin.decision.acting.believed_arm import BelievedFault, Seen
+from failuretwin.decision.acting.judging import Judge, Judgement
 from failuretwin.decision.acting.planner import Planner
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.task import Task
@@ -54,6 +53,7 @@ from failuretwin.inference.healthy_model import HealthyModel
 TOLERANCE_M = 0.005
 MOST_STEPS = 90
 SCALE = (0.1, 0.6)
+DRIFT = (0.01, 0.02)
 STRATEGIES = ("open", "feedback", "diagnose", "oracle")
 NEVER = 2.0
 """A probability that is never reached."""
@@ -228,7 +228,13 @@ def faults_of(kind: str, robot: Robot, arms: int, seed: int) -> list[TrueFault]:
     """Return `arms` faults of a kind at each motor; of healthy ones so many in all."""
     if kind == "healthy":
         return [TrueFault("healthy")] * arms
-    ends = {"bias": ERROR_RAD, "scale": SCALE, "torque": (0.4, 0.7), "lost": (0.5, 0.5)}
+    ends = {
+        "bias": ERROR_RAD,
+        "scale": SCALE,
+        "torque": (0.4, 0.7),
+        "lost": (0.5, 0.5),
+        "drift": DRIFT,
+    }
     rng, found = np.random.default_rng([seed, 5]), []
     for motor in range(len(robot.motors)):
         for _ in range(arms):

@@ -39,6 +39,7 @@ MODES = {
     "scale": "encoder_scale",
     "torque": "torque_loss",
     "lost": "lost_commands",
+    "drift": "drift",
 }
 
 
@@ -79,7 +80,7 @@ class World:
         self.base = self.home + self.bias
         self.error = np.zeros(n)
         self.held = np.full(n, np.nan)
-        self.time_s = 0.0
+        self.time_s = self.struck_s = 0.0
         if self.engine == "physics":
             self.arms = LiveArms(PhysicsEngine(robot), self.base, STEP_S, np.zeros(n))
             self.angle = self.arms.angle
@@ -117,6 +118,8 @@ class World:
             luck = rng.random(3)
             if self.count > self.onset:
                 self._strike(i, luck, aim, held, weak, still)
+        if self.count <= self.onset:
+            self.struck_s = self.time_s
         scatter *= self.scatter
         friction = 0.0 if self.engine == "physics" else self.friction
         new = aim + self.bias - friction * np.sign(target - self.commanded) + scatter
@@ -164,6 +167,8 @@ class World:
             aim[i, k] += fault.size
         elif fault.kind == "scale":
             aim[i, k] *= 1.0 + fault.size
+        elif fault.kind == "drift":
+            aim[i, k] += fault.size * (self.time_s - self.struck_s)
         elif fault.kind == "torque":
             weak[i, k] = fault.size
         elif fault.kind == "lost":

@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from failuretwin.app.acting import emulated_arm
     from failuretwin.app.plots import run_figure
     from failuretwin.connection.calibration.calibrate import calibrate
     from failuretwin.connection.calibration.result import Calibration, save_calibration
@@ -80,6 +81,7 @@ _HOME = {
     "calibrate": "connection.calibration.calibrate",
     "compare": "decision.evaluation",
     "diagnose": "inference.diagnoser",
+    "emulated_arm": "app.acting",
     "evaluate": "decision.evaluation",
     "isolability": "inference.isolability",
     "iterate": "data_knowledge.generate",
@@ -134,6 +136,7 @@ __all__ = [
     "calibrate",
     "compare",
     "diagnose",
+    "emulated_arm",
     "evaluate",
     "isolability",
     "iterate",

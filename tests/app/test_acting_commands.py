@@ -5,9 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from failuretwin import InputError, load_robot
+import failuretwin as ft
+from failuretwin import DigitalTwin, InputError, load_robot
 from failuretwin.app.acting import emulated_faults, spared_of
 from failuretwin.app.reach_report import held_of
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
+from failuretwin.inference.healthy_model import HealthyModel
 
 pytest.importorskip("mujoco")
 TASK = "x,y,z\n0.1,0.1,0.2\n-0.1,0.12,0.18\n0.05,0.15,0.15\n0,0.12,0.25\n0.08,0.1,0.22\n"
@@ -45,6 +48,9 @@ def test_act_reaches_what_a_stuck_motor_leaves(failuretwin, task, tmp_path):
         (["--fault", "motor_9:stuck"], "motor_9"),
         (["--fault", "motor_1:stuck=much"], "expected a number"),
         (["--spare", "motor_9"], "motor_9"),
+        (["--spare", "motor_2=1.2.3"], "expected a number"),
+        (["--spare", "motor_2=-1"], "below 0"),
+        (["--wear", "nothing.history.jsonl"], "nothing.history.jsonl"),
     ],
 )
 def test_what_act_refuses(failuretwin, task, arguments, said):
@@ -117,8 +123,14 @@ def test_faults_of_an_emulated_arm(armpi):
     assert not found.modes["encoder_bias"].both_signs
     with pytest.raises(InputError, match="expected a number"):
         emulated_faults(["motor_1:drift=x"], armpi)
-    assert spared_of(["motor_2=0.5", "motor_4"], armpi).tolist() == [0.0, 0.5, 0.0, 1.0]
-    assert spared_of([], armpi) is None
+    model = HealthyModel.of(DigitalTwin(armpi), NO_IMPERFECTIONS)
+    assert spared_of(["motor_2=0.5", "motor_4"], None, model, print).tolist() == [
+        0.0,
+        0.5,
+        0.0,
+        1.0,
+    ]
+    assert spared_of([], None, model, print) is None
 
 
 def test_held_motors_in_words(armpi):
@@ -127,3 +139,12 @@ def test_held_motors_in_words(armpi):
         held_of("motor_9=1", load_robot("armpi_fpv"))
     with pytest.raises(InputError, match="MOTOR=DEGREES"):
         held_of("motor_2", armpi)
+
+
+def test_a_task_in_python():
+    said = []
+    task = ft.Task((ft.Target((0.10, 0.10, 0.20)), ft.Target((0.0, 0.12, 0.25))))
+    with ft.emulated_arm("armpi_fpv", ["motor_3:stuck=0.3"], 1) as arm:
+        results = ft.act(task, arm, tell=said.append)
+    assert [result.reached for result in results] == [True, True]
+    assert any("motor_3" in text for text in said)

@@ -203,3 +203,22 @@ def test_samples_for_progpy():
 def test_what_makes_no_sense_is_refused(level, variance, limit):
     with pytest.raises(InputError):
         remaining_life(level, variance, limit, np.random.default_rng(0))
+
+
+def test_a_few_jumps_are_not_taken_for_a_curve():
+    """Lives that wear by jumps: late or early in few, though no shape of ours is theirs."""
+    holds, late = [], []
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        jumps = (rng.random(6000) < 20 / 1200) * rng.exponential(0.2, 6000)
+        wear = np.cumsum(jumps)
+        end = int(np.flatnonzero(wear >= 4.0)[0])
+        now = int(0.3 * end)
+        seen = wear[:now] + 0.4 * rng.standard_normal(now)
+        seen[-25:] = np.nan
+        life = remaining_life(seen, 0.16, 4.0, rng)
+        left = end - now
+        holds.append(life.quantile(0.05) <= left <= life.quantile(0.95))
+        late.append(left < life.quantile(0.05))
+    assert np.mean(holds) >= 0.8
+    assert np.mean(late) <= 0.1

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,12 +18,14 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.actor import TargetResult
-from failuretwin.digital_model.calibrated_robot import CalibratedRobot
+from failuretwin.decision.acting.sparing import wear_weights
+from failuretwin.digital_model.calibrated_robot import CalibratedRobot, RobotLike, calibrated
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.injection import ScheduledFault
 from failuretwin.failure_behavior.mode import FaultMode, SizedMode
 from failuretwin.failure_behavior.modes import SteadyStateError, Stuck
 from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.healthy_model import HealthyModel
 
 PLACES = f"{EMULATED}, {ROS1} or {ROSBRIDGE}://HOST[:PORT]"
 
@@ -65,7 +66,7 @@ def emulated_faults(texts: Sequence[str], robot: Robot) -> EmulatedFaults:
         scheduled = ScheduledFault.parse(f"{kind}@{when or '0'}", robot.motor_names)
         schedule.append(scheduled)
         if size:
-            value = _number(size, text)
+            value = _number(size, f"fault {text!r}: size")
             mode = modes[scheduled.fault.mode]
             if isinstance(mode, Stuck):
                 start[robot.motor_names.index(scheduled.fault.motor)] = value
@@ -83,14 +84,39 @@ def _of_size(mode: FaultMode, size: float, text: str) -> FaultMode:
     return replace(mode, magnitude=(size, size), **signs)
 
 
-def _number(value: str, text: str) -> float:
+def _number(value: str, what: str) -> float:
     try:
         number = float(value)
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise InputError(f"fault {text!r}: size is {value!r}, expected a number.")
+        raise InputError(f"{what} is {value!r}, expected a number.")
     return number
+
+
+def emulated_arm(
+    robot: RobotLike = "armpi_fpv", faults: Sequence[str] = (), seed: int = 0
+) -> Commander:
+    """Return an arm that exists only as physics and does what it is told, as `act` takes it.
+
+    Args:
+        robot: The robot, its name or its profile, as it is known.
+        faults: What is wrong with it, such as ``motor_3:stuck=-0.4`` or
+            ``motor_2:encoder_bias=0.1@20``: MOTOR:MODE[=SIZE][@START[-END]], the size in the unit
+            of the mode [rad], times in seconds.
+        seed: Seed of all chance.
+
+    Raises:
+        InputError: If a fault cannot be read, or mujoco is missing.
+    """
+    from failuretwin.connection.commanded_arm import CommandedArm
+    from failuretwin.connection.emulated_arm import Emulation
+
+    known = calibrated(robot)
+    own = emulated_faults(faults, known.robot)
+    return CommandedArm(
+        Emulation(known.robot, known.imperfections, own.schedule, seed, own.modes, own.start)
+    )
 
 
 def commander_of(
@@ -107,14 +133,7 @@ def commander_of(
         InputError: If it cannot be reached or is none of `PLACES`.
     """
     if place == EMULATED:
-        from failuretwin.connection.commanded_arm import CommandedArm
-        from failuretwin.connection.emulated_arm import Emulation
-
-        own = emulated_faults(faults, known.robot)
-        emulation = Emulation(
-            known.robot, known.imperfections, own.schedule, seed, own.modes, own.start
-        )
-        return stack.enter_context(CommandedArm(emulation))
+        return stack.enter_context(emulated_arm(known, faults, seed))
     if faults:
         raise InputError(
             f"--fault is of an emulated arm, but --on is {place!r}. Leave it out, or act on "
@@ -139,11 +158,14 @@ def commander_of(
 
 def record(number: int, result: TargetResult) -> dict[str, Any]:
     """Return what became of a target as a JSON object."""
+    directed = result.target.direction is not None and not math.isnan(result.error_rad)
+    error_rad = result.error_rad if directed else None
     return {
         "target": number,
         "position": list(result.target.position),
         "reached": result.reached,
         "error_m": None if math.isnan(result.error_m) else result.error_m,
+        "error_rad": error_rad,
         "movements": result.movements,
         "reachable": result.reachable,
         "believed": result.believed or None,
@@ -169,6 +191,8 @@ def table_lines(results: Sequence[TargetResult]) -> list[str]:
     lines = []
     for number, result in enumerate(results, start=1):
         error = "not seen" if math.isnan(result.error_m) else f"{1e3 * result.error_m:5.1f} mm"
+        if result.target.direction is not None and not math.isnan(result.error_rad):
+            error += f" {math.degrees(result.error_rad):4.1f} deg"
         state = "reached" if result.reached else result.why
         lines.append(f"{number:4d}  {error:>9s}  {result.movements:2d} movements  {state}")
     reached = sum(result.reached for result in results)
@@ -177,21 +201,31 @@ def table_lines(results: Sequence[TargetResult]) -> list[str]:
     return lines
 
 
-def spared_of(texts: Sequence[str], robot: Robot) -> FloatArray | None:
+def spared_of(
+    texts: Sequence[str], history: Path | None, model: HealthyModel, tell: Callable[[str], None]
+) -> FloatArray | None:
     """Return the weight of each motor that is to be spared, (motor,); None: of none.
 
     Args:
-        texts: MOTOR or MOTOR=WEIGHT.
-        robot: The robot.
+        texts: MOTOR or MOTOR=WEIGHT; it counts instead of what the history says of this motor.
+        history: CAL.history.jsonl; None: there is none.
+        model: The robot.
+        tell: Called with what the history says.
 
     Raises:
-        InputError: If a motor is unknown or a weight is no number.
+        InputError: If a motor is unknown, a weight is no number, or the history cannot be read.
     """
-    weight = np.zeros(len(robot.motors))
+    names = model.motor_names
+    weight = np.zeros(len(names))
+    if history is not None:
+        weight = wear_weights(history, model)
+        worn = [f"{names[k]} {weight[k]:.0%}" for k in np.flatnonzero(weight)]
+        tell(f"worn, of what is allowed: {', '.join(worn) or 'no motor beyond doubt'}")
     for text in texts:
-        match = re.fullmatch(r"([^=]+)(?:=([\d.]+))?", text)
-        if match is None:
-            raise InputError(f"--spare {text!r} is not of the form MOTOR[=WEIGHT].")
-        Hypothesis.parse(f"{match[1]}:stuck", robot.motor_names)
-        weight[robot.motor_names.index(match[1])] = float(match[2] or 1.0)
+        name, _, share = text.partition("=")
+        Hypothesis.parse(f"{name}:stuck", names)
+        value = _number(share or "1", f"--spare {text!r}: the weight")
+        if value < 0.0:
+            raise InputError(f"--spare {text!r}: the weight is below 0. Leave the motor out.")
+        weight[names.index(name)] = value
     return weight if weight.any() else None

@@ -60,6 +60,8 @@ def map_lines(found: Reach, *, per_point: bool) -> list[str]:
     if per_point:
         for i, (point, miss) in enumerate(zip(found.points, found.miss_m, strict=True), start=1):
             state = "can be reached" if found.reached[i - 1] else f"misses by {1e3 * miss:.0f} mm"
+            if np.isinf(miss):
+                state = "no pose off the floor and the links points as it shall"
             lines.append(f"{i:4d}  {point[0]:8.3f} {point[1]:8.3f} {point[2]:8.3f}  {state}")
     count = int(found.reached.sum())
     where = f"{found.motor} held at {np.rad2deg(found.angle):.0f} deg"

@@ -112,6 +112,11 @@ class InverseKinematics:
         """Return tool points (..., 3) [m] and Jacobians (..., 3, motor) [m/rad] of poses."""
         return self._tool(self._points, pose)
 
+    def axis(self, pose: FloatArray) -> FloatArray:
+        """Return where z of the tool frame points, unit vectors (..., 3), of poses."""
+        points, _ = self._tool(self._pointers, pose)
+        return np.asarray((points[..., 3:] - points[..., :3]) / POINTER_M)
+
     def _tool(self, points: ChainFrames, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
         sense = self.robot.sensor_sense
         point, jacobian = points.tool_points(pose * sense)
@@ -147,8 +152,7 @@ class InverseKinematics:
         miss_rad = np.zeros(len(pose))
         if direction is not None:
             axis, asked = point[:, 3:] - point[:, :3], wanted[:, 3:] - wanted[:, :3]
-            cosine = np.sum(axis * asked, axis=-1) / POINTER_M**2
-            miss_rad = np.arccos(np.clip(cosine, -1.0, 1.0))
+            miss_rad = angle_between(axis / POINTER_M, asked / POINTER_M)
         by_goal = shape[:2]
         return Poses(pose.reshape(shape), miss_m.reshape(by_goal), miss_rad.reshape(by_goal))
 
@@ -204,6 +208,11 @@ class InverseKinematics:
             step = _damped(jacobian * (free & ~outward)[:, None, :], residual, damping)
         largest = np.abs(step).max(axis=-1, keepdims=True)
         return np.asarray(step * np.minimum(1.0, LONGEST_STEP / np.maximum(largest, 1e-12)))
+
+
+def angle_between(axis: FloatArray, other: FloatArray) -> FloatArray:
+    """Return the angle between unit vectors (..., 3), (...) [rad]."""
+    return np.asarray(np.arccos(np.clip(np.sum(axis * other, axis=-1), -1.0, 1.0)))
 
 
 def _unfinished(square: FloatArray, starts: int) -> BoolArray:

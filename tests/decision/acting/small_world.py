@@ -8,11 +8,11 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Fault
 from failuretwin.decision.acting.actor import ActingSettings, Actor
-from failuretwin.decision.acting.belief import Judge
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault
+from failuretwin.decision.acting.judging import Judge
 from failuretwin.decision.acting.planner import Planner
 from failuretwin.decision.acting.safety import SafetyGate
-from failuretwin.decision.acting.task import Task
+from failuretwin.decision.acting.task import Target, Task
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
 
 PERIOD_S = 1.5
@@ -27,6 +27,15 @@ def task_of(robot, count, seed=0, tolerance_m=0.005):
     low, high = np.array([motor.movement_range for motor in robot.motors]).T
     pose = np.random.default_rng(seed).uniform(low, high, (count, len(low)))
     return Task.of_points(InverseKinematics.of(robot).tool(pose)[0], tolerance_m)
+
+
+def task_with_directions(robot, count, seed=0):
+    """Points and directions of poses that the arm can take."""
+    low, high = np.array([motor.movement_range for motor in robot.motors]).T
+    pose = np.random.default_rng(seed).uniform(low, high, (count, len(low)))
+    kinematics = InverseKinematics.of(robot)
+    where, along = kinematics.tool(pose)[0], kinematics.axis(pose)
+    return Task(tuple(Target(tuple(w), tuple(a)) for w, a in zip(where, along, strict=True)))
 
 
 @dataclass
@@ -61,15 +70,15 @@ class SmallWorld:
                 sign = 1.0 if self.rng.random() < 0.5 else -1.0
                 self.error = sign * self.rng.uniform(0.05, 0.2)
             pose[truth.motor] += self.error
-        self.command = target
+        self.command, self.pose = target, pose
         self.time_s += PERIOD_S
         return self.model.twin.path(pose)
 
 
-def carry_out(world, belief, task, settings=None, steps=200, each=None):
+def carry_out(world, belief, task, settings=None, steps=200, each=None, spared=None):
     """Return the actor after the task; `each` is called with the number of every movement."""
     robot = world.model.twin.robot
-    planner = Planner(SafetyGate(robot))
+    planner = Planner(SafetyGate(robot), spared)
     actor = Actor(planner, world.model, task, belief, world.command, settings or ActingSettings())
     judge = Judge(world.model)
     for number in range(steps):

@@ -12,7 +12,7 @@ from failuretwin.decision.acting.belief import LatchedBelief
 from failuretwin.decision.acting.believed_arm import BelievedArm
 from failuretwin.decision.acting.planner import Planner, Standing
 from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
-from failuretwin.decision.acting.task import Task
+from failuretwin.decision.acting.task import Target
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.inverse_kinematics import usable_limits
 from failuretwin.failure_behavior.registry import MODES
@@ -80,10 +80,11 @@ def random_case(model, gate, rng):
     scale = robot.reach
     point = rng.uniform([-scale, -scale, -0.1 * scale], [scale, scale, scale])
     planner = Planner(gate, rng.random(len(low)) if rng.random() < 0.3 else None)
+    direction = tuple(rng.normal(size=3)) if rng.random() < 0.3 else None
     plan = planner.plan(
-        Task.of_points(point[None]).targets[0],
+        Target(tuple(point), direction, 0.005 if direction is None else 0.1),
         arm,
-        Standing(pose, command, float(rng.uniform(0.0, 9.0))),
+        Standing(pose, command, float(rng.uniform(0.0, 9.0)), rng.normal(size=len(low))),
     )
     return command, plan
 

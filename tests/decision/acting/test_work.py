@@ -17,7 +17,8 @@ from failuretwin.connection.links.commander import Order
 from failuretwin.core.errors import InputError
 from failuretwin.decision.acting import work as work_module
 from failuretwin.decision.acting.actor import Actor
-from failuretwin.decision.acting.belief import Judge, LatchedBelief, NoBelief
+from failuretwin.decision.acting.belief import LatchedBelief, NoBelief
+from failuretwin.decision.acting.judging import Judge
 from failuretwin.decision.acting.planner import Planner
 from failuretwin.decision.acting.rest import RestWatch
 from failuretwin.decision.acting.safety import SafetyGate, UnsafeOrderError

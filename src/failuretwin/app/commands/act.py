@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -74,6 +75,13 @@ from failuretwin.app.terminal import tell
     help="A worn motor that poses shall load and move little. Can be given several times.",
 )
 @click.option(
+    "--wear",
+    "history",
+    type=PATH,
+    metavar="CAL.history.jsonl",
+    help="What `diagnose --track` keeps: motors are spared by how worn they are.",
+)
+@click.option(
     "--json", "json_file", type=PATH, metavar="FILE", help="Write a line for each target."
 )
 @click.option("--topics", type=PATH, metavar="FILE.toml", help="Names and types of ROS topics.")
@@ -91,6 +99,7 @@ def act(
     floor: float | None,
     radius: float | None,
     spare: tuple[str, ...],
+    history: Path | None,
     json_file: Path | None,
     topics: Path | None,
     calibration: Path | None,
@@ -118,9 +127,10 @@ def act(
         SafetyGate(known.robot, limits),
         strategy,
         ActingSettings(most_movements=most_movements),
-        spared_of(spare, known.robot),
+        None,
         seed,
     )
+    acting = replace(acting, spared=spared_of(spare, history, acting.model, tell))
     with ExitStack() as stack:
         arm = commander_of(place, known, faults, seed, topics, stack)
         if move or place == EMULATED:

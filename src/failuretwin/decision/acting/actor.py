@@ -16,11 +16,14 @@ import numpy as np
 
 from failuretwin.connection.links.commander import Order
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.belief import Belief, Judgement
+from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault, Seen
+from failuretwin.decision.acting.judging import Judgement
 from failuretwin.decision.acting.planner import Plan, Planner, Standing
 from failuretwin.decision.acting.reactions import lost_command, probing, told
-from failuretwin.decision.acting.task import Target, Task
+from failuretwin.decision.acting.sparing import Effort
+from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, Target, Task
+from failuretwin.digital_model.inverse_kinematics import angle_between
 from failuretwin.failure_behavior.reaction import Reaction
 from failuretwin.inference.healthy_model import HealthyModel
 
@@ -61,6 +64,8 @@ class TargetResult:
         target: The target.
         reached: Whether the tool was seen within its tolerance.
         error_m: How far it was from it in the end [m]; NaN: it was not seen.
+        error_rad: How far from its approach direction, as far as the believed arm tells [rad]; 0
+            where none is asked for.
         first_error_m: The same after the first movement [m].
         movements: Movements made.
         reachable: Whether the last plan could reach it on the arm as it was believed to be.
@@ -71,6 +76,7 @@ class TargetResult:
     target: Target
     reached: bool
     error_m: float
+    error_rad: float
     first_error_m: float
     movements: int
     reachable: bool
@@ -119,10 +125,11 @@ class Actor:
         self.said: list[str] = []
         self._command = self._previous = command
         self._order: Order | None = None
-        self._time_s = 0.0
+        self._time_s = self._pace_s = 0.0
         self._seen: Seen | None = None
         self._attempt = _Attempt()
         self._since_probe = 0
+        self.ways: list[tuple[Effort, ...]] = []  # as taken, and as if no motor were spared
 
     # What is known.
 
@@ -151,7 +158,8 @@ class Actor:
         """Return where the arm stands as far as is believed."""
         arm = BelievedArm(self._model, self.belief.believed)
         pose = arm.settle(self._command, self._previous, self._time_s)
-        return Standing(pose, self._command, self._time_s)
+        travel = self._command - self._previous
+        return Standing(pose, self._command, self._time_s + self._pace_s, travel)
 
     # What was seen.
 
@@ -165,7 +173,7 @@ class Actor:
         """
         if self._order is None:
             return
-        self._time_s = rest_s
+        self._time_s, self._pace_s = rest_s, rest_s - start_s
         self._seen = Seen(
             self._command, self._previous, self._order.duration, start_s, rest_s, point
         )
@@ -188,7 +196,7 @@ class Actor:
         error = self._error_m(seen)
         if self._attempt.movements == 1:
             self._attempt.first_error_m = error
-        if error <= self.target.tolerance_m:
+        if error <= self.target.tolerance_m and self._error_rad(seen) <= DIRECTION_TOLERANCE_RAD:
             self._conclude("")
         elif self._attempt.movements >= self._most_movements:
             self._conclude(f"not reached in {self._attempt.movements} movements")
@@ -207,15 +215,29 @@ class Actor:
             return np.nan
         return float(np.linalg.norm(seen.point - self.target.point))
 
+    def _error_rad(self, seen: Seen) -> float:
+        """Return how far the tool is from its approach direction [rad].
+
+        The tool sensor tells positions: directions are those of the most probable pose.
+        """
+        axis = self.target.axis
+        if axis is None or seen.point is None:
+            return 0.0 if axis is None else np.nan
+        seen_axis = self._planner.whole.axis(self.arm.most_probable_pose(seen))
+        return float(angle_between(seen_axis, axis))
+
     def _conclude(self, why: str) -> None:
         seen, attempt = self._seen, self._attempt
-        error = np.nan if seen is None or attempt.movements == 0 else self._error_m(seen)
+        error, turned = np.nan, np.nan
+        if seen is not None and attempt.movements > 0:
+            error, turned = self._error_m(seen), self._error_rad(seen)
         believed = self.belief.believed
         self.results.append(
             TargetResult(
                 self.target,
                 not why,
                 error,
+                turned,
                 attempt.first_error_m,
                 attempt.movements,
                 attempt.reachable,
@@ -268,10 +290,13 @@ class Actor:
         if plan.order is None:
             self._conclude(f"no safe way: {plan.why}")
             return None
-        if plan.miss_m > self.target.tolerance_m:
-            self._conclude(f"out of reach by {1e3 * plan.miss_m:.0f} mm")
+        if not plan.reachable:
+            self._conclude(f"out of reach by {plan.misses}")
             return None
         attempt.pose = plan.pose
+        if plan.unspared is not None:
+            poses = plan.pose, plan.unspared
+            self.ways.append(tuple(Effort.of(self._planner, pose, at) for pose in poses))
         return self._probed(plan.order, at)
 
     def _out_of_reach(self, plan: Plan, at: Standing) -> Plan:
@@ -280,13 +305,15 @@ class Actor:
         assert believed is not None
         if believed.reaction is Reaction.PARK:
             self.belief.stands_at(np.nan, 0.0)
-        else:
-            self._attempt.as_healthy = True
-            self._say(
-                f"target {len(self.results) + 1} is out of reach with {believed.fault}, "
-                f"{1e3 * plan.miss_m:.0f} mm at the nearest; tried as if it were not there"
-            )
-        return self._planner.plan(self.target, self.arm, at)
+            return self._planner.plan(self.target, self.arm, at)
+        self._attempt.as_healthy = True
+        other = self._planner.plan(self.target, self.arm, at)
+        tried = "; tried as if it were not there" if other.reachable else ""
+        self._say(
+            f"target {len(self.results) + 1} is out of reach with {believed.fault}, "
+            f"{plan.misses} at the nearest{tried}"
+        )
+        return other
 
     def _probed(self, order: Order, at: Standing) -> Order:
         """Return an order that also asks whether a motor that is held has been repaired."""
@@ -304,11 +331,13 @@ class Actor:
         seen, attempt = self._seen, self._attempt
         assert seen is not None and self._order is not None
         if attempt.repeats < self._settings.most_repeats:
-            lost = "the tool was not seen" if seen.point is None else lost_command(self.arm, seen)
-            if lost:
+            lost = [] if seen.point is None else lost_command(self.arm, seen)
+            if lost or seen.point is None:
                 attempt.repeats += 1
-                self._say(f"{lost}: sent again")
-                return self._again()
+                names = ", ".join(self._model.motor_names[k] for k in lost)
+                why = f"the command of {names} seems lost" if lost else "the tool was not seen"
+                self._say(f"{why}: sent again")
+                return self._again(lost)
         if seen.point is None:
             self._conclude("the tool is not seen at rest")
             return None
@@ -317,9 +346,14 @@ class Actor:
             return parked
         return self._fed_back(seen)
 
-    def _again(self) -> Order | None:
-        """Return the last order once more, with the time that it needs from where it began."""
+    def _again(self, lost: Sequence[int]) -> Order | None:
+        """Return the last order once more, with the time that it needs from where it began.
+
+        Motors that have lost it stand where they were told to be before.
+        """
         assert self._order is not None
+        self._command = self._command.copy()
+        self._command[lost] = self._previous[lost]
         order, wrong = self._planner.checked(self._order.target, self.arm, self.standing())
         if wrong:
             self._conclude(f"no safe way: {wrong}")
@@ -350,10 +384,13 @@ class Actor:
         first = attempt.corrections == 0
         attempt.corrections += 1
         gain = self._settings.first_gain if first else self._settings.later_gain
-        wrong, low_high = "", arm.limits
-        for share in 0.5 ** np.arange(HALVINGS + 1):
-            step = self._step(arm, attempt.pose, gain * share * (self.target.point - seen.point))
-            command = np.clip(self._command + step / arm.gain(seen), *low_high)
+        wrong = ""
+        miss, turn = self.target.point - seen.point, self._turn(seen)
+        then = arm.settle(seen.command, seen.previous, self._time_s + self._pace_s)
+        slips = then - arm.settle(seen.command, seen.previous, seen.rest_s)
+        for share in gain * 0.5 ** np.arange(HALVINGS + 1):
+            step = self._step(arm, attempt.pose, share * miss, share * turn)
+            command = np.clip(self._command + (step - slips) / arm.gain(seen), *arm.limits)
             command = arm.rounded(arm.with_rest(command, self._command))
             order, wrong = self._planner.checked(command, arm, self.standing())
             if not wrong:
@@ -362,11 +399,33 @@ class Actor:
         self._conclude(f"no safe correction: {wrong}")
         return None
 
-    def _step(self, arm: BelievedArm, pose: FloatArray, miss: FloatArray) -> FloatArray:
-        """Return by how much the motors must turn to move the tool by `miss` (3,) [m]."""
-        point, _ = self._planner.whole.tool(pose[None])
-        found = self._planner.whole.solve(point + miss, pose[None], arm.locked)
-        return np.asarray(found.pose[0, 0] - pose)
+    def _turn(self, seen: Seen) -> FloatArray:
+        """Return by how much the tool's axis must change, (3,); 0 where no direction is asked."""
+        axis = self.target.axis
+        if axis is None:
+            return np.zeros(3)
+        return np.asarray(axis - self._planner.whole.axis(self.arm.most_probable_pose(seen)))
+
+    def _step(
+        self, arm: BelievedArm, pose: FloatArray, miss: FloatArray, turn: FloatArray
+    ) -> FloatArray:
+        """Return by how much the motors must turn to move the tool, (motor,) [rad].
+
+        The point comes first: what the motors cannot do of both is taken from the direction.
+
+        Args:
+            arm: The arm as it is believed to be.
+            pose: Where the motors were to settle, (motor,) [rad].
+            miss: How far the tool must go, (3,) [m].
+            turn: By how much its axis must change, (3,).
+        """
+        whole = self._planner.whole
+        goal, start = whole.tool(pose[None])[0] + miss, pose[None]
+        if self.target.axis is not None:
+            axis = whole.axis(pose) + turn
+            axis /= np.linalg.norm(axis)
+            start = whole.solve(goal, start, arm.locked, axis[None]).pose[0]
+        return np.asarray(whole.solve(goal, start, arm.locked).pose[0, 0] - pose)
 
     # What is told.
 

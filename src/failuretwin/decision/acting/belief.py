@@ -17,166 +17,14 @@ from typing import Protocol
 
 import numpy as np
 
-from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
-from failuretwin.core.movements import Movements
-from failuretwin.core.types import FloatArray
+from failuretwin.core.hypothesis import HEALTHY, Hypothesis
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault, Seen
+from failuretwin.decision.acting.drifting import followed
+from failuretwin.decision.acting.judging import Judgement
+from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.reaction import Reaction
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.posterior import LEVELS, Posterior, compute_posterior
-from failuretwin.inference.priors import MONITORING, Priors
-from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.shared_posterior import shared_posterior
-
-ACTED_ON = ("stuck", "steady_state_error", "encoder_bias", "encoder_scale")
-"""Modes that are told from settled positions and call for another plan; of the others, feedback,
-waiting and sending again are the whole answer, whatever they are called."""
-
-# What the latest movements of some arms say.
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """Posterior of one arm over its latest movements.
-
-    Attributes:
-        posterior: Of all hypotheses, for several arms.
-        row: Which of them.
-    """
-
-    posterior: Posterior
-    row: int
-
-    def probability(self, hypothesis: Hypothesis) -> float:
-        """Return the probability of a hypothesis; 0 of one that was not weighed."""
-        if hypothesis not in self.posterior.hypotheses:
-            return 0.0
-        at = self.posterior.hypotheses.index(hypothesis)
-        return float(np.exp(self.posterior.log_posterior[self.row, at]))
-
-    @property
-    def best(self) -> Hypothesis:
-        """The most probable hypothesis."""
-        return self.posterior.hypotheses[int(np.argmax(self.posterior.log_posterior[self.row]))]
-
-    def log_evidence(self, hypothesis: Hypothesis) -> float:
-        """Return log p(movements | hypothesis)."""
-        at = self.posterior.hypotheses.index(hypothesis)
-        joint = self.posterior.log_posterior[self.row, at] - self.posterior.log_prior[at]
-        return float(joint)
-
-    def size(self, hypothesis: Hypothesis) -> tuple[float, float]:
-        """Return median and half of the 90 % interval of the size; NaN and 0 where it has none."""
-        at = self.posterior.hypotheses.index(hypothesis)
-        size = self.posterior.weights[at].estimate(self.row).size
-        if size is None:
-            return np.nan, 0.0
-        low, middle, high = size.quantiles(LEVELS).tolist()
-        return middle, 0.5 * (high - low)
-
-
-@dataclass(frozen=True)
-class Judge:
-    """Weighs hypotheses by the latest movements of arms.
-
-    Attributes:
-        model: The healthy robot.
-        priors: Beliefs about faults.
-        hypotheses: What may be the case.
-    """
-
-    model: HealthyModel
-    priors: Priors = MONITORING
-    hypotheses: Sequence[Hypothesis] = ()
-
-    def __post_init__(self) -> None:
-        if not self.hypotheses:
-            names = self.model.twin.robot.motor_names
-            object.__setattr__(self, "hypotheses", single_faults(names, ACTED_ON))
-
-    def __call__(
-        self, windows: Sequence[Sequence[Seen]], believed: Sequence[BelievedFault | None]
-    ) -> list[Judgement | None]:
-        """Return what movements say of each arm; None where it has made none.
-
-        Doubts about an arm count as scatter first. Where that points to another fault than the one
-        believed, they are integrated out as common to all movements, which takes long.
-
-        Args:
-            windows: Movements of each arm.
-            believed: What each arm is taken to have.
-        """
-        found: list[Judgement | None] = [None] * len(windows)
-        for length in {len(window) for window in windows} - {0}:
-            rows = [i for i, window in enumerate(windows) if len(window) == length]
-            evidence = settled_evidence_of([windows[i] for i in rows])
-            likelihood = RunLikelihood(evidence, self.model)
-            rough = compute_posterior(likelihood, self.hypotheses, self.priors)
-            judged = [Judgement(rough, at) for at in range(len(rows))]
-            news = [at for at, i in enumerate(rows) if self._is_news(judged[at], believed[i])]
-            if news:
-                some = likelihood[np.array(news)]
-                fine = shared_posterior(some, _left(rough, news), self.priors, False)
-                for at, row in enumerate(news):
-                    judged[row] = Judgement(fine, at)
-            for at, i in enumerate(rows):
-                found[i] = judged[at]
-        return found
-
-    def _is_news(self, judgement: Judgement, believed: BelievedFault | None) -> bool:
-        """Return whether movements point to a fault that is not believed already."""
-        if self.model.imperfections.variation is None:
-            return False
-        best = judgement.best
-        if best.is_healthy or judgement.probability(best) < SUSPICIOUS:
-            return False
-        return believed is None or best.faults[0].motor != believed.fault.motor
-
-
-SUSPICIOUS = 0.3
-"""Probability of a fault from which it is looked at more closely."""
-RULED_OUT_NATS = 12.0
-"""What lies so far below the best of some arms is not looked at more closely [nats]."""
-
-
-def _left(posterior: Posterior, rows: Sequence[int]) -> list[Hypothesis]:
-    """Return healthy and the hypotheses that are not ruled out for some arms."""
-    log_posterior = posterior.log_posterior[np.array(rows)]
-    near = log_posterior > log_posterior.max(axis=1, keepdims=True) - RULED_OUT_NATS
-    kept = near.any(axis=0)
-    return [h for h, keep in zip(posterior.hypotheses, kept, strict=True) if keep or h.is_healthy]
-
-
-def settled_evidence_of(windows: Sequence[Sequence[Seen]]) -> SettledEvidence:
-    """Return movements of several arms, equally many of each, as settled evidence."""
-
-    def of_each(name: str) -> FloatArray:
-        return np.array([[getattr(seen, name) for seen in window] for window in windows])
-
-    usable = np.array([[seen.point is not None for seen in window] for window in windows])
-    nowhere = np.zeros(3)
-    point = np.array(
-        [[nowhere if seen.point is None else seen.point for seen in w] for w in windows]
-    )
-    start, rest = of_each("start_s"), of_each("rest_s")
-    zero = start[:, :1]
-    movements = Movements(
-        of_each("previous")[:, 0], of_each("command"), of_each("duration"), start - zero
-    )
-    return SettledEvidence(
-        movements=movements,
-        point=point,
-        usable=usable,
-        moving=np.zeros_like(usable),
-        begin=rest - zero,
-        end=rest - zero,
-        first_reading_delay=np.full(start.shape, np.nan),
-    )
-
-
-# What an arm is taken to be.
 
 GROWTH = 1.2
 """The spread of a size that is remembered grows by this factor with each movement [-]."""
@@ -188,6 +36,8 @@ class BeliefSettings:
 
     Attributes:
         latch: Probability from which a fault is believed.
+        until_told_apart: A constant error is believed from this probability on if an error of its
+            motor is as probable as `latch`.
         movements: Latest movements that are weighed together.
         least_movements: No fault is believed after fewer.
         start_lead: Log Bayes factor with which a belief begins.
@@ -195,7 +45,8 @@ class BeliefSettings:
         let_go: Lead below which a belief is let go.
     """
 
-    latch: float = 0.95
+    latch: float = 0.9
+    until_told_apart: float = 0.3
     movements: int = 5
     least_movements: int = 2
     start_lead: float = 4.0
@@ -310,13 +161,24 @@ class LatchedBelief:
     # Taking up.
 
     def _taken_up(self, judgement: Judgement) -> str:
-        best = judgement.best
-        sure = judgement.probability(best) >= self.settings.latch
+        best, sure = judgement.best, judgement.probability(judgement.best)
+        if sure < self.settings.latch:
+            best, sure = judgement.until_told_apart
+            if judgement.probability(best) < self.settings.until_told_apart:
+                return ""
         enough = sum(seen.point is not None for seen in self.window)
-        if not (best.known and best.faults and sure and enough >= self.settings.least_movements):
+        if not (
+            best.known
+            and best.faults
+            and sure >= self.settings.latch
+            and enough >= self.settings.least_movements
+        ):
             return ""
         self._believe(best, judgement)
-        return f"taken for {best}, {judgement.probability(best):.0%} sure"
+        said = f"taken for {best}, {judgement.probability(best):.0%} sure"
+        if judgement.probability(best) < self.settings.latch:
+            said += f", {sure:.0%} with what looks alike at first"
+        return said
 
     def _believe(self, hypothesis: Hypothesis, judgement: Judgement) -> None:
         fault = hypothesis.faults[0]
@@ -327,7 +189,7 @@ class LatchedBelief:
             motor=self.model.motor_names.index(fault.motor),
             size=size,
             spread=spread,
-            since_s=self.history[-1].start_s,
+            since_s=self.window[0].start_s + judgement.onset_s(hypothesis),
             angle=size if held else np.nan,
             probability=judgement.probability(hypothesis),
         )
@@ -337,6 +199,9 @@ class LatchedBelief:
         """Take over what the latest movements say of the size where that is sharper."""
         believed = self.believed
         if believed is None or believed.reaction is Reaction.PARK:
+            return
+        if believed.mode.signature is Signature.GROWING_OFFSET:
+            self.believed = followed(self.model, believed, self.history)
             return
         hypothesis = Hypothesis((believed.fault,))
         if hypothesis not in judgement.posterior.hypotheses:

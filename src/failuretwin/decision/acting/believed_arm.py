@@ -229,12 +229,14 @@ class BelievedArm:
         if seen.point is None:
             return 0.0
         pose = self.settle(seen.command, seen.previous, seen.rest_s)
-        error, _, spread = self.model.residual(seen.point, pose, self.scatter(seen.command))
+        error, _, spread = self.model.residual(
+            seen.point, pose, self.scatter(seen.command, seen.rest_s)
+        )
         found = float(spread.log_student(error, self.model.settling.tail_dof))
         sure, odd = np.log1p(-OUTLIER_RATE), np.log(OUTLIER_RATE)
         return float(np.logaddexp(sure + found, odd + self.model.anywhere_log_density))
 
-    def scatter(self, command: FloatArray) -> FloatArray:
+    def scatter(self, command: FloatArray, time_s: float) -> FloatArray:
         """Return by how much each motor settles beside `settle`, (motor,) [rad]."""
         scatter, fault = self.model.scatter.copy(), self.fault
         if fault is None:
@@ -246,7 +248,8 @@ class BelievedArm:
             size = fault.size if np.isfinite(fault.size) else 0.5 * sum(mode.considered)
             scatter[k] = np.hypot(scatter[k], size)
         elif fault.inverted:
-            angle = fault.spread / HALF_90 * (1.0 if mode.unit == "rad" else abs(command[k]))
+            per_unit = {"rad": 1.0, "rad/s": max(time_s - fault.since_s, 0.0)}
+            angle = fault.spread / HALF_90 * per_unit.get(mode.unit, abs(float(command[k])))
             scatter[k] = np.hypot(scatter[k], angle)
         return scatter
 
@@ -255,7 +258,7 @@ class BelievedArm:
         expected = self.settle(seen.command, seen.previous, seen.rest_s)
         if seen.point is None:
             return expected
-        scatter, pose = self.scatter(seen.command), expected
+        scatter, pose = self.scatter(seen.command, seen.rest_s), expected
         for _ in range(3):
             error, jacobian, _ = self.model.residual(seen.point, pose, scatter)
             spread = Ellipsoid.of(jacobian * scatter, self.model.path_noise**2)

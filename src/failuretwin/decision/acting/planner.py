@@ -9,13 +9,13 @@ joints. The cheapest that has a safe way is taken.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from failuretwin.connection.links.commander import Order
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.decision.acting.believed_arm import BelievedArm
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, Target
@@ -29,7 +29,12 @@ the arm settles."""
 MISS_S_PER_M = 1e3
 """What a metre off the target costs beside the time of the way [s/m]."""
 SPARED_S = 1.0
-"""What full load of a weak or worn motor costs beside the time of the way [s]."""
+"""What full load of a weak or worn motor costs beside the time of the way [s]; as much as half a
+turn of its travel."""
+REVERSAL = 0.1
+"""What turning such a motor round costs, as a share of full load [-]; assumed."""
+SPARING_STARTS = 3 * STARTS
+"""Poses that a search begins with where motors are spared: there is more to choose from."""
 TRIED = 6
 """So many poses are looked at for a safe way, the cheapest first."""
 ROUGH_M = 1e-4
@@ -43,12 +48,14 @@ class Standing:
     Attributes:
         pose: Where its motors are believed to be, (motor,) [rad].
         command: What they were told last, (motor,) [rad].
-        time_s: By its clock [s].
+        time_s: When the next movement will be over, by its clock [s].
+        travel: How far they went last, (motor,) [rad]; None: not known.
     """
 
     pose: FloatArray
     command: FloatArray
     time_s: float
+    travel: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -59,22 +66,39 @@ class Plan:
         order: The movement; None: none is safe.
         pose: Where the arm shall settle, (motor,) [rad].
         miss_m: How far the tool will be from the target at least [m].
-        reachable: Whether that is within its tolerance.
+        miss_rad: And how far from its approach direction [rad].
+        reachable: Whether both are within its tolerances.
         why: What stands in the way of a plan, empty if nothing does.
+        unspared: The pose that would have been taken if no worn motor were spared, (motor,) [rad];
+            None: none is.
     """
 
     order: Order | None
     pose: FloatArray
     miss_m: float
+    miss_rad: float
     reachable: bool
     why: str = ""
+    unspared: FloatArray | None = None
+
+    @property
+    def misses(self) -> str:
+        """By how much it misses the target, in words."""
+        turned = ""
+        if self.miss_rad > DIRECTION_TOLERANCE_RAD:
+            turned = f" and {np.rad2deg(self.miss_rad):.0f} deg"
+        return f"{1e3 * self.miss_m:.0f} mm{turned}"
+
+    def uses_up(self, target: Target) -> float:
+        """Return what share of the tolerances of a target it uses up [-]."""
+        return max(self.miss_m / target.tolerance_m, self.miss_rad / DIRECTION_TOLERANCE_RAD)
 
 
-def _is_better(plan: Plan, other: Plan) -> bool:
+def _is_better(plan: Plan, other: Plan, target: Target) -> bool:
     """Return whether a plan is the better one: safe, then near."""
     if (plan.order is None) != (other.order is None):
         return plan.order is not None
-    return plan.miss_m < other.miss_m
+    return plan.uses_up(target) < other.uses_up(target)
 
 
 @dataclass(frozen=True)
@@ -121,9 +145,9 @@ class Planner:
         for kinematics in (self.usual, self.whole):
             found = self._poses(kinematics, target, arm, at)
             plan = self._cheapest_safe(found, target, arm, at)
-            if best is None or _is_better(plan, best):
+            if best is None or _is_better(plan, best, target):
                 best = plan
-            if best.order is not None and best.miss_m <= NEAR_ENOUGH * target.tolerance_m:
+            if best.order is not None and best.uses_up(target) <= NEAR_ENOUGH:
                 break
         assert best is not None
         return best
@@ -132,28 +156,41 @@ class Planner:
         self, kinematics: InverseKinematics, target: Target, arm: BelievedArm, at: Standing
     ) -> Poses:
         """Return poses that bring the tool near to a target."""
-        start = kinematics.starts(STARTS, self._rng, at.pose)
+        count = STARTS if self.spared is None else SPARING_STARTS
+        start = kinematics.starts(count, self._rng, at.pose)
         if arm.fault is not None and arm.fault.rests:
             start[:, arm.fault.motor] = arm.fault.angle
         axis = None if target.axis is None else target.axis[None]
         return kinematics.solve(target.point[None], start, arm.locked, axis)
 
     def _cheapest_safe(self, found: Poses, target: Target, arm: BelievedArm, at: Standing) -> Plan:
-        cost = self.cost(found.pose[0], arm, at)
-        cost = cost + MISS_S_PER_M * np.maximum(found.miss_m[0] - ROUGH_M, 0.0)
-        cost = cost + np.maximum(found.miss_rad[0] - 0.1 * DIRECTION_TOLERANCE_RAD, 0.0) * 100.0
+        misses = MISS_S_PER_M * np.maximum(found.miss_m[0] - ROUGH_M, 0.0)
+        misses += np.maximum(found.miss_rad[0] - 0.1 * DIRECTION_TOLERANCE_RAD, 0.0) * 100.0
         near = found.miss_m[0] <= target.tolerance_m
         near &= found.miss_rad[0] <= DIRECTION_TOLERANCE_RAD
+        cost = misses + self.cost(found.pose[0], arm, at)
         order = np.argsort(cost)
+        i, ordered, why = self._first_safe(order, found, arm, at)
+        miss_m, miss_rad = float(found.miss_m[0, i]), float(found.miss_rad[0, i])
+        plan = Plan(ordered, found.pose[0, i], miss_m, miss_rad, bool(near[i]), why)
+        if self.spared is None or ordered is None:
+            return plan
+        plain = replace(self, spared=None)
+        cost = misses + plain.cost(found.pose[0], arm, at)
+        i, _, _ = self._first_safe(np.argsort(cost), found, arm, at)
+        return replace(plan, unspared=found.pose[0, i])
+
+    def _first_safe(
+        self, order: IntArray, found: Poses, arm: BelievedArm, at: Standing
+    ) -> tuple[int, Order | None, str]:
+        """Return the first pose of some that has a safe way: which, its order, or why none has."""
         why = ""
         for i in order[:TRIED]:
-            pose = found.pose[0, i]
-            ordered, wrong = self.order_for(pose, arm, at)
+            ordered, wrong = self.order_for(found.pose[0, i], arm, at)
             if not wrong:
-                return Plan(ordered, pose, float(found.miss_m[0, i]), bool(near[i]))
+                return int(i), ordered, ""
             why = why or wrong
-        best = order[0]
-        return Plan(None, found.pose[0, best], float(found.miss_m[0, best]), bool(near[best]), why)
+        return int(order[0]), None, why
 
     def order_for(self, pose: FloatArray, arm: BelievedArm, at: Standing) -> tuple[Order, str]:
         """Return the order that brings the arm to a pose, and why it must not be sent."""
@@ -177,24 +214,38 @@ class Planner:
         return longer
 
     def cost(self, pose: FloatArray, arm: BelievedArm, at: Standing) -> FloatArray:
-        """Return what poses cost, (pose,) [s]: time of the way, and load and travel of the weak.
+        """Return what poses cost, (pose,) [s]: time of the way, and what weak motors have to do.
 
         Args:
             pose: (pose, motor) [rad].
             arm: The arm as it is believed to be.
             at: Where it stands.
         """
-        away = np.abs(pose - at.pose)
-        cost = np.max(away / self.gate.speed, axis=-1)
+        cost = self.way_s(pose, at)
         weight = np.zeros(pose.shape[-1]) if self.spared is None else self.spared.copy()
         if arm.fault is not None and arm.fault.reaction is Reaction.SPARE:
             weight[arm.fault.motor] += 1.0
         if not weight.any():
             return np.asarray(cost)
+        effort = self.load(pose) + np.abs(pose - at.pose) / np.pi
+        return np.asarray(cost + SPARED_S * ((effort + REVERSAL * turned_round(pose, at)) @ weight))
+
+    def way_s(self, pose: FloatArray, at: Standing) -> FloatArray:
+        """Return the time of the way to poses (..., motor) [rad], (...) [s]."""
+        return np.asarray(np.max(np.abs(pose - at.pose) / self.gate.speed, axis=-1))
+
+    def load(self, pose: FloatArray) -> FloatArray:
+        """Return the load of each motor in poses (..., motor) [rad], in shares of its largest."""
         robot = self.gate.robot
-        load = np.abs(robot.loads.torque(pose * robot.sense)) / self._largest_load
-        return np.asarray(cost + SPARED_S * ((load + away / np.pi) @ weight))
+        return np.asarray(np.abs(robot.loads.torque(pose * robot.sense)) / self._largest_load)
 
     @cached_property
     def _largest_load(self) -> FloatArray:
         return np.maximum(largest_load(self.gate.robot, 0.0), 1e-9)
+
+
+def turned_round(pose: FloatArray, at: Standing) -> BoolArray:
+    """Return which motors go back on the way to poses (..., motor) [rad], (..., motor)."""
+    if at.travel is None:
+        return np.zeros(pose.shape, dtype=bool)
+    return np.asarray((pose - at.pose) * at.travel < 0.0)

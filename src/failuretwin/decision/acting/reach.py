@@ -5,22 +5,23 @@ share(k, phi) = share of points with min over q, q_k = phi, of |tool(q) - point|
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.decision.acting.safety import SafetyGate
-from failuretwin.decision.acting.task import TOLERANCE_M, Task
+from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, TOLERANCE_M, Task
 from failuretwin.digital_model.inverse_kinematics import (
     STARTS,
     InverseKinematics,
     feedback_factor,
 )
-from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.robot import Robot, load_robot
 
 POINTS = 300
 """Points of a workspace, unless told otherwise."""
@@ -36,7 +37,8 @@ class Reach:
         motor: Its name; empty: none is held.
         angle: Where it is held [rad]; NaN: it is not.
         points: (point, 3) [m], in the frame of the tool sensor.
-        miss_m: How far the tool stays from each at least, (point,) [m].
+        miss_m: How far the tool stays from each at least, (point,) [m]; infinite where no allowed
+            pose has the approach direction that is asked for.
         tolerance_m: How near is near enough, (point,) [m].
     """
 
@@ -63,7 +65,7 @@ class Reach:
             "angle_rad": None if np.isnan(self.angle) else self.angle,
             "share": self.share,
             "points": self.points.tolist(),
-            "miss_m": self.miss_m.tolist(),
+            "miss_m": [miss if np.isfinite(miss) else None for miss in self.miss_m.tolist()],
             "reached": self.reached.tolist(),
         }
 
@@ -110,7 +112,7 @@ def workspace(robot: Robot, count: int = POINTS, seed: int = 0) -> FloatArray:
 
 
 def reach(
-    gate: SafetyGate,
+    arm: SafetyGate | Robot | str | Path,
     points: FloatArray | Task,
     held: tuple[str, float] | None = None,
     seed: int = 0,
@@ -118,14 +120,15 @@ def reach(
     """Return which points an arm can reach in poses that keep off the floor and its own links.
 
     Args:
-        gate: The arm, and what is safe.
-        points: (point, 3) [m], or a task, whose tolerances then count.
+        arm: The arm and what is safe; or a robot, its name or its profile, with the usual limits.
+        points: (point, 3) [m], or a task, whose tolerances and directions then count.
         held: Name of a motor that is held, and its angle [rad]; None: none is.
         seed: Seed of the poses that a search begins with.
 
     Raises:
         InputError: If the robot has no such motor.
     """
+    gate = arm if isinstance(arm, SafetyGate) else SafetyGate(load_robot(arm))
     robot = gate.robot
     kinematics, rng = InverseKinematics.of(robot), np.random.default_rng(seed)
     if isinstance(points, Task):
@@ -140,11 +143,26 @@ def reach(
         if not locked.any():
             raise InputError(f"robot {robot.name!r} has no motor {held[0]!r}.")
         start[:, locked] = held[1]
-    found = kinematics.solve(where, start, locked)
-    safe = gate.clearance.margin(found.pose) >= 0.0
-    miss = np.where(safe, found.miss_m, np.inf).min(axis=1)
+    miss = np.empty(len(where))
+    for rows, direction in _by_direction(points, len(where)):
+        found = kinematics.solve(where[rows], start, locked, direction)
+        allowed = gate.clearance.margin(found.pose) >= 0.0
+        allowed &= found.miss_rad <= DIRECTION_TOLERANCE_RAD
+        miss[rows] = np.where(allowed, found.miss_m, np.inf).min(axis=1)
     name, angle = held if held is not None else ("", np.nan)
     return Reach(name, angle, where, miss, tolerance)
+
+
+def _by_direction(
+    points: FloatArray | Task, count: int
+) -> Iterator[tuple[IntArray, FloatArray | None]]:
+    """Yield which points have no approach direction, and which have one, (point, 3)."""
+    axes = [t.axis for t in points.targets] if isinstance(points, Task) else [None] * count
+    directed = np.array([axis is not None for axis in axes])
+    if not directed.all():
+        yield np.flatnonzero(~directed), None
+    if directed.any():
+        yield np.flatnonzero(directed), np.array([axis for axis in axes if axis is not None])
 
 
 def reach_by_motor(

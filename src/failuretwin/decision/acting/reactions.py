@@ -31,7 +31,7 @@ def told(believed: BelievedFault, robot: Robot) -> str:
     return f"{believed.mode.plain_name(believed.fault.motor)}{size}: {believed.reaction.value}"
 
 
-def lost_command(arm: BelievedArm, seen: Seen) -> str:
+def lost_command(arm: BelievedArm, seen: Seen) -> list[int]:
     """Return which motors seem not to have got a command, empty if all seem to have.
 
         log p(e | lost) + log rate > log p(e | arrived) + 2
@@ -42,7 +42,7 @@ def lost_command(arm: BelievedArm, seen: Seen) -> str:
         arm: The arm as it is believed to be.
         seen: The movement.
     """
-    arrived, best, names = arm.log_density(seen), -np.inf, ""
+    arrived, best, lost = arm.log_density(seen), -np.inf, list[int]()
     for motors, rate in _loss_sets(arm):
         moved = np.abs(seen.command - seen.previous) > MOVED_RAD
         if not moved[motors].any() or (len(motors) == 1 and arm.locked[motors].any()):
@@ -51,10 +51,8 @@ def lost_command(arm: BelievedArm, seen: Seen) -> str:
         command[motors] = seen.previous[motors]
         says = arm.log_density(replace(seen, command=command)) + np.log(rate)
         if says > best:
-            best, names = says, ", ".join(arm.robot.motor_names[k] for k in motors)
-    if best <= arrived + SURPRISE_NATS:
-        return ""
-    return f"the command of {names} seems lost"
+            best, lost = says, motors
+    return lost if best > arrived + SURPRISE_NATS else []
 
 
 def _loss_sets(arm: BelievedArm) -> list[tuple[list[int], float]]:

@@ -6,17 +6,20 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
-from failuretwin.connection.links.commander import Commander, Order
+from failuretwin.connection.links.commander import Commander
 from failuretwin.core.errors import unknown_name
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.actor import ActingSettings, Actor, TargetResult
-from failuretwin.decision.acting.belief import Belief, Judge, LatchedBelief, NoBelief
+from failuretwin.decision.acting.belief import Belief, LatchedBelief, NoBelief
 from failuretwin.decision.acting.believed_arm import BelievedArm
-from failuretwin.decision.acting.planner import Planner, Standing
+from failuretwin.decision.acting.judging import Judge
+from failuretwin.decision.acting.planner import Plan, Planner, Standing
 from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
+from failuretwin.decision.acting.sparing import sparing_lines, wear_weights
 from failuretwin.decision.acting.task import Task
 from failuretwin.decision.acting.work import Work, first_standing
 from failuretwin.digital_model.calibrated_robot import (
@@ -80,6 +83,9 @@ class Acting:
         actor = self.actor(task, standing)
         judge = Judge(self.model) if self.strategy == DIAGNOSE else None
         Work(actor, judge, self.gate, commander, standing, tell).carry_out()
+        if self.spared is not None:
+            for line in sparing_lines(self.known.robot.motor_names, self.spared, actor.ways):
+                tell(line)
         return actor.results
 
     def dry_run(
@@ -92,19 +98,22 @@ class Acting:
             pose = arm.settle(command, command, 0.0)
             plan = planner.plan(target, arm, Standing(pose, command, 0.0))
             results.append(
-                TargetResult(target, False, math.nan, math.nan, 0, plan.reachable, "", "dry run")
+                TargetResult(
+                    target, False, math.nan, math.nan, math.nan, 0, plan.reachable, "", "dry run"
+                )
             )
-            tell(f"target {number}: {_planned(plan.order, plan.reachable, plan.why, plan.miss_m)}")
+            tell(f"target {number}: {_planned(plan)}")
             if plan.order is not None and plan.reachable:
                 command = plan.order.target
         return results
 
 
-def _planned(order: Order | None, reachable: bool, why: str, miss_m: float) -> str:
+def _planned(plan: Plan) -> str:
+    order = plan.order
     if order is None:
-        return f"no safe way: {why}"
-    if not reachable:
-        return f"out of reach by {1e3 * miss_m:.0f} mm"
+        return f"no safe way: {plan.why}"
+    if not plan.reachable:
+        return f"out of reach by {plan.misses}"
     angles = " ".join(f"{angle:.1f}" for angle in np.rad2deg(order.target))
     return f"would order {angles} deg in {order.duration.max():.2f} s"
 
@@ -116,6 +125,7 @@ def act(
     calibration: HealthyLike = None,
     strategy: str = DIAGNOSE,
     limits: SafetyLimits | None = None,
+    history: str | Path | None = None,
     tell: Callable[[str], None] = print,
 ) -> Sequence[TargetResult]:
     """Carry a task out on an arm, whatever is wrong with it; the arm moves.
@@ -127,6 +137,8 @@ def act(
         calibration: What `calibrate` learned of it, by name or path; None: what its profile names.
         strategy: ``diagnose``, ``feedback`` or ``open``.
         limits: What orders must keep to; None: the usual limits.
+        history: CAL.history.jsonl that `diagnose --track` keeps: motors are spared by how worn they
+            are; None: none is.
         tell: Called with what is found out and done, as it happens.
 
     Returns:
@@ -139,4 +151,7 @@ def act(
     """
     known = calibrated(robot, calibration)
     gate = SafetyGate(known.robot, limits or SafetyLimits())
-    return Acting(known, gate, strategy, ActingSettings()).work(task, commander, tell)
+    acting = Acting(known, gate, strategy, ActingSettings())
+    if history is not None:
+        acting = replace(acting, spared=wear_weights(Path(history), acting.model))
+    return acting.work(task, commander, tell)

@@ -13,7 +13,7 @@ from failuretwin.connection.links.commander import Commander, Order
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.actor import Actor
-from failuretwin.decision.acting.belief import Judge, Judgement
+from failuretwin.decision.acting.judging import Judge, Judgement
 from failuretwin.decision.acting.rest import RestWatch
 from failuretwin.decision.acting.safety import SafetyGate, UnsafeOrderError
 

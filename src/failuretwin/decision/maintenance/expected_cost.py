@@ -195,16 +195,17 @@ def cost_table(
     return [*actions, (INSPECT, "")], np.vstack([table, known])
 
 
-def advise(posterior: Mapping[str, float], costs: Costs) -> Advice:
+def advise(posterior: Mapping[str, float], costs: Costs | str | Path) -> Advice:
     """Return what to do about an arm.
 
     Args:
         posterior: Probability of each hypothesis, by its text; they sum to 1.
-        costs: What things cost.
+        costs: What things cost, or the file that says it.
 
     Raises:
-        InputError: If a mode has no share of missed targets.
+        InputError: If a mode has no share of missed targets, or the file cannot be read.
     """
+    costs = costs if isinstance(costs, Costs) else load_costs(Path(costs))
     hypotheses = [Hypothesis.parse(name) for name in posterior]
     if HEALTHY not in hypotheses:
         raise InputError("the posterior does not say how probable it is that the arm is healthy.")

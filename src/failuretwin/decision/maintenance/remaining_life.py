@@ -4,8 +4,9 @@
     T = first t with |x(t)| >= limit
 
 Averaged over shapes phi and diffusions q by how well each predicted every run from those before
-(a Kalman filter each). A straight line without diffusion is sure and wrong as soon as wear speeds
-up. Between two steps the limit is crossed unseen with the probability of a Brownian bridge.
+(a Kalman filter each); before anything was seen steady wear is the most probable. A straight line
+without diffusion is sure and wrong as soon as wear speeds up. Between two steps the limit is
+crossed unseen with the probability of a Brownian bridge.
 
 Section: docs/acting.md#remaining-life
 """
@@ -25,6 +26,9 @@ RATES = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0)
 """Growths exp(rate t / t_now) that wear may follow."""
 DIFFUSIONS = (0.0, 1e-3, 1e-2, 3e-2, 1e-1, 3e-1, 1.0, 3.0)
 """Variance of the random walk in one step, in variances of one reading."""
+STEADY = 10.0
+"""Steady wear is so many times as probable as any other shape, before anything was seen; assumed:
+else a few jumps that happen to lie on a curve are taken for one."""
 BLOCKS = 100
 """Runs are averaged to so many at most: more say nothing new of shapes."""
 FASTEST = 3.0
@@ -163,7 +167,7 @@ class _Filters:
         a: Variance of x.
         b: Covariance of x and v.
         c: Variance of v.
-        log_evidence: Log density of all runs.
+        log_evidence: Log density of all runs, and what was believed of the shape before.
         last: Time of the last block.
     """
 
@@ -190,7 +194,7 @@ class _Filters:
         q = np.tile(np.array(DIFFUSIONS) * scale, count)
         level, rate, a, b = (np.zeros(len(q)) for _ in range(4))
         c = np.full(len(q), (FASTEST * limit / now) ** 2)
-        log_evidence = np.zeros(len(q))
+        log_evidence = np.where(shape == POWERS.index(1.0), np.log(STEADY), 0.0)
         before = np.concatenate([[0.0], time])
         for i in range(len(time)):
             h = shapes[shape, i + 1] - shapes[shape, i]
