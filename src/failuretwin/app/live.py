@@ -22,9 +22,16 @@ from rich.text import Text
 from failuretwin.app.commands.options import LiveOptions
 from failuretwin.app.shadow import SILENCE_S, Change, Changes, Shadow, Snapshot
 from failuretwin.app.terminal import tell
-from failuretwin.connection.links import ros_messages
 from failuretwin.connection.links.base import LinkCounts, Pace, Sink, Source, source_from_text
-from failuretwin.connection.links.ros_messages import LEVEL_NAMES, RosTopics, load_topics, statuses
+from failuretwin.connection.links.ros_messages import RosTopics, load_topics
+from failuretwin.connection.links.statuses import (
+    LEVEL_ERROR,
+    LEVEL_NAMES,
+    LEVEL_OK,
+    LEVEL_STALE,
+    LEVEL_WARN,
+    statuses,
+)
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import printable
 from failuretwin.data_knowledge.bag_messages import BagTopics
@@ -145,10 +152,10 @@ def _rosbridge(
 # The live view on a terminal: motors, residual, posterior over time, what changed.
 
 STYLES = {
-    ros_messages.LEVEL_OK: "green",
-    ros_messages.LEVEL_WARN: "yellow",
-    ros_messages.LEVEL_ERROR: "bold red",
-    ros_messages.LEVEL_STALE: "magenta",
+    LEVEL_OK: "green",
+    LEVEL_WARN: "yellow",
+    LEVEL_ERROR: "bold red",
+    LEVEL_STALE: "magenta",
 }
 BLOCKS = " ▁▂▃▄▅▆▇█"
 COLUMNS = 60

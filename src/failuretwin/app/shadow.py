@@ -22,10 +22,14 @@ from failuretwin.connection.links.base import (
     StreamClock,
 )
 from failuretwin.connection.links.live_events import LiveReference, ReorderBuffer
-from failuretwin.connection.links.ros_messages import SURE, statuses
+from failuretwin.connection.links.statuses import statuses
+from failuretwin.core.alarm import RAISED, SUSPECTED, Alarm, Episode
+from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser
+from failuretwin.decision.streaming.monitor import FaultMonitor
 from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.explanation import plain_name
 
 SILENCE_S = 5.0
 """Without a reading for so long on our own clock, the answer is stale [s]."""
@@ -59,7 +63,7 @@ class Shadow:
     def __init__(
         self,
         source: Source,
-        diagnoser: StreamingDiagnoser,
+        diagnoser: StreamingDiagnoser | FaultMonitor,
         twin: DigitalTwin,
         sinks: Sequence[Sink] = (),
         commands_late_s: float = 0.0,
@@ -147,7 +151,7 @@ class Shadow:
     def _publish(self, answer: Answer, residual: FloatArray) -> None:
         silent = time.monotonic() - self._read_s > SILENCE_S
         state = STALE if silent or answer.state != OK else OK
-        stamped = Answer(self._clock.stamp(answer.time), state, answer.diagnosis)
+        stamped = replace(answer, time=self._clock.stamp(answer.time), state=state)
         self.snapshot = Snapshot(stamped, answer.time, residual, self.snapshot.seconds)
         for sink in self._sinks:
             sink.put(stamped)
@@ -159,6 +163,14 @@ KEPT = 1000
 """Changes that are remembered; the recording holds all of them."""
 GARBAGE_EVERY_S = 10.0
 """Time between two reports of messages that make no sense [s]."""
+
+
+def _over(episode: Episode | None) -> str:
+    """Return that a fault is over, and how long it lasted."""
+    if episode is None or episode.duration_s is None:
+        return "cleared"
+    cause = plain_name(Hypothesis.parse(episode.cause))
+    return f"cleared after {episode.duration_s:.0f} s ({cause})"
 
 
 @dataclass(frozen=True)
@@ -179,7 +191,8 @@ class Changes:
     def __init__(self, motors: list[str]) -> None:
         self.lines: deque[Change] = deque(maxlen=KEPT)
         self._motors = motors
-        self._alarm = ""
+        self._alarm: Alarm | None = None
+        self._undecided = ""
         self._state = ""
         self._troubles: tuple[str, ...] = ()
         self._counts = LinkCounts()
@@ -205,14 +218,25 @@ class Changes:
 
     def _diagnosis(self, snapshot: Snapshot) -> list[str]:
         answer = snapshot.answer
-        if answer.state == STALE or answer.diagnosis is None or answer.diagnosis.undecided:
+        if answer.state == STALE or answer.diagnosis is None:
             return []
-        arm = statuses(answer, self._motors)[0]
-        best, before = answer.diagnosis.ranked[0], self._alarm
-        if best == before or answer.diagnosis.posterior[best] < SURE:
+        undecided, self._undecided = self._undecided, answer.diagnosis.undecided
+        if self._undecided:
+            return [] if self._undecided == undecided else [f"undecided: {self._undecided}"]
+        before, self._alarm = self._alarm, answer.alarm
+        if before is not None and (before.state, before.cause) == (
+            self._alarm.state,
+            self._alarm.cause,
+        ):
             return []
-        self._alarm = best
-        return [f"healthy again: {arm.message}" if before and best == "healthy" else arm.message]
+        message = statuses(answer, self._motors)[0].message
+        if self._alarm.state == RAISED:
+            return [f"alarm: {message}"]
+        if before is None or self._alarm.state == SUSPECTED:
+            return [message]
+        if before.state == SUSPECTED:
+            return [f"no longer suspected: {message}"]
+        return [f"{_over(self._alarm.episode)}: {message}"]
 
     def _link(
         self, at: float, counts: LinkCounts, jumps: int, troubles: tuple[str, ...]

@@ -289,6 +289,7 @@ class Posterior:
         log_posterior: (run, hypothesis).
         weights: What the runs say of each hypothesis, in their order.
         set_up: What is to be said of the set-up of each run; empty: nothing of any.
+        repairs: Whether a fault may have been repaired: what a healthy robot explains is explained.
     """
 
     likelihood: RunLikelihood
@@ -297,6 +298,7 @@ class Posterior:
     log_posterior: FloatArray
     weights: Sequence[MarginalLikelihood]
     set_up: Sequence[str] = ()
+    repairs: bool = False
 
     def undecided(self, run: int, quality: LogQuality) -> str:
         """Return why a run allows no verdict, empty if it does.
@@ -306,12 +308,15 @@ class Posterior:
             quality: Defects of its log.
         """
         best = int(np.argmax(self.log_posterior[run]))
+        explained = self.weights[best].settled(run)
+        if self.repairs:
+            explained = np.maximum(explained, self.likelihood.log_healthy[run])
         return abstention_reason(
             quality,
             self.likelihood.evidence,
             run,
             float(np.exp(self.log_posterior[run, best])),
-            self.weights[best].settled(run),
+            explained,
             self.likelihood.model,
         )
 

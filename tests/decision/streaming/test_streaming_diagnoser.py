@@ -16,10 +16,10 @@ from failuretwin.data_knowledge.generate import simulate
 from failuretwin.decision.streaming.diagnoser import (
     StreamingDiagnoser,
     load_fleet,
-    monitor,
     save_fleet,
 )
 from failuretwin.decision.streaming.fleet import StreamingFleet
+from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 

@@ -34,6 +34,15 @@ if TYPE_CHECKING:
     metavar="FILE.mcap",
     help="Record readings, commands and diagnoses; Foxglove, PlotJuggler and failuretwin read it.",
 )
+@click.option(
+    "--false-alarms-per-100h",
+    "budget",
+    type=click.FloatRange(0.0, 1000.0, min_open=True),
+    default=1.0,
+    show_default=True,
+    metavar="N",
+    help="False alarms that you allow in 100 hours of work; fewer come later.",
+)
 @live_options
 @plugin_option
 @common_options
@@ -41,6 +50,7 @@ def watch(
     source: str,
     calibration: Path | None,
     record: Path | None,
+    budget: float,
     live: LiveOptions,
     robot: str,
     seed: int,
@@ -58,14 +68,15 @@ def watch(
     from failuretwin.app.shadow import Shadow
     from failuretwin.app.tables import console
     from failuretwin.connection.links.recording import Recorder
-    from failuretwin.connection.links.ros_messages import statuses
-    from failuretwin.decision.streaming.diagnoser import monitor
+    from failuretwin.connection.links.statuses import statuses
+    from failuretwin.decision.streaming.monitor import monitor
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
 
     model = load_robot(robot)
     known, motors = load_calibration(calibration, model), model.motor_names
-    diagnoser, wait_s = monitor(known.twin, known.imperfections), topics_of(live.topics).wait_s
+    diagnoser = monitor(known.twin, known.imperfections, budget)
+    wait_s = topics_of(live.topics).wait_s
     tell(_rests_on(known.imperfections))
     # An emulated robot ends by itself, a log when it is over.
     length = live.duration if live.duration and source != "emulated" else math.inf

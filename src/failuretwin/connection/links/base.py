@@ -11,6 +11,7 @@ from threading import Condition
 from time import time as wall_clock
 from typing import Protocol, Self, cast
 
+from failuretwin.core.alarm import ALL_CLEAR, Alarm
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import FloatArray
@@ -62,11 +63,13 @@ class Answer:
         time: By the robot's clock [s].
         state: ``OK``, or ``STALE`` where data have stopped; then nothing is known of the present.
         diagnosis: The diagnosis as it stands, or stood when data stopped; None: there was none yet.
+        alarm: Whether to call somebody.
     """
 
     time: float
     state: str
     diagnosis: Diagnosis | None
+    alarm: Alarm = ALL_CLEAR
 
 
 Item = Reading | CommandSent | Answer

@@ -21,7 +21,8 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.decision.streaming.tracking import MovementTracker
-from failuretwin.decision.streaming.window import KEEP_S, FrozenSensorDetector
+from failuretwin.decision.streaming.trouble import FrozenSensorDetector, UntoldMotion
+from failuretwin.decision.streaming.window import KEEP_S
 from failuretwin.digital_model.calibrated_robot import RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.log_quality import LogQuality
@@ -42,6 +43,10 @@ for 4 s."""
 DEAD = LogQuality(
     fatal="the tool stands still though motors are told to move: the sensor or the arm is dead"
 )
+UNTOLD = LogQuality(
+    fatal="the tool moves though no command came: commands do not arrive here, or something else "
+    "moves the arm"
+)
 
 
 @dataclass(frozen=True)
@@ -54,12 +59,14 @@ class FleetPosterior(ArrayStruct):
         point: Where the tool was taken to rest after the present movement, (robot, axis) [m]; NaN
             if that movement does not count yet.
         dead: Robots whose tools stand still though they should move, (robot,).
+        untold: Robots whose tools move though they should not, (robot,).
     """
 
     posterior: Annotated[FloatArray, Axes("run", "hypothesis")]
     judged: Annotated[BoolArray, Axes("run", empty=False)]
     point: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
     dead: Annotated[BoolArray, Axes("run", empty=False)]
+    untold: Annotated[BoolArray, Axes("run", empty=False)]
 
 
 class StreamingFleet:
@@ -109,6 +116,7 @@ class StreamingFleet:
         self._settings = model.settings
         self._tracker = MovementTracker(model, robots, movements, rate_hz)
         self._frozen = FrozenSensorDetector.empty(run=robots, axis=3, value=4, motor=motors)
+        self._untold = UntoldMotion.empty(run=robots, axis=3)
         self._prior = np.exp(log_prior(diagnoser.hypothesis_set, diagnoser.priors))
         sizes = {"run": robots, "hypothesis": len(self._prior), "axis": 3}
         self._beliefs = FleetPosterior.empty(**sizes)
@@ -154,9 +162,24 @@ class StreamingFleet:
         reference, points = self._checked(time, command, measured)
         time = self._by_own_clock(time)
         points, died = self._alive(time, reference, points)
-        begun, at_rest = self._tracker.take(time, reference, points)
+        away, strayed = self._astray(time, points)
+        begun, at_rest = self._tracker.take(time, reference, points, away)
         self._beliefs.point[begun] = np.nan
-        return np.append(died, self._judge(self._with_news(at_rest)))
+        judged = self._judge(self._with_news(at_rest))
+        return np.unique(np.concatenate([died, strayed, judged]))
+
+    def _astray(self, time: float, points: FloatArray) -> tuple[BoolArray, IntArray]:
+        """Return tools that left where they rested without a command, (robot,), and changes.
+
+        Changes are the robots that begin or cease to move without being told.
+        """
+        tracker, settings = self._tracker, self._settings
+        told = (tracker.window.count > 0) | tracker.references.moved
+        near_m = settings.same_place_m, settings.unmoved_m
+        away = self._untold.see(time, points, tracker.rest(), told, near_m)
+        untold, before = self._untold.untold(time), self._beliefs.untold.copy()
+        self._beliefs.untold[:] = untold
+        return away, np.flatnonzero(untold != before)
 
     def conclude(self) -> None:
         """Count all that has come, as if the stream were over: answers are those of recorded runs.
@@ -170,27 +193,58 @@ class StreamingFleet:
         tracker.conclude(there)
         self._judge(there)
 
-    def diagnosis(self, robot: int, before: Diagnosis | None = None) -> Diagnosis | None:
+    def diagnosis(
+        self,
+        robot: int,
+        before: Diagnosis | None = None,
+        log_posterior: FloatArray | None = None,
+    ) -> Diagnosis | None:
         """Return the diagnosis of a robot in words; None where nothing can be said yet.
 
         Args:
             robot: Its index.
             before: What was said of it before; of a fault that is older than what is remembered,
                 the onset told then stands.
+            log_posterior: Log probability of each hypothesis, (hypothesis,), where more is known
+                than the last movements say.
         """
-        beliefs, window = self._beliefs, self._tracker.window
-        known = beliefs.judged[robot] or beliefs.dead[robot]
-        if not known or window.count[robot] == 0:
+        if not self._known(robot):
             return None
+        found, at, position = self._found(robot)
+        if log_posterior is not None:
+            rows = found.log_posterior.copy()
+            rows[at] = log_posterior
+            found = replace(found, log_posterior=rows, repairs=True)
+        place = replace(position, before=before)
+        return found.to_diagnosis(at, f"robot {robot}", self._quality(robot), place=place)
+
+    def seen(self, robot: int) -> tuple[RunLikelihood, int] | None:
+        """Return what the last movements of a robot say, and how many there were before them.
+
+        None where nothing was judged yet.
+        """
+        if not self._known(robot):
+            return None
+        found, at, position = self._found(robot)
+        return found.likelihood[at], position.movements
+
+    def _known(self, robot: int) -> bool:
+        """Return whether anything can be said of a robot."""
+        beliefs = self._beliefs
+        known = beliefs.judged[robot] or beliefs.dead[robot] or beliefs.untold[robot]
+        return bool(known and self._tracker.window.count[robot] > 0)
+
+    def _found(self, robot: int) -> tuple[Posterior, int, StreamPosition]:
+        """Return the last judgement of a robot, its row in that, and where the robot was."""
         if robot not in self._latest:
             self._remember(np.array([robot]), self._judgement(np.array([robot])))
-        posterior_of_runs, at, position = self._latest[robot]
-        return posterior_of_runs.to_diagnosis(
-            at,
-            f"robot {robot}",
-            DEAD if beliefs.dead[robot] else LogQuality(),
-            place=replace(position, before=before),
-        )
+        return self._latest[robot]
+
+    def _quality(self, robot: int) -> LogQuality:
+        """Return what keeps the readings of a robot from saying anything of its motors."""
+        if self._beliefs.dead[robot]:
+            return DEAD
+        return UNTOLD if self._beliefs.untold[robot] else LogQuality()
 
     def _remember(self, robots: IntArray, posterior_of_runs: Posterior) -> None:
         """Keep the last judgement, and where each robot then was, for whoever asks for words."""
@@ -241,6 +295,7 @@ class StreamingFleet:
             "window": self._tracker.window,
             "beliefs": self._beliefs,
             "frozen": self._frozen,
+            "untold": self._untold,
         }
 
     def _checked(
