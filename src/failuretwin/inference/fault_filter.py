@@ -82,11 +82,14 @@ class FaultBelief(ArrayStruct):
         healthy: h, (robot,).
         held: W of all motors one after the other, (robot, node).
         off: V of all motors one after the other, (robot, cell).
+        log_predictive: Log density of the last movement given those before it, over that of a
+            healthy robot, (robot,).
     """
 
     healthy: Annotated[FloatArray, Axes("run", empty=1.0)]
     held: Annotated[FloatArray, Axes("run", "node")]
     off: Annotated[FloatArray, Axes("run", "cell")]
+    log_predictive: Annotated[FloatArray, Axes("run")]
 
     @property
     def log_odds(self) -> FloatArray:
@@ -204,7 +207,10 @@ class FaultFilter:
         off = off * np.exp(np.clip(seen.off[:, movement], -MOST_NATS, MOST_NATS))
         total = healthy + held.sum(axis=1) + off.sum(axis=1)
         return FaultBelief(
-            np.maximum(healthy / total, LEAST), held / total[:, None], off / total[:, None]
+            np.maximum(healthy / total, LEAST),
+            held / total[:, None],
+            off / total[:, None],
+            np.log(total),
         )
 
     def posterior(self, belief: FaultBelief) -> FloatArray:

@@ -289,7 +289,8 @@ class Posterior:
         log_posterior: (run, hypothesis).
         weights: What the runs say of each hypothesis, in their order.
         set_up: What is to be said of the set-up of each run; empty: nothing of any.
-        repairs: Whether a fault may have been repaired: what a healthy robot explains is explained.
+        explained: Log density of each settled position given all before it, (run, movement), where
+            more is known than the runs say; None: what the best hypothesis makes of it counts.
     """
 
     likelihood: RunLikelihood
@@ -298,7 +299,7 @@ class Posterior:
     log_posterior: FloatArray
     weights: Sequence[MarginalLikelihood]
     set_up: Sequence[str] = ()
-    repairs: bool = False
+    explained: FloatArray | None = None
 
     def undecided(self, run: int, quality: LogQuality) -> str:
         """Return why a run allows no verdict, empty if it does.
@@ -308,9 +309,8 @@ class Posterior:
             quality: Defects of its log.
         """
         best = int(np.argmax(self.log_posterior[run]))
-        explained = self.weights[best].settled(run)
-        if self.repairs:
-            explained = np.maximum(explained, self.likelihood.log_healthy[run])
+        known = self.explained
+        explained = self.weights[best].settled(run) if known is None else known[run]
         return abstention_reason(
             quality,
             self.likelihood.evidence,

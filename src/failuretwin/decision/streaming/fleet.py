@@ -197,7 +197,7 @@ class StreamingFleet:
         self,
         robot: int,
         before: Diagnosis | None = None,
-        log_posterior: FloatArray | None = None,
+        told: tuple[FloatArray, FloatArray] | None = None,
     ) -> Diagnosis | None:
         """Return the diagnosis of a robot in words; None where nothing can be said yet.
 
@@ -205,16 +205,18 @@ class StreamingFleet:
             robot: Its index.
             before: What was said of it before; of a fault that is older than what is remembered,
                 the onset told then stands.
-            log_posterior: Log probability of each hypothesis, (hypothesis,), where more is known
-                than the last movements say.
+            told: Log probability of each hypothesis, (hypothesis,), and log density of each
+                movement given those before it, (movement,), where more is known than the last
+                movements say.
         """
         if not self._known(robot):
             return None
         found, at, position = self._found(robot)
-        if log_posterior is not None:
-            rows = found.log_posterior.copy()
-            rows[at] = log_posterior
-            found = replace(found, log_posterior=rows, repairs=True)
+        if told is not None:
+            log_posterior, explained = told
+            rows = np.tile(found.log_prior, (at + 1, 1))
+            rows[at], explained = log_posterior, np.tile(explained, (at + 1, 1))
+            found = replace(found, log_posterior=rows, explained=explained)
         place = replace(position, before=before)
         return found.to_diagnosis(at, f"robot {robot}", self._quality(robot), place=place)
 

@@ -51,6 +51,8 @@ class FaultMonitor:
         )
         self._concluded = self._filter.begin(1)
         self._movements = 0
+        self._window = 0, 0
+        self._explained: dict[int, float] = {}
         self._diagnosis: Diagnosis | None = None
 
     def update(
@@ -92,7 +94,9 @@ class FaultMonitor:
         if seen is None:
             return
         posterior = self._followed(*seen)
-        found = self._fleet.diagnosis(0, self._diagnosis, log_of(posterior))
+        explained = np.array([self._explained.get(m, np.inf) for m in range(*self._window)])
+        told = log_of(posterior), explained
+        found = self._fleet.diagnosis(0, self._diagnosis, told)
         if found is not None:
             self._diagnosis = replace(found, run="stream")
 
@@ -105,7 +109,9 @@ class FaultMonitor:
             likelihood: What the last movements say.
             before: How many there were before them.
         """
-        count = int(likelihood.evidence.movements.exists[0].sum())
+        count = likelihood.usable.shape[1]
+        self._window = before, before + count
+        self._explained = {m: v for m, v in self._explained.items() if m >= before}
         new = max(self._movements - before, 0)
         part = slice(max(new - 1, 0), count)
         evidence, findings = likelihood.evidence[:, part], likelihood.findings[:, part]
@@ -114,6 +120,8 @@ class FaultMonitor:
         for movement in range(new, count):
             at = movement - part.start
             belief = self._filter.advance(belief, says, at)
+            density = some.log_healthy[0, at] + belief.log_predictive[0]
+            self._explained[before + movement] = float(density)
             if movement < count - 1:
                 hours += float(says.hours[0, at])
                 self._concluded, self._movements = belief, before + movement + 1
