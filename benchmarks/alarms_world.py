@@ -44,6 +44,7 @@ class Lives:
         onset: First movement that a fault spoils, (life,); past the last of healthy ones.
         at_rest: Whether a motor got stuck on a plateau, (life,).
         held: Angle of a stuck motor, (life,) [rad]; NaN of others.
+        off: Steady-state error of each movement, (life, movement) [rad]; 0 without.
         late: Movements that start late, (life, movement).
     """
 
@@ -53,6 +54,7 @@ class Lives:
     onset: IntArray
     at_rest: BoolArray
     held: FloatArray
+    off: FloatArray
     late: BoolArray
 
 
@@ -86,7 +88,13 @@ def live(
     first[[fault == "healthy" for fault in faults]] = movements
     motor = np.array([_motor(fault, robot.motor_names) for fault in faults])
     spoilt = np.arange(movements) >= first[:, None]
-    angle, at_rest, held = _settled(twin, told, chance, faults, motor, spoilt, rng)
+    errs = np.array([fault.endswith("error") for fault in faults])
+    off = rng.uniform(*ERROR_RAD, spoilt.shape) * rng.choice([-1.0, 1.0], spoilt.shape)
+    off = np.where(spoilt & errs[:, None], off, 0.0)
+    target = told.target.copy()
+    target[np.arange(len(faults)), :, motor] += off
+    base = actual_movements(replace(told, target=target), chance).target
+    angle, at_rest, held = _settled(twin, told, chance, faults, motor, spoilt, rng, base)
     readings = imperfections.readings
     if readings is not None and readings.whole_counts:
         units = robot.servo_units
@@ -108,7 +116,7 @@ def live(
         first_reading_delay=chance.late + READ_S,
     )
     hours = (told.start[:, -1] - told.start[:, 0]) / 3600.0
-    return Lives(evidence, hours, faults, first, at_rest, held, late)
+    return Lives(evidence, hours, faults, first, at_rest, held, off, late)
 
 
 def _motor(fault: str, names: Sequence[str]) -> int:
@@ -123,14 +131,9 @@ def _settled(
     motor: IntArray,
     spoilt: BoolArray,
     rng: np.random.Generator,
+    base: FloatArray,
 ) -> tuple[FloatArray, BoolArray, FloatArray]:
     """Return where motors settle (life, movement, motor) [rad], and how stuck ones are held."""
-    life = np.arange(len(faults))
-    off = rng.uniform(*ERROR_RAD, spoilt.shape) * rng.choice([-1.0, 1.0], spoilt.shape)
-    errs = np.array([fault.endswith("error") for fault in faults])
-    target = told.target.copy()
-    target[life, :, motor] += np.where(spoilt & errs[:, None], off, 0.0)
-    base = actual_movements(replace(told, target=target), chance).target
     compliance = chance.compliance[:, None]
 
     def sagged(base: FloatArray, stays: BoolArray) -> FloatArray:

@@ -166,11 +166,11 @@ GARBAGE_EVERY_S = 10.0
 
 
 def _over(episode: Episode | None) -> str:
-    """Return that a fault is over, and how long it lasted."""
+    """Return that a fault is over, and how long its alarm stood."""
     if episode is None or episode.duration_s is None:
-        return "cleared"
+        return "healthy again"
     cause = plain_name(Hypothesis.parse(episode.cause))
-    return f"cleared after {episode.duration_s:.0f} s ({cause})"
+    return f"healthy again, the alarm for {cause} stood {episode.duration_s:.0f} s"
 
 
 @dataclass(frozen=True)
@@ -230,9 +230,7 @@ class Changes:
         ):
             return []
         message = statuses(answer, self._motors)[0].message
-        if self._alarm.state == RAISED:
-            return [f"alarm: {message}"]
-        if before is None or self._alarm.state == SUSPECTED:
+        if before is None or self._alarm.state in (SUSPECTED, RAISED):
             return [message]
         if before.state == SUSPECTED:
             return [f"no longer suspected: {message}"]

@@ -149,7 +149,7 @@ class FaultFilter:
 
     def begin(self, robots: int) -> FaultBelief:
         """Return the belief that all is well."""
-        return FaultBelief.empty(run=robots, node=len(self._node_of), cell=len(self._cell_of))
+        return FaultBelief.empty(run=robots, node=len(self.held_of), cell=len(self._cell_of))
 
     def evidence(self, likelihood: RunLikelihood) -> FaultEvidence:
         """Return what movements say of each fault.
@@ -201,7 +201,7 @@ class FaultFilter:
         healthy = belief.healthy * (1.0 - came.sum(axis=1)) + mended * broken
         begun = belief.healthy[:, None] * came
         kept = (1.0 - mended)[:, None]
-        held = kept * belief.held + begun[:, self._node_of] * seen.begun[:, movement]
+        held = kept * belief.held + begun[:, self.held_of] * seen.begun[:, movement]
         off = kept * belief.off + begun[:, self._cell_of] * self._cell_share
         held = held * np.exp(np.clip(seen.held[:, movement], -MOST_NATS, MOST_NATS))
         off = off * np.exp(np.clip(seen.off[:, movement], -MOST_NATS, MOST_NATS))
@@ -217,7 +217,7 @@ class FaultFilter:
         """Return the probability of each hypothesis, (robot, hypothesis)."""
         found = np.zeros((len(belief.healthy), len(self.hypotheses)))
         found[:, [h.is_healthy for h in self.hypotheses]] = belief.healthy[:, None]
-        for of, values in ((self._node_of, belief.held), (self._cell_of, belief.off)):
+        for of, values in ((self.held_of, belief.held), (self._cell_of, belief.off)):
             for k in np.unique(of):
                 found[:, k] = values[:, of == k].sum(axis=1)
         return found
@@ -256,8 +256,13 @@ class FaultFilter:
             found.append(np.linspace(low - margin, high + margin, count + 1))
         return found
 
+    @property
+    def held_angles(self) -> FloatArray:
+        """Held angle of each node, (node,) [rad]."""
+        return np.concatenate([*self._grids, np.zeros(0)])
+
     @cached_property
-    def _node_of(self) -> IntArray:
+    def held_of(self) -> IntArray:
         """Hypothesis of each node, (node,)."""
         own = [self._index(fault) for fault in self._of(Signature.HELD)]
         return np.repeat(np.array(own, dtype=np.int64), [len(grid) for grid in self._grids])
