@@ -1,7 +1,7 @@
 """False alarms and delays of the watch: healthy hours and faults, robots drawn at random.
 
     python benchmarks/alarms.py [--hours 30] [--faults 200] [--seed 0] [--robot armpi_fpv]
-                                [--of CALIBRATION] [--by CALIBRATION] [--learn] [--picture FILE]
+                                [--of CALIBRATION] [--by CALIBRATION] [--alone] [--picture FILE]
 
 Movements are seen at rest alone (`alarms_world.py`). Each healthy life is an hour of a robot of its
 own. A fault is shown with the first movement at which what was seen speaks for it, its onset and
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,9 +27,12 @@ from failuretwin.core.alarm import RAISED
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.alarm_rule import AlarmRule
+from failuretwin.decision.streaming.monitor import FOREIGN
+from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.inference.fault_filter import FaultFilter
+from failuretwin.inference.healthy_mixture import HealthyMixture
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.joint_likelihood import movement_likelihoods
 from failuretwin.inference.priors import Priors
@@ -43,8 +47,10 @@ ONSET = (15, 21)
 SHOWN_NATS = 5.0
 SPELL = 5
 """Alarms of a residual that lie closer than so many movements are one."""
-SHARE = 0.9
+SHARE = 0.75
 """Share of healthy residuals below the drift of the CUSUM."""
+CAPPED = 4.0
+"""Residuals beyond so many drifts count as this: one lost command must not decide alone."""
 
 
 @dataclass(frozen=True)
@@ -80,22 +86,26 @@ class Seen:
     shown: np.ndarray
 
 
-def look(lives: Lives, faults: FaultFilter, model: HealthyModel) -> Seen:
+def look(lives: Lives, mixture: HealthyMixture) -> Seen:
     """Return lives as they are seen."""
-    found = movement_likelihoods(lives.evidence, model)
-    belief, posterior, hours = faults.begin(len(lives.hours)), [], []
+    models = [one.model for one in mixture.filters]
+    found = [movement_likelihoods(lives.evidence, model) for model in models]
+    belief, posterior, hours = mixture.begin(len(lives.hours)), [], []
     movements = lives.evidence.usable.shape[1]
     for first in range(0, movements, BLOCK):
         before = max(first - 1, 0)
         part = (slice(None), slice(before, min(first + BLOCK, movements)))
-        some = RunLikelihood(lives.evidence[part], model, remembered=found[part])
-        says = faults.evidence(some)
-        for at in range(first - before, says.hours.shape[1]):
-            belief = faults.advance(belief, says, at)
-            posterior.append(faults.posterior(belief))
-            hours.append(says.hours[:, at])
-    whole = RunLikelihood(lives.evidence, model, remembered=found)
-    pose = found.expected[:, :, 0]
+        says = [
+            one.evidence(RunLikelihood(lives.evidence[part], one.model, remembered=known[part]))
+            for one, known in zip(mixture.filters, found, strict=True)
+        ]
+        for at in range(first - before, says[0].hours.shape[1]):
+            belief = mixture.advance(belief, says, at)
+            posterior.append(mixture.posterior(belief))
+            hours.append(says[0].hours[:, at])
+    model = models[0]
+    whole = RunLikelihood(lives.evidence, model, remembered=found[0])
+    pose = found[0].expected[:, :, 0]
     error, _, spread = model.residual(lives.evidence.point, pose, model.scatter)
     residual = np.where(lives.evidence.usable, np.sqrt(spread.product(error, error)), 0.0)
     return Seen(
@@ -158,10 +168,10 @@ def by_threshold(values: FloatArray, threshold: float) -> Told:
 
 def cusum(residual: FloatArray, drift: float) -> FloatArray:
     """Return the CUSUM of residuals, (life, movement); what it says of a fault does not go back."""
-    total = np.zeros_like(residual)
+    total, most = np.zeros_like(residual), CAPPED * drift
     for m in range(residual.shape[1]):
         before = total[:, m - 1] if m else 0.0
-        total[:, m] = np.maximum(0.0, before + residual[:, m] - drift)
+        total[:, m] = np.maximum(0.0, before + np.minimum(residual[:, m], most) - drift)
     return total
 
 
@@ -203,10 +213,10 @@ class Delays:
             return f"found 0 of {self.of}"
         quantiles = np.quantile(self.movements, (0.5, 0.9, 0.99), method="inverted_cdf")
         after = np.nanquantile(self.after_shown, (0.5, 0.9), method="inverted_cdf")
+        right = f"right {100 * self.right / self.found:.1f} %" if self.right else "names nothing"
         return (
             f"found {self.found} of {self.of}; movements {'/'.join(f'{q:.0f}' for q in quantiles)};"
-            f" after shown {'/'.join(f'{q:.0f}' for q in after)};"
-            f" right {100 * self.right / self.found:.1f} %"
+            f" after shown {'/'.join(f'{q:.0f}' for q in after)}; {right}"
         )
 
 
@@ -228,39 +238,43 @@ def main() -> None:
     parser.add_argument("--robot", default="armpi_fpv")
     parser.add_argument("--of", default=None, help="calibration of the robot that works")
     parser.add_argument("--by", default=None, help="calibration that the watch uses")
+    parser.add_argument("--alone", action="store_true", help="believe the calibration for sure")
     parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
     robot = ft.load_robot(options.robot)
     works, known = (load_calibration(name, robot) for name in (options.of, options.by))
-    model = HealthyModel(known.twin, known.imperfections)
     hypotheses = paper_hypotheses(robot.motor_names)
     names = [str(h) for h in hypotheses]
-    faults = FaultFilter(model, hypotheses, Priors())
+    models = [HealthyModel(known.twin, known.imperfections)]
+    if not options.alone and known.imperfections.name != GENERIC_NAME:
+        models.append(HealthyModel.of(known.twin, generic_imperfections(robot)))
+    filters = [FaultFilter(model, hypotheses, Priors()) for model in models]
+    share = np.array([1.0 - FOREIGN, FOREIGN] if len(filters) > 1 else [1.0])
+    mixture, faults_per_h = HealthyMixture(filters, share), filters[0].faults_per_h
     begun = time.process_time()
     healthy = [
-        look(lives, faults, model)
+        look(lives, mixture)
         for lives in healthy_lives(works.twin, works.imperfections, options.hours, options.seed)
     ]
     truth = [names[1 + k % (len(names) - 1)] for k in range(options.faults)]
     broken = look(
         live(works.twin, works.imperfections, truth, FAULTY, ONSET, options.seed + 77_777),
-        faults,
-        model,
+        mixture,
     )
     hours = sum(float(seen.lives.hours.sum()) for seen in healthy)
     print(f"{hours:.0f} h, {options.faults} faults, {time.process_time() - begun:.0f} s of a core")
     curves: dict[str, list[tuple[float, float]]] = {}
     everything = range(options.faults)
     for budget in BUDGETS:
-        rows = [by_filter(seen, names, faults.faults_per_h, budget) for seen in healthy]
+        rows = [by_filter(seen, names, faults_per_h, budget) for seen in healthy]
         alarms = Told([r for t in rows for r in t.raised], [c for t in rows for c in t.cause])
-        told = by_filter(broken, names, faults.faults_per_h, budget)
+        told = by_filter(broken, names, faults_per_h, budget)
         delays = Delays.of_alarms(told, broken, everything)
         _note(curves, "filter", alarms, hours, delays)
         print(f"filter, {budget:5.1f} allowed: {false_alarms(alarms, hours)}; {delays}", flush=True)
         if budget == 1.0:
             which = [c for row in alarms.cause for c in row]
-            print(f"    false ones name {which}")
+            print(f"    false ones name {dict(Counter(which))}")
             for name in names[1:]:
                 some = [i for i in everything if truth[i] == name]
                 print(f"    {name:30s} {Delays.of_alarms(told, broken, some)}")

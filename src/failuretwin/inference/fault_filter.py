@@ -109,12 +109,15 @@ class FaultEvidence(ArrayStruct):
         begun: p(held angle | stuck since the movement before), (robot, movement, node); sums to 1
             for each motor.
         hours: Time since the movement before, (robot, movement) [h].
+        healthy: Log density of each settled position if no motor is faulty, (robot, movement); 0
+            where it was not seen.
     """
 
     held: Annotated[FloatArray, Axes("run", "movement", "node")]
     off: Annotated[FloatArray, Axes("run", "movement", "cell")]
     begun: Annotated[FloatArray, Axes("run", "movement", "node")]
     hours: Annotated[FloatArray, Axes("run", "movement")]
+    healthy: Annotated[FloatArray, Axes("run", "movement")]
 
 
 @dataclass(frozen=True)
@@ -184,6 +187,7 @@ class FaultFilter:
             np.concatenate([*off, none], axis=-1),
             np.concatenate([*begun, none], axis=-1),
             self._hours(likelihood),
+            likelihood.log_healthy,
         )
 
     def advance(self, belief: FaultBelief, seen: FaultEvidence, movement: int) -> FaultBelief:

@@ -20,14 +20,14 @@ def odds(total, first=1.0):
 
 
 def test_the_threshold_is_the_bound_of_the_budget():
-    """Faults in 100 hours over false alarms in 100 hours."""
-    assert np.exp(AlarmRule(NAMES, PER_H).log_odds) == pytest.approx(4.0)
-    assert np.exp(AlarmRule(NAMES, PER_H, 10.0).log_odds) == pytest.approx(0.4)
+    """Faults in 100 hours over a third of the false alarms in 100 hours."""
+    assert np.exp(AlarmRule(NAMES, PER_H).log_odds) == pytest.approx(4.0 / 3.0)
+    assert np.exp(AlarmRule(NAMES, PER_H, 10.0).log_odds) == pytest.approx(0.4 / 3.0)
 
 
 def test_states_from_clear_over_suspected_to_an_alarm_and_back():
     rule = AlarmRule(NAMES, PER_H)
-    told = [rule.see(float(k), odds(x)) for k, x in enumerate([1e-4, 0.05, 4.1, 1.0, 0.01, 1e-4])]
+    told = [rule.see(float(k), odds(x)) for k, x in enumerate([1e-4, 0.05, 1.4, 1.0, 0.01, 1e-4])]
     assert [alarm.state for alarm in told] == [CLEAR, SUSPECTED, RAISED, RAISED, CLEAR, CLEAR]
     assert [alarm.cause for alarm in told] == ["", *["motor_1:stuck"] * 3, "", ""]
     assert told[1].episode is None
@@ -56,15 +56,15 @@ def test_another_cause_is_another_episode():
 
 
 def test_a_robot_that_is_often_suspected_in_vain_needs_more_to_alarm():
-    """Chance allows a hundred times the budget of suspicions; four times that raises the bar."""
+    """Chance allows some hundred times the budget of suspicions; more raise the bar."""
     rule = AlarmRule(NAMES, PER_H)
     usual = rule.log_odds
     for k in range(400):
-        rule.see(2.0 * k, odds(0.2), 0.05)
-        rule.see(2.0 * k + 1.0, odds(1e-4), 0.05)
-    assert rule.hours == pytest.approx(40.0)
+        rule.see(2.0 * k, odds(0.2), 0.01)
+        rule.see(2.0 * k + 1.0, odds(1e-4), 0.01)
+    assert rule.hours == pytest.approx(8.0)
     assert 100 < rule.passed < 400  # what is suspected at last takes more, too
-    assert rule.log_odds - usual == pytest.approx(np.log((1.0 + rule.passed) / 41.0))
+    assert rule.log_odds - usual == pytest.approx(np.log((1.0 + rule.passed) / 25.0))
 
 
 def test_a_robot_that_does_what_its_model_says_keeps_the_bound():

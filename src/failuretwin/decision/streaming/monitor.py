@@ -1,13 +1,14 @@
 """Watching one robot at work: what is the case by all movements so far, and when to call somebody.
 
 The last movements are seen and estimated as by `StreamingDiagnoser`; what is believed of the
-faults comes from all movements so far (`FaultFilter`), the alarm from `AlarmRule`.
+faults comes from all movements so far (`FaultFilter`), by the calibration that is given and by what
+the robot itself teaches (`HealthyMixture`, `LifeLearner`); the alarm comes from `AlarmRule`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,14 +16,36 @@ from numpy.typing import ArrayLike
 from failuretwin.connection.links.base import OK, STALE, Answer
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.numerics import log_of
-from failuretwin.core.types import as_floats
+from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.decision.streaming.alarm_rule import AlarmRule
 from failuretwin.decision.streaming.diagnoser import reference_of
 from failuretwin.decision.streaming.fleet import StreamingFleet
+from failuretwin.decision.streaming.learning import LifeLearner
+from failuretwin.digital_model.arm_classes import GENERIC_NAME
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.fault_filter import RATES, FaultFilter, FaultRates
+from failuretwin.inference.healthy_mixture import HealthyMixture
+from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.run_likelihood import RunLikelihood
+
+FOREIGN = 0.1
+"""Probability that a calibration is of another robot, or no longer true; assumed."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Whose healthy behaviour the robot has, so far.
+
+    Attributes:
+        given: Name of the calibration that was given; empty: none of this robot.
+        fits: Probability that it is this robot's; 0 without one.
+        learned: Movements that this robot itself has taught.
+    """
+
+    given: str
+    fits: float
+    learned: int
 
 
 class FaultMonitor:
@@ -44,16 +67,30 @@ class FaultMonitor:
         rates: FaultRates = RATES,
     ) -> None:
         self._fleet = StreamingFleet(diagnoser, 1)
-        hypotheses = diagnoser.hypothesis_set
-        self._filter = FaultFilter(diagnoser.healthy_model, hypotheses, diagnoser.priors, rates)
+        known = diagnoser.healthy_model
+        ideal, cold = known.imperfections.settling is None, known.imperfections.name == GENERIC_NAME
+        self._learner = None if ideal else LifeLearner(diagnoser)
+        self._models: list[HealthyModel] = [] if cold else [known]
+        if self._learner is not None:
+            self._models.append(self._learner.model)
+        hypotheses, priors = diagnoser.hypothesis_set, diagnoser.priors
+        filters = [FaultFilter(model, hypotheses, priors, rates) for model in self._models]
+        share = [1.0] if len(filters) == 1 else [1.0 - FOREIGN, FOREIGN]
+        self._mixture = HealthyMixture(filters, np.array(share))
+        self._given = "" if cold else known.imperfections.name
         self._rule = AlarmRule(
-            self._fleet.hypotheses, self._filter.faults_per_h, false_alarms_per_100h
+            self._fleet.hypotheses, filters[0].faults_per_h, false_alarms_per_100h
         )
-        self._concluded = self._filter.begin(1)
+        self._concluded = self._mixture.begin(1)
         self._movements = 0
-        self._window = 0, 0
         self._explained: dict[int, float] = {}
         self._diagnosis: Diagnosis | None = None
+
+    @property
+    def fit(self) -> Fit:
+        """Whose healthy behaviour the robot has, so far."""
+        fits = float(np.exp(self._concluded.log_weight[0, 0])) if self._given else 0.0
+        return Fit(self._given, fits, 0 if self._learner is None else self._learner.movements)
 
     def update(
         self,
@@ -93,41 +130,64 @@ class FaultMonitor:
         seen = self._fleet.seen(0)
         if seen is None:
             return
-        posterior = self._followed(*seen)
-        explained = np.array([self._explained.get(m, np.inf) for m in range(*self._window)])
-        told = log_of(posterior), explained
-        found = self._fleet.diagnosis(0, self._diagnosis, told)
+        likelihood, before = seen
+        posterior = self._followed(likelihood, before)
+        window = range(before, before + likelihood.usable.shape[1])
+        explained = np.array([self._explained.get(m, np.inf) for m in window])
+        found = self._fleet.diagnosis(0, self._diagnosis, (log_of(posterior), explained))
         if found is not None:
             self._diagnosis = replace(found, run="stream")
 
-    def _followed(self, likelihood: RunLikelihood, before: int) -> np.ndarray:
+    def _followed(self, likelihood: RunLikelihood, before: int) -> FloatArray:
         """Return the probability of each hypothesis, (hypothesis,).
 
-        Movements that are over are counted once and for all; the present one as it looks now.
+        Movements that are over are counted once and for all, then learned from; the present one
+        as it looks now.
 
         Args:
             likelihood: What the last movements say.
             before: How many there were before them.
         """
         count = likelihood.usable.shape[1]
-        self._window = before, before + count
-        self._explained = {m: v for m, v in self._explained.items() if m >= before}
         new = max(self._movements - before, 0)
         part = slice(max(new - 1, 0), count)
-        evidence, findings = likelihood.evidence[:, part], likelihood.findings[:, part]
-        some = RunLikelihood(evidence, likelihood.model, remembered=findings)
-        says, belief, hours = self._filter.evidence(some), self._concluded, 0.0
+        says = [
+            one.evidence(self._part(likelihood, model, part))
+            for one, model in zip(self._mixture.filters, self._models, strict=True)
+        ]
+        belief, hours = self._concluded, 0.0
+        self._explained = {m: v for m, v in self._explained.items() if m >= before}
         for movement in range(new, count):
-            at = movement - part.start
-            belief = self._filter.advance(belief, says, at)
-            density = some.log_healthy[0, at] + belief.log_predictive[0]
-            self._explained[before + movement] = float(density)
+            belief = self._mixture.advance(belief, says, movement - part.start)
+            self._explained[before + movement] = float(belief.explained[0])
             if movement < count - 1:
-                hours += float(says.hours[0, at])
+                hours += float(says[0].hours[0, movement - part.start])
                 self._concluded, self._movements = belief, before + movement + 1
-        posterior = self._filter.posterior(belief)[0]
+        posterior = self._mixture.posterior(belief)[0]
         self._rule.see(self._fleet.time, posterior, hours)
+        self._learn(likelihood, range(new, count - 1))
         return posterior
+
+    @staticmethod
+    def _part(likelihood: RunLikelihood, model: HealthyModel, part: slice) -> RunLikelihood:
+        """Return what some of the last movements say by a model."""
+        if model is not likelihood.model:
+            likelihood = RunLikelihood(likelihood.evidence, model)
+        rows = slice(None), part
+        evidence, findings = likelihood.evidence[rows], likelihood.findings[rows]
+        return RunLikelihood(evidence, model, remembered=findings)
+
+    def _learn(self, likelihood: RunLikelihood, finished: range) -> None:
+        """Learn from movements that are over; what is known better counts from the next on."""
+        if self._learner is None:
+            return
+        evidence, movements = likelihood.evidence, likelihood.evidence.movements
+        for m in finished:
+            one = evidence[(slice(None), slice(m, m + 1))]
+            stood = movements.origin()[:, m]
+            one = replace(one, movements=replace(one.movements, initial=stood))
+            if self._learner.take(one):
+                self._models[-1] = self._learner.model
 
 
 def monitor(
