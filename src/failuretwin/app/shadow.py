@@ -143,10 +143,13 @@ class Shadow:
                 command = angles
         residual = self.snapshot.residual
         if seen is not None:
-            self._read_s = self._fed_s
             expected = np.full(3, np.nan) if command is None else self._twin.path(command)
             residual = seen - expected
-        self._publish(self._diagnoser.update(reading.time, command, seen), residual)
+        answer = self._diagnoser.update(reading.time, command, seen)
+        self._fed_s = time.monotonic()  # what we take to think is no silence of the robot
+        if seen is not None:
+            self._read_s = self._fed_s
+        self._publish(answer, residual)
 
     def _publish(self, answer: Answer, residual: FloatArray) -> None:
         silent = time.monotonic() - self._read_s > SILENCE_S

@@ -24,6 +24,7 @@ from failuretwin.decision.streaming.tracking import MovementTracker
 from failuretwin.decision.streaming.trouble import FrozenSensorDetector, UntoldMotion
 from failuretwin.decision.streaming.window import KEEP_S
 from failuretwin.digital_model.calibrated_robot import RobotLike
+from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.log_quality import LogQuality
 from failuretwin.inference.posterior import (
@@ -220,15 +221,21 @@ class StreamingFleet:
         place = replace(position, before=before)
         return found.to_diagnosis(at, f"robot {robot}", self._quality(robot), place=place)
 
-    def seen(self, robot: int) -> tuple[RunLikelihood, int] | None:
-        """Return what the last movements of a robot say, and how many there were before them.
+    def seen(self, robot: int) -> tuple[RunLikelihood, StreamPosition] | None:
+        """Return what the last movements of a robot say, and where they lie in the stream.
 
         None where nothing was judged yet.
         """
         if not self._known(robot):
             return None
         found, at, position = self._found(robot)
-        return found.likelihood[at], position.movements
+        return found.likelihood[at], position
+
+    def adopt(self, imperfections: Imperfections) -> None:
+        """Judge by another healthy behaviour from now on, the last movements too."""
+        self.diagnoser = replace(self.diagnoser, imperfections=imperfections)
+        self._tracker.adopt(self.diagnoser.healthy_model)
+        self._latest = {}
 
     def _known(self, robot: int) -> bool:
         """Return whether anything can be said of a robot."""

@@ -6,6 +6,7 @@ the others alone (`LifeFilter`).
 
 from __future__ import annotations
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -30,6 +31,9 @@ TIMED = 200
 class LifeLearner:
     """Learns of one robot from its movements, beginning with what arms of its kind are like.
 
+    A run is worked on in a thread of its own, so that answers need not wait; what it taught is
+    known when the next run is complete, however fast time passes.
+
     Args:
         diagnoser: The method, with its hypotheses and priors.
     """
@@ -38,14 +42,50 @@ class LifeLearner:
         self._life = begin(diagnoser, cold=True)
         self._waiting: list[SettledEvidence] = []
         self._told: Movements | None = None
+        self._worker = ThreadPoolExecutor(1, "learning")
+        self._work: Future[None] | None = None
+        self.model = self._life.model
+        self.movements = 0
 
-    @property
-    def model(self) -> HealthyModel:
-        """The healthy robot as it is believed to be by now, with what is left of the doubt."""
-        life = self._life
-        if life.window is None:
-            return life.model
-        learned = life.learned
+    def take(self, movement: SettledEvidence, learns: bool) -> bool:
+        """Take in a finished movement and return whether the model has changed.
+
+        Args:
+            movement: A run of this movement alone, by the time of the stream.
+            learns: Whether it is worth while; else it is only remembered for a while.
+        """
+        self._waiting.append(movement)
+        run = RUN if self.movements < LITTLE else LONG_RUN
+        if len(self._waiting) < run:
+            return False
+        if not learns:
+            self._waiting = self._waiting[1:]
+            return False
+        taught = self._finish()
+        seen, self._waiting = _joined(self._waiting), []
+        told = seen.movements
+        self._told = told if self._told is None else _followed_by(self._told, told)
+        if seen.usable.any():
+            self._work = self._worker.submit(self._follow, seen, _from_zero(self._told))
+        return taught
+
+    def _finish(self) -> bool:
+        """Wait until the last run is learned and return whether there was one."""
+        if self._work is None:
+            return False
+        self._work.result()
+        self._work, self.movements, self.model = None, self._life.movements, self._model()
+        return True
+
+    def _follow(self, run: SettledEvidence, told: Movements) -> None:
+        life, robot = self._life, self._life.model.twin.robot
+        now = with_timing_of(life.model.imperfections, told, robot)
+        life.model = replace(life.model, imperfections=_learning(now))
+        life.follow(replace(run, movements=_from_zero(run.movements)))
+
+    def _model(self) -> HealthyModel:
+        """Return the robot as it is believed to be by now, with what is left of the doubt."""
+        life, learned = self._life, self._life.learned
         _, (bias, compliance, friction) = life.offsets
         size = np.abs(np.asarray(learned.settling.compliance if learned.settling else 0.0))
         relative = np.divide(compliance, size, out=np.zeros_like(compliance), where=size > 1e-9)
@@ -57,32 +97,6 @@ class LifeLearner:
         )
         return replace(life.model, imperfections=replace(learned, variation=doubt))
 
-    @property
-    def movements(self) -> int:
-        """Movements that were learned from."""
-        return self._life.movements
-
-    def take(self, movement: SettledEvidence) -> bool:
-        """Take in a finished movement and return whether more is known now.
-
-        Args:
-            movement: A run of this movement alone.
-        """
-        self._waiting.append(movement)
-        if len(self._waiting) < (RUN if self.movements < LITTLE else LONG_RUN):
-            return False
-        run = _joined(self._waiting)
-        self._waiting = []
-        if not run.usable.any():
-            return False
-        life, robot = self._life, self._life.model.twin.robot
-        movements = run.movements
-        self._told = movements if self._told is None else _followed_by(self._told, movements)
-        now = with_timing_of(life.model.imperfections, self._told, robot)
-        life.model = replace(life.model, imperfections=_learning(now))
-        life.follow(run)
-        return True
-
 
 def _learning(now: Imperfections) -> Imperfections:
     """Return imperfections that say that runs taught them."""
@@ -91,12 +105,17 @@ def _learning(now: Imperfections) -> Imperfections:
 
 
 def _joined(movements: list[SettledEvidence]) -> SettledEvidence:
-    """Return movements one after the other as one run, its times from the first command."""
+    """Return movements one after the other as one run."""
     run = movements[0].blank(1, len(movements))
     for at, movement in enumerate(movements):
         run.put((slice(0, 1), slice(at, at + 1)), movement)
     run.movements.initial[:] = movements[0].movements.initial
     return run
+
+
+def _from_zero(movements: Movements) -> Movements:
+    """Return movements with times from the first command on."""
+    return replace(movements, start=movements.start - movements.start[:, :1])
 
 
 def _followed_by(before: Movements, after: Movements) -> Movements:

@@ -24,11 +24,15 @@ from failuretwin.decision.streaming.learning import LifeLearner
 from failuretwin.digital_model.arm_classes import GENERIC_NAME
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.fault_filter import RATES, FaultFilter, FaultRates
 from failuretwin.inference.healthy_mixture import HealthyMixture
 from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.posterior import StreamPosition
 from failuretwin.inference.run_likelihood import RunLikelihood
 
+WORTH_LEARNING = 0.01
+"""Probability that the calibration that was given is not this robot's from which it learns."""
 FOREIGN = 0.1
 """Probability that a calibration is of another robot, or no longer true; assumed."""
 
@@ -130,15 +134,16 @@ class FaultMonitor:
         seen = self._fleet.seen(0)
         if seen is None:
             return
-        likelihood, before = seen
-        posterior = self._followed(likelihood, before)
+        likelihood, position = seen
+        before = position.movements
+        posterior = self._followed(likelihood, position)
         window = range(before, before + likelihood.usable.shape[1])
         explained = np.array([self._explained.get(m, np.inf) for m in window])
         found = self._fleet.diagnosis(0, self._diagnosis, (log_of(posterior), explained))
         if found is not None:
             self._diagnosis = replace(found, run="stream")
 
-    def _followed(self, likelihood: RunLikelihood, before: int) -> FloatArray:
+    def _followed(self, likelihood: RunLikelihood, position: StreamPosition) -> FloatArray:
         """Return the probability of each hypothesis, (hypothesis,).
 
         Movements that are over are counted once and for all, then learned from; the present one
@@ -146,9 +151,9 @@ class FaultMonitor:
 
         Args:
             likelihood: What the last movements say.
-            before: How many there were before them.
+            position: Where they lie in the stream.
         """
-        count = likelihood.usable.shape[1]
+        count, before = likelihood.usable.shape[1], position.movements
         new = max(self._movements - before, 0)
         part = slice(max(new - 1, 0), count)
         says = [
@@ -165,7 +170,8 @@ class FaultMonitor:
                 self._concluded, self._movements = belief, before + movement + 1
         posterior = self._mixture.posterior(belief)[0]
         self._rule.see(self._fleet.time, posterior, hours)
-        self._learn(likelihood, range(new, count - 1))
+        for movement in range(new, count - 1):
+            self._learn(likelihood.evidence, movement, position.begin_s)
         return posterior
 
     @staticmethod
@@ -177,17 +183,30 @@ class FaultMonitor:
         evidence, findings = likelihood.evidence[rows], likelihood.findings[rows]
         return RunLikelihood(evidence, model, remembered=findings)
 
-    def _learn(self, likelihood: RunLikelihood, finished: range) -> None:
-        """Learn from movements that are over; what is known better counts from the next on."""
+    def _learn(self, evidence: SettledEvidence, movement: int, begin_s: float) -> None:
+        """Learn from a movement that is over; what is known better counts from the next on.
+
+        Nothing is learned of a robot that its calibration fits.
+
+        Args:
+            evidence: The last movements.
+            movement: Which of them.
+            begin_s: When they begin by the time of the stream [s].
+        """
         if self._learner is None:
             return
-        evidence, movements = likelihood.evidence, likelihood.evidence.movements
-        for m in finished:
-            one = evidence[(slice(None), slice(m, m + 1))]
-            stood = movements.origin()[:, m]
-            one = replace(one, movements=replace(one.movements, initial=stood))
-            if self._learner.take(one):
-                self._models[-1] = self._learner.model
+        own = float(np.exp(self._concluded.log_weight[0, -1]))
+        one, stood = evidence[(slice(None), slice(movement, movement + 1))], evidence.movements
+        told = replace(
+            one.movements,
+            initial=stood.origin()[:, movement],
+            start=one.movements.start + begin_s,
+        )
+        if self._learner.take(replace(one, movements=told), learns=own > WORTH_LEARNING):
+            self._models[-1] = self._learner.model
+            if own > 0.5:
+                self._fleet.adopt(self._models[-1].imperfections)
+                self._models[-1] = self._fleet.diagnoser.healthy_model
 
 
 def monitor(

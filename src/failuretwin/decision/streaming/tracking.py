@@ -123,8 +123,12 @@ class MovementTracker:
         self.window = MovementWindow.of(model, robots, movements)
         self._twin, self._settings = model.twin, model.settings
         self._least_step = 0.0 if rate_hz is None else 0.9 / rate_hz
-        self._latest_start_s = model.imperfections.timing.late_s[1] + model.lag_s + SETTLING_S
-        self._late_after_s = model.lost_commands.late_after_s
+        self._latest_start_s, self._late_after_s = _lateness(model)
+
+    def adopt(self, model: HealthyModel) -> None:
+        """Judge all movements anew, by another healthy robot."""
+        self._latest_start_s, self._late_after_s = _lateness(model)
+        self.window.judged[:] = False
 
     def take(
         self, time: float, command: FloatArray, points: FloatArray, away: BoolArray
@@ -286,6 +290,12 @@ class MovementTracker:
         unmoved = np.linalg.norm(point - rested, axis=1) < self._settings.unmoved_m
         since = self.window.read_s[robots] - known.start[at]
         return np.asarray(unmoved & (since < self._latest_start_s))
+
+
+def _lateness(model: HealthyModel) -> tuple[float, float]:
+    """Return how late a movement may begin, and when readings come back of one that did [s]."""
+    latest = model.imperfections.timing.late_s[1] + model.lag_s + SETTLING_S
+    return latest, model.lost_commands.late_after_s
 
 
 def _since_rest(
