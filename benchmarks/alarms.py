@@ -1,7 +1,7 @@
 """False alarms and delays of the watch: healthy hours and faults, robots drawn at random.
 
     python benchmarks/alarms.py [--hours 30] [--faults 200] [--seed 0] [--robot armpi_fpv]
-                                [--of CALIBRATION] [--by CALIBRATION] [--alone] [--picture FILE]
+        [--of CALIBRATION] [--by CALIBRATION] [--learn | --alone] [--picture FILE]
 
 Movements are seen at rest alone (`alarms_world.py`). Each healthy life is an hour of a robot of its
 own. A fault is shown with the first movement at which what was seen speaks for it, its onset and
@@ -15,7 +15,7 @@ import argparse
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,10 +27,12 @@ from failuretwin.core.alarm import RAISED
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.alarm_rule import AlarmRule
-from failuretwin.decision.streaming.monitor import FOREIGN
+from failuretwin.decision.streaming.learning import LITTLE, LONG_RUN, RUN, LifeLearner
+from failuretwin.decision.streaming.monitor import FOREIGN, WORTH_LEARNING
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections
+from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.fault_filter import FaultFilter
 from failuretwin.inference.healthy_mixture import HealthyMixture
 from failuretwin.inference.healthy_model import HealthyModel
@@ -42,6 +44,8 @@ BUDGETS = (0.1, 1.0, 3.0, 10.0, 30.0, 100.0)
 """False alarms in 100 hours that are allowed."""
 AT_ONCE, MOVEMENTS, BLOCK = 10, 1560, 40
 """Lives that are simulated together, movements of a healthy one (an hour), and judged together."""
+BEHIND = 4
+"""Movements before a block that are looked at for commands that were lost in a row."""
 FAULTY = 60
 ONSET = (15, 21)
 SHOWN_NATS = 5.0
@@ -115,6 +119,47 @@ def look(lives: Lives, mixture: HealthyMixture) -> Seen:
         residual,
         _shown(lives, whole),
     )
+
+
+def look_and_learn(lives: Lives, mixture: HealthyMixture, diagnoser: ft.BayesDiagnoser) -> Seen:
+    """Return lives as they are seen by a watch that learns of each as it goes, as `FaultMonitor`.
+
+    What it takes to see the past is that of the calibration alone.
+    """
+    plain = look(lives, HealthyMixture(mixture.filters[:1], np.ones(1)))
+    posterior = plain.posterior.copy()
+    for i in range(len(lives.hours)):
+        rows = (slice(i, i + 1), slice(None))
+        posterior[i] = _learning(lives.evidence[rows], mixture, LifeLearner(diagnoser))
+    return replace(plain, posterior=posterior)
+
+
+def _learning(
+    evidence: SettledEvidence, mixture: HealthyMixture, learner: LifeLearner
+) -> FloatArray:
+    """Return the posterior of one life, (movement, hypothesis)."""
+    models = [one.model for one in mixture.filters]
+    belief, posterior, first = mixture.begin(1), [], 0
+    while first < evidence.usable.shape[1]:
+        before = max(first - BEHIND, 0)
+        stop = first + (RUN if learner.movements < LITTLE else LONG_RUN)
+        part = evidence[(slice(None), slice(before, stop))]
+        stood = evidence.movements.origin()[:, before]
+        part = replace(part, movements=replace(part.movements, initial=stood))
+        says = [
+            one.evidence(RunLikelihood(part, model))
+            for one, model in zip(mixture.filters, models, strict=True)
+        ]
+        for at in range(first - before, part.usable.shape[1]):
+            belief = mixture.advance(belief, says, at)
+            posterior.append(mixture.posterior(belief)[0])
+            one = part[(slice(None), slice(at, at + 1))]
+            here = replace(one.movements, initial=part.movements.origin()[:, at])
+            own = float(np.exp(belief.log_weight[0, -1]))
+            if learner.take(replace(one, movements=here), own > WORTH_LEARNING):
+                models[-1] = learner.model
+        first += part.usable.shape[1] - (first - before)
+    return np.stack(posterior)
 
 
 def _shown(lives: Lives, likelihood: RunLikelihood) -> np.ndarray:
@@ -238,6 +283,7 @@ def main() -> None:
     parser.add_argument("--robot", default="armpi_fpv")
     parser.add_argument("--of", default=None, help="calibration of the robot that works")
     parser.add_argument("--by", default=None, help="calibration that the watch uses")
+    parser.add_argument("--learn", action="store_true", help="learn of each life as it goes")
     parser.add_argument("--alone", action="store_true", help="believe the calibration for sure")
     parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
@@ -251,16 +297,18 @@ def main() -> None:
     filters = [FaultFilter(model, hypotheses, Priors()) for model in models]
     share = np.array([1.0 - FOREIGN, FOREIGN] if len(filters) > 1 else [1.0])
     mixture, faults_per_h = HealthyMixture(filters, share), filters[0].faults_per_h
+    diagnoser = ft.BayesDiagnoser(known.twin, known.imperfections, whole_run=False)
+
+    def see(lives: Lives) -> Seen:
+        return look_and_learn(lives, mixture, diagnoser) if options.learn else look(lives, mixture)
+
     begun = time.process_time()
     healthy = [
-        look(lives, mixture)
+        see(lives)
         for lives in healthy_lives(works.twin, works.imperfections, options.hours, options.seed)
     ]
     truth = [names[1 + k % (len(names) - 1)] for k in range(options.faults)]
-    broken = look(
-        live(works.twin, works.imperfections, truth, FAULTY, ONSET, options.seed + 77_777),
-        mixture,
-    )
+    broken = see(live(works.twin, works.imperfections, truth, FAULTY, ONSET, options.seed + 77_777))
     hours = sum(float(seen.lives.hours.sum()) for seen in healthy)
     print(f"{hours:.0f} h, {options.faults} faults, {time.process_time() - begun:.0f} s of a core")
     curves: dict[str, list[tuple[float, float]]] = {}
@@ -278,6 +326,17 @@ def main() -> None:
             for name in names[1:]:
                 some = [i for i in everything if truth[i] == name]
                 print(f"    {name:30s} {Delays.of_alarms(told, broken, some)}")
+    by_residual(healthy, broken, curves)
+    if options.picture:
+        draw(curves, options.picture)
+
+
+def by_residual(
+    healthy: Sequence[Seen], broken: Seen, curves: dict[str, list[tuple[float, float]]]
+) -> None:
+    """Print what a CUSUM of the residual and a threshold on it give."""
+    everything = range(len(broken.lives.hours))
+    hours = sum(float(seen.lives.hours.sum()) for seen in healthy)
     residual = np.concatenate([seen.residual for seen in healthy])
     drift = float(np.quantile(residual[residual > 0.0], SHARE))
     methods = {
@@ -291,8 +350,6 @@ def main() -> None:
             delays = Delays.of_alarms(told, broken, everything)
             _note(curves, name, alarms, hours, delays)
             print(f"{name}: {false_alarms(alarms, hours)}; {delays}", flush=True)
-    if options.picture:
-        draw(curves, options.picture)
 
 
 def _threshold(values: FloatArray, spells: float) -> float:
