@@ -15,6 +15,7 @@ from failuretwin.data_knowledge.generate import simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.fault_filter import FaultEvidence, FaultFilter, FaultRates
+from failuretwin.inference.healthy_mixture import CHANGED, HealthyMixture
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.run_likelihood import RunLikelihood
 
@@ -46,7 +47,7 @@ def made_up(faults, movements, rng):
     held = rng.normal(0.0, 2.0, (1, movements, nodes))
     off = rng.normal(0.0, 2.0, (1, movements, cells))
     hours = rng.uniform(0.001, 0.01, (1, movements))
-    return FaultEvidence(held, off, begun, hours)
+    return FaultEvidence(held, off, begun, hours, rng.normal(10.0, 2.0, (1, movements)))
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,7 @@ def test_the_filter_is_the_sum_over_all_onsets_and_repairs(faults):
 def test_the_predictive_density_is_that_of_the_movement_given_those_before(faults):
     seen = made_up(faults, 2, np.random.default_rng(2))
     before = faults.advance(faults.begin(1), seen, 0)
-    silent = FaultEvidence(0.0 * seen.held, 0.0 * seen.off, seen.begun, seen.hours)
+    silent = replace(seen, held=0.0 * seen.held, off=0.0 * seen.off)
     expected = faults.advance(before, silent, 1)
     mean = expected.healthy + (expected.held * np.exp(seen.held[:, 1])).sum(axis=1)
     mean += (expected.off * np.exp(seen.off[:, 1])).sum(axis=1)
@@ -167,9 +168,7 @@ def test_a_stuck_motor_is_found_and_a_repair_is_noticed(faults, stuck):
         belief = faults.advance(belief, seen, m)
     assert faults.posterior(belief)[0, 3] > 0.9
     assert faults.posterior(belief)[1, 0] > 0.9
-    repaired = FaultEvidence(
-        *(part[[1, 1]] for part in (seen.held, seen.off, seen.begun, seen.hours))
-    )
+    repaired = seen[[1, 1]]
     for m in range(1, seen.hours.shape[1]):
         belief = faults.advance(belief, repaired, m)
     assert (faults.posterior(belief)[:, 0] > 0.9).all()
@@ -185,3 +184,24 @@ def test_what_cannot_be_followed_is_refused(model, armpi, names):
 def test_senseless_rates_are_refused():
     with pytest.raises(InputError, match="faults_per_1000_h"):
         FaultRates(faults_per_1000_h=0.0)
+
+
+def test_candidates_are_weighed_by_what_they_foretold(faults):
+    """Two healthy behaviours, one movement after the other, against the product of densities."""
+    rng, mixture = np.random.default_rng(3), HealthyMixture([faults, faults], np.array([0.9, 0.1]))
+    seen = [made_up(faults, 3, rng), made_up(faults, 3, rng)]
+    belief, alone = mixture.begin(1), [faults.begin(1), faults.begin(1)]
+    weight = np.array([0.9, 0.1])
+    for m in range(3):
+        belief = mixture.advance(belief, seen, m)
+        alone = [faults.advance(a, says, m) for a, says in zip(alone, seen, strict=True)]
+        density = [
+            np.exp(says.healthy[0, m] + a.log_predictive[0])
+            for a, says in zip(alone, seen, strict=True)
+        ]
+        weight = ((1.0 - CHANGED) * weight + CHANGED / 2.0) * density
+        assert belief.explained[0] == pytest.approx(np.log(weight.sum()), rel=1e-12)
+        weight = weight / weight.sum()
+    np.testing.assert_allclose(np.exp(belief.log_weight[0]), weight, rtol=1e-10)
+    expected = sum(w * faults.posterior(a) for w, a in zip(weight, alone, strict=True))
+    np.testing.assert_allclose(mixture.posterior(belief), expected, rtol=1e-10)

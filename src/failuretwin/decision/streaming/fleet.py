@@ -21,11 +21,12 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.decision.streaming.tracking import MovementTracker
-from failuretwin.decision.streaming.trouble import FrozenSensorDetector, UntoldMotion
+from failuretwin.decision.streaming.trouble import FrozenSensorDetector, TwoPlaces, UntoldMotion
 from failuretwin.decision.streaming.window import KEEP_S
 from failuretwin.digital_model.calibrated_robot import RobotLike
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.explanation import worded
 from failuretwin.inference.log_quality import LogQuality
 from failuretwin.inference.posterior import (
     Posterior,
@@ -48,6 +49,9 @@ UNTOLD = LogQuality(
     fatal="the tool moves though no command came: commands do not arrive here, or something else "
     "moves the arm"
 )
+TWO = LogQuality(
+    fatal="readings jump between two places: two robots, or two sensors, speak on one topic"
+)
 
 
 @dataclass(frozen=True)
@@ -60,14 +64,12 @@ class FleetPosterior(ArrayStruct):
         point: Where the tool was taken to rest after the present movement, (robot, axis) [m]; NaN
             if that movement does not count yet.
         dead: Robots whose tools stand still though they should move, (robot,).
-        untold: Robots whose tools move though they should not, (robot,).
     """
 
     posterior: Annotated[FloatArray, Axes("run", "hypothesis")]
     judged: Annotated[BoolArray, Axes("run", empty=False)]
     point: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
     dead: Annotated[BoolArray, Axes("run", empty=False)]
-    untold: Annotated[BoolArray, Axes("run", empty=False)]
 
 
 class StreamingFleet:
@@ -118,6 +120,7 @@ class StreamingFleet:
         self._tracker = MovementTracker(model, robots, movements, rate_hz)
         self._frozen = FrozenSensorDetector.empty(run=robots, axis=3, value=4, motor=motors)
         self._untold = UntoldMotion.empty(run=robots, axis=3)
+        self._split = TwoPlaces.empty(run=robots, axis=3)
         self._prior = np.exp(log_prior(diagnoser.hypothesis_set, diagnoser.priors))
         sizes = {"run": robots, "hypothesis": len(self._prior), "axis": 3}
         self._beliefs = FleetPosterior.empty(**sizes)
@@ -163,24 +166,28 @@ class StreamingFleet:
         reference, points = self._checked(time, command, measured)
         time = self._by_own_clock(time)
         points, died = self._alive(time, reference, points)
-        away, strayed = self._astray(time, points)
+        before = self._odd
+        split = self._split.see(points, self._settings.unmoved_m)
+        points = np.where(split[:, None], np.nan, points)
+        away = self._astray(time, points)
         begun, at_rest = self._tracker.take(time, reference, points, away)
         self._beliefs.point[begun] = np.nan
+        self._untold.begin(np.union1d(begun, np.flatnonzero(self._tracker.references.moved)))
         judged = self._judge(self._with_news(at_rest))
-        return np.unique(np.concatenate([died, strayed, judged]))
+        odd = np.flatnonzero((self._odd != before).any(axis=0))
+        return np.unique(np.concatenate([died, odd, judged]))
 
-    def _astray(self, time: float, points: FloatArray) -> tuple[BoolArray, IntArray]:
-        """Return tools that left where they rested without a command, (robot,), and changes.
-
-        Changes are the robots that begin or cease to move without being told.
-        """
+    def _astray(self, time: float, points: FloatArray) -> BoolArray:
+        """Return tools that left where they rested without a command, (robot,)."""
         tracker, settings = self._tracker, self._settings
         told = (tracker.window.count > 0) | tracker.references.moved
         near_m = settings.same_place_m, settings.unmoved_m
-        away = self._untold.see(time, points, tracker.rest(), told, near_m)
-        untold, before = self._untold.untold(time), self._beliefs.untold.copy()
-        self._beliefs.untold[:] = untold
-        return away, np.flatnonzero(untold != before)
+        return self._untold.see(time, points, tracker.rest(), told, near_m)
+
+    @property
+    def _odd(self) -> BoolArray:
+        """Whether each robot moves without being told, or its readings are of two, (2, robot)."""
+        return np.stack([self._untold.untold, self._split.split])
 
     def conclude(self) -> None:
         """Count all that has come, as if the stream were over: answers are those of recorded runs.
@@ -211,7 +218,7 @@ class StreamingFleet:
                 movements say.
         """
         if not self._known(robot):
-            return None
+            return self._unseen(robot)
         found, at, position = self._found(robot)
         if told is not None:
             log_posterior, explained = told
@@ -220,6 +227,15 @@ class StreamingFleet:
             found = replace(found, log_posterior=rows, explained=explained)
         place = replace(position, before=before)
         return found.to_diagnosis(at, f"robot {robot}", self._quality(robot), place=place)
+
+    def _unseen(self, robot: int) -> Diagnosis | None:
+        """Return why nothing can be said of a robot that was not judged; None: it is too early."""
+        if not self._odd[:, robot].any() or self._tracker.window.count[robot] > 0:
+            return None
+        prior = dict(zip(self.hypotheses, self._prior.tolist(), strict=True))
+        reason = self._quality(robot).fatal
+        nothing = Diagnosis(f"robot {robot}", prior, undecided=reason)
+        return worded(nothing, self.diagnoser.hypothesis_set)
 
     def seen(self, robot: int) -> tuple[RunLikelihood, StreamPosition] | None:
         """Return what the last movements of a robot say, and where they lie in the stream.
@@ -240,7 +256,7 @@ class StreamingFleet:
     def _known(self, robot: int) -> bool:
         """Return whether anything can be said of a robot."""
         beliefs = self._beliefs
-        known = beliefs.judged[robot] or beliefs.dead[robot] or beliefs.untold[robot]
+        known = beliefs.judged[robot] or beliefs.dead[robot] or self._odd[:, robot].any()
         return bool(known and self._tracker.window.count[robot] > 0)
 
     def _found(self, robot: int) -> tuple[Posterior, int, StreamPosition]:
@@ -253,7 +269,9 @@ class StreamingFleet:
         """Return what keeps the readings of a robot from saying anything of its motors."""
         if self._beliefs.dead[robot]:
             return DEAD
-        return UNTOLD if self._beliefs.untold[robot] else LogQuality()
+        if self._split.split[robot]:
+            return TWO
+        return UNTOLD if self._untold.untold[robot] else LogQuality()
 
     def _remember(self, robots: IntArray, posterior_of_runs: Posterior) -> None:
         """Keep the last judgement, and where each robot then was, for whoever asks for words."""
@@ -305,6 +323,7 @@ class StreamingFleet:
             "beliefs": self._beliefs,
             "frozen": self._frozen,
             "untold": self._untold,
+            "split": self._split,
         }
 
     def _checked(

@@ -131,15 +131,14 @@ class FaultMonitor:
 
     def _judge(self) -> None:
         """Renew what is believed by what the last movements say."""
-        seen = self._fleet.seen(0)
-        if seen is None:
-            return
-        likelihood, position = seen
-        before = position.movements
-        posterior = self._followed(likelihood, position)
-        window = range(before, before + likelihood.usable.shape[1])
-        explained = np.array([self._explained.get(m, np.inf) for m in window])
-        found = self._fleet.diagnosis(0, self._diagnosis, (log_of(posterior), explained))
+        seen, told = self._fleet.seen(0), None
+        if seen is not None:
+            likelihood, position = seen
+            posterior, before = self._followed(likelihood, position), position.movements
+            window = range(before, before + likelihood.usable.shape[1])
+            explained = np.array([self._explained.get(m, np.inf) for m in window])
+            told = log_of(posterior), explained
+        found = self._fleet.diagnosis(0, self._diagnosis, told)
         if found is not None:
             self._diagnosis = replace(found, run="stream")
 

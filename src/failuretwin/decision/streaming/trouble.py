@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from failuretwin.core.arrays import ArrayStruct, Axes
-from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.log_quality import (
     FROZEN_S,
     NEAR_ZERO_M,
@@ -100,14 +100,16 @@ class UntoldMotion(ArrayStruct):
     Attributes:
         place: Where each tool stood when it was last seen to move, (robot, axis) [m].
         since_s: Since when it has stood there, (robot,) [s].
-        rest: Where it rested last before any command, (robot, axis) [m].
+        rest: Where it rested last, since its last command, (robot, axis) [m]; NaN: not yet.
         away_s: Since when it has been away from where it rested, (robot,) [s]; NaN: it is not.
+        untold: Whether it moves without a command, (robot,); it stands until the next.
     """
 
     place: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
     since_s: Annotated[FloatArray, Axes("run", empty=np.nan)]
     rest: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
     away_s: Annotated[FloatArray, Axes("run", empty=np.nan)]
+    untold: Annotated[BoolArray, Axes("run", empty=False)]
 
     def see(
         self,
@@ -133,16 +135,64 @@ class UntoldMotion(ArrayStruct):
             stands = read & (np.linalg.norm(points - self.place, axis=1) <= same_place_m)
         anew = read & ~stands
         self.place[anew], self.since_s[anew] = points[anew], time
-        rested = stands & (time - self.since_s >= RESTED_S) & np.isnan(self.rest[:, 0])
+        rested = ~told & stands & (time - self.since_s >= RESTED_S) & np.isnan(self.rest[:, 0])
         self.rest[rested] = self.place[rested]
-        at = np.where(told[:, None], rest, self.rest)
+        known = told & np.isfinite(rest[:, 0]) & np.isnan(self.away_s)
+        self.rest[known] = rest[known]
         with np.errstate(invalid="ignore"):
-            away = read & (np.linalg.norm(points - at, axis=1) > moved_m)
-        self.away_s[(read & ~away) | np.isnan(at[:, 0])] = np.nan
+            away = read & (np.linalg.norm(points - self.rest, axis=1) > moved_m)
+        self.away_s[read & ~away] = np.nan
         self.away_s[away & np.isnan(self.away_s)] = time
-        return np.isfinite(self.away_s)
-
-    def untold(self, time: float) -> BoolArray:
-        """Return which tools move without a command, as of a time [s], (robot,)."""
         with np.errstate(invalid="ignore"):
-            return np.asarray(time - self.away_s >= UNTOLD_S)
+            self.untold[time - self.away_s >= UNTOLD_S] = True
+        return np.isfinite(self.away_s) | self.untold
+
+    def begin(self, robots: IntArray) -> None:
+        """Take note of robots that have had a command."""
+        self.away_s[robots], self.rest[robots], self.untold[robots] = np.nan, np.nan, False
+
+
+# Readings that jump to and fro: two robots, or two sensors, on one topic.
+
+JUMP_BACK, NO_JUMP = 3.0, -1.0
+"""What a reading counts that is back where the one before the last was, and any other."""
+SPLIT, MOST_JUMPS = 9.0, 15.0
+"""Sum from which readings come from two places: three in a row; and what it is at most."""
+BACK = 0.5
+"""A reading is back if it is nearer to the one before the last than this share of the jump."""
+
+
+@dataclass(frozen=True)
+class TwoPlaces(ArrayStruct):
+    """Watches for readings that come from two places in turn, however often each speaks.
+
+    Attributes:
+        last: The newest reading, (robot, axis) [m].
+        before: The one before it.
+        jumps: Jumps to and fro of late, (robot,).
+        split: Whether there are two, (robot,).
+    """
+
+    last: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
+    before: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
+    jumps: Annotated[FloatArray, Axes("run")]
+    split: Annotated[BoolArray, Axes("run", empty=False)]
+
+    def see(self, points: FloatArray, moved_m: float) -> BoolArray:
+        """Take readings and return the robots whose readings come from two places, (robot,).
+
+        Args:
+            points: Tool positions, (robot, axis) [m]; NaN where there is none.
+            moved_m: A shorter jump is none [m].
+        """
+        read = np.isfinite(points).all(axis=1)
+        with np.errstate(invalid="ignore"):
+            jump = np.linalg.norm(points - self.last, axis=1)
+            back = np.linalg.norm(points - self.before, axis=1)
+            jumped = (jump > moved_m) & (back < BACK * jump)
+        step = np.where(jumped, JUMP_BACK, NO_JUMP)
+        self.jumps[read] = np.clip(self.jumps + step, 0.0, MOST_JUMPS)[read]
+        self.before[read], self.last[read] = self.last[read], points[read]
+        self.split[self.jumps >= SPLIT] = True
+        self.split[self.jumps <= 0.0] = False
+        return self.split.copy()
