@@ -35,6 +35,7 @@ from failuretwin.connection.links.statuses import (
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import printable
 from failuretwin.data_knowledge.bag_messages import BagTopics
+from failuretwin.decision.streaming.monitor import FaultMonitor, Fit
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.injection import ScheduledFault
@@ -264,6 +265,8 @@ REFRESH_S = 0.25
 """Time between two drawings [s]."""
 POLL_S = 0.1
 """Longest wait for an event [s]."""
+EVEN = 0.5
+"""Probability below which a calibration is taken to be of another robot."""
 LATE_S = 0.3
 """A command that comes later than this spoils the diagnosis, and the user is told [s]."""
 
@@ -275,9 +278,11 @@ def watch_until_end(
     motors: list[str],
     console: Console,
     until_s: float,
+    monitor: FaultMonitor | None = None,
 ) -> Changes:
     """Watch a robot until `until_s` of our monotonic clock [s], and return all that has changed.
 
+    With a monitor it is told if its calibration does not fit.
     On a terminal there is a live view, else a line for each change.
     """
     changes, view = Changes(motors), View(motors, source.name)
@@ -288,6 +293,7 @@ def watch_until_end(
         while going:
             going = shadow.step(POLL_S) and time.monotonic() < until_s
             troubles = _troubles(shadow, source, sinks, time.monotonic() - begun_s)
+            troubles += () if monitor is None else _misfit(monitor.fit)
             found = changes.notice(shadow.snapshot, source.counts, shadow.clock_jumps, troubles)
             if shown is None:
                 for change in found:
@@ -299,6 +305,16 @@ def watch_until_end(
                 picture = view.draw(shadow.snapshot, source.counts, changes.lines)
                 shown.update(picture, refresh=True)
     return changes
+
+
+def _misfit(fit: Fit) -> tuple[str, ...]:
+    """Return that the calibration is not this robot's, if that is so."""
+    if not fit.given or fit.fits >= EVEN:
+        return ()
+    return (
+        f"this robot does not do what calibration {fit.given!r} says: it is judged by what arms of "
+        "its kind do and by what it teaches itself",
+    )
 
 
 def _troubles(

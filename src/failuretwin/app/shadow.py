@@ -33,6 +33,7 @@ from failuretwin.inference.explanation import plain_name
 
 SILENCE_S = 5.0
 """Without a reading for so long on our own clock, the answer is stale [s]."""
+STUCK = "stuck"
 TICK_S = 0.5
 """Time without an event after which the diagnoser is told that time goes on [s]."""
 
@@ -78,6 +79,7 @@ class Shadow:
         self._read_s = -np.inf
         self._fed_s = time.monotonic()
         self._newest = 0.0
+        self._computed = False
         self.snapshot = Snapshot(
             Answer(self._clock.stamp(0.0), STALE, None), 0.0, np.full(3, np.nan), 0.0
         )
@@ -134,6 +136,7 @@ class Shadow:
         self._fed_s = time.monotonic()
         if reading.position is not None and np.isfinite(reading.position).all():
             self._reference.start_at(reading.position)
+            self._computed = bool(np.allclose(reading.tool, self._twin.path(reading.position)))
         seen = reading.tool if np.isfinite(reading.tool).all() else None
         command = None
         for at, angles in self._reference.corners_to(reading.time):
@@ -155,9 +158,26 @@ class Shadow:
         silent = time.monotonic() - self._read_s > SILENCE_S
         state = STALE if silent or answer.state != OK else OK
         stamped = replace(answer, time=self._clock.stamp(answer.time), state=state)
+        if self._computed:
+            stamped = _with_doubt(stamped)
         self.snapshot = Snapshot(stamped, answer.time, residual, self.snapshot.seconds)
         for sink in self._sinks:
             sink.put(stamped)
+
+
+def _with_doubt(answer: Answer) -> Answer:
+    """Return an answer that says that a frozen reading looks like a stuck motor.
+
+    Where the tool is computed from the motors' own readings nothing else tells the two apart.
+    """
+    motor, _, mode = answer.alarm.cause.partition(":")
+    if answer.diagnosis is None or mode != STUCK:
+        return answer
+    said = (
+        f"{answer.diagnosis.verdict}; the tool is computed from motor readings, so a frozen "
+        f"reading of {motor.replace('_', ' ')} looks the same"
+    )
+    return replace(answer, diagnosis=replace(answer.diagnosis, verdict=said))
 
 
 # What changes, in words: faults found, repairs noticed, silence, trouble with the link.

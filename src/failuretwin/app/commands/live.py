@@ -21,6 +21,7 @@ from failuretwin.app.commands.options import (
 from failuretwin.app.terminal import tell
 
 if TYPE_CHECKING:
+    from failuretwin.decision.streaming.monitor import Fit
     from failuretwin.digital_model.nonidealities import Imperfections
     from failuretwin.failure_behavior.injection import ScheduledFault
 
@@ -78,6 +79,8 @@ def watch(
     diagnoser = monitor(known.twin, known.imperfections, budget)
     wait_s = topics_of(live.topics).wait_s
     tell(_rests_on(known.imperfections))
+    for line in _limits(known.imperfections, motors, budget):
+        tell(line)
     # An emulated robot ends by itself, a log when it is over.
     length = live.duration if live.duration and source != "emulated" else math.inf
     with ExitStack() as stack:
@@ -87,10 +90,11 @@ def watch(
         shadow = Shadow(link, diagnoser, known.twin, sinks, wait_s)
         try:
             until = time.monotonic() + length
-            watch_until_end(shadow, link, sinks, motors, console(), until)
+            watch_until_end(shadow, link, sinks, motors, console(), until, diagnoser)
         except KeyboardInterrupt:
             tell("stopped")
     arm = statuses(shadow.snapshot.answer, motors)[0]
+    tell(_fit(diagnoser.fit))
     tell(f"last answer: {arm.message}")
 
 
@@ -101,10 +105,35 @@ def _rests_on(known: Imperfections) -> str:
     if known.name != GENERIC_NAME:
         return f"healthy behaviour: {known.name} ({known.protocol}; {known.source})"
     return (
-        f"healthy behaviour: {known.name}; {known.source}. What this robot does is not known, so "
-        "small errors do not show: `failuretwin diagnose LOGS --track --out FILE` learns it from "
-        "its runs, and --calibration FILE uses it"
+        f"healthy behaviour: {known.name}; {known.source}. What this robot does is not known yet: "
+        "it is learned as it works, and until then faults take longer to show. --calibration FILE "
+        "uses what was learned before"
     )
+
+
+def _fit(fit: Fit) -> str:
+    """Return how well the calibration has fitted this robot, in one sentence."""
+    from failuretwin.inference.explanation import percent
+
+    taught = f"{fit.learned} movements taught how this robot is"
+    if not fit.given:
+        return f"no calibration was given; {taught}"
+    own = f"; {taught}" if fit.learned else ""
+    return f"calibration {fit.given!r} is this robot's: {percent(fit.fits)} sure{own}"
+
+
+def _limits(known: Imperfections, motors: Sequence[str], budget: float) -> list[str]:
+    """Return what losses of commands cost: the motor that takes longest to be told stuck."""
+    from failuretwin.decision.streaming.alarm_rule import movements_to_tell
+
+    needed = movements_to_tell(known, motors, budget)
+    if not needed:
+        return []
+    worst = max(needed, key=lambda motor: needed[motor])
+    return [
+        f"at these losses a {worst.replace('_', ' ')} that sticks at rest takes about "
+        f"{needed[worst]} movements to be told from lost commands"
+    ]
 
 
 # `failuretwin emulate`: a robot that exists only as physics, on a network or in a file.

@@ -24,6 +24,8 @@ import numpy as np
 from failuretwin.core.alarm import ALL_CLEAR, CLEAR, RAISED, SUSPECTED, Alarm, Episode
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
+from failuretwin.digital_model.nonidealities import Imperfections
+from failuretwin.inference.fault_filter import S_PER_H
 
 UNUSED = 3.0
 """The bound over what simulated healthy robots reach (303 h: 1.0 false alarms in 100 h where the
@@ -131,3 +133,38 @@ class AlarmRule:
         elif self.alarm.state != CLEAR:
             self.passed += 1
             self.alarm = Alarm(CLEAR, "", last)
+
+
+def movements_to_tell(
+    imperfections: Imperfections, motors: Sequence[str], per_100_h: float
+) -> dict[str, int]:
+    """Return how many movements a motor that sticks at rest takes to be told from lost commands.
+
+    A motor that is stuck where it had settled and one that misses n commands do the same, so each
+    movement says -ln p(lost) for the fault, and no rule can do better:
+
+        n = ceil( T / ((1 - l) (-(1 - l) ln p - l ln p_late)) ),    T = ln(movements / false alarms)
+
+    with l the share of late starts, before which a movement is not seen.
+
+    Args:
+        imperfections: Rates of losses and late starts, and the time between movements.
+        motors: Names of the motors.
+        per_100_h: False alarms that are allowed in 100 hours.
+
+    Returns:
+        By motor; those that never lose a command are left out.
+    """
+    late, period_s = imperfections.timing.late_rate, np.mean(imperfections.schedule.period_s)
+    period_s += late * np.mean(imperfections.timing.late_s)
+    needed = np.log(100.0 * S_PER_H / period_s / (UNUSED * per_100_h))
+    found = {}
+    for motor in motors:
+        entries = [entry for entry in imperfections.lost_commands if motor in entry.motors]
+        lost, when_late = (
+            sum(getattr(entry, name) for entry in entries) for name in ("rate", "rate_when_late")
+        )
+        if lost > 0.0 and (when_late > 0.0 or late == 0.0):
+            each = -(1.0 - late) * np.log(lost) - (late * np.log(when_late) if late else 0.0)
+            found[motor] = max(1, int(np.ceil(needed / ((1.0 - late) * each))))
+    return found
