@@ -12,6 +12,7 @@ the movement that showed it. Beside the filter: a CUSUM of the residual, and a t
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -131,6 +132,7 @@ def look_and_learn(lives: Lives, mixture: HealthyMixture, diagnoser: ft.BayesDia
     for i in range(len(lives.hours)):
         rows = (slice(i, i + 1), slice(None))
         posterior[i] = _learning(lives.evidence[rows], mixture, LifeLearner(diagnoser))
+        print(f"    learned from life {i + 1} of {len(lives.hours)}", file=sys.stderr, flush=True)
     return replace(plain, posterior=posterior)
 
 

@@ -265,8 +265,8 @@ REFRESH_S = 0.25
 """Time between two drawings [s]."""
 POLL_S = 0.1
 """Longest wait for an event [s]."""
-EVEN = 0.5
-"""Probability below which a calibration is taken to be of another robot."""
+MISFIT = 0.05
+"""Probability below which it is told that a calibration does not fit."""
 LATE_S = 0.3
 """A command that comes later than this spoils the diagnosis, and the user is told [s]."""
 
@@ -309,7 +309,7 @@ def watch_until_end(
 
 def _misfit(fit: Fit) -> tuple[str, ...]:
     """Return that the calibration is not this robot's, if that is so."""
-    if not fit.given or fit.fits >= EVEN:
+    if not fit.given or fit.fits >= MISFIT:
         return ()
     return (
         f"this robot does not do what calibration {fit.given!r} says: it is judged by what arms of "
