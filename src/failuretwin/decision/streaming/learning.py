@@ -12,11 +12,13 @@ from dataclasses import replace
 import numpy as np
 
 from failuretwin.connection.tracked_diagnosis import begin, with_timing_of
+from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.shared_unknowns import SetupPrior
 
 RUN = 5
 """Movements of a run that is learned from at first: as many as a run of the paper has."""
@@ -31,15 +33,18 @@ TIMED = 200
 class LifeLearner:
     """Learns of one robot from its movements, beginning with what arms of its kind are like.
 
-    A run is worked on in a thread of its own, so that answers need not wait; what it taught is
-    known when the next run is complete, however fast time passes.
+    The frame of the sensor is taken to be as the profile says. A run is worked on in a thread of
+    its own, so that answers need not wait; what it taught is known when the next run is complete,
+    however fast time passes.
 
     Args:
         diagnoser: The method, with its hypotheses and priors.
     """
 
     def __init__(self, diagnoser: BayesDiagnoser) -> None:
-        self._life = begin(diagnoser, cold=True)
+        known = replace(diagnoser.priors, setup=SetupPrior.known())
+        self._diagnoser = replace(diagnoser, priors=known)
+        self._life = begin(self._diagnoser, cold=True)
         self._waiting: list[SettledEvidence] = []
         self._told: Movements | None = None
         self._worker = ThreadPoolExecutor(1, "learning")
@@ -73,8 +78,15 @@ class LifeLearner:
         """Wait until the last run is learned and return whether there was one."""
         if self._work is None:
             return False
-        self._work.result()
-        self._work, self.movements, self.model = None, self._life.movements, self._model()
+        work, self._work = self._work, None
+        try:
+            work.result()
+            self.movements, self.model = self._life.movements, self._model()
+        except (InputError, np.linalg.LinAlgError):
+            # What was learned makes no sense. What was believed before counts on, and all begins
+            # anew: a watch must not end because of what it learns.
+            self._life, self._told, self.movements = begin(self._diagnoser, cold=True), None, 0
+            return False
         return True
 
     def _follow(self, run: SettledEvidence, told: Movements) -> None:
