@@ -331,6 +331,17 @@ def test_trouble_with_the_link_is_told(armpi):
     assert [c.text for c in changes.notice(still, counts, 1, ())] == ["over: disk full"]
 
 
+def test_stamps_that_leap_without_end_are_told_now_and_then(armpi):
+    changes = Changes(armpi.motor_names)
+    told = [changes.notice(moment(float(k), OK, None), LinkCounts(), k, ()) for k in range(25)]
+    texts = [(c.stream_time, c.text) for found in told for c in found]
+    assert texts == [
+        (1.0, "the robot's clock jumped; going on by our own"),
+        (11.0, "the robot's clock jumped, 11 times so far; going on by our own"),
+        (21.0, "the robot's clock jumped, 21 times so far; going on by our own"),
+    ]
+
+
 def test_the_posterior_over_time_goes_by_the_robots_clock(armpi):
     """However fast a log is replayed, and with gaps where nothing was known."""
     view = View(armpi.motor_names, "a script")

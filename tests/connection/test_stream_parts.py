@@ -104,6 +104,25 @@ def test_late_messages_and_silences_are_no_jumps():
     assert clock.stamp(30.0) == 80.0
 
 
+def test_a_clock_that_is_set_back_a_little_is_noticed_by_readings_that_stay_behind():
+    """Two late ones are late; the third is not, and from then on time runs as it did."""
+    clock, told = StreamClock(), []
+    for k in range(40):
+        stamp = 50.0 + 0.1 * k - (2.0 if k >= 20 else 0.0)
+        told.append(clock.to_stream_time(stamp, 0.1 * k, reading=True))
+    np.testing.assert_allclose(told[:20], 0.1 * np.arange(20), atol=1e-9)
+    np.testing.assert_allclose(told[22:], 0.1 * np.arange(22, 40), atol=1e-9)
+    assert clock.jumps == 1
+
+
+def test_commands_that_come_late_are_no_clock_that_was_set_back():
+    clock = StreamClock()
+    for k in range(40):
+        clock.to_stream_time(50.0 + 0.1 * k, 0.1 * k, reading=True)
+        assert clock.to_stream_time(48.0 + 0.1 * k, 0.1 * k) == pytest.approx(0.1 * k - 2.0)
+    assert clock.jumps == 0
+
+
 def test_without_events_the_stream_goes_on_by_our_own_clock():
     clock = StreamClock()
     clock.to_stream_time(100.0, 7.0)

@@ -111,7 +111,7 @@ class Shadow:
         now_s = time.monotonic()
         for sink in self._sinks:
             sink.put(event)
-        at = self._clock.to_stream_time(event.time, now_s)
+        at = self._clock.to_stream_time(event.time, now_s, isinstance(event, Reading))
         self._newest = max(self._newest, at)
         self._sequencer.add(replace(event, time=at))
         self._feed_all(self._newest)
@@ -185,7 +185,7 @@ def _with_doubt(answer: Answer) -> Answer:
 KEPT = 1000
 """Changes that are remembered; the recording holds all of them."""
 GARBAGE_EVERY_S = 10.0
-"""Time between two reports of messages that make no sense [s]."""
+"""Time between two reports of messages that make no sense, and of stamps that leap [s]."""
 
 
 def _over(episode: Episode | None) -> str:
@@ -220,7 +220,7 @@ class Changes:
         self._troubles: tuple[str, ...] = ()
         self._counts = LinkCounts()
         self._jumps = 0
-        self._garbage_at = -GARBAGE_EVERY_S
+        self._garbage_at = self._jump_at = -GARBAGE_EVERY_S
 
     def notice(
         self, snapshot: Snapshot, counts: LinkCounts, jumps: int, troubles: tuple[str, ...]
@@ -267,8 +267,10 @@ class Changes:
             texts.append("the link is back")
         if counts.dropped > before.dropped:
             texts.append(f"{counts.dropped} events dropped so far: this computer is too slow")
-        if jumps > self._jumps:
-            texts.append("the robot's clock jumped; going on by our own")
+        if jumps > self._jumps and at >= self._jump_at + GARBAGE_EVERY_S:
+            self._jump_at, self._jumps = at, jumps
+            often = f", {jumps} times so far" if jumps > 1 else ""
+            texts.append(f"the robot's clock jumped{often}; going on by our own")
         garbage = before.garbage
         if counts.garbage > garbage and at >= self._garbage_at + GARBAGE_EVERY_S:
             self._garbage_at = at
@@ -277,5 +279,5 @@ class Changes:
         texts += [trouble for trouble in troubles if trouble not in self._troubles]
         texts += [f"over: {old}" for old in self._troubles if old not in troubles]
         self._counts = LinkCounts(counts.received, garbage, counts.dropped, counts.reconnects)
-        self._jumps, self._troubles = jumps, troubles
+        self._troubles = troubles
         return texts
