@@ -1,10 +1,11 @@
 """False alarms and delays of the watch: healthy hours and faults, robots drawn at random.
 
     python benchmarks/alarms.py [--hours 30] [--faults 200] [--seed 0] [--robot armpi_fpv]
-        [--of CALIBRATION] [--by CALIBRATION] [--learn | --alone] [--picture FILE]
+        [--of CALIBRATION] [--by CALIBRATION] [--robots N | --alone] [--picture FILE]
 
 Movements are seen at rest alone (`alarms_world.py`). Each healthy life is an hour of a robot of its
-own. A fault is shown with the first movement at which what was seen speaks for it, its onset and
+own; with --robots N, N robots are drawn and each has taught the watch before. A fault is shown with
+the first movement at which what was seen speaks for it, its onset and
 size known, by 5 nats. Delay 1 is the movement that a fault spoils first; after it was shown, 0 is
 the movement that showed it. Beside the filter: a CUSUM of the residual, and a threshold on it.
 """
@@ -12,7 +13,6 @@ the movement that showed it. Beside the filter: a CUSUM of the residual, and a t
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -28,12 +28,11 @@ from failuretwin.core.alarm import RAISED
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.alarm_rule import AlarmRule
-from failuretwin.decision.streaming.learning import LITTLE, LONG_RUN, RUN, LifeLearner
-from failuretwin.decision.streaming.monitor import FOREIGN, WORTH_LEARNING
+from failuretwin.decision.streaming.learning import LifeLearner
+from failuretwin.decision.streaming.monitor import FOREIGN
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
-from failuretwin.digital_model.calibrated_robot import load_calibration
-from failuretwin.digital_model.nonidealities import Imperfections
-from failuretwin.inference.evidence import SettledEvidence
+from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
+from failuretwin.digital_model.nonidealities import Imperfections, vary
 from failuretwin.inference.fault_filter import FaultFilter
 from failuretwin.inference.healthy_mixture import HealthyMixture
 from failuretwin.inference.healthy_model import HealthyModel
@@ -45,8 +44,8 @@ BUDGETS = (0.1, 1.0, 3.0, 10.0, 30.0, 100.0)
 """False alarms in 100 hours that are allowed."""
 AT_ONCE, MOVEMENTS, BLOCK = 10, 1560, 40
 """Lives that are simulated together, movements of a healthy one (an hour), and judged together."""
-BEHIND = 4
-"""Movements before a block that are looked at for commands that were lost in a row."""
+TAUGHT = 600
+"""Movements from which a robot is learned where some robots are asked for: 23 minutes of work."""
 FAULTY = 60
 ONSET = (15, 21)
 SHOWN_NATS = 5.0
@@ -122,46 +121,29 @@ def look(lives: Lives, mixture: HealthyMixture) -> Seen:
     )
 
 
-def look_and_learn(lives: Lives, mixture: HealthyMixture, diagnoser: ft.BayesDiagnoser) -> Seen:
-    """Return lives as they are seen by a watch that learns of each as it goes, as `FaultMonitor`.
-
-    What it takes to see the past is that of the calibration alone.
-    """
-    plain = look(lives, HealthyMixture(mixture.filters[:1], np.ones(1)))
-    posterior = plain.posterior.copy()
-    for i in range(len(lives.hours)):
-        rows = (slice(i, i + 1), slice(None))
-        posterior[i] = _learning(lives.evidence[rows], mixture, LifeLearner(diagnoser))
-        print(f"    learned from life {i + 1} of {len(lives.hours)}", file=sys.stderr, flush=True)
-    return replace(plain, posterior=posterior)
+def taught(
+    twin: ft.DigitalTwin, robot_itself: Imperfections, diagnoser: ft.BayesDiagnoser, seed: int
+) -> HealthyModel:
+    """Return what a watch has learned of one robot after `TAUGHT` movements."""
+    life = live(twin, robot_itself, ["healthy"], TAUGHT, ONSET, seed).evidence
+    learner, stood = LifeLearner(diagnoser), life.movements.origin()
+    for m in range(TAUGHT):
+        one = life[(slice(None), slice(m, m + 1))]
+        learner.take(replace(one, movements=replace(one.movements, initial=stood[:, m])), True)
+    return learner.model
 
 
-def _learning(
-    evidence: SettledEvidence, mixture: HealthyMixture, learner: LifeLearner
-) -> FloatArray:
-    """Return the posterior of one life, (movement, hypothesis)."""
-    models = [one.model for one in mixture.filters]
-    belief, posterior, first = mixture.begin(1), [], 0
-    while first < evidence.usable.shape[1]:
-        before = max(first - BEHIND, 0)
-        stop = first + (RUN if learner.movements < LITTLE else LONG_RUN)
-        part = evidence[(slice(None), slice(before, stop))]
-        stood = evidence.movements.origin()[:, before]
-        part = replace(part, movements=replace(part.movements, initial=stood))
-        says = [
-            one.evidence(RunLikelihood(part, model))
-            for one, model in zip(mixture.filters, models, strict=True)
-        ]
-        for at in range(first - before, part.usable.shape[1]):
-            belief = mixture.advance(belief, says, at)
-            posterior.append(mixture.posterior(belief)[0])
-            one = part[(slice(None), slice(at, at + 1))]
-            here = replace(one.movements, initial=part.movements.origin()[:, at])
-            own = float(np.exp(belief.log_weight[0, -1]))
-            if learner.take(replace(one, movements=here), own > WORTH_LEARNING):
-                models[-1] = learner.model
-        first += part.usable.shape[1] - (first - before)
-    return np.stack(posterior)
+def joined(parts: Sequence[Seen]) -> Seen:
+    """Return lives that were seen apart as one; what was seen of them is left out."""
+    lives = replace(
+        parts[0].lives,
+        hours=np.concatenate([part.lives.hours for part in parts]),
+        truth=[fault for part in parts for fault in part.lives.truth],
+        onset=np.concatenate([part.lives.onset for part in parts]),
+    )
+    names = ("posterior", "hours", "residual", "shown")
+    values = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return Seen(lives, **values)
 
 
 def _shown(lives: Lives, likelihood: RunLikelihood) -> np.ndarray:
@@ -276,6 +258,43 @@ def healthy_lives(
         yield live(twin, imperfections, ["healthy"] * count, MOVEMENTS, ONSET, seed + number)
 
 
+def candidates(
+    known: CalibratedRobot, alone: bool, works: CalibratedRobot | None, seed: int
+) -> HealthyMixture:
+    """Return what a watch believes that its robot may be.
+
+    Args:
+        known: The calibration that it was given.
+        alone: Whether that is believed for sure.
+        works: The robot that has taught it; None: none has, it knows arms of the kind.
+        seed: Seed of what it was taught by.
+    """
+    hypotheses = paper_hypotheses(known.robot.motor_names)
+    model, cold = HealthyModel.of(known), known.imperfections.name == GENERIC_NAME
+    models = [model]
+    if works is not None:
+        diagnoser = ft.BayesDiagnoser(known, whole_run=False)
+        own = taught(works.twin, works.imperfections, diagnoser, seed + 5_000)
+        models = [own] if cold else [model, own]
+    elif not (alone or cold):
+        models.append(HealthyModel.of(known.twin, generic_imperfections(known.robot)))
+    filters = [FaultFilter(model, hypotheses, Priors()) for model in models]
+    share = np.array([1.0 - FOREIGN, FOREIGN] if len(filters) > 1 else [1.0])
+    return HealthyMixture(filters, share)
+
+
+def watched(
+    works: CalibratedRobot, mixture: HealthyMixture, counts: tuple[int, int], seed: int
+) -> tuple[list[Seen], Seen]:
+    """Return healthy hours and faults of a robot as they are seen; `counts` says how many."""
+    names = [str(h) for h in paper_hypotheses(works.robot.motor_names)]
+    hours, count = counts
+    healthy = healthy_lives(works.twin, works.imperfections, hours, seed)
+    faults = [names[1 + k % (len(names) - 1)] for k in range(count)]
+    broken = live(works.twin, works.imperfections, faults, FAULTY, ONSET, seed + 7_777)
+    return [look(lives, mixture) for lives in healthy], look(broken, mixture)
+
+
 def main() -> None:
     """Print the tables, and draw the picture."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -285,36 +304,31 @@ def main() -> None:
     parser.add_argument("--robot", default="armpi_fpv")
     parser.add_argument("--of", default=None, help="calibration of the robot that works")
     parser.add_argument("--by", default=None, help="calibration that the watch uses")
-    parser.add_argument("--learn", action="store_true", help="learn of each life as it goes")
+    parser.add_argument("--robots", type=int, default=0, help="so many, which have taught")
     parser.add_argument("--alone", action="store_true", help="believe the calibration for sure")
     parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
     robot = ft.load_robot(options.robot)
     works, known = (load_calibration(name, robot) for name in (options.of, options.by))
-    hypotheses = paper_hypotheses(robot.motor_names)
-    names = [str(h) for h in hypotheses]
-    models = [HealthyModel(known.twin, known.imperfections)]
-    if not options.alone and known.imperfections.name != GENERIC_NAME:
-        models.append(HealthyModel.of(known.twin, generic_imperfections(robot)))
-    filters = [FaultFilter(model, hypotheses, Priors()) for model in models]
-    share = np.array([1.0 - FOREIGN, FOREIGN] if len(filters) > 1 else [1.0])
-    mixture, faults_per_h = HealthyMixture(filters, share), filters[0].faults_per_h
-    diagnoser = ft.BayesDiagnoser(known.twin, known.imperfections, whole_run=False)
-
-    def see(lives: Lives) -> Seen:
-        return look_and_learn(lives, mixture, diagnoser) if options.learn else look(lives, mixture)
-
-    begun = time.process_time()
-    healthy = [
-        see(lives)
-        for lives in healthy_lives(works.twin, works.imperfections, options.hours, options.seed)
-    ]
-    truth = [names[1 + k % (len(names) - 1)] for k in range(options.faults)]
-    broken = see(live(works.twin, works.imperfections, truth, FAULTY, ONSET, options.seed + 77_777))
+    names = [str(h) for h in paper_hypotheses(robot.motor_names)]
+    begun, rng = time.process_time(), np.random.default_rng(options.seed)
+    groups = max(options.robots, 1)
+    counts = options.hours // groups, options.faults // groups
+    healthy, broken_parts = [], []
+    for group in range(groups):
+        itself = vary(works.imperfections, rng) if options.robots else works.imperfections
+        robot_itself = replace(works, imperfections=itself)
+        seed = options.seed + 10_000 * group
+        mixture = candidates(known, options.alone, robot_itself if options.robots else None, seed)
+        usual, faulty = watched(robot_itself, mixture, counts, seed)
+        healthy += usual
+        broken_parts.append(faulty)
+    broken, faults_per_h = joined(broken_parts), mixture.filters[0].faults_per_h
+    truth = broken.lives.truth
     hours = sum(float(seen.lives.hours.sum()) for seen in healthy)
     print(f"{hours:.0f} h, {options.faults} faults, {time.process_time() - begun:.0f} s of a core")
     curves: dict[str, list[tuple[float, float]]] = {}
-    everything = range(options.faults)
+    everything = range(len(truth))
     for budget in BUDGETS:
         rows = [by_filter(seen, names, faults_per_h, budget) for seen in healthy]
         alarms = Told([r for t in rows for r in t.raised], [c for t in rows for c in t.cause])
