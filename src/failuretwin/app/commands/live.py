@@ -78,9 +78,7 @@ def watch(
     known, motors = load_calibration(calibration, model), model.motor_names
     diagnoser = monitor(known.twin, known.imperfections, budget)
     wait_s = topics_of(live.topics).wait_s
-    tell(_rests_on(known.imperfections))
-    for line in _limits(known.imperfections, motors, budget):
-        tell(line)
+    tell(_rests_on(known.imperfections) + _limit(known.imperfections, motors, budget))
     # An emulated robot ends by itself, a log when it is over.
     length = live.duration if live.duration and source != "emulated" else math.inf
     with ExitStack() as stack:
@@ -122,18 +120,18 @@ def _fit(fit: Fit) -> str:
     return f"calibration {fit.given!r} is this robot's: {percent(fit.fits)} sure{own}"
 
 
-def _limits(known: Imperfections, motors: Sequence[str], budget: float) -> list[str]:
+def _limit(known: Imperfections, motors: Sequence[str], budget: float) -> str:
     """Return what losses of commands cost: the motor that takes longest to be told stuck."""
     from failuretwin.decision.streaming.alarm_rule import movements_to_tell
 
     needed = movements_to_tell(known, motors, budget)
     if not needed:
-        return []
+        return ""
     worst = max(needed, key=lambda motor: needed[motor])
-    return [
-        f"at these losses a {worst.replace('_', ' ')} that sticks at rest takes about "
+    return (
+        f". At these losses a {worst.replace('_', ' ')} that sticks at rest takes about "
         f"{needed[worst]} movements to be told from lost commands"
-    ]
+    )
 
 
 # `failuretwin emulate`: a robot that exists only as physics, on a network or in a file.
