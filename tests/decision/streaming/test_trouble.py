@@ -9,6 +9,7 @@ from failuretwin.decision.streaming.trouble import TwoPlaces, UntoldMotion
 
 UNTOLD = "the tool moves though no command came"
 TWO = "readings jump between two places"
+TOLD = np.array([True])
 
 
 def undecided(watcher, samples):
@@ -78,7 +79,7 @@ def test_a_glitch_is_neither(rng):
     for k in range(400):
         point = np.full((1, 3), 0.1) if k % 20 in (3, 4) or k % 33 == 7 else rest
         assert not jumps.see(point, 0.02)[0]
-        untold.see(0.1 * k, point, rest, np.array([True]), (0.002, 0.02))
+        untold.see(0.1 * k, point, rest, TOLD, TOLD, (0.002, 0.02))
         assert not untold.untold[0]
 
 
@@ -86,5 +87,15 @@ def test_a_movement_that_is_under_way_is_no_motion_without_a_command():
     seen = UntoldMotion.empty(run=1, axis=3)
     nowhere = np.full((1, 3), np.nan)
     for k in range(50):
-        seen.see(0.1 * k, np.full((1, 3), 0.01 * k), nowhere, np.array([True]), (0.002, 0.02))
+        seen.see(0.1 * k, np.full((1, 3), 0.01 * k), nowhere, TOLD, TOLD, (0.002, 0.02))
     assert not seen.untold[0]
+
+
+def test_the_first_command_of_a_recording_is_one(watcher, work):
+    """Nobody says where the arm stood before it, so its reference does not move."""
+    samples = work(6)
+    start = next(i for i, (t, *_) in enumerate(samples) if t > 0.5)
+    first = [(t, None, p) for t, _, p in samples[:start]]
+    told = [(t, samples[start + 10][1], p) for t, _, p in samples[start : start + 10]]
+    rows = undecided(watcher, [*first, *told, *samples[start + 10 :]])
+    assert not any(reason for _, reason in rows)

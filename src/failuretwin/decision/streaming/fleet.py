@@ -169,7 +169,7 @@ class StreamingFleet:
         before = self._odd
         split = self._split.see(points, self._settings.unmoved_m)
         points = np.where(split[:, None], np.nan, points)
-        away = self._astray(time, points)
+        away = self._astray(time, reference, points)
         begun, at_rest = self._tracker.take(time, reference, points, away)
         self._beliefs.point[begun] = np.nan
         self._untold.begin(np.union1d(begun, np.flatnonzero(self._tracker.references.moved)))
@@ -177,12 +177,13 @@ class StreamingFleet:
         odd = np.flatnonzero((self._odd != before).any(axis=0))
         return np.unique(np.concatenate([died, odd, judged]))
 
-    def _astray(self, time: float, points: FloatArray) -> BoolArray:
+    def _astray(self, time: float, reference: FloatArray, points: FloatArray) -> BoolArray:
         """Return tools that left where they rested without a command, (robot,)."""
         tracker, settings = self._tracker, self._settings
         told = (tracker.window.count > 0) | tracker.references.moved
         near_m = settings.same_place_m, settings.unmoved_m
-        return self._untold.see(time, points, tracker.rest(), told, near_m)
+        known = np.isfinite(tracker.references.last[:, 0]) | np.isfinite(reference).all(axis=1)
+        return self._untold.see(time, points, tracker.rest(), told, known, near_m)
 
     @property
     def _odd(self) -> BoolArray:

@@ -103,6 +103,8 @@ class UntoldMotion(ArrayStruct):
         rest: Where it rested last, since its last command, (robot, axis) [m]; NaN: not yet.
         away_s: Since when it has been away from where it rested, (robot,) [s]; NaN: it is not.
         untold: Whether it moves without a command, (robot,); it stands until the next.
+        unknown: Whether readings came before any reference was known, (robot,): the first command
+            then says where the arm goes, but not that it moves.
     """
 
     place: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
@@ -110,6 +112,7 @@ class UntoldMotion(ArrayStruct):
     rest: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
     away_s: Annotated[FloatArray, Axes("run", empty=np.nan)]
     untold: Annotated[BoolArray, Axes("run", empty=False)]
+    unknown: Annotated[BoolArray, Axes("run", empty=False)]
 
     def see(
         self,
@@ -117,6 +120,7 @@ class UntoldMotion(ArrayStruct):
         points: FloatArray,
         rest: FloatArray,
         told: BoolArray,
+        known: BoolArray,
         near_m: tuple[float, float],
     ) -> BoolArray:
         """Take readings and return which tools are away from where they rested, (robot,).
@@ -127,18 +131,23 @@ class UntoldMotion(ArrayStruct):
             rest: Where tools came to rest after their last command, (robot, axis) [m]; NaN: they
                 may be on their way.
             told: Robots that have had a command, (robot,); of others the first rest counts.
+            known: Robots whose reference is known, (robot,).
             near_m: How near is the same place, and how far away is moved [m].
         """
         same_place_m, moved_m = near_m
         read = np.isfinite(points).all(axis=1)
+        self.unknown[read & ~known] = True
+        first = self.unknown & known & ~told
+        self.begin(np.flatnonzero(first))
+        told = told | first
         with np.errstate(invalid="ignore"):
             stands = read & (np.linalg.norm(points - self.place, axis=1) <= same_place_m)
         anew = read & ~stands
         self.place[anew], self.since_s[anew] = points[anew], time
         rested = ~told & stands & (time - self.since_s >= RESTED_S) & np.isnan(self.rest[:, 0])
         self.rest[rested] = self.place[rested]
-        known = told & np.isfinite(rest[:, 0]) & np.isnan(self.away_s)
-        self.rest[known] = rest[known]
+        rests = told & np.isfinite(rest[:, 0]) & np.isnan(self.away_s)
+        self.rest[rests] = rest[rests]
         with np.errstate(invalid="ignore"):
             away = read & (np.linalg.norm(points - self.rest, axis=1) > moved_m)
         self.away_s[read & ~away] = np.nan
