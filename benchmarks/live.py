@@ -26,7 +26,7 @@ from failuretwin.connection.links.ros1 import Ros1Robot, Ros1Source
 from failuretwin.connection.links.ros_messages import RosTopics
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.streaming.diagnoser import monitor
+from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.injection import ScheduledFault

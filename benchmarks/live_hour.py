@@ -21,9 +21,9 @@ from failuretwin import DigitalTwin, load_robot
 from failuretwin.app.shadow import Shadow
 from failuretwin.connection.emulated_arm import Emulation, emulated
 from failuretwin.connection.links.base import Pace
-from failuretwin.connection.links.ros_messages import SURE
+from failuretwin.core.alarm import RAISED, SUSPECTED
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.decision.streaming.diagnoser import monitor
+from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.failure_behavior.injection import ScheduledFault, state_at
 
@@ -40,8 +40,8 @@ class Said:
 
     Attributes:
         time: When [s].
-        name: The most probable hypothesis.
-        sure: Whether that was said with certainty.
+        name: What the alarm names; healthy without one.
+        sure: Whether there is an alarm, or nothing is suspected.
     """
 
     time: float
@@ -81,8 +81,9 @@ def live(
                 memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0)
             if answer.diagnosis is None or answer.diagnosis.undecided:
                 continue
-            best = answer.diagnosis.ranked[0]
-            said.append(Said(answer.time, best, answer.diagnosis.posterior[best] >= SURE))
+            alarm = answer.alarm
+            name = alarm.cause if alarm.state == RAISED else "healthy"
+            said.append(Said(answer.time, name, alarm.state != SUSPECTED))
     return said, commands, memory
 
 

@@ -33,8 +33,9 @@ if TYPE_CHECKING:
     from failuretwin.decision.maintenance.expected_cost import advise
     from failuretwin.decision.maintenance.remaining_life import remaining_life
     from failuretwin.decision.results import read_results
-    from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser, monitor
+    from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser
     from failuretwin.decision.streaming.fleet import StreamingFleet
+    from failuretwin.decision.streaming.monitor import monitor
     from failuretwin.decision.training import train
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import Robot, load_robot
@@ -88,7 +89,7 @@ _HOME = {
     "load_calibration": "digital_model.calibrated_robot",
     "load_network": "decision.learned.storage",
     "load_robot": "digital_model.robot",
-    "monitor": "decision.streaming.diagnoser",
+    "monitor": "decision.streaming.monitor",
     "reach": "decision.acting.reach",
     "read_results": "decision.results",
     "read_runs": "data_knowledge.read",

@@ -37,7 +37,7 @@ def recording(failuretwin, tmp_path_factory):
 
 def check_found(changes):
     """Check that motor 3 is found stuck after it began, and healthy after it was repaired."""
-    stuck = [at for at, text in changes if text.startswith("motor 3 stuck")]
+    stuck = [at for at, text in changes if text.startswith("motor 3 stuck")]  # not: suspected
     assert stuck
     assert 12.0 < stuck[0] < 25.0
     assert [text.startswith("healthy again") for at, text in changes if at > 25.0][-1]

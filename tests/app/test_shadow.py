@@ -14,6 +14,7 @@ from failuretwin.app.shadow import Changes, Shadow
 from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, LinkCounts, Reading
 from failuretwin.connection.links.live_events import SampledCommands
 from failuretwin.connection.links.ros_messages import RosTopics
+from failuretwin.core.alarm import ALL_CLEAR, CLEAR, RAISED, SUSPECTED, Alarm, Episode
 from failuretwin.core.hypothesis import Diagnosis
 
 HEALTHY = Diagnosis("live", {"healthy": 0.99, "motor_3:stuck": 0.01}, verdict="healthy, 99 % sure")
@@ -267,30 +268,52 @@ def lines(changes, moments, counts=None, troubles=()):
     return found
 
 
-def moment(time, state, diagnosis):
-    answer = Answer(time, state, diagnosis)
+def moment(time, state, diagnosis, alarm=ALL_CLEAR):
+    answer = Answer(time, state, diagnosis, alarm)
     return shadow_module.Snapshot(answer, time, np.full(3, np.nan), 0.001)
+
+
+CAUSE = "motor_3:stuck"
+LASTS, ENDED = Episode(1, CAUSE, 3.0), Episode(1, CAUSE, 3.0, 65.0)
 
 
 def test_what_changes_is_told_once(armpi):
     changes = Changes(armpi.motor_names)
-    states = [(OK, HEALTHY)] * 3 + [(OK, STUCK)] * 3 + [(STALE, STUCK)] * 3 + [(OK, HEALTHY)] * 3
+    raised, over = Alarm(RAISED, CAUSE, LASTS), Alarm(CLEAR, "", ENDED)
+    states = [(OK, HEALTHY)] * 3 + [(OK, STUCK, raised)] * 3 + [(STALE, STUCK, raised)] * 3
+    states += [(OK, HEALTHY, over)] * 3
     told = lines(changes, [moment(float(k), *state) for k, state in enumerate(states)])
     assert told == [
         "healthy, 99 % sure",
         "motor 3 stuck",
         "no data any more",
         "data are coming",
-        "healthy again: healthy, 99 % sure",
+        "healthy again, the alarm for motor 3 stuck stood 62 s: healthy, 99 % sure",
     ]
     assert str(changes.lines[1]) == "     3.0 s  motor 3 stuck"
 
 
-def test_an_uncertain_answer_is_no_change(armpi):
-    unsure = Diagnosis("live", {"healthy": 0.6, "motor_3:stuck": 0.4}, verdict="healthy?")
+def test_what_is_suspected_is_told_and_that_it_passed(armpi):
+    """Whatever the probabilities are: the alarm decides."""
+    unsure = Diagnosis("live", {"healthy": 0.6, CAUSE: 0.4}, verdict="healthy?")
+    changes, suspected = Changes(armpi.motor_names), Alarm(SUSPECTED, CAUSE)
+    moments = [moment(0.0, OK, HEALTHY), moment(1.0, OK, unsure, suspected)]
+    moments += [moment(2.0, OK, unsure, suspected), moment(3.0, OK, unsure)]
+    assert lines(changes, moments) == [
+        "healthy, 99 % sure",
+        "suspected: motor 3 stuck, 40 %; healthy?",
+        "no longer suspected: healthy?",
+    ]
+
+
+def test_why_nothing_can_be_said_is_told_once(armpi):
+    untold = Diagnosis("live", {"healthy": 1.0}, undecided="the tool moves though no command came")
     changes = Changes(armpi.motor_names)
-    told = lines(changes, [moment(0.0, OK, STUCK), moment(1.0, OK, unsure), moment(2.0, OK, STUCK)])
-    assert told == ["motor 3 stuck"]
+    moments = [moment(float(k), OK, untold) for k in range(3)] + [moment(3.0, OK, HEALTHY)]
+    assert lines(changes, moments) == [
+        "undecided: the tool moves though no command came",
+        "healthy, 99 % sure",
+    ]
 
 
 def test_trouble_with_the_link_is_told(armpi):
@@ -306,6 +329,17 @@ def test_trouble_with_the_link_is_told(armpi):
         "disk full",
     ]
     assert [c.text for c in changes.notice(still, counts, 1, ())] == ["over: disk full"]
+
+
+def test_stamps_that_leap_without_end_are_told_now_and_then(armpi):
+    changes = Changes(armpi.motor_names)
+    told = [changes.notice(moment(float(k), OK, None), LinkCounts(), k, ()) for k in range(25)]
+    texts = [(c.stream_time, c.text) for found in told for c in found]
+    assert texts == [
+        (1.0, "the robot's clock jumped; going on by our own"),
+        (11.0, "the robot's clock jumped, 11 times so far; going on by our own"),
+        (21.0, "the robot's clock jumped, 21 times so far; going on by our own"),
+    ]
 
 
 def test_the_posterior_over_time_goes_by_the_robots_clock(armpi):
@@ -326,7 +360,7 @@ def test_the_posterior_over_time_goes_by_the_robots_clock(armpi):
 
 def test_the_view_shows_motors_posterior_and_changes(armpi):
     view, changes = View(armpi.motor_names, "a script"), Changes(armpi.motor_names)
-    told = moment(3.0, OK, STUCK)
+    told = moment(3.0, OK, STUCK, Alarm(RAISED, CAUSE, LASTS))
     changes.notice(told, LinkCounts(), 0, ())
     console = Console(width=120, file=StringIO())
     view.remember(told)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -100,3 +101,16 @@ def test_without_a_server_the_user_is_told(monkeypatch):
     monkeypatch.setattr(rosbridge, "CONNECT_S", 0.5)
     with pytest.raises(InputError, match="no rosbridge server answers"):
         rosbridge.connect("127.0.0.1", free_port())
+
+
+def test_what_a_server_refuses_is_told(armpi, server, ros):
+    """A topic that it refuses stays silent; without its own words nobody would know why."""
+    with rosbridge.RosbridgeSource(armpi, TOPICS, ros) as source:
+        wait_for(lambda: server.has_subscriber("/tool"))
+        said = {"op": "status", "level": "error", "msg": "subscribe: no permission for /tool"}
+        server.send_raw("/tool", json.dumps(said))
+        server.send_raw("/tool", json.dumps({**said, "level": "info", "msg": "welcome"}))
+        server.publish("/tool", point(1))
+        assert source.poll(WAIT_S).time == 1.0
+        assert source.counts.garbage == 1
+        assert source.counts.last_garbage == "rosbridge says: subscribe: no permission for /tool"

@@ -25,17 +25,17 @@ from failuretwin.connection.links.base import (
     source_from_text,
 )
 from failuretwin.connection.links.live_events import ReorderBuffer
-from failuretwin.connection.links.ros_messages import (
+from failuretwin.connection.links.ros_messages import RosTopics, load_topics
+from failuretwin.connection.links.statuses import (
     LEVEL_ERROR,
     LEVEL_OK,
     LEVEL_STALE,
     LEVEL_WARN,
     RateLimiter,
-    RosTopics,
     Status,
-    load_topics,
     statuses,
 )
+from failuretwin.core.alarm import ALL_CLEAR, CLEAR, RAISED, SUSPECTED, Alarm, Episode
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 
@@ -104,6 +104,25 @@ def test_late_messages_and_silences_are_no_jumps():
     assert clock.stamp(30.0) == 80.0
 
 
+def test_a_clock_that_is_set_back_a_little_is_noticed_by_readings_that_stay_behind():
+    """Two late ones are late; the third is not, and from then on time runs as it did."""
+    clock, told = StreamClock(), []
+    for k in range(40):
+        stamp = 50.0 + 0.1 * k - (2.0 if k >= 20 else 0.0)
+        told.append(clock.to_stream_time(stamp, 0.1 * k, reading=True))
+    np.testing.assert_allclose(told[:20], 0.1 * np.arange(20), atol=1e-9)
+    np.testing.assert_allclose(told[22:], 0.1 * np.arange(22, 40), atol=1e-9)
+    assert clock.jumps == 1
+
+
+def test_commands_that_come_late_are_no_clock_that_was_set_back():
+    clock = StreamClock()
+    for k in range(40):
+        clock.to_stream_time(50.0 + 0.1 * k, 0.1 * k, reading=True)
+        assert clock.to_stream_time(48.0 + 0.1 * k, 0.1 * k) == pytest.approx(0.1 * k - 2.0)
+    assert clock.jumps == 0
+
+
 def test_without_events_the_stream_goes_on_by_our_own_clock():
     clock = StreamClock()
     clock.to_stream_time(100.0, 7.0)
@@ -131,8 +150,8 @@ def test_a_senseless_speed_is_refused(speed):
         Pace(speed)
 
 
-def answer(posterior, state=OK, **more):
-    return Answer(5.0, state, Diagnosis("run", posterior, verdict="the verdict", **more))
+def answer(posterior, state=OK, alarm=ALL_CLEAR, **more):
+    return Answer(5.0, state, Diagnosis("run", posterior, verdict="the verdict", **more), alarm)
 
 
 MOTORS = ["motor_1", "motor_2"]
@@ -140,12 +159,17 @@ MOTORS = ["motor_1", "motor_2"]
 
 def test_the_statuses_of_a_fault():
     posterior = {"healthy": 0.03, "motor_2:stuck": 0.92, "motor_2:drift": 0.05}
-    told = answer(posterior, magnitude=-0.2, magnitude_unit="rad", onset_s=3.25)
+    alarm = Alarm(RAISED, "motor_2:stuck", Episode(2, "motor_2:stuck", 4.5))
+    told = answer(posterior, OK, alarm, magnitude=-0.2, magnitude_unit="rad", onset_s=3.25)
     arm, first, second = statuses(told, MOTORS)
     assert [s.name for s in (arm, first, second)] == ["arm", "motor_1", "motor_2"]
     assert [s.level for s in (arm, first, second)] == [LEVEL_ERROR, LEVEL_OK, LEVEL_ERROR]
     assert arm.message == "the verdict"
     assert arm.values == {
+        "alarm": "alarm",
+        "episode": "2",
+        "episode_cause": "motor_2:stuck",
+        "raised_s": "4.50",
         "diagnosis": "motor_2:stuck",
         "probability": "0.92",
         "magnitude": "-0.2",
@@ -165,11 +189,24 @@ def test_the_statuses_of_a_fault():
 
 
 @pytest.mark.parametrize(
-    ("healthy", "level"), [(0.6, LEVEL_OK), (0.4, LEVEL_WARN), (0.05, LEVEL_ERROR)]
+    ("state", "level"), [(CLEAR, LEVEL_OK), (SUSPECTED, LEVEL_WARN), (RAISED, LEVEL_ERROR)]
 )
-def test_the_level_follows_the_probability_of_a_fault(healthy, level):
-    arm, motor, _ = statuses(answer({"healthy": healthy, "motor_1:stuck": 1 - healthy}), MOTORS)
-    assert (arm.level, motor.level) == (level, level)
+@pytest.mark.parametrize("healthy", [0.9, 0.1])
+def test_the_alarm_decides_the_level_not_the_probability(healthy, state, level):
+    alarm = Alarm(state, "" if state == CLEAR else "motor_1:stuck")
+    told = answer({"healthy": healthy, "motor_1:stuck": 1 - healthy}, OK, alarm)
+    assert [s.level for s in statuses(told, MOTORS)] == [level, level, LEVEL_OK]
+
+
+def test_an_alarm_stands_while_nothing_can_be_said():
+    alarm = Alarm(RAISED, "motor_1:stuck")
+    told = answer({"healthy": 0.5, "motor_1:stuck": 0.5}, OK, alarm, undecided="too dark")
+    assert [s.level for s in statuses(told, MOTORS)] == [LEVEL_ERROR, LEVEL_ERROR, LEVEL_WARN]
+
+
+def test_when_an_episode_ended_is_told():
+    alarm = Alarm(CLEAR, "", Episode(1, "motor_1:stuck", 4.0, 9.25))
+    assert statuses(answer({"healthy": 1.0}, OK, alarm), MOTORS)[0].values["cleared_s"] == "9.25"
 
 
 def test_without_data_nothing_is_healthy_and_nothing_is_forgotten():

@@ -20,8 +20,8 @@ from failuretwin.decision.learned.feature_encoder import (
     original_features,
     signals_of,
 )
-from failuretwin.decision.streaming.diagnoser import monitor
 from failuretwin.decision.streaming.fleet import StreamingFleet
+from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import LostCommand, Readings

@@ -22,12 +22,20 @@ from rich.text import Text
 from failuretwin.app.commands.options import LiveOptions
 from failuretwin.app.shadow import SILENCE_S, Change, Changes, Shadow, Snapshot
 from failuretwin.app.terminal import tell
-from failuretwin.connection.links import ros_messages
 from failuretwin.connection.links.base import LinkCounts, Pace, Sink, Source, source_from_text
-from failuretwin.connection.links.ros_messages import LEVEL_NAMES, RosTopics, load_topics, statuses
+from failuretwin.connection.links.ros_messages import RosTopics, load_topics
+from failuretwin.connection.links.statuses import (
+    LEVEL_ERROR,
+    LEVEL_NAMES,
+    LEVEL_OK,
+    LEVEL_STALE,
+    LEVEL_WARN,
+    statuses,
+)
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import printable
 from failuretwin.data_knowledge.bag_messages import BagTopics
+from failuretwin.decision.streaming.monitor import FaultMonitor, Fit
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.injection import ScheduledFault
@@ -145,10 +153,10 @@ def _rosbridge(
 # The live view on a terminal: motors, residual, posterior over time, what changed.
 
 STYLES = {
-    ros_messages.LEVEL_OK: "green",
-    ros_messages.LEVEL_WARN: "yellow",
-    ros_messages.LEVEL_ERROR: "bold red",
-    ros_messages.LEVEL_STALE: "magenta",
+    LEVEL_OK: "green",
+    LEVEL_WARN: "yellow",
+    LEVEL_ERROR: "bold red",
+    LEVEL_STALE: "magenta",
 }
 BLOCKS = " ▁▂▃▄▅▆▇█"
 COLUMNS = 60
@@ -257,6 +265,8 @@ REFRESH_S = 0.25
 """Time between two drawings [s]."""
 POLL_S = 0.1
 """Longest wait for an event [s]."""
+MISFIT = 0.05
+"""Probability below which it is told that a calibration does not fit."""
 LATE_S = 0.3
 """A command that comes later than this spoils the diagnosis, and the user is told [s]."""
 
@@ -268,9 +278,11 @@ def watch_until_end(
     motors: list[str],
     console: Console,
     until_s: float,
+    monitor: FaultMonitor | None = None,
 ) -> Changes:
     """Watch a robot until `until_s` of our monotonic clock [s], and return all that has changed.
 
+    With a monitor it is told if its calibration does not fit.
     On a terminal there is a live view, else a line for each change.
     """
     changes, view = Changes(motors), View(motors, source.name)
@@ -281,6 +293,7 @@ def watch_until_end(
         while going:
             going = shadow.step(POLL_S) and time.monotonic() < until_s
             troubles = _troubles(shadow, source, sinks, time.monotonic() - begun_s)
+            troubles += () if monitor is None else _misfit(monitor.fit)
             found = changes.notice(shadow.snapshot, source.counts, shadow.clock_jumps, troubles)
             if shown is None:
                 for change in found:
@@ -292,6 +305,16 @@ def watch_until_end(
                 picture = view.draw(shadow.snapshot, source.counts, changes.lines)
                 shown.update(picture, refresh=True)
     return changes
+
+
+def _misfit(fit: Fit) -> tuple[str, ...]:
+    """Return that the calibration is not this robot's, if that is so."""
+    if not fit.given or fit.fits >= MISFIT:
+        return ()
+    return (
+        f"this robot does not do what calibration {fit.given!r} says: it is judged by what arms of "
+        "its kind do and by what it teaches itself",
+    )
 
 
 def _troubles(

@@ -22,13 +22,18 @@ from failuretwin.connection.links.base import (
     StreamClock,
 )
 from failuretwin.connection.links.live_events import LiveReference, ReorderBuffer
-from failuretwin.connection.links.ros_messages import SURE, statuses
+from failuretwin.connection.links.statuses import statuses
+from failuretwin.core.alarm import RAISED, SUSPECTED, Alarm, Episode
+from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser
+from failuretwin.decision.streaming.monitor import FaultMonitor
 from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.explanation import plain_name
 
 SILENCE_S = 5.0
 """Without a reading for so long on our own clock, the answer is stale [s]."""
+STUCK = "stuck"
 TICK_S = 0.5
 """Time without an event after which the diagnoser is told that time goes on [s]."""
 
@@ -59,7 +64,7 @@ class Shadow:
     def __init__(
         self,
         source: Source,
-        diagnoser: StreamingDiagnoser,
+        diagnoser: StreamingDiagnoser | FaultMonitor,
         twin: DigitalTwin,
         sinks: Sequence[Sink] = (),
         commands_late_s: float = 0.0,
@@ -74,6 +79,7 @@ class Shadow:
         self._read_s = -np.inf
         self._fed_s = time.monotonic()
         self._newest = 0.0
+        self._computed = False
         self.snapshot = Snapshot(
             Answer(self._clock.stamp(0.0), STALE, None), 0.0, np.full(3, np.nan), 0.0
         )
@@ -105,7 +111,7 @@ class Shadow:
         now_s = time.monotonic()
         for sink in self._sinks:
             sink.put(event)
-        at = self._clock.to_stream_time(event.time, now_s)
+        at = self._clock.to_stream_time(event.time, now_s, isinstance(event, Reading))
         self._newest = max(self._newest, at)
         self._sequencer.add(replace(event, time=at))
         self._feed_all(self._newest)
@@ -130,6 +136,7 @@ class Shadow:
         self._fed_s = time.monotonic()
         if reading.position is not None and np.isfinite(reading.position).all():
             self._reference.start_at(reading.position)
+            self._computed = bool(np.allclose(reading.tool, self._twin.path(reading.position)))
         seen = reading.tool if np.isfinite(reading.tool).all() else None
         command = None
         for at, angles in self._reference.corners_to(reading.time):
@@ -139,18 +146,38 @@ class Shadow:
                 command = angles
         residual = self.snapshot.residual
         if seen is not None:
-            self._read_s = self._fed_s
             expected = np.full(3, np.nan) if command is None else self._twin.path(command)
             residual = seen - expected
-        self._publish(self._diagnoser.update(reading.time, command, seen), residual)
+        answer = self._diagnoser.update(reading.time, command, seen)
+        self._fed_s = time.monotonic()  # what we take to think is no silence of the robot
+        if seen is not None:
+            self._read_s = self._fed_s
+        self._publish(answer, residual)
 
     def _publish(self, answer: Answer, residual: FloatArray) -> None:
         silent = time.monotonic() - self._read_s > SILENCE_S
         state = STALE if silent or answer.state != OK else OK
-        stamped = Answer(self._clock.stamp(answer.time), state, answer.diagnosis)
+        stamped = replace(answer, time=self._clock.stamp(answer.time), state=state)
+        if self._computed:
+            stamped = _with_doubt(stamped)
         self.snapshot = Snapshot(stamped, answer.time, residual, self.snapshot.seconds)
         for sink in self._sinks:
             sink.put(stamped)
+
+
+def _with_doubt(answer: Answer) -> Answer:
+    """Return an answer that says that a frozen reading looks like a stuck motor.
+
+    Where the tool is computed from the motors' own readings nothing else tells the two apart.
+    """
+    motor, _, mode = answer.alarm.cause.partition(":")
+    if answer.diagnosis is None or mode != STUCK:
+        return answer
+    said = (
+        f"{answer.diagnosis.verdict}; the tool is computed from motor readings, so a frozen "
+        f"reading of {motor.replace('_', ' ')} looks the same"
+    )
+    return replace(answer, diagnosis=replace(answer.diagnosis, verdict=said))
 
 
 # What changes, in words: faults found, repairs noticed, silence, trouble with the link.
@@ -158,7 +185,15 @@ class Shadow:
 KEPT = 1000
 """Changes that are remembered; the recording holds all of them."""
 GARBAGE_EVERY_S = 10.0
-"""Time between two reports of messages that make no sense [s]."""
+"""Time between two reports of messages that make no sense, and of stamps that leap [s]."""
+
+
+def _over(episode: Episode | None) -> str:
+    """Return that a fault is over, and how long its alarm stood."""
+    if episode is None or episode.duration_s is None:
+        return "healthy again"
+    cause = plain_name(Hypothesis.parse(episode.cause))
+    return f"healthy again, the alarm for {cause} stood {episode.duration_s:.0f} s"
 
 
 @dataclass(frozen=True)
@@ -179,12 +214,13 @@ class Changes:
     def __init__(self, motors: list[str]) -> None:
         self.lines: deque[Change] = deque(maxlen=KEPT)
         self._motors = motors
-        self._alarm = ""
+        self._alarm: Alarm | None = None
+        self._undecided = ""
         self._state = ""
         self._troubles: tuple[str, ...] = ()
         self._counts = LinkCounts()
         self._jumps = 0
-        self._garbage_at = -GARBAGE_EVERY_S
+        self._garbage_at = self._jump_at = -GARBAGE_EVERY_S
 
     def notice(
         self, snapshot: Snapshot, counts: LinkCounts, jumps: int, troubles: tuple[str, ...]
@@ -205,14 +241,23 @@ class Changes:
 
     def _diagnosis(self, snapshot: Snapshot) -> list[str]:
         answer = snapshot.answer
-        if answer.state == STALE or answer.diagnosis is None or answer.diagnosis.undecided:
+        if answer.state == STALE or answer.diagnosis is None:
             return []
-        arm = statuses(answer, self._motors)[0]
-        best, before = answer.diagnosis.ranked[0], self._alarm
-        if best == before or answer.diagnosis.posterior[best] < SURE:
+        undecided, self._undecided = self._undecided, answer.diagnosis.undecided
+        if self._undecided:
+            return [] if self._undecided == undecided else [f"undecided: {self._undecided}"]
+        before, self._alarm = self._alarm, answer.alarm
+        if before is not None and (before.state, before.cause) == (
+            self._alarm.state,
+            self._alarm.cause,
+        ):
             return []
-        self._alarm = best
-        return [f"healthy again: {arm.message}" if before and best == "healthy" else arm.message]
+        message = statuses(answer, self._motors)[0].message
+        if before is None or self._alarm.state in (SUSPECTED, RAISED):
+            return [message]
+        if before.state == SUSPECTED:
+            return [f"no longer suspected: {message}"]
+        return [f"{_over(self._alarm.episode)}: {message}"]
 
     def _link(
         self, at: float, counts: LinkCounts, jumps: int, troubles: tuple[str, ...]
@@ -222,8 +267,10 @@ class Changes:
             texts.append("the link is back")
         if counts.dropped > before.dropped:
             texts.append(f"{counts.dropped} events dropped so far: this computer is too slow")
-        if jumps > self._jumps:
-            texts.append("the robot's clock jumped; going on by our own")
+        if jumps > self._jumps and at >= self._jump_at + GARBAGE_EVERY_S:
+            self._jump_at, self._jumps = at, jumps
+            often = f", {jumps} times so far" if jumps > 1 else ""
+            texts.append(f"the robot's clock jumped{often}; going on by our own")
         garbage = before.garbage
         if counts.garbage > garbage and at >= self._garbage_at + GARBAGE_EVERY_S:
             self._garbage_at = at
@@ -232,5 +279,5 @@ class Changes:
         texts += [trouble for trouble in troubles if trouble not in self._troubles]
         texts += [f"over: {old}" for old in self._troubles if old not in troubles]
         self._counts = LinkCounts(counts.received, garbage, counts.dropped, counts.reconnects)
-        self._jumps, self._troubles = jumps, troubles
+        self._troubles = troubles
         return texts

@@ -21,10 +21,12 @@ from failuretwin.connection.life_history import History
 from failuretwin.connection.self_calibration import as_calibration, more_when_late
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.movements import Movements
 from failuretwin.core.runs import truth_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
+from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.evidence import Evidence, SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
@@ -263,9 +265,20 @@ class _Seen:
         if not cold:
             return now
         movements = life.joined_evidence(self.evidence[batch]).movements
-        late = lateness(movements)
-        schedule = schedule_of(movements, late, self.diagnoser.twin.robot)
-        return replace(now, timing=timing_of(None, late, np.zeros(0)), schedule=schedule)
+        return with_timing_of(now, movements, self.diagnoser.twin.robot)
+
+
+def with_timing_of(known: Imperfections, movements: Movements, robot: Robot) -> Imperfections:
+    """Return imperfections with the late starts and the schedule that commands tell.
+
+    Args:
+        known: What is believed of the robot otherwise.
+        movements: Movements as they were commanded.
+        robot: The robot.
+    """
+    late = lateness(movements)
+    schedule = schedule_of(movements, late, robot)
+    return replace(known, timing=timing_of(None, late, np.zeros(0)), schedule=schedule)
 
 
 def calibration_of(life: LifeFilter, runs: xr.Dataset) -> Calibration:

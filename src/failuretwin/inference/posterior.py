@@ -289,6 +289,8 @@ class Posterior:
         log_posterior: (run, hypothesis).
         weights: What the runs say of each hypothesis, in their order.
         set_up: What is to be said of the set-up of each run; empty: nothing of any.
+        explained: Log density of each settled position given all before it, (run, movement), where
+            more is known than the runs say; None: what the best hypothesis makes of it counts.
     """
 
     likelihood: RunLikelihood
@@ -297,6 +299,7 @@ class Posterior:
     log_posterior: FloatArray
     weights: Sequence[MarginalLikelihood]
     set_up: Sequence[str] = ()
+    explained: FloatArray | None = None
 
     def undecided(self, run: int, quality: LogQuality) -> str:
         """Return why a run allows no verdict, empty if it does.
@@ -306,12 +309,14 @@ class Posterior:
             quality: Defects of its log.
         """
         best = int(np.argmax(self.log_posterior[run]))
+        known = self.explained
+        explained = self.weights[best].settled(run) if known is None else known[run]
         return abstention_reason(
             quality,
             self.likelihood.evidence,
             run,
             float(np.exp(self.log_posterior[run, best])),
-            self.weights[best].settled(run),
+            explained,
             self.likelihood.model,
         )
 

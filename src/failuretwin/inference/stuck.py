@@ -129,8 +129,28 @@ def _log_prior(
 ) -> FloatArray:
     """Return log prior masses, (run, movement first affected, plateau | ramp, node).
 
-    Each interval has its share of the prior; within it the nodes carry the density of the angle
-    times the weights of the trapezoidal rule, normalised so that no mass is lost between nodes.
+    Each interval has its share of the prior.
+    """
+    mass = held_prior(likelihood, motor, angle, prior)
+    intervals = stuck_intervals(likelihood, motor)
+    if prior.known_s is not None:
+        return mass + log_of(intervals.holding(prior.known_s))[..., None]
+    return mass + log_of(intervals.weights(prior.before_run("stuck")))[..., None]
+
+
+def held_prior(
+    likelihood: RunLikelihood, motor: int, angle: FloatArray, prior: OnsetPrior
+) -> FloatArray:
+    """Return log p(held angle | onset in an interval), (run, movement, plateau | ramp, node).
+
+    The nodes carry the density of the angle times the weights of the trapezoidal rule, normalised
+    so that no mass is lost between nodes.
+
+    Args:
+        likelihood: The runs.
+        motor: Index of the motor.
+        angle: Nodes, sorted, (run, node) [rad].
+        prior: How closely the angle is tied to the commands.
     """
     origin, target = _ends(likelihood, motor)
     scale = max(float(likelihood.model.scatter[motor]), 1e-4)
@@ -145,11 +165,7 @@ def _log_prior(
     share = FREE_IF_KNOWN if prior.known_s is not None else prior.free
     mixed = np.logaddexp(np.log1p(-share) + tied, np.log(share) - np.log(high - low))
     mass = mixed + log_trapezoid_weights(angle)[:, None, None]
-    mass -= log_sum(mass, axis=-1)[..., None]
-    intervals = _intervals(likelihood, motor)
-    if prior.known_s is not None:
-        return mass + log_of(intervals.holding(prior.known_s))[..., None]
-    return mass + log_of(intervals.weights(prior.before_run("stuck")))[..., None]
+    return np.asarray(mass - log_sum(mass, axis=-1)[..., None])
 
 
 def _tied(off: FloatArray, scale: float) -> FloatArray:
@@ -185,7 +201,7 @@ def _ends(likelihood: RunLikelihood, motor: int) -> tuple[FloatArray, FloatArray
     return np.nan_to_num(movements.origin()[..., motor]) + before, np.nan_to_num(settled)
 
 
-def _intervals(likelihood: RunLikelihood, motor: int) -> OnsetIntervals:
+def stuck_intervals(likelihood: RunLikelihood, motor: int) -> OnsetIntervals:
     """Return plateau and ramp of each movement, (run, movement, plateau | ramp) [s].
 
     Movements that are likely to have started late count as begun by so much later.
@@ -221,7 +237,7 @@ def _onsets(
         angle: Held angles, (node,) [rad].
     """
     movements, model = likelihood.evidence.movements, likelihood.model
-    intervals = _intervals(likelihood, motor)
+    intervals = stuck_intervals(likelihood, motor)
     plateau = OnsetIntervals(intervals.begin[..., 0], intervals.end[..., 0])
     end = np.nan_to_num(intervals.end)
     waits = end[:, 0, 0] / np.maximum(end.max(axis=(1, 2)), 1e-9)

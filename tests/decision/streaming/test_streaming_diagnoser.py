@@ -11,49 +11,19 @@ from failuretwin import BayesDiagnoser, DigitalTwin, Plan, load_robot
 from failuretwin.connection.links.base import OK, STALE
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.core.movements import Movements
 from failuretwin.data_knowledge.generate import simulate
 from failuretwin.decision.streaming.diagnoser import (
     StreamingDiagnoser,
     load_fleet,
-    monitor,
     save_fleet,
 )
 from failuretwin.decision.streaming.fleet import StreamingFleet
+from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 
 PERIOD_S = 2.04
 STEP_S = 0.1
-
-
-@pytest.fixture
-def watcher(twin):
-    """What watches an exact arm."""
-    return monitor(twin, NO_IMPERFECTIONS)
-
-
-@pytest.fixture
-def work(twin, rng):
-    """A healthy, exact arm at work: random movements every two seconds, readings at 10 Hz."""
-
-    def samples(movements, stuck=()):
-        count, motors = movements, len(twin.robot.motors)
-        low, high = np.array([motor.movement_range for motor in twin.robot.motors]).T
-        target = rng.uniform(0.5 * low, 0.5 * high, (1, count, motors))
-        start = 0.5 + PERIOD_S * np.arange(count)[None]
-        commanded = Movements(np.zeros((1, motors)), target, np.full(target.shape, 0.8), start)
-        time = np.arange(round((0.5 + PERIOD_S * count) / STEP_S)) * STEP_S
-        reference = commanded.reference(time)[0]
-        angles = reference.copy()
-        for motor, first, last in stuck:
-            begin, end = (0.3 + PERIOD_S * number for number in (first, last))
-            inside = (time >= begin) & (time < end)
-            angles[inside, motor] = angles[np.argmax(inside), motor]
-        points = twin.path(angles) + rng.normal(0.0, 3e-4, (len(time), 3))
-        return list(zip(time.tolist(), reference, points, strict=True))
-
-    return samples
 
 
 def said(diagnoser, samples):

@@ -21,6 +21,7 @@ from failuretwin.app.commands.options import (
 from failuretwin.app.terminal import tell
 
 if TYPE_CHECKING:
+    from failuretwin.decision.streaming.monitor import Fit
     from failuretwin.digital_model.nonidealities import Imperfections
     from failuretwin.failure_behavior.injection import ScheduledFault
 
@@ -34,6 +35,15 @@ if TYPE_CHECKING:
     metavar="FILE.mcap",
     help="Record readings, commands and diagnoses; Foxglove, PlotJuggler and failuretwin read it.",
 )
+@click.option(
+    "--false-alarms-per-100h",
+    "budget",
+    type=click.FloatRange(0.0, 1000.0, min_open=True),
+    default=1.0,
+    show_default=True,
+    metavar="N",
+    help="False alarms that you allow in 100 hours of work; fewer come later.",
+)
 @live_options
 @plugin_option
 @common_options
@@ -41,6 +51,7 @@ def watch(
     source: str,
     calibration: Path | None,
     record: Path | None,
+    budget: float,
     live: LiveOptions,
     robot: str,
     seed: int,
@@ -58,15 +69,16 @@ def watch(
     from failuretwin.app.shadow import Shadow
     from failuretwin.app.tables import console
     from failuretwin.connection.links.recording import Recorder
-    from failuretwin.connection.links.ros_messages import statuses
-    from failuretwin.decision.streaming.diagnoser import monitor
+    from failuretwin.connection.links.statuses import statuses
+    from failuretwin.decision.streaming.monitor import monitor
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
 
     model = load_robot(robot)
     known, motors = load_calibration(calibration, model), model.motor_names
-    diagnoser, wait_s = monitor(known.twin, known.imperfections), topics_of(live.topics).wait_s
-    tell(_rests_on(known.imperfections))
+    diagnoser = monitor(known.twin, known.imperfections, budget)
+    wait_s = topics_of(live.topics).wait_s
+    tell(_rests_on(known.imperfections) + _limit(known.imperfections, motors, budget))
     # An emulated robot ends by itself, a log when it is over.
     length = live.duration if live.duration and source != "emulated" else math.inf
     with ExitStack() as stack:
@@ -76,10 +88,11 @@ def watch(
         shadow = Shadow(link, diagnoser, known.twin, sinks, wait_s)
         try:
             until = time.monotonic() + length
-            watch_until_end(shadow, link, sinks, motors, console(), until)
+            watch_until_end(shadow, link, sinks, motors, console(), until, diagnoser)
         except KeyboardInterrupt:
             tell("stopped")
     arm = statuses(shadow.snapshot.answer, motors)[0]
+    tell(_fit(diagnoser.fit))
     tell(f"last answer: {arm.message}")
 
 
@@ -90,9 +103,34 @@ def _rests_on(known: Imperfections) -> str:
     if known.name != GENERIC_NAME:
         return f"healthy behaviour: {known.name} ({known.protocol}; {known.source})"
     return (
-        f"healthy behaviour: {known.name}; {known.source}. What this robot does is not known, so "
-        "small errors do not show: `failuretwin diagnose LOGS --track --out FILE` learns it from "
-        "its runs, and --calibration FILE uses it"
+        f"healthy behaviour: {known.name}; {known.source}. What this robot does is not known yet: "
+        "it is learned as it works, and until then faults take longer to show. --calibration FILE "
+        "uses what was learned before"
+    )
+
+
+def _fit(fit: Fit) -> str:
+    """Return how well the calibration has fitted this robot, in one sentence."""
+    from failuretwin.inference.explanation import percent
+
+    taught = f"{fit.learned} movements taught how this robot is"
+    if not fit.given:
+        return f"no calibration was given; {taught}"
+    own = f"; {taught}" if fit.learned else ""
+    return f"calibration {fit.given!r} is this robot's: {percent(fit.fits)} sure{own}"
+
+
+def _limit(known: Imperfections, motors: Sequence[str], budget: float) -> str:
+    """Return what losses of commands cost: the motor that takes longest to be told stuck."""
+    from failuretwin.decision.streaming.alarm_rule import movements_to_tell
+
+    needed = movements_to_tell(known, motors, budget)
+    if not needed:
+        return ""
+    worst = max(needed, key=lambda motor: needed[motor])
+    return (
+        f". At these losses a {worst.replace('_', ' ')} that sticks at rest takes about "
+        f"{needed[worst]} movements to be told from lost commands"
     )
 
 

@@ -11,6 +11,9 @@ from threading import Condition
 from time import time as wall_clock
 from typing import Protocol, Self, cast
 
+import numpy as np
+
+from failuretwin.core.alarm import ALL_CLEAR, Alarm
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import FloatArray
@@ -62,11 +65,13 @@ class Answer:
         time: By the robot's clock [s].
         state: ``OK``, or ``STALE`` where data have stopped; then nothing is known of the present.
         diagnosis: The diagnosis as it stands, or stood when data stopped; None: there was none yet.
+        alarm: Whether to call somebody.
     """
 
     time: float
     state: str
     diagnosis: Diagnosis | None
+    alarm: Alarm = ALL_CLEAR
 
 
 Item = Reading | CommandSent | Answer
@@ -245,11 +250,16 @@ LEAP_S = 60.0
 BACK_S = 5.0
 """A stamp this far behind the newest is a clock that was set, no message that comes late [s]."""
 
+SET_BACK_S, SET_BACK_READINGS = 0.5, 3
+"""So many readings in a row, each this far behind one that came before, are a clock that was set
+back [s]; a message that comes late is one alone."""
+
 
 class StreamClock:
     """Turns stamps into a time that starts at zero and never leaps.
 
-    Where the stamps leap, the time that has passed on our own clock is taken instead.
+    Where the stamps leap, the time that has passed on our own clock is taken instead. Readings
+    that go on behind those before them tell of a clock that was set back a little.
     """
 
     def __init__(self) -> None:
@@ -257,24 +267,37 @@ class StreamClock:
         self._offset: float | None = None
         self._newest = 0.0
         self._seen_s = 0.0
+        self._last_reading = -np.inf
+        self._behind = 0
 
-    def to_stream_time(self, stamp: float, now_s: float) -> float:
+    def to_stream_time(self, stamp: float, now_s: float, reading: bool = False) -> float:
         """Return the stream time of an event [s].
 
         Args:
             stamp: Its stamp by the robot's clock [s].
             now_s: Our own monotonic clock [s].
+            reading: Whether it is a reading; commands may well come late.
         """
         if self._offset is None:
             self._offset, self._seen_s = -stamp, now_s
         time = stamp + self._offset
-        if not -BACK_S <= time - self._newest <= LEAP_S:
+        set_back = reading and self._is_set_back(stamp)
+        if set_back or not -BACK_S <= time - self._newest <= LEAP_S:
             self.jumps += 1
+            self._last_reading, self._behind = stamp if reading else -np.inf, 0
             time = self.at(now_s)
             self._offset = time - stamp
         if time >= self._newest:
             self._newest, self._seen_s = time, now_s
         return time
+
+    def _is_set_back(self, stamp: float) -> bool:
+        """Return whether readings have gone on behind those before them for a while."""
+        if stamp < self._last_reading - SET_BACK_S:
+            self._behind += 1
+        else:
+            self._last_reading, self._behind = max(stamp, self._last_reading), 0
+        return self._behind >= SET_BACK_READINGS
 
     def at(self, now_s: float) -> float:
         """Return the stream time [s] at a time of our own clock [s]; 0 until an event comes."""

@@ -352,11 +352,15 @@ class NetworkSource:
             # Anyone may publish anything here, and a message of wrong bytes fails in struct, numpy
             # or rosbags. It is counted; the next one may be sound.
             except Exception as error:
-                self._garbage += 1
-                self._last_garbage = f"{type(error).__name__}: {error}"
+                self.note(f"{type(error).__name__}: {error}")
                 return
             for event in events:
                 self._queue.put(event)
+
+    def note(self, what: str) -> None:
+        """Count a message that made no sense, or says that something is wrong."""
+        self._garbage += 1
+        self._last_garbage = what
 
     def poll(self, timeout_s: float) -> Event | None:
         """Return the next event; None if none came within `timeout_s` [s]."""

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from failuretwin.connection.links.base import STALE, Answer, CommandSent, Reading
+from failuretwin.connection.links.base import Answer, CommandSent, Reading
+from failuretwin.connection.links.statuses import RateLimiter, Status, statuses
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.types import MS_PER_S, FloatArray
 from failuretwin.data_knowledge.bag_messages import (
     MONITORING,
@@ -301,134 +301,3 @@ class DiagnosticsPublisher:
         if not self._beat.due(found, time.monotonic()):
             return None
         return diagnostics_message(found, answer.time, self._topics, self._robot)
-
-
-LEVEL_OK, LEVEL_WARN, LEVEL_ERROR, LEVEL_STALE = range(4)
-"""Levels of ``diagnostic_msgs/DiagnosticStatus``."""
-LEVEL_NAMES = ("OK", "WARN", "ERROR", "STALE")
-LIKELY = 0.5
-"""Probability of a fault from which there is a warning."""
-SURE = 0.9
-"""Probability of a fault from which there is an error."""
-PERIOD_S = 1.0
-"""Time between two reports when nothing gets worse [s]."""
-
-
-@dataclass(frozen=True)
-class Status:
-    """State of a motor or of the whole arm.
-
-    Attributes:
-        name: ``arm``, or the name of the motor.
-        level: One of the four levels.
-        message: What is the matter, in words.
-        values: Key-values: probability, mode, magnitude, onset, runner-up.
-    """
-
-    name: str
-    level: int
-    message: str
-    values: Mapping[str, str]
-
-
-def statuses(answer: Answer, motors: Sequence[str]) -> list[Status]:
-    """Return the statuses of an answer: the arm first, then its motors.
-
-    Without data everything is stale; what was known before is told with it.
-
-    Args:
-        answer: The answer.
-        motors: Names of the robot's motors in chain order.
-    """
-    names = ["arm", *motors]
-    diagnosis = answer.diagnosis
-    if diagnosis is None:
-        text = "no data have come yet" if answer.state == STALE else "nothing can be said yet"
-        return [Status(name, LEVEL_STALE, text, {}) for name in names]
-    if diagnosis.undecided:
-        found = [Status(name, LEVEL_WARN, diagnosis.verdict, {}) for name in names]
-    else:
-        found = [_arm(diagnosis), *(_motor(diagnosis, motor) for motor in motors)]
-    if answer.state != STALE:
-        return found
-    told = "no data for a while; before that: "
-    return [Status(s.name, LEVEL_STALE, told + s.message, s.values) for s in found]
-
-
-def _arm(diagnosis: Diagnosis) -> Status:
-    best = diagnosis.ranked[0]
-    values = {"diagnosis": best, "probability": _number(diagnosis.posterior[best])}
-    if best != "healthy":
-        values |= _size(diagnosis)
-    if diagnosis.runner_up is not None:
-        runner_up = diagnosis.runner_up
-        values |= {
-            "runner_up": runner_up,
-            "runner_up_probability": _number(diagnosis.posterior[runner_up]),
-        }
-    healthy = diagnosis.posterior.get("healthy", 0.0)
-    return Status("arm", _level(1.0 - healthy), diagnosis.verdict, values)
-
-
-def _motor(diagnosis: Diagnosis, motor: str) -> Status:
-    modes = {
-        fault.mode: probability
-        for name, probability in diagnosis.posterior.items()
-        for fault in Hypothesis.parse(name).faults
-        if fault.motor == motor
-    }
-    total = min(1.0, sum(modes.values()))
-    ranked = sorted(modes, key=lambda mode: -modes[mode])
-    values = {"probability": _number(total)}
-    if ranked:
-        values["mode"] = ranked[0]
-        best = diagnosis.ranked[0]
-        if f"{motor}:{ranked[0]}" in best.split("+"):
-            values |= _size(diagnosis)
-    if len(ranked) > 1:
-        values["runner_up"] = ranked[1]
-    if total < LIKELY or not ranked:
-        return Status(motor, LEVEL_OK, f"no fault seen ({100 * total:.1f} % faulty)", values)
-    return Status(motor, _level(total), f"{ranked[0]}, {100 * total:.1f} %", values)
-
-
-def _size(diagnosis: Diagnosis) -> dict[str, str]:
-    values = {}
-    if diagnosis.magnitude is not None and np.isfinite(diagnosis.magnitude):
-        values["magnitude"] = _number(diagnosis.magnitude)
-        values["magnitude_unit"] = diagnosis.magnitude_unit or ""
-    if diagnosis.onset_s is not None:
-        values["onset_s"] = f"{diagnosis.onset_s:.2f}"
-    return values
-
-
-def _number(value: float) -> str:
-    return f"{value:.6g}"
-
-
-def _level(probability: float) -> int:
-    if probability >= SURE:
-        return LEVEL_ERROR
-    return LEVEL_WARN if probability >= LIKELY else LEVEL_OK
-
-
-class RateLimiter:
-    """Says when to report: every second, and at once when any status gets worse."""
-
-    def __init__(self) -> None:
-        self._levels: list[int] = []
-        self._due_s = -np.inf
-
-    def due(self, found: Sequence[Status], now_s: float) -> bool:
-        """Return whether these statuses are to be reported now.
-
-        Args:
-            found: The statuses.
-            now_s: Our own monotonic clock [s].
-        """
-        levels = [status.level for status in found]
-        worse = any(new > old for new, old in zip(levels, self._levels, strict=False))
-        if not worse and now_s < self._due_s:
-            return False
-        self._levels, self._due_s = levels, now_s + PERIOD_S
-        return True

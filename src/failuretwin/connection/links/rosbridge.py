@@ -27,6 +27,10 @@ RECONNECT_S = 2.0
 """Longest pause between two attempts to reach a server that has gone [s]."""
 GOODBYE_S = 2.0
 """Longest wait for the server in the end [s]."""
+STATUS = "status of the server"
+"""The event under which a server's own words are passed on."""
+COMPLAINTS = ("error", "warning")
+"""Levels of them that are told."""
 _ROS1_TIME = {"secs": "sec", "nsecs": "nanosec"}
 """What ROS 1 calls the parts of a time, and what ROS 2 does."""
 
@@ -45,6 +49,7 @@ def connect(host: str, port: int) -> Any:
         ) from error
     ros = roslibpy.Ros(host, port, transport="asyncio")
     ros.factory.set_max_delay(RECONNECT_S)
+    ros.factory.on("ready", partial(_hear_status, ros.factory))
     try:
         ros.run(CONNECT_S)
     except roslibpy.core.RosTimeoutError as error:
@@ -54,6 +59,14 @@ def connect(host: str, port: int) -> Any:
             "`roslaunch rosbridge_server rosbridge_websocket.launch`."
         ) from error
     return ros
+
+
+def _hear_status(factory: Any, protocol: Any) -> None:
+    """Pass on what a server says of our calls, such as that it refuses one.
+
+    roslibpy has a place for that, which stays empty, and takes no handler of ours for it.
+    """
+    protocol._message_handlers["status"] = partial(factory.emit, STATUS)
 
 
 def disconnect(ros: Any) -> None:
@@ -88,6 +101,7 @@ class RosbridgeSource(NetworkSource):
         self._reconnects = -1
         self._topics = []
         self._count_connections(None)
+        ros.factory.on(STATUS, self._complain)
         for role, name, type_ in topics.subscribed:
             topic = roslibpy.Topic(ros, name, type_)
             topic.subscribe(partial(self._take, role, kind_of_type(type_)))
@@ -110,6 +124,11 @@ class RosbridgeSource(NetworkSource):
 
     def _await_next(self, _: Any) -> None:
         self._ros.factory.once("ready", self._count_connections)
+
+    def _complain(self, status: Any) -> None:
+        """Take what the server says of our calls: a topic that it refuses will stay silent."""
+        if status.get("level") in COMPLAINTS:
+            self.note(f"rosbridge says: {status.get('msg', '')}")
 
     def _take(self, role: Role, kind: Kind, message: Any) -> None:
         self.take(role, lambda: (_as_object(message), kind))

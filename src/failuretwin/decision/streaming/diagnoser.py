@@ -21,13 +21,12 @@ from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.file_claims import check_npz
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision.streaming.fleet import MOVEMENTS, StreamingFleet
-from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
+from failuretwin.digital_model.calibrated_robot import RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
-from failuretwin.inference.priors import MONITORING
 
 # The state of a stream in a file: plain arrays, read without running anything.
 
-FORMAT = 3
+FORMAT = 4
 SUFFIX = ".npz"
 HEADER = "header"
 
@@ -147,7 +146,7 @@ class StreamingDiagnoser:
         Raises:
             InputError: If a motor is missing, shapes do not fit or the time is not finite.
         """
-        reference = None if command is None else self._reference(command)[None]
+        reference = None if command is None else reference_of(self._motors, command)[None]
         point = None if measured is None else as_floats(measured)[None]
         if len(self._fleet.update(time, reference, point)):
             self._diagnosis = self._told()
@@ -184,14 +183,6 @@ class StreamingDiagnoser:
         stream._diagnosis = said[0] if said else None
         return stream
 
-    def _reference(self, command: Mapping[str, float] | ArrayLike) -> FloatArray:
-        if not isinstance(command, Mapping):
-            return as_floats(command)
-        for name in self._motors:
-            if name not in command:
-                raise unknown_name("motor", name, command)
-        return as_floats([command[name] for name in self._motors])
-
     def _answer(self) -> Answer:
         state = STALE if self._fleet.stale[0] else OK
         return Answer(self._fleet.time, state, self._diagnosis)
@@ -201,13 +192,19 @@ class StreamingDiagnoser:
         return None if found is None else replace(found, run="stream")
 
 
-def monitor(twin: RobotLike, imperfections: HealthyLike = None) -> StreamingDiagnoser:
-    """Return what watches a robot at work: settled poses, and faults are rare.
+def reference_of(motors: Sequence[str], command: Mapping[str, float] | ArrayLike) -> FloatArray:
+    """Return a reference as an array, (motor,) [rad].
 
     Args:
-        twin: The robot: its twin, itself, its name or its profile.
-        imperfections: How the healthy robot differs from it, or a calibration by name or path;
-            None: as its profile says.
+        motors: Names of the motors in chain order.
+        command: Reference of every motor, by name or (motor,) [rad].
+
+    Raises:
+        InputError: If a motor is missing.
     """
-    method = BayesDiagnoser(twin, imperfections, priors=MONITORING, whole_run=False)
-    return StreamingDiagnoser(method)
+    if not isinstance(command, Mapping):
+        return as_floats(command)
+    for name in motors:
+        if name not in command:
+            raise unknown_name("motor", name, command)
+    return as_floats([command[name] for name in motors])

@@ -21,9 +21,12 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.decision.streaming.tracking import MovementTracker
-from failuretwin.decision.streaming.window import KEEP_S, FrozenSensorDetector
+from failuretwin.decision.streaming.trouble import FrozenSensorDetector, TwoPlaces, UntoldMotion
+from failuretwin.decision.streaming.window import KEEP_S
 from failuretwin.digital_model.calibrated_robot import RobotLike
+from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.explanation import worded
 from failuretwin.inference.log_quality import LogQuality
 from failuretwin.inference.posterior import (
     Posterior,
@@ -41,6 +44,13 @@ SILENCE_S = 5.0
 for 4 s."""
 DEAD = LogQuality(
     fatal="the tool stands still though motors are told to move: the sensor or the arm is dead"
+)
+UNTOLD = LogQuality(
+    fatal="the tool moves though no command came: commands do not arrive here, or something else "
+    "moves the arm"
+)
+TWO = LogQuality(
+    fatal="readings jump between two places: two robots, or two sensors, speak on one topic"
 )
 
 
@@ -109,6 +119,8 @@ class StreamingFleet:
         self._settings = model.settings
         self._tracker = MovementTracker(model, robots, movements, rate_hz)
         self._frozen = FrozenSensorDetector.empty(run=robots, axis=3, value=4, motor=motors)
+        self._untold = UntoldMotion.empty(run=robots, axis=3)
+        self._split = TwoPlaces.empty(run=robots, axis=3)
         self._prior = np.exp(log_prior(diagnoser.hypothesis_set, diagnoser.priors))
         sizes = {"run": robots, "hypothesis": len(self._prior), "axis": 3}
         self._beliefs = FleetPosterior.empty(**sizes)
@@ -154,9 +166,29 @@ class StreamingFleet:
         reference, points = self._checked(time, command, measured)
         time = self._by_own_clock(time)
         points, died = self._alive(time, reference, points)
-        begun, at_rest = self._tracker.take(time, reference, points)
+        before = self._odd
+        split = self._split.see(points, self._settings.unmoved_m)
+        points = np.where(split[:, None], np.nan, points)
+        away = self._astray(time, reference, points)
+        begun, at_rest = self._tracker.take(time, reference, points, away)
         self._beliefs.point[begun] = np.nan
-        return np.append(died, self._judge(self._with_news(at_rest)))
+        self._untold.begin(np.union1d(begun, np.flatnonzero(self._tracker.references.moved)))
+        judged = self._judge(self._with_news(at_rest))
+        odd = np.flatnonzero((self._odd != before).any(axis=0))
+        return np.unique(np.concatenate([died, odd, judged]))
+
+    def _astray(self, time: float, reference: FloatArray, points: FloatArray) -> BoolArray:
+        """Return tools that left where they rested without a command, (robot,)."""
+        tracker, settings = self._tracker, self._settings
+        told = (tracker.window.count > 0) | tracker.references.moved
+        near_m = settings.same_place_m, settings.unmoved_m
+        known = np.isfinite(tracker.references.last[:, 0]) | np.isfinite(reference).all(axis=1)
+        return self._untold.see(time, points, tracker.rest(), told, known, near_m)
+
+    @property
+    def _odd(self) -> BoolArray:
+        """Whether each robot moves without being told, or its readings are of two, (2, robot)."""
+        return np.stack([self._untold.untold, self._split.split])
 
     def conclude(self) -> None:
         """Count all that has come, as if the stream were over: answers are those of recorded runs.
@@ -170,27 +202,77 @@ class StreamingFleet:
         tracker.conclude(there)
         self._judge(there)
 
-    def diagnosis(self, robot: int, before: Diagnosis | None = None) -> Diagnosis | None:
+    def diagnosis(
+        self,
+        robot: int,
+        before: Diagnosis | None = None,
+        told: tuple[FloatArray, FloatArray] | None = None,
+    ) -> Diagnosis | None:
         """Return the diagnosis of a robot in words; None where nothing can be said yet.
 
         Args:
             robot: Its index.
             before: What was said of it before; of a fault that is older than what is remembered,
                 the onset told then stands.
+            told: Log probability of each hypothesis, (hypothesis,), and log density of each
+                movement given those before it, (movement,), where more is known than the last
+                movements say.
         """
-        beliefs, window = self._beliefs, self._tracker.window
-        known = beliefs.judged[robot] or beliefs.dead[robot]
-        if not known or window.count[robot] == 0:
+        if not self._known(robot):
+            return self._unseen(robot)
+        found, at, position = self._found(robot)
+        if told is not None:
+            log_posterior, explained = told
+            rows = np.tile(found.log_prior, (at + 1, 1))
+            rows[at], explained = log_posterior, np.tile(explained, (at + 1, 1))
+            found = replace(found, log_posterior=rows, explained=explained)
+        place = replace(position, before=before)
+        return found.to_diagnosis(at, f"robot {robot}", self._quality(robot), place=place)
+
+    def _unseen(self, robot: int) -> Diagnosis | None:
+        """Return why nothing can be said of a robot that was not judged; None: it is too early."""
+        if not self._odd[:, robot].any() or self._tracker.window.count[robot] > 0:
             return None
+        prior = dict(zip(self.hypotheses, self._prior.tolist(), strict=True))
+        reason = self._quality(robot).fatal
+        nothing = Diagnosis(f"robot {robot}", prior, undecided=reason)
+        return worded(nothing, self.diagnoser.hypothesis_set)
+
+    def seen(self, robot: int) -> tuple[RunLikelihood, StreamPosition] | None:
+        """Return what the last movements of a robot say, and where they lie in the stream.
+
+        None where nothing was judged yet.
+        """
+        if not self._known(robot):
+            return None
+        found, at, position = self._found(robot)
+        return found.likelihood[at], position
+
+    def adopt(self, imperfections: Imperfections) -> None:
+        """Judge by another healthy behaviour from now on, the last movements too."""
+        self.diagnoser = replace(self.diagnoser, imperfections=imperfections)
+        self._tracker.adopt(self.diagnoser.healthy_model)
+        self._latest = {}
+
+    def _known(self, robot: int) -> bool:
+        """Return whether anything can be said of a robot."""
+        beliefs = self._beliefs
+        known = beliefs.judged[robot] or beliefs.dead[robot] or self._odd[:, robot].any()
+        return bool(known and self._tracker.window.count[robot] > 0)
+
+    def _found(self, robot: int) -> tuple[Posterior, int, StreamPosition]:
+        """Return the last judgement of a robot, its row in that, and where the robot was."""
         if robot not in self._latest:
             self._remember(np.array([robot]), self._judgement(np.array([robot])))
-        posterior_of_runs, at, position = self._latest[robot]
-        return posterior_of_runs.to_diagnosis(
-            at,
-            f"robot {robot}",
-            DEAD if beliefs.dead[robot] else LogQuality(),
-            place=replace(position, before=before),
-        )
+        return self._latest[robot]
+
+    def _quality(self, robot: int) -> LogQuality:
+        """Return what keeps the readings of a robot from saying anything of its motors."""
+        if self._beliefs.dead[robot]:
+            return DEAD
+        if self._split.split[robot]:
+            return TWO
+        return UNTOLD if self._untold.untold[robot] else LogQuality()
 
     def _remember(self, robots: IntArray, posterior_of_runs: Posterior) -> None:
         """Keep the last judgement, and where each robot then was, for whoever asks for words."""
@@ -241,6 +323,8 @@ class StreamingFleet:
             "window": self._tracker.window,
             "beliefs": self._beliefs,
             "frozen": self._frozen,
+            "untold": self._untold,
+            "split": self._split,
         }
 
     def _checked(

@@ -123,16 +123,24 @@ class MovementTracker:
         self.window = MovementWindow.of(model, robots, movements)
         self._twin, self._settings = model.twin, model.settings
         self._least_step = 0.0 if rate_hz is None else 0.9 / rate_hz
-        self._latest_start_s = model.imperfections.timing.late_s[1] + model.lag_s + SETTLING_S
-        self._late_after_s = model.lost_commands.late_after_s
+        self._latest_start_s, self._late_after_s = _lateness(model)
 
-    def take(self, time: float, command: FloatArray, points: FloatArray) -> tuple[IntArray, ...]:
+    def adopt(self, model: HealthyModel) -> None:
+        """Judge all movements anew, by another healthy robot."""
+        self._latest_start_s, self._late_after_s = _lateness(model)
+        self.window.judged[:] = False
+
+    def take(
+        self, time: float, command: FloatArray, points: FloatArray, away: BoolArray
+    ) -> tuple[IntArray, ...]:
         """Take a sample.
 
         Args:
             time: When it was taken [s].
             command: References, (robot, motor) [rad]; NaN where not known.
             points: Tool positions, (robot, axis) [m]; NaN where there is none.
+            away: Tools that have left where they rested though no command came, (robot,): where
+                they go says nothing of the last one.
 
         Returns:
             Robots that have begun a movement, as far as is known by now, and robots whose tools
@@ -144,7 +152,18 @@ class MovementTracker:
             self.find_movements(int(robot))
         read = np.flatnonzero(np.isfinite(points).all(axis=1))
         self.window.read_s[read] = np.maximum(self.window.read_s[read], time)
-        return begun, self.look(read)
+        return begun, self.look(read[~away[read]])
+
+    def rest(self) -> FloatArray:
+        """Return where tools rest after their present movement, (robot, axis) [m].
+
+        NaN where that is not known, or the reference has moved on.
+        """
+        window = self.window
+        robots = np.arange(len(window.count))
+        last = np.maximum(window.count - 1, 0)
+        known = window.settled.usable[robots, last] & (window.count > 0) & ~self.references.moved
+        return np.where(known[:, None], window.settled.point[robots, last], np.nan)
 
     def find_movements(self, robot: int) -> None:
         """Add the movements of a reference, up to now."""
@@ -271,6 +290,12 @@ class MovementTracker:
         unmoved = np.linalg.norm(point - rested, axis=1) < self._settings.unmoved_m
         since = self.window.read_s[robots] - known.start[at]
         return np.asarray(unmoved & (since < self._latest_start_s))
+
+
+def _lateness(model: HealthyModel) -> tuple[float, float]:
+    """Return how late a movement may begin, and when readings come back of one that did [s]."""
+    latest = model.imperfections.timing.late_s[1] + model.lag_s + SETTLING_S
+    return latest, model.lost_commands.late_after_s
 
 
 def _since_rest(

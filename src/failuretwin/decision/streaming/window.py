@@ -18,13 +18,6 @@ from failuretwin.inference.joint_likelihood import (
     joint_likelihoods,
     movement_likelihoods,
 )
-from failuretwin.inference.log_quality import (
-    FROZEN_S,
-    NEAR_ZERO_M,
-    NEARLY_STILL_S,
-    STILL_M,
-    should_move,
-)
 
 
 @dataclass(frozen=True)
@@ -236,70 +229,3 @@ def _fill(old: FloatArray, new: FloatArray) -> None:
     """Replace the values of robots (robot, ...) of which something new is known, in place."""
     known = np.isfinite(new).all(axis=-1)
     old[known] = new[known]
-
-
-# Tools that stand still though motors are told to move: a dead sensor, or a dead arm.
-
-
-STILL_FOR_S = np.array([FROZEN_S, FROZEN_S, FROZEN_S, NEARLY_STILL_S])
-"""Shortest time for which each axis must stand still to be called frozen, and the tool [s]."""
-
-
-@dataclass(frozen=True)
-class FrozenSensorDetector(ArrayStruct):
-    """Watches the tools of many robots, by the same rules as `log_quality`.
-
-    Four values of each robot may stand still: each axis, as long as it reports the very same
-    number, and the tool as a whole, as long as it stays near one place.
-
-    Attributes:
-        number: What each axis reports, (robot, axis) [m].
-        place: Where the tool is, (robot, axis) [m].
-        since_s: Since when each stands still, (robot, value) [s].
-        low: Least references since then, (robot, value, motor) [rad].
-        high: Greatest ones.
-    """
-
-    number: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
-    place: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
-    since_s: Annotated[FloatArray, Axes("run", "value", empty=np.nan)]
-    low: Annotated[FloatArray, Axes("run", "value", "motor", empty=np.nan)]
-    high: Annotated[FloatArray, Axes("run", "value", "motor", empty=np.nan)]
-
-    def still_since(self, robot: int) -> float:
-        """Return since when the tool of a robot has stood where it stands [s]."""
-        return float(min(self.since_s[robot, 3], self.since_s[robot, :3].max()))
-
-    def see(
-        self, time: float, read: BoolArray, points: FloatArray, command: FloatArray, near_m: float
-    ) -> tuple[BoolArray, BoolArray]:
-        """Take readings and say what is dead.
-
-        Args:
-            time: When they were taken [s].
-            read: Robots that were read, (robot,).
-            points: Tool positions of all, (robot, axis) [m].
-            command: References of all, as far as known, (robot, motor) [rad].
-            near_m: A tool that stays this near stands still [m].
-
-        Returns:
-            Tools among those read that stand still, (robot,), and channels that do alone,
-            (robot, axis).
-        """
-        anew = np.repeat(read[:, None], 4, axis=1)
-        with np.errstate(invalid="ignore"):
-            anew[:, :3] &= ~(np.abs(points - self.number) <= STILL_M)
-            anew[:, 3] &= ~(np.abs(points - self.place).max(axis=1) <= near_m)
-        self.number[anew[:, :3]], self.place[anew[:, 3]] = points[anew[:, :3]], points[anew[:, 3]]
-        self.since_s[anew] = time
-        reference = np.broadcast_to(command[:, None], self.low.shape)
-        self.low[anew] = self.high[anew] = reference[anew]
-        np.fmin(self.low, reference, out=self.low)
-        np.fmax(self.high, reference, out=self.high)
-        with np.errstate(invalid="ignore"):
-            still = (time - self.since_s >= STILL_FOR_S) & should_move(self.high - self.low)
-        still &= read[:, None]
-        dead = still[:, 3] | still[:, :3].all(axis=1)
-        # One at zero may be held there by a stuck motor; see `log_quality`.
-        alone = still[:, :3] & ~dead[:, None] & (np.abs(self.number) > NEAR_ZERO_M)
-        return dead, alone

@@ -1,0 +1,413 @@
+"""False alarms and delays of the watch: healthy hours and faults, robots drawn at random.
+
+    python benchmarks/alarms.py [--hours 30] [--faults 200] [--seed 0] [--robot armpi_fpv]
+        [--of CALIBRATION] [--by CALIBRATION] [--robots N | --alone] [--picture FILE]
+
+Movements are seen at rest alone (`alarms_world.py`). Each healthy life is an hour of a robot of its
+own; with --robots N, N robots are drawn and each has taught the watch before. A fault is shown with
+the first movement at which what was seen speaks for it, its onset and
+size known, by 5 nats. Delay 1 is the movement that a fault spoils first; after it was shown, 0 is
+the movement that showed it. Beside the filter: a CUSUM of the residual, and a threshold on it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from alarms_world import Lives, live
+from scipy import stats
+
+import failuretwin as ft
+from failuretwin.core.alarm import RAISED
+from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.core.types import FloatArray
+from failuretwin.decision.streaming.alarm_rule import AlarmRule
+from failuretwin.decision.streaming.learning import LifeLearner
+from failuretwin.decision.streaming.monitor import FOREIGN
+from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
+from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
+from failuretwin.digital_model.nonidealities import Imperfections, vary
+from failuretwin.inference.fault_filter import FaultFilter
+from failuretwin.inference.healthy_mixture import HealthyMixture
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.joint_likelihood import movement_likelihoods
+from failuretwin.inference.priors import Priors
+from failuretwin.inference.run_likelihood import RunLikelihood
+
+BUDGETS = (0.1, 1.0, 3.0, 10.0, 30.0, 100.0)
+"""False alarms in 100 hours that are allowed."""
+AT_ONCE, MOVEMENTS, BLOCK = 10, 1560, 40
+"""Lives that are simulated together, movements of a healthy one (an hour), and judged together."""
+TAUGHT = 600
+"""Movements from which a robot is learned where some robots are asked for: 23 minutes of work."""
+FAULTY = 60
+ONSET = (15, 21)
+SHOWN_NATS = 5.0
+SPELL = 5
+"""Alarms of a residual that lie closer than so many movements are one."""
+SHARE = 0.75
+"""Share of healthy residuals below the drift of the CUSUM."""
+CAPPED = 4.0
+"""Residuals beyond so many drifts count as this: one lost command must not decide alone."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What was said of some lives.
+
+    Attributes:
+        raised: First movement of each false alarm, by life, and of each alarm of a fault.
+        cause: What was named then.
+    """
+
+    raised: list[list[int]]
+    cause: list[list[str]]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Some lives as a method sees them.
+
+    Attributes:
+        lives: The lives.
+        posterior: Of the filter, (life, movement, hypothesis).
+        hours: Of each movement, (life, movement) [h].
+        residual: Distance of the tool from where a healthy one settles, in scatters,
+            (life, movement); 0 where it was not seen.
+        shown: First movement that shows the fault, (life,); -1: none.
+    """
+
+    lives: Lives
+    posterior: FloatArray
+    hours: FloatArray
+    residual: FloatArray
+    shown: np.ndarray
+
+
+def look(lives: Lives, mixture: HealthyMixture) -> Seen:
+    """Return lives as they are seen."""
+    models = [one.model for one in mixture.filters]
+    found = [movement_likelihoods(lives.evidence, model) for model in models]
+    belief, posterior, hours = mixture.begin(len(lives.hours)), [], []
+    movements = lives.evidence.usable.shape[1]
+    for first in range(0, movements, BLOCK):
+        before = max(first - 1, 0)
+        part = (slice(None), slice(before, min(first + BLOCK, movements)))
+        says = [
+            one.evidence(RunLikelihood(lives.evidence[part], one.model, remembered=known[part]))
+            for one, known in zip(mixture.filters, found, strict=True)
+        ]
+        for at in range(first - before, says[0].hours.shape[1]):
+            belief = mixture.advance(belief, says, at)
+            posterior.append(mixture.posterior(belief))
+            hours.append(says[0].hours[:, at])
+    model = models[0]
+    whole = RunLikelihood(lives.evidence, model, remembered=found[0])
+    pose = found[0].expected[:, :, 0]
+    error, _, spread = model.residual(lives.evidence.point, pose, model.scatter)
+    residual = np.where(lives.evidence.usable, np.sqrt(spread.product(error, error)), 0.0)
+    return Seen(
+        lives,
+        np.stack(posterior, axis=1),
+        np.stack(hours, axis=1),
+        residual,
+        _shown(lives, whole),
+    )
+
+
+def taught(
+    twin: ft.DigitalTwin, robot_itself: Imperfections, diagnoser: ft.BayesDiagnoser, seed: int
+) -> HealthyModel:
+    """Return what a watch has learned of one robot after `TAUGHT` movements."""
+    life = live(twin, robot_itself, ["healthy"], TAUGHT, ONSET, seed).evidence
+    learner, stood = LifeLearner(diagnoser), life.movements.origin()
+    for m in range(TAUGHT):
+        one = life[(slice(None), slice(m, m + 1))]
+        learner.take(replace(one, movements=replace(one.movements, initial=stood[:, m])), True)
+    return learner.model
+
+
+def joined(parts: Sequence[Seen]) -> Seen:
+    """Return lives that were seen apart as one; what was seen of them is left out."""
+    lives = replace(
+        parts[0].lives,
+        hours=np.concatenate([part.lives.hours for part in parts]),
+        truth=[fault for part in parts for fault in part.lives.truth],
+        onset=np.concatenate([part.lives.onset for part in parts]),
+    )
+    names = ("posterior", "hours", "residual", "shown")
+    values = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return Seen(lives, **values)
+
+
+def _shown(lives: Lives, likelihood: RunLikelihood) -> np.ndarray:
+    """Return the first movement that shows each fault, (life,); -1: none does."""
+    shown = np.full(len(lives.hours), -1)
+    for i, fault in enumerate(lives.truth):
+        if fault == "healthy":
+            continue
+        one = likelihood[i]
+        profile = one.profile(one.model.motor_names.index(fault.partition(":")[0]))
+        stuck = np.isfinite(lives.held[i])
+        angle = np.full_like(profile.mode, lives.held[i]) if stuck else profile.faulty_baseline
+        angle = angle + lives.off[i, :, None]
+        log_ratio = (
+            profile.log_density(angle[:, :, None], bool(stuck))[0, :, 0] - one.log_healthy[0]
+        )
+        log_ratio[: lives.onset[i]] = 0.0
+        beyond = np.cumsum(log_ratio) >= SHOWN_NATS
+        shown[i] = int(np.argmax(beyond)) if beyond.any() else -1
+    return shown
+
+
+def by_filter(seen: Seen, names: Sequence[str], faults_per_h: float, budget: float) -> Told:
+    """Return what the filter says if so many false alarms in 100 hours are allowed."""
+    told = Told([], [])
+    for posterior, hours in zip(seen.posterior, seen.hours, strict=True):
+        rule, episode = AlarmRule(names, faults_per_h, budget), None
+        raised: list[int] = []
+        cause: list[str] = []
+        for m in range(len(posterior)):
+            alarm = rule.see(float(m), posterior[m], float(hours[m]))
+            if alarm.state == RAISED and alarm.episode != episode:
+                raised.append(m)
+                cause.append(alarm.cause)
+                episode = alarm.episode
+        told.raised.append(raised)
+        told.cause.append(cause)
+    return told
+
+
+def by_threshold(values: FloatArray, threshold: float) -> Told:
+    """Return what a threshold says of values (life, movement); it names nothing."""
+    told = Told([], [])
+    for row in values:
+        above = np.flatnonzero(row > threshold)
+        first = [int(m) for k, m in enumerate(above) if k == 0 or m - above[k - 1] > SPELL]
+        told.raised.append(first)
+        told.cause.append(["?"] * len(first))
+    return told
+
+
+def cusum(residual: FloatArray, drift: float) -> FloatArray:
+    """Return the CUSUM of residuals, (life, movement); what it says of a fault does not go back."""
+    total, most = np.zeros_like(residual), CAPPED * drift
+    for m in range(residual.shape[1]):
+        before = total[:, m - 1] if m else 0.0
+        total[:, m] = np.maximum(0.0, before + np.minimum(residual[:, m], most) - drift)
+    return total
+
+
+def false_alarms(told: Told, hours: float) -> str:
+    """Return false alarms in 100 hours with their 95 % Poisson interval."""
+    count = sum(map(len, told.raised))
+    low = stats.chi2.ppf(0.025, 2 * count) / 2.0 if count else 0.0
+    high = stats.chi2.ppf(0.975, 2 * count + 2) / 2.0
+    return f"{100 * count / hours:6.1f} [{100 * low / hours:5.1f} to {100 * high / hours:5.1f}]"
+
+
+@dataclass(frozen=True)
+class Delays:
+    """How faults were found: delay and delay after shown, of those that were, and who was named."""
+
+    found: int
+    of: int
+    movements: FloatArray
+    after_shown: FloatArray
+    right: int
+
+    @classmethod
+    def of_alarms(cls, told: Told, seen: Seen, some: Sequence[int]) -> Delays:
+        """Return the delays of some lives; alarms before the onset do not count."""
+        movements, after, right = [], [], 0
+        for i in some:
+            onset, shown = int(seen.lives.onset[i]), int(seen.shown[i])
+            rows = zip(told.raised[i], told.cause[i], strict=True)
+            first = next(((m, c) for m, c in rows if m >= onset), None)
+            if first is None:
+                continue
+            movements.append(first[0] - onset + 1)
+            after.append(first[0] - shown if shown >= 0 else np.nan)
+            right += first[1] == seen.lives.truth[i]
+        return cls(len(movements), len(some), np.array(movements), np.array(after), right)
+
+    def __str__(self) -> str:
+        if not self.found:
+            return f"found 0 of {self.of}"
+        quantiles = np.quantile(self.movements, (0.5, 0.9, 0.99), method="inverted_cdf")
+        after = np.nanquantile(self.after_shown, (0.5, 0.9), method="inverted_cdf")
+        right = f"right {100 * self.right / self.found:.1f} %" if self.right else "names nothing"
+        return (
+            f"found {self.found} of {self.of}; movements {'/'.join(f'{q:.0f}' for q in quantiles)};"
+            f" after shown {'/'.join(f'{q:.0f}' for q in after)}; {right}"
+        )
+
+
+def healthy_lives(
+    twin: ft.DigitalTwin, imperfections: Imperfections, hours: int, seed: int
+) -> Iterator[Lives]:
+    """Yield healthy lives of an hour."""
+    for number in range(0, hours, AT_ONCE):
+        count = min(AT_ONCE, hours - number)
+        yield live(twin, imperfections, ["healthy"] * count, MOVEMENTS, ONSET, seed + number)
+
+
+def candidates(
+    known: CalibratedRobot, alone: bool, works: CalibratedRobot | None, seed: int
+) -> HealthyMixture:
+    """Return what a watch believes that its robot may be.
+
+    Args:
+        known: The calibration that it was given.
+        alone: Whether that is believed for sure.
+        works: The robot that has taught it; None: none has, it knows arms of the kind.
+        seed: Seed of what it was taught by.
+    """
+    hypotheses = paper_hypotheses(known.robot.motor_names)
+    model, cold = HealthyModel.of(known), known.imperfections.name == GENERIC_NAME
+    models = [model]
+    if works is not None:
+        diagnoser = ft.BayesDiagnoser(known, whole_run=False)
+        own = taught(works.twin, works.imperfections, diagnoser, seed + 5_000)
+        models = [own] if cold else [model, own]
+    elif not (alone or cold):
+        models.append(HealthyModel.of(known.twin, generic_imperfections(known.robot)))
+    filters = [FaultFilter(model, hypotheses, Priors()) for model in models]
+    share = np.array([1.0 - FOREIGN, FOREIGN] if len(filters) > 1 else [1.0])
+    return HealthyMixture(filters, share)
+
+
+def watched(
+    works: CalibratedRobot, mixture: HealthyMixture, counts: tuple[int, int], seed: int
+) -> tuple[list[Seen], Seen]:
+    """Return healthy hours and faults of a robot as they are seen; `counts` says how many."""
+    names = [str(h) for h in paper_hypotheses(works.robot.motor_names)]
+    hours, count = counts
+    healthy = healthy_lives(works.twin, works.imperfections, hours, seed)
+    faults = [names[1 + k % (len(names) - 1)] for k in range(count)]
+    broken = live(works.twin, works.imperfections, faults, FAULTY, ONSET, seed + 7_777)
+    return [look(lives, mixture) for lives in healthy], look(broken, mixture)
+
+
+def main() -> None:
+    """Print the tables, and draw the picture."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--hours", type=int, default=30)
+    parser.add_argument("--faults", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--robot", default="armpi_fpv")
+    parser.add_argument("--of", default=None, help="calibration of the robot that works")
+    parser.add_argument("--by", default=None, help="calibration that the watch uses")
+    parser.add_argument("--robots", type=int, default=0, help="so many, which have taught")
+    parser.add_argument("--alone", action="store_true", help="believe the calibration for sure")
+    parser.add_argument("--picture", type=Path)
+    options = parser.parse_args()
+    robot = ft.load_robot(options.robot)
+    works, known = (load_calibration(name, robot) for name in (options.of, options.by))
+    names = [str(h) for h in paper_hypotheses(robot.motor_names)]
+    begun, rng = time.process_time(), np.random.default_rng(options.seed)
+    groups = max(options.robots, 1)
+    counts = options.hours // groups, options.faults // groups
+    healthy, broken_parts = [], []
+    for group in range(groups):
+        itself = vary(works.imperfections, rng) if options.robots else works.imperfections
+        robot_itself = replace(works, imperfections=itself)
+        seed = options.seed + 10_000 * group
+        mixture = candidates(known, options.alone, robot_itself if options.robots else None, seed)
+        usual, faulty = watched(robot_itself, mixture, counts, seed)
+        healthy += usual
+        broken_parts.append(faulty)
+    broken, faults_per_h = joined(broken_parts), mixture.filters[0].faults_per_h
+    truth = broken.lives.truth
+    hours = sum(float(seen.lives.hours.sum()) for seen in healthy)
+    print(f"{hours:.0f} h, {options.faults} faults, {time.process_time() - begun:.0f} s of a core")
+    curves: dict[str, list[tuple[float, float]]] = {}
+    everything = range(len(truth))
+    for budget in BUDGETS:
+        rows = [by_filter(seen, names, faults_per_h, budget) for seen in healthy]
+        alarms = Told([r for t in rows for r in t.raised], [c for t in rows for c in t.cause])
+        told = by_filter(broken, names, faults_per_h, budget)
+        delays = Delays.of_alarms(told, broken, everything)
+        _note(curves, "filter", alarms, hours, delays)
+        print(f"filter, {budget:5.1f} allowed: {false_alarms(alarms, hours)}; {delays}", flush=True)
+        if budget == 1.0:
+            which = [c for row in alarms.cause for c in row]
+            print(f"    false ones name {dict(Counter(which))}")
+            for name in names[1:]:
+                some = [i for i in everything if truth[i] == name]
+                print(f"    {name:30s} {Delays.of_alarms(told, broken, some)}")
+    by_residual(healthy, broken, curves)
+    if options.picture:
+        draw(curves, options.picture)
+
+
+def by_residual(
+    healthy: Sequence[Seen], broken: Seen, curves: dict[str, list[tuple[float, float]]]
+) -> None:
+    """Print what a CUSUM of the residual and a threshold on it give."""
+    everything = range(len(broken.lives.hours))
+    hours = sum(float(seen.lives.hours.sum()) for seen in healthy)
+    residual = np.concatenate([seen.residual for seen in healthy])
+    drift = float(np.quantile(residual[residual > 0.0], SHARE))
+    methods = {
+        "CUSUM of the residual": (cusum(residual, drift), cusum(broken.residual, drift)),
+        "threshold on the residual": (residual, broken.residual),
+    }
+    for name, (usual, faulty) in methods.items():
+        for per_100_h in (1.0, 10.0, 100.0):
+            top = _threshold(usual, per_100_h * hours / 100.0)
+            alarms, told = by_threshold(usual, top), by_threshold(faulty, top)
+            delays = Delays.of_alarms(told, broken, everything)
+            _note(curves, name, alarms, hours, delays)
+            print(f"{name}: {false_alarms(alarms, hours)}; {delays}", flush=True)
+
+
+def _threshold(values: FloatArray, spells: float) -> float:
+    """Return the threshold that values exceed in so many spells."""
+    candidates = np.unique(np.quantile(values, 1.0 - np.geomspace(1e-6, 0.05, 200)))
+    counts = [sum(map(len, by_threshold(values, float(c)).raised)) for c in candidates]
+    fitting = [c for c, count in zip(candidates, counts, strict=True) if count <= spells]
+    return float(min(fitting, default=values.max()))
+
+
+def _note(
+    curves: dict[str, list[tuple[float, float]]],
+    name: str,
+    alarms: Told,
+    hours: float,
+    delays: Delays,
+) -> None:
+    missed = np.full(delays.of - delays.found, np.inf)
+    late = np.quantile(np.append(delays.movements, missed), 0.9, method="inverted_cdf")
+    rate = 100.0 * sum(map(len, alarms.raised)) / hours
+    curves.setdefault(name, []).append((rate, float(late)))
+
+
+def draw(curves: dict[str, list[tuple[float, float]]], path: Path) -> None:
+    """Draw false alarms against the delay within which nine of ten faults are found."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(6.4, 4.0))
+    for name, points in curves.items():
+        rate, delay = np.array(points).T
+        axes.plot(np.maximum(rate, 0.1), np.minimum(delay, FAULTY), "o-", label=name)
+    axes.set_xscale("log")
+    axes.set_xlabel("false alarms in 100 h (0.1: none seen)")
+    axes.set_ylabel("movements until nine of ten faults are found")
+    axes.set_ylim(0, 30)
+    axes.legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    main()

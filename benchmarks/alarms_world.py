@@ -1,0 +1,159 @@
+"""Lives of robots seen at rest alone: hours of movements in seconds.
+
+What `EmulatedArm` does to a robot, without the way between plateaus: offsets of its own, scatter,
+lost commands, late starts, gaps in which a movement is not seen, whole counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from failuretwin.core.movements import Movements
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.digital_model.disturbances import (
+    Disturbances,
+    actual_movements,
+    delay_commands,
+    draw_disturbances,
+    stack,
+)
+from failuretwin.digital_model.nonidealities import Imperfections, vary
+from failuretwin.digital_model.settling import sag
+from failuretwin.digital_model.twin import SAG_ROUNDS, DigitalTwin
+from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
+from failuretwin.inference.evidence import JUST_AFTER_S, SETTLING_S, SettledEvidence
+from failuretwin.inference.settings import InferenceSettings
+
+READ_S = 0.05
+"""Time from a command to the first reading after it [s], if the bus does not stall."""
+ERROR_RAD = (np.deg2rad(2.4), np.deg2rad(12.0))
+"""The paper's steady-state errors, 10 to 50 counts [rad]."""
+
+
+@dataclass(frozen=True)
+class Lives:
+    """Some lives of equally many movements.
+
+    Attributes:
+        evidence: What was seen.
+        hours: Length of each, (life,) [h].
+        truth: What is the case from its onset on, (life,), such as ``motor_1:stuck``.
+        onset: First movement that a fault spoils, (life,); past the last of healthy ones.
+        at_rest: Whether a motor got stuck on a plateau, (life,).
+        held: Angle of a stuck motor, (life,) [rad]; NaN of others.
+        off: Steady-state error of each movement, (life, movement) [rad]; 0 without.
+        late: Movements that start late, (life, movement).
+    """
+
+    evidence: SettledEvidence
+    hours: FloatArray
+    truth: Sequence[str]
+    onset: IntArray
+    at_rest: BoolArray
+    held: FloatArray
+    off: FloatArray
+    late: BoolArray
+
+
+def live(
+    twin: DigitalTwin,
+    imperfections: Imperfections,
+    faults: Sequence[str],
+    movements: int,
+    onset: tuple[int, int],
+    seed: int,
+    gaps: bool = True,
+) -> Lives:
+    """Return lives, each of a robot drawn anew from what the imperfections say of robots.
+
+    Args:
+        twin: Kinematics.
+        imperfections: What such robots are like.
+        faults: ``healthy``, ``motor_k:stuck`` or ``motor_k:steady_state_error`` of each life.
+        movements: Movements of each life.
+        onset: First and last movement that a fault may spoil first.
+        seed: Seed of all chance.
+        gaps: Whether a bus that stalls swallows the readings before a late start.
+    """
+    rng, robot = np.random.default_rng(seed), twin.robot
+    own = [vary(imperfections, rng) for _ in faults]
+    drawn = RandomMovements(count=movements)
+    told = stack_movements([drawn.draw(robot, imperfections.schedule, rng) for _ in faults])
+    chance = stack([draw_disturbances(one, robot, movements, 0.0, rng) for one in own])
+    told = delay_commands(told, chance.late)
+    first = rng.integers(onset[0], onset[1] + 1, len(faults))
+    first[[fault == "healthy" for fault in faults]] = movements
+    motor = np.array([_motor(fault, robot.motor_names) for fault in faults])
+    spoilt = np.arange(movements) >= first[:, None]
+    errs = np.array([fault.endswith("error") for fault in faults])
+    off = rng.uniform(*ERROR_RAD, spoilt.shape) * rng.choice([-1.0, 1.0], spoilt.shape)
+    off = np.where(spoilt & errs[:, None], off, 0.0)
+    target = told.target.copy()
+    target[np.arange(len(faults)), :, motor] += off
+    base = actual_movements(replace(told, target=target), chance).target
+    angle, at_rest, held = _settled(twin, told, chance, faults, motor, spoilt, rng, base)
+    readings = imperfections.readings
+    if readings is not None and readings.whole_counts:
+        units = robot.servo_units
+        angle = units.to_rad(np.round(units.to_counts(angle)))
+    noise_m = InferenceSettings.of(robot, imperfections).least_noise_m
+    point = twin.path(angle) + rng.normal(0.0, noise_m, (*angle.shape[:2], 3))
+    usable = np.ones(point.shape[:2], dtype=bool)
+    late = chance.late > 0.0
+    if gaps:
+        usable[:, :-1] = ~late[:, 1:]
+    begin = told.start + chance.late + told.ramp_duration.max(axis=-1) + SETTLING_S
+    evidence = SettledEvidence(
+        movements=told,
+        point=np.where(usable[..., None], point, 0.0),
+        usable=usable,
+        moving=np.zeros_like(usable),
+        begin=begin,
+        end=begin + JUST_AFTER_S,
+        first_reading_delay=chance.late + READ_S,
+    )
+    hours = (told.start[:, -1] - told.start[:, 0]) / 3600.0
+    return Lives(evidence, hours, faults, first, at_rest, held, off, late)
+
+
+def _motor(fault: str, names: Sequence[str]) -> int:
+    return 0 if fault == "healthy" else list(names).index(fault.partition(":")[0])
+
+
+def _settled(
+    twin: DigitalTwin,
+    told: Movements,
+    chance: Disturbances,
+    faults: Sequence[str],
+    motor: IntArray,
+    spoilt: BoolArray,
+    rng: np.random.Generator,
+    base: FloatArray,
+) -> tuple[FloatArray, BoolArray, FloatArray]:
+    """Return where motors settle (life, movement, motor) [rad], and how stuck ones are held."""
+    compliance = chance.compliance[:, None]
+
+    def sagged(base: FloatArray, stays: BoolArray) -> FloatArray:
+        angle = base
+        for _ in range(SAG_ROUNDS):
+            angle = np.where(stays, base, base + sag(twin.robot, angle, compliance, 0.0))
+        return angle
+
+    angle = sagged(base, np.zeros_like(base, dtype=bool))
+    stuck = np.array([fault.endswith("stuck") for fault in faults])
+    at_rest, held = np.zeros(len(faults), dtype=bool), np.full(len(faults), np.nan)
+    stays = np.zeros_like(base, dtype=bool)
+    for i in np.flatnonzero(stuck):
+        m, k = int(np.argmax(spoilt[i])), motor[i]
+        ramp = told.ramp_duration[i, m, k]
+        period = float(np.median(np.diff(told.start[i])))
+        place = rng.random() * period - (period - ramp)
+        at_rest[i] = place < 0.0
+        before, after = angle[i, m - 1, k], angle[i, m, k]
+        held[i] = before + (after - before) * max(place, 0.0) / ramp
+        stays[i, m:, k] = True
+        base[i, m:, k] = held[i]
+    return sagged(base, stays), at_rest, held

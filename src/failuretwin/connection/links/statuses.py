@@ -1,0 +1,167 @@
+"""Answers as the statuses of the arm and of each motor: one rule for all who are told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from failuretwin.connection.links.base import STALE, Answer
+from failuretwin.core.alarm import CLEAR, RAISED, SUSPECTED, Alarm
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis
+from failuretwin.inference.explanation import percent, plain_name
+
+LEVEL_OK, LEVEL_WARN, LEVEL_ERROR, LEVEL_STALE = range(4)
+"""Levels of ``diagnostic_msgs/DiagnosticStatus``."""
+LEVEL_NAMES = ("OK", "WARN", "ERROR", "STALE")
+LEVELS = {CLEAR: LEVEL_OK, SUSPECTED: LEVEL_WARN, RAISED: LEVEL_ERROR}
+PERIOD_S = 1.0
+"""Time between two reports when nothing gets worse [s]."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """State of a motor or of the whole arm.
+
+    Attributes:
+        name: ``arm``, or the name of the motor.
+        level: One of the four levels.
+        message: What is the matter, in words.
+        values: Key-values: probability, mode, magnitude, onset, runner-up.
+    """
+
+    name: str
+    level: int
+    message: str
+    values: Mapping[str, str]
+
+
+def statuses(answer: Answer, motors: Sequence[str]) -> list[Status]:
+    """Return the statuses of an answer: the arm first, then its motors.
+
+    The alarm decides the levels, whatever the probabilities are.
+    Without data everything is stale; what was known before is told with it.
+
+    Args:
+        answer: The answer.
+        motors: Names of the robot's motors in chain order.
+    """
+    names = ["arm", *motors]
+    diagnosis = answer.diagnosis
+    if diagnosis is None:
+        text = "no data have come yet" if answer.state == STALE else "nothing can be said yet"
+        return [Status(name, LEVEL_STALE, text, {}) for name in names]
+    alarm = answer.alarm
+    if diagnosis.undecided:
+        found = [
+            Status(name, max(LEVEL_WARN, _level(alarm, name)), diagnosis.verdict, {})
+            for name in names
+        ]
+    else:
+        found = [_arm(diagnosis, alarm), *(_motor(diagnosis, alarm, motor) for motor in motors)]
+    if answer.state != STALE:
+        return found
+    told = "no data for a while; before that: "
+    return [Status(s.name, LEVEL_STALE, told + s.message, s.values) for s in found]
+
+
+def _arm(diagnosis: Diagnosis, alarm: Alarm) -> Status:
+    best = diagnosis.ranked[0]
+    values = {"alarm": alarm.state} | _episode(alarm)
+    values |= {"diagnosis": best, "probability": _number(diagnosis.posterior[best])}
+    if best != "healthy":
+        values |= _size(diagnosis)
+    if diagnosis.runner_up is not None:
+        runner_up = diagnosis.runner_up
+        values |= {
+            "runner_up": runner_up,
+            "runner_up_probability": _number(diagnosis.posterior[runner_up]),
+        }
+    message = diagnosis.verdict
+    if alarm.cause and alarm.cause != best:
+        share = diagnosis.posterior.get(alarm.cause, 0.0)
+        what = plain_name(Hypothesis.parse(alarm.cause))
+        message = f"{alarm.state}: {what}, {percent(share)}; {message}"
+    elif alarm.state == SUSPECTED:
+        message = f"{alarm.state}: {message}"
+    return Status("arm", LEVELS[alarm.state], message, values)
+
+
+def _episode(alarm: Alarm) -> dict[str, str]:
+    """Return the last fault that an alarm told of."""
+    episode = alarm.episode
+    if episode is None:
+        return {}
+    told = {
+        "episode": str(episode.number),
+        "episode_cause": episode.cause,
+        "raised_s": f"{episode.raised_s:.2f}",
+    }
+    if episode.cleared_s is not None:
+        told["cleared_s"] = f"{episode.cleared_s:.2f}"
+    return told
+
+
+def _motor(diagnosis: Diagnosis, alarm: Alarm, motor: str) -> Status:
+    modes = {
+        fault.mode: probability
+        for name, probability in diagnosis.posterior.items()
+        for fault in Hypothesis.parse(name).faults
+        if fault.motor == motor
+    }
+    total = min(1.0, sum(modes.values()))
+    ranked = sorted(modes, key=lambda mode: -modes[mode])
+    values = {"probability": _number(total)}
+    if ranked:
+        values["mode"] = ranked[0]
+        best = diagnosis.ranked[0]
+        if f"{motor}:{ranked[0]}" in best.split("+"):
+            values |= _size(diagnosis)
+    if len(ranked) > 1:
+        values["runner_up"] = ranked[1]
+    level = _level(alarm, motor)
+    if level == LEVEL_OK or not ranked:
+        return Status(motor, level, f"no fault seen ({100 * total:.1f} % faulty)", values)
+    return Status(motor, level, f"{ranked[0]}, {100 * total:.1f} %", values)
+
+
+def _size(diagnosis: Diagnosis) -> dict[str, str]:
+    values = {}
+    if diagnosis.magnitude is not None and np.isfinite(diagnosis.magnitude):
+        values["magnitude"] = _number(diagnosis.magnitude)
+        values["magnitude_unit"] = diagnosis.magnitude_unit or ""
+    if diagnosis.onset_s is not None:
+        values["onset_s"] = f"{diagnosis.onset_s:.2f}"
+    return values
+
+
+def _number(value: float) -> str:
+    return f"{value:.6g}"
+
+
+def _level(alarm: Alarm, name: str) -> int:
+    """Return the level of the arm, or of a motor by its name."""
+    return LEVELS[alarm.state] if name == "arm" or alarm.concerns(name) else LEVEL_OK
+
+
+class RateLimiter:
+    """Says when to report: every second, and at once when any status gets worse."""
+
+    def __init__(self) -> None:
+        self._levels: list[int] = []
+        self._due_s = -np.inf
+
+    def due(self, found: Sequence[Status], now_s: float) -> bool:
+        """Return whether these statuses are to be reported now.
+
+        Args:
+            found: The statuses.
+            now_s: Our own monotonic clock [s].
+        """
+        levels = [status.level for status in found]
+        worse = any(new > old for new, old in zip(levels, self._levels, strict=False))
+        if not worse and now_s < self._due_s:
+            return False
+        self._levels, self._due_s = levels, now_s + PERIOD_S
+        return True

@@ -1,0 +1,141 @@
+"""What a watch learns of its robot as it goes: finished movements teach the life filter.
+
+Movements are judged before they are learned from; what is suspected of a motor in a run teaches of
+the others alone (`LifeFilter`).
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+
+from failuretwin.connection.tracked_diagnosis import begin, with_timing_of
+from failuretwin.core.errors import InputError
+from failuretwin.core.movements import Movements
+from failuretwin.digital_model.nonidealities import Imperfections, Variation
+from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.evidence import SettledEvidence
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.shared_unknowns import SetupPrior
+
+RUN = 5
+"""Movements of a run that is learned from at first: as many as a run of the paper has."""
+LONG_RUN = 20
+"""The same once the robot is known a little: longer runs cost less time."""
+LITTLE = 100
+"""Movements from which it is."""
+TIMED = 200
+"""Latest movements whose commands tell how late this robot starts."""
+
+
+class LifeLearner:
+    """Learns of one robot from its movements, beginning with what arms of its kind are like.
+
+    The frame of the sensor is taken to be as the profile says. A run is worked on in a thread of
+    its own, so that answers need not wait; what it taught is known when the next run is complete,
+    however fast time passes.
+
+    Args:
+        diagnoser: The method, with its hypotheses and priors.
+    """
+
+    def __init__(self, diagnoser: BayesDiagnoser) -> None:
+        known = replace(diagnoser.priors, setup=SetupPrior.known())
+        self._diagnoser = replace(diagnoser, priors=known)
+        self._life = begin(self._diagnoser, cold=True)
+        self._waiting: list[SettledEvidence] = []
+        self._told: Movements | None = None
+        self._worker = ThreadPoolExecutor(1, "learning")
+        self._work: Future[None] | None = None
+        self.model = self._life.model
+        self.movements = 0
+
+    def take(self, movement: SettledEvidence, learns: bool) -> bool:
+        """Take in a finished movement and return whether the model has changed.
+
+        Args:
+            movement: A run of this movement alone, by the time of the stream.
+            learns: Whether it is worth while; else it is only remembered for a while.
+        """
+        self._waiting.append(movement)
+        run = RUN if self.movements < LITTLE else LONG_RUN
+        if len(self._waiting) < run:
+            return False
+        if not learns:
+            self._waiting = self._waiting[1:]
+            return False
+        taught = self._finish()
+        seen, self._waiting = _joined(self._waiting), []
+        told = seen.movements
+        self._told = told if self._told is None else _followed_by(self._told, told)
+        if seen.usable.any():
+            self._work = self._worker.submit(self._follow, seen, _from_zero(self._told))
+        return taught
+
+    def _finish(self) -> bool:
+        """Wait until the last run is learned and return whether there was one."""
+        if self._work is None:
+            return False
+        work, self._work = self._work, None
+        try:
+            work.result()
+            self.movements, self.model = self._life.movements, self._model()
+        except (InputError, np.linalg.LinAlgError):
+            # What was learned makes no sense. What was believed before counts on, and all begins
+            # anew: a watch must not end because of what it learns.
+            self._life, self._told, self.movements = begin(self._diagnoser, cold=True), None, 0
+            return False
+        return True
+
+    def _follow(self, run: SettledEvidence, told: Movements) -> None:
+        life, robot = self._life, self._life.model.twin.robot
+        now = with_timing_of(life.model.imperfections, told, robot)
+        life.model = replace(life.model, imperfections=_learning(now))
+        life.follow(replace(run, movements=_from_zero(run.movements)))
+
+    def _model(self) -> HealthyModel:
+        """Return the robot as it is believed to be by now, with what is left of the doubt."""
+        life, learned = self._life, self._life.learned
+        _, (bias, compliance, friction) = life.offsets
+        size = np.abs(np.asarray(learned.settling.compliance if learned.settling else 0.0))
+        relative = np.divide(compliance, size, out=np.zeros_like(compliance), where=size > 1e-9)
+        doubt = replace(
+            learned.variation or Variation(),
+            bias=tuple(bias.tolist()),
+            compliance=tuple(np.minimum(relative, 1.0).tolist()),
+            friction=tuple(friction.tolist()),
+        )
+        return replace(life.model, imperfections=replace(learned, variation=doubt))
+
+
+def _learning(now: Imperfections) -> Imperfections:
+    """Return imperfections that say that runs taught them."""
+    name = now.name if now.name.endswith("learned") else f"{now.name}, learned"
+    return replace(now, name=name, protocol="P1")
+
+
+def _joined(movements: list[SettledEvidence]) -> SettledEvidence:
+    """Return movements one after the other as one run."""
+    run = movements[0].blank(1, len(movements))
+    for at, movement in enumerate(movements):
+        run.put((slice(0, 1), slice(at, at + 1)), movement)
+    run.movements.initial[:] = movements[0].movements.initial
+    return run
+
+
+def _from_zero(movements: Movements) -> Movements:
+    """Return movements with times from the first command on."""
+    return replace(movements, start=movements.start - movements.start[:, :1])
+
+
+def _followed_by(before: Movements, after: Movements) -> Movements:
+    """Return the movements of a robot with later ones behind them, the latest `TIMED`."""
+    return Movements(
+        before.initial,
+        *(
+            np.concatenate([getattr(before, name), getattr(after, name)], axis=1)[:, -TIMED:]
+            for name in ("target", "ramp_duration", "start")
+        ),
+    )

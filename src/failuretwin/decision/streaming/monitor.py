@@ -1,0 +1,222 @@
+"""Watching one robot at work: what is the case by all movements so far, and when to call somebody.
+
+The last movements are seen and estimated as by `StreamingDiagnoser`; what is believed of the
+faults comes from all movements so far (`FaultFilter`), by the calibration that is given and by what
+the robot itself teaches (`HealthyMixture`, `LifeLearner`); the alarm comes from `AlarmRule`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from failuretwin.connection.links.base import OK, STALE, Answer
+from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.numerics import log_of
+from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.decision.streaming.alarm_rule import AlarmRule
+from failuretwin.decision.streaming.diagnoser import reference_of
+from failuretwin.decision.streaming.fleet import StreamingFleet
+from failuretwin.decision.streaming.learning import LifeLearner
+from failuretwin.digital_model.arm_classes import GENERIC_NAME
+from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
+from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.evidence import SettledEvidence
+from failuretwin.inference.fault_filter import RATES, FaultFilter, FaultRates
+from failuretwin.inference.healthy_mixture import HealthyMixture
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.posterior import StreamPosition
+from failuretwin.inference.run_likelihood import RunLikelihood
+
+WORTH_LEARNING = 0.01
+"""Probability that the calibration that was given is not this robot's from which it learns."""
+FOREIGN = 0.1
+"""Probability that a calibration is of another robot, or no longer true; assumed."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Whose healthy behaviour the robot has, so far.
+
+    Attributes:
+        given: Name of the calibration that was given; empty: none of this robot.
+        fits: Probability that it is this robot's; 0 without one.
+        learned: Movements that this robot itself has taught.
+    """
+
+    given: str
+    fits: float
+    learned: int
+
+
+class FaultMonitor:
+    """Watches one robot; times and samples as of `StreamingDiagnoser.update`.
+
+    Args:
+        diagnoser: The method, with its hypotheses and healthy behaviour.
+        false_alarms_per_100h: False alarms that are allowed in 100 hours of work.
+        rates: How often faults come and go.
+
+    Raises:
+        InputError: If the budget makes no sense, or a hypothesis cannot be followed.
+    """
+
+    def __init__(
+        self,
+        diagnoser: BayesDiagnoser,
+        false_alarms_per_100h: float = 1.0,
+        rates: FaultRates = RATES,
+    ) -> None:
+        self._fleet = StreamingFleet(diagnoser, 1)
+        known = diagnoser.healthy_model
+        ideal, cold = known.imperfections.settling is None, known.imperfections.name == GENERIC_NAME
+        self._learner = None if ideal else LifeLearner(diagnoser)
+        self._models: list[HealthyModel] = [] if cold else [known]
+        if self._learner is not None:
+            self._models.append(self._learner.model)
+        hypotheses, priors = diagnoser.hypothesis_set, diagnoser.priors
+        filters = [FaultFilter(model, hypotheses, priors, rates) for model in self._models]
+        share = [1.0] if len(filters) == 1 else [1.0 - FOREIGN, FOREIGN]
+        self._mixture = HealthyMixture(filters, np.array(share))
+        self._given = "" if cold else known.imperfections.name
+        self._rule = AlarmRule(
+            self._fleet.hypotheses, filters[0].faults_per_h, false_alarms_per_100h
+        )
+        self._concluded = self._mixture.begin(1)
+        self._movements = 0
+        self._explained: dict[int, float] = {}
+        self._diagnosis: Diagnosis | None = None
+
+    @property
+    def fit(self) -> Fit:
+        """Whose healthy behaviour the robot has, so far."""
+        fits = float(np.exp(self._concluded.log_weight[0, 0])) if self._given else 0.0
+        return Fit(self._given, fits, 0 if self._learner is None else self._learner.movements)
+
+    def update(
+        self,
+        time: float,
+        command: Mapping[str, float] | ArrayLike | None,
+        measured: ArrayLike | None,
+    ) -> Answer:
+        """Take what is known at a time and return what is believed then.
+
+        Args:
+            time: Time of the stream [s]; a sample may come late, as long as its movement lasts.
+            command: Reference of every motor, by name or (motor,) [rad]; None: not known.
+            measured: Tool position, (axis,) [m]; None or NaN: no reading.
+
+        Raises:
+            InputError: If a motor is missing, shapes do not fit or the time is not finite.
+        """
+        motors = self._fleet.diagnoser.twin.robot.motor_names
+        reference = None if command is None else reference_of(motors, command)[None]
+        point = None if measured is None else as_floats(measured)[None]
+        if len(self._fleet.update(time, reference, point)):
+            self._judge()
+        return self._answer()
+
+    def conclude(self) -> Answer:
+        """Count all that has come, as if the stream were over."""
+        self._fleet.conclude()
+        self._judge()
+        return self._answer()
+
+    def _answer(self) -> Answer:
+        state = STALE if self._fleet.stale[0] else OK
+        return Answer(self._fleet.time, state, self._diagnosis, self._rule.alarm)
+
+    def _judge(self) -> None:
+        """Renew what is believed by what the last movements say."""
+        seen, told = self._fleet.seen(0), None
+        if seen is not None:
+            likelihood, position = seen
+            posterior, before = self._followed(likelihood, position), position.movements
+            window = range(before, before + likelihood.usable.shape[1])
+            explained = np.array([self._explained.get(m, np.inf) for m in window])
+            told = log_of(posterior), explained
+        found = self._fleet.diagnosis(0, self._diagnosis, told)
+        if found is not None:
+            self._diagnosis = replace(found, run="stream")
+
+    def _followed(self, likelihood: RunLikelihood, position: StreamPosition) -> FloatArray:
+        """Return the probability of each hypothesis, (hypothesis,).
+
+        Movements that are over are counted once and for all, then learned from; the present one
+        as it looks now.
+
+        Args:
+            likelihood: What the last movements say.
+            position: Where they lie in the stream.
+        """
+        count, before = likelihood.usable.shape[1], position.movements
+        new = max(self._movements - before, 0)
+        part = slice(max(new - 1, 0), count)
+        says = [
+            one.evidence(self._part(likelihood, model, part))
+            for one, model in zip(self._mixture.filters, self._models, strict=True)
+        ]
+        belief, hours = self._concluded, 0.0
+        self._explained = {m: v for m, v in self._explained.items() if m >= before}
+        for movement in range(new, count):
+            belief = self._mixture.advance(belief, says, movement - part.start)
+            self._explained[before + movement] = float(belief.explained[0])
+            if movement < count - 1:
+                hours += float(says[0].hours[0, movement - part.start])
+                self._concluded, self._movements = belief, before + movement + 1
+        posterior = self._mixture.posterior(belief)[0]
+        self._rule.see(self._fleet.time, posterior, hours)
+        for movement in range(new, count - 1):
+            self._learn(likelihood.evidence, movement, position.begin_s)
+        return posterior
+
+    @staticmethod
+    def _part(likelihood: RunLikelihood, model: HealthyModel, part: slice) -> RunLikelihood:
+        """Return what some of the last movements say by a model."""
+        if model is not likelihood.model:
+            likelihood = RunLikelihood(likelihood.evidence, model)
+        rows = slice(None), part
+        evidence, findings = likelihood.evidence[rows], likelihood.findings[rows]
+        return RunLikelihood(evidence, model, remembered=findings)
+
+    def _learn(self, evidence: SettledEvidence, movement: int, begin_s: float) -> None:
+        """Learn from a movement that is over; what is known better counts from the next on.
+
+        Nothing is learned of a robot that its calibration fits.
+
+        Args:
+            evidence: The last movements.
+            movement: Which of them.
+            begin_s: When they begin by the time of the stream [s].
+        """
+        if self._learner is None:
+            return
+        own = float(np.exp(self._concluded.log_weight[0, -1]))
+        one, stood = evidence[(slice(None), slice(movement, movement + 1))], evidence.movements
+        told = replace(
+            one.movements,
+            initial=stood.origin()[:, movement],
+            start=one.movements.start + begin_s,
+        )
+        if self._learner.take(replace(one, movements=told), learns=own > WORTH_LEARNING):
+            self._models[-1] = self._learner.model
+            if own > 0.5:
+                self._fleet.adopt(self._models[-1].imperfections)
+                self._models[-1] = self._fleet.diagnoser.healthy_model
+
+
+def monitor(
+    twin: RobotLike, imperfections: HealthyLike = None, false_alarms_per_100h: float = 1.0
+) -> FaultMonitor:
+    """Return what watches a robot at work: settled poses, and faults are rare.
+
+    Args:
+        twin: The robot: its twin, itself, its name or its profile.
+        imperfections: How the healthy robot differs from it, or a calibration by name or path;
+            None: as its profile says.
+        false_alarms_per_100h: False alarms that are allowed in 100 hours of work.
+    """
+    return FaultMonitor(BayesDiagnoser(twin, imperfections, whole_run=False), false_alarms_per_100h)

@@ -1,0 +1,207 @@
+"""What makes the readings of a robot say nothing of its motors, seen reading by reading."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from failuretwin.core.arrays import ArrayStruct, Axes
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.inference.log_quality import (
+    FROZEN_S,
+    NEAR_ZERO_M,
+    NEARLY_STILL_S,
+    STILL_M,
+    should_move,
+)
+
+# Tools that stand still though motors are told to move: a dead sensor, or a dead arm.
+
+
+STILL_FOR_S = np.array([FROZEN_S, FROZEN_S, FROZEN_S, NEARLY_STILL_S])
+"""Shortest time for which each axis must stand still to be called frozen, and the tool [s]."""
+
+
+@dataclass(frozen=True)
+class FrozenSensorDetector(ArrayStruct):
+    """Watches the tools of many robots, by the same rules as `log_quality`.
+
+    Four values of each robot may stand still: each axis, as long as it reports the very same
+    number, and the tool as a whole, as long as it stays near one place.
+
+    Attributes:
+        number: What each axis reports, (robot, axis) [m].
+        place: Where the tool is, (robot, axis) [m].
+        since_s: Since when each stands still, (robot, value) [s].
+        low: Least references since then, (robot, value, motor) [rad].
+        high: Greatest ones.
+    """
+
+    number: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
+    place: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
+    since_s: Annotated[FloatArray, Axes("run", "value", empty=np.nan)]
+    low: Annotated[FloatArray, Axes("run", "value", "motor", empty=np.nan)]
+    high: Annotated[FloatArray, Axes("run", "value", "motor", empty=np.nan)]
+
+    def still_since(self, robot: int) -> float:
+        """Return since when the tool of a robot has stood where it stands [s]."""
+        return float(min(self.since_s[robot, 3], self.since_s[robot, :3].max()))
+
+    def see(
+        self, time: float, read: BoolArray, points: FloatArray, command: FloatArray, near_m: float
+    ) -> tuple[BoolArray, BoolArray]:
+        """Take readings and say what is dead.
+
+        Args:
+            time: When they were taken [s].
+            read: Robots that were read, (robot,).
+            points: Tool positions of all, (robot, axis) [m].
+            command: References of all, as far as known, (robot, motor) [rad].
+            near_m: A tool that stays this near stands still [m].
+
+        Returns:
+            Tools among those read that stand still, (robot,), and channels that do alone,
+            (robot, axis).
+        """
+        anew = np.repeat(read[:, None], 4, axis=1)
+        with np.errstate(invalid="ignore"):
+            anew[:, :3] &= ~(np.abs(points - self.number) <= STILL_M)
+            anew[:, 3] &= ~(np.abs(points - self.place).max(axis=1) <= near_m)
+        self.number[anew[:, :3]], self.place[anew[:, 3]] = points[anew[:, :3]], points[anew[:, 3]]
+        self.since_s[anew] = time
+        reference = np.broadcast_to(command[:, None], self.low.shape)
+        self.low[anew] = self.high[anew] = reference[anew]
+        np.fmin(self.low, reference, out=self.low)
+        np.fmax(self.high, reference, out=self.high)
+        with np.errstate(invalid="ignore"):
+            still = (time - self.since_s >= STILL_FOR_S) & should_move(self.high - self.low)
+        still &= read[:, None]
+        dead = still[:, 3] | still[:, :3].all(axis=1)
+        # One at zero may be held there by a stuck motor; see `log_quality`.
+        alone = still[:, :3] & ~dead[:, None] & (np.abs(self.number) > NEAR_ZERO_M)
+        return dead, alone
+
+
+# Tools that move though nobody has told the motors to.
+
+UNTOLD_S = 0.25
+"""Time that a tool must have been away from where it rested to be called moving without a command
+[s]; glitches of readings are shorter."""
+RESTED_S = 0.15
+"""Time in the same place that shows a tool at rest before the first command [s]."""
+
+
+@dataclass(frozen=True)
+class UntoldMotion(ArrayStruct):
+    """Watches for tools that leave the place where they rest though no command came.
+
+    Attributes:
+        place: Where each tool stood when it was last seen to move, (robot, axis) [m].
+        since_s: Since when it has stood there, (robot,) [s].
+        rest: Where it rested last, since its last command, (robot, axis) [m]; NaN: not yet.
+        away_s: Since when it has been away from where it rested, (robot,) [s]; NaN: it is not.
+        untold: Whether it moves without a command, (robot,); it stands until the next.
+        unknown: Whether readings came before any reference was known, (robot,): the first command
+            then says where the arm goes, but not that it moves.
+    """
+
+    place: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
+    since_s: Annotated[FloatArray, Axes("run", empty=np.nan)]
+    rest: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
+    away_s: Annotated[FloatArray, Axes("run", empty=np.nan)]
+    untold: Annotated[BoolArray, Axes("run", empty=False)]
+    unknown: Annotated[BoolArray, Axes("run", empty=False)]
+
+    def see(
+        self,
+        time: float,
+        points: FloatArray,
+        rest: FloatArray,
+        told: BoolArray,
+        known: BoolArray,
+        near_m: tuple[float, float],
+    ) -> BoolArray:
+        """Take readings and return which tools are away from where they rested, (robot,).
+
+        Args:
+            time: When they were taken [s].
+            points: Tool positions, (robot, axis) [m]; NaN where there is none.
+            rest: Where tools came to rest after their last command, (robot, axis) [m]; NaN: they
+                may be on their way.
+            told: Robots that have had a command, (robot,); of others the first rest counts.
+            known: Robots whose reference is known, (robot,).
+            near_m: How near is the same place, and how far away is moved [m].
+        """
+        same_place_m, moved_m = near_m
+        read = np.isfinite(points).all(axis=1)
+        self.unknown[read & ~known] = True
+        first = self.unknown & known & ~told
+        self.begin(np.flatnonzero(first))
+        told = told | first
+        with np.errstate(invalid="ignore"):
+            stands = read & (np.linalg.norm(points - self.place, axis=1) <= same_place_m)
+        anew = read & ~stands
+        self.place[anew], self.since_s[anew] = points[anew], time
+        rested = ~told & stands & (time - self.since_s >= RESTED_S) & np.isnan(self.rest[:, 0])
+        self.rest[rested] = self.place[rested]
+        rests = told & np.isfinite(rest[:, 0]) & np.isnan(self.away_s)
+        self.rest[rests] = rest[rests]
+        with np.errstate(invalid="ignore"):
+            away = read & (np.linalg.norm(points - self.rest, axis=1) > moved_m)
+        self.away_s[read & ~away] = np.nan
+        self.away_s[away & np.isnan(self.away_s)] = time
+        with np.errstate(invalid="ignore"):
+            self.untold[time - self.away_s >= UNTOLD_S] = True
+        return np.isfinite(self.away_s) | self.untold
+
+    def begin(self, robots: IntArray) -> None:
+        """Take note of robots that have had a command."""
+        self.away_s[robots], self.rest[robots], self.untold[robots] = np.nan, np.nan, False
+
+
+# Readings that jump to and fro: two robots, or two sensors, on one topic.
+
+JUMP_BACK, NO_JUMP = 3.0, -1.0
+"""What a reading counts that is back where the one before the last was, and any other."""
+SPLIT, MOST_JUMPS = 9.0, 15.0
+"""Sum from which readings come from two places: three in a row; and what it is at most."""
+BACK = 0.5
+"""A reading is back if it is nearer to the one before the last than this share of the jump."""
+
+
+@dataclass(frozen=True)
+class TwoPlaces(ArrayStruct):
+    """Watches for readings that come from two places in turn, however often each speaks.
+
+    Attributes:
+        last: The newest reading, (robot, axis) [m].
+        before: The one before it.
+        jumps: Jumps to and fro of late, (robot,).
+        split: Whether there are two, (robot,).
+    """
+
+    last: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
+    before: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
+    jumps: Annotated[FloatArray, Axes("run")]
+    split: Annotated[BoolArray, Axes("run", empty=False)]
+
+    def see(self, points: FloatArray, moved_m: float) -> BoolArray:
+        """Take readings and return the robots whose readings come from two places, (robot,).
+
+        Args:
+            points: Tool positions, (robot, axis) [m]; NaN where there is none.
+            moved_m: A shorter jump is none [m].
+        """
+        read = np.isfinite(points).all(axis=1)
+        with np.errstate(invalid="ignore"):
+            jump = np.linalg.norm(points - self.last, axis=1)
+            back = np.linalg.norm(points - self.before, axis=1)
+            jumped = (jump > moved_m) & (back < BACK * jump)
+        step = np.where(jumped, JUMP_BACK, NO_JUMP)
+        self.jumps[read] = np.clip(self.jumps + step, 0.0, MOST_JUMPS)[read]
+        self.before[read], self.last[read] = self.last[read], points[read]
+        self.split[self.jumps >= SPLIT] = True
+        self.split[self.jumps <= 0.0] = False
+        return self.split.copy()

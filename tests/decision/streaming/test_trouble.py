@@ -1,0 +1,101 @@
+"""Readings that say nothing of the motors: motion without a command, two robots on one topic."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from failuretwin.decision.streaming.trouble import TwoPlaces, UntoldMotion
+
+UNTOLD = "the tool moves though no command came"
+TWO = "readings jump between two places"
+TOLD = np.array([True])
+
+
+def undecided(watcher, samples):
+    """Return when it was said that nothing can be said, and why, (time, reason)."""
+    rows = []
+    for sample in samples:
+        answer = watcher.update(*sample)
+        if answer.diagnosis is not None:
+            rows.append((answer.time, answer.diagnosis.undecided))
+    return rows
+
+
+def test_an_arm_that_moves_on_without_commands_is_told_at_once(watcher, work):
+    """And not before; it stands until a command comes, and nothing of it is taken for a fault."""
+    samples = work(14)
+    last = next(i for i, (t, *_) in enumerate(samples) if t > 0.5 + 2.04 * 6 - 0.05)
+    silent = [(t, samples[last][1], point) for t, _, point in samples[last:]]
+    rows = undecided(watcher, [*samples[:last], *silent])
+    moved = samples[last][0]
+    assert not any(reason for at, reason in rows if at <= moved)
+    told = [at for at, reason in rows if reason.startswith(UNTOLD)]
+    assert told[0] < moved + 1.0
+    assert all(reason for at, reason in rows if at >= told[0])
+    assert watcher.update(60.0, None, None).alarm.state == "clear"
+
+
+def test_an_arm_that_nobody_commands_is_told(watcher, work):
+    rows = undecided(watcher, [(t, np.zeros(4), point) for t, _, point in work(4)])
+    assert rows[0][1].startswith(UNTOLD)
+    assert rows[0][0] < 1.5
+
+
+def test_a_command_ends_it(watcher, work):
+    samples = work(12)
+    rest = samples[64][1]  # before the fourth movement, which is not told of
+    rows = undecided(watcher, [(t, rest if 6.4 < t < 8.6 else c, p) for t, c, p in samples])
+    assert any(reason.startswith(UNTOLD) for _, reason in rows)
+    assert not rows[-1][1]
+
+
+def test_two_robots_on_one_topic_are_told(watcher, work):
+    one, two = work(8), work(8)
+    both = [
+        (t, c, p if k % 2 else q)
+        for k, ((t, c, p), (_, _, q)) in enumerate(zip(one, two, strict=True))
+    ]
+    rows = undecided(watcher, both)
+    assert {reason[:32] for at, reason in rows if at > 3.0} == {TWO}
+
+
+@pytest.mark.parametrize("pattern", ["ab", "aab", "abb", "aabb"])
+def test_two_robots_may_speak_at_any_rate(pattern):
+    places = {"a": np.zeros((1, 3)), "b": np.full((1, 3), 0.1)}
+    seen, told = TwoPlaces.empty(run=1, axis=3), []
+    for k in range(60):
+        told.append(bool(seen.see(places[pattern[k % len(pattern)]], 0.02)[0]))
+    assert told[-1] == (pattern != "aabb")
+    for _ in range(20):
+        alone = seen.see(places["a"], 0.02)[0]
+    assert not alone
+
+
+def test_a_glitch_is_neither(rng):
+    """A reading or two that lie elsewhere, now and then."""
+    jumps, untold = TwoPlaces.empty(run=1, axis=3), UntoldMotion.empty(run=1, axis=3)
+    rest = np.zeros((1, 3))
+    for k in range(400):
+        point = np.full((1, 3), 0.1) if k % 20 in (3, 4) or k % 33 == 7 else rest
+        assert not jumps.see(point, 0.02)[0]
+        untold.see(0.1 * k, point, rest, TOLD, TOLD, (0.002, 0.02))
+        assert not untold.untold[0]
+
+
+def test_a_movement_that_is_under_way_is_no_motion_without_a_command():
+    seen = UntoldMotion.empty(run=1, axis=3)
+    nowhere = np.full((1, 3), np.nan)
+    for k in range(50):
+        seen.see(0.1 * k, np.full((1, 3), 0.01 * k), nowhere, TOLD, TOLD, (0.002, 0.02))
+    assert not seen.untold[0]
+
+
+def test_the_first_command_of_a_recording_is_one(watcher, work):
+    """Nobody says where the arm stood before it, so its reference does not move."""
+    samples = work(6)
+    start = next(i for i, (t, *_) in enumerate(samples) if t > 0.5)
+    first = [(t, None, p) for t, _, p in samples[:start]]
+    told = [(t, samples[start + 10][1], p) for t, _, p in samples[start : start + 10]]
+    rows = undecided(watcher, [*first, *told, *samples[start + 10 :]])
+    assert not any(reason for _, reason in rows)
