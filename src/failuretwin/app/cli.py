@@ -15,6 +15,7 @@ import click
 from failuretwin import __version__
 from failuretwin.app.commands.act import act, stop
 from failuretwin.app.commands.advise import advise
+from failuretwin.app.commands.check import check, design, isolability
 from failuretwin.app.commands.data import import_, robot, simulate
 from failuretwin.app.commands.diagnose import diagnose, evaluate
 from failuretwin.app.commands.learn import calibrate, study, train
@@ -34,7 +35,8 @@ def cli() -> None:
 
 for command in (
     *(import_, simulate, diagnose, evaluate, calibrate),
-    *(train, study, emulate, watch, act, stop, reach, advise, robot),
+    *(train, study, emulate, watch, act, stop, reach, check, design, isolability),
+    *(advise, robot),
 ):
     cli.add_command(command)
 

@@ -1,0 +1,143 @@
+"""From the command line to a check or a design, and to the arm that makes the movements."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
+from failuretwin.core.types import FloatArray
+from failuretwin.decision.acting.safety import SafetyGate
+from failuretwin.decision.test_motions.design import Designer
+from failuretwin.decision.test_motions.health_check import (
+    CheckResult,
+    HealthCheck,
+    checking,
+    faults_at_rest,
+    result_of,
+)
+from failuretwin.decision.test_motions.motions import Motions, read_motions
+from failuretwin.decision.test_motions.outlook import Outlook, of_priors
+from failuretwin.digital_model.calibrated_robot import CalibratedRobot
+from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.evidence import Evidence
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.priors import Priors
+from failuretwin.inference.run_likelihood import RunLikelihood
+
+
+@dataclass(frozen=True)
+class Checking:
+    """What a check and a design need.
+
+    Attributes:
+        known: The robot as it is known.
+        gate: What is safe.
+        named: Hypotheses that the user names; None: all faults that show at rest.
+        usual: Whether poses keep to the ranges of usual movements.
+        seed: Seed of the poses that are tried.
+    """
+
+    known: CalibratedRobot
+    gate: SafetyGate
+    named: Sequence[Hypothesis] | None = None
+    usual: bool = False
+    seed: int = 0
+
+    @cached_property
+    def model(self) -> HealthyModel:
+        """The healthy robot."""
+        return HealthyModel.of(self.known.twin, self.known.imperfections)
+
+    @property
+    def hypotheses(self) -> Sequence[Hypothesis]:
+        """What is weighed."""
+        return self.named or faults_at_rest(self.model.motor_names)
+
+    @property
+    def asked(self) -> Sequence[Hypothesis]:
+        """What movements are chosen to tell apart."""
+        return self.named or paper_hypotheses(self.model.motor_names)
+
+    @property
+    def home(self) -> FloatArray:
+        """Where an arm is taken to stand that is not asked, (motor,) [rad]."""
+        motors = self.known.robot.motors
+        return np.array([float(np.clip(0.0, *motor.movement_range)) for motor in motors])
+
+    @property
+    def designer(self) -> Designer:
+        """What chooses movements."""
+        members = of_priors(self.model, self.asked, Priors())
+        return Designer(self.gate, Outlook(self.model, members), self.seed, self.usual)
+
+    def motions(self, seconds: float, repeat: Path | None, most: int = 1000) -> Motions:
+        """Return the motions of a check: those of a file that is there, or designed anew.
+
+        Args:
+            seconds: Time for all of them [s].
+            repeat: The file; None: there is none.
+            most: So many at most.
+
+        Raises:
+            InputError: If the file cannot be read or is of another robot, or no movement is safe.
+        """
+        if repeat is not None and repeat.exists():
+            return read_motions(repeat, self.known.robot)
+        made = self.designer.sequence(self.home, seconds, most)
+        return Motions.of(self.known.robot, made)
+
+    def health_check(self, motions: Motions, further: int) -> HealthCheck:
+        """Return a check that has not begun."""
+        return HealthCheck(
+            self.model,
+            self.gate,
+            motions,
+            self.hypotheses,
+            checking(self.hypotheses),
+            further,
+            self.seed,
+        )
+
+    def of_logs(self, paths: Sequence[Path]) -> list[CheckResult]:
+        """Return what logs of a check say that was made elsewhere, a result a run.
+
+        Raises:
+            InputError: If they cannot be read.
+        """
+        from failuretwin.data_knowledge.read import read_runs
+
+        runs = read_runs(list(paths), self.known.robot)
+        priors = checking(self.hypotheses)
+        diagnoser = BayesDiagnoser(
+            self.known.twin, self.known.imperfections, self.hypotheses, priors
+        )
+        settled = Evidence(runs, self.model.settings).sound.settled
+        return [
+            result_of(RunLikelihood(settled[row : row + 1], self.model), diagnosis)
+            for row, diagnosis in enumerate(diagnoser.diagnose(runs))
+        ]
+
+
+def carry_out(
+    check: HealthCheck, known: CalibratedRobot, place: str, faults: Sequence[str],
+    topics: Path | None,
+) -> CheckResult:  # fmt: skip
+    """Return what a check finds on an arm; the arm moves.
+
+    Raises:
+        InputError: If the arm cannot be reached, or it is not known where it stands.
+        Halted: If somebody else commands it, or it falls silent.
+        UnsafeOrderError: If an order must not be sent.
+    """
+    from failuretwin.app.acting import commander_of
+    from failuretwin.app.terminal import tell
+
+    with ExitStack() as stack:
+        arm = commander_of(place, known, faults, check.seed, topics, stack)
+        return check.work(arm, tell)
