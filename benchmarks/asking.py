@@ -8,11 +8,12 @@
 `check`: arms of the ArmPi FPV, each its own robot, with random errors of 5 counts (1.2 deg) at each
 motor, and healthy ones; checks of 20 and 60 s, random movements of the usual ranges beside them, on
 the physics engine. `others`: arms that nobody has calibrated, unknown zeros of 0.3 deg. `further`:
-posteriors that three random movements leave open, how many more settle them (P >= 0.99), designed
-or random. `promised`: faults as large as `ft.isolability` says that the motions show.
+errors of 4 to 12 counts; posteriors that three random movements leave open, how many more settle
+them (P >= 0.99), designed or random. `promised`:
+faults as large as `ft.isolability` says that the motions show.
 
 A fault is named right if the motor is (P of its modes together above all else), healthy if P of
-healthy is above that of every motor. Nothing of the truth is looked at but to count.
+healthy is above that of every motor. The set-up of the sensor is taken as known.
 """
 
 from __future__ import annotations
@@ -31,12 +32,10 @@ from failuretwin.decision.acting.belief import settled_evidence_of
 from failuretwin.decision.acting.believed_arm import Seen
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.proportions import wilson_interval
-from failuretwin.decision.test_motions.design import Designer, Movement
+from failuretwin.decision.test_motions.design import Designer, Movement, next_movement
 from failuretwin.decision.test_motions.health_check import (
     checking,
     faults_at_rest,
-    judged,
-    next_movement,
 )
 from failuretwin.decision.test_motions.motions import Motions
 from failuretwin.decision.test_motions.outlook import Outlook, of_priors
@@ -44,8 +43,8 @@ from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_cal
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.isolability import isolability
 from failuretwin.inference.posterior import Posterior
-from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.shared_posterior import shared_posterior
 
 COUNT_RAD = float(np.deg2rad(0.24))
 AT_ONCE = 20
@@ -78,17 +77,19 @@ class Robots:
     def designer(self, seed: int, *, usual: bool) -> Designer:
         """Return what chooses movements."""
         model = self.model
-        members = of_priors(model, paper_hypotheses(self.names), Priors())
+        asked = paper_hypotheses(self.names)
+        members = of_priors(model, asked, checking(model, asked))
         return Designer(SafetyGate(self.known.robot), Outlook(model, members), seed, usual)
 
     def judge(self, windows: Sequence[Sequence[Seen]]) -> list[Posterior]:
         """Return the posterior of some arms at a time."""
-        model, priors = self.model, checking(self.hypotheses)
+        model, priors = self.model, checking(self.model, self.hypotheses)
         return [
-            judged(
+            shared_posterior(
                 RunLikelihood(settled_evidence_of(windows[at : at + AT_ONCE]), model),
                 self.hypotheses,
                 priors,
+                in_doubt=False,
             )
             for at in range(0, len(windows), AT_ONCE)
         ]
@@ -205,16 +206,15 @@ def further(arms: int, seed: int) -> None:
     """Movements that settle what random ones leave open."""
     robots = Robots(load_calibration(None, "armpi_fpv"), nine=True)
     home, motors = home_of(robots.known.robot), len(robots.names)
-    sizes = (4, 6, 8, 10, 12)
-    faults = [TrueFault("healthy")] * (4 * arms)
-    faults += [TrueFault("random", k, s * COUNT_RAD)
-               for k in range(motors) for s in sizes for _ in range(arms)]  # fmt: skip
+    faults = [TrueFault("healthy")] * arms
+    faults += [TrueFault("random", k) for k in range(motors) for _ in range(arms)]
     truth = np.array([0 if f.kind == "healthy" else 1 + f.motor for f in faults])
     usual = robots.designer(seed, usual=True)
     gate = SafetyGate(robots.known.robot)
     first = usual.random(home, 1e3, FIRST)
     for name in ("random", "designed"):
-        world = World(robots.known, faults, seed, "physics", onset=0)
+        small = (4.0 * COUNT_RAD, 12.0 * COUNT_RAD)
+        world = World(robots.known, faults, seed, "physics", onset=0, errors=small)
         windows = windows_of(world, [[m.order] * len(faults) for m in first], [1.6] * FIRST)
         needed = np.full(len(faults), np.nan)
         right = np.zeros(len(faults), dtype=bool)
@@ -238,14 +238,12 @@ def further(arms: int, seed: int) -> None:
             add(world, windows, orders, 1.6)
         told = np.where(np.isnan(needed), MOST, needed)[was_open]
         settled = was_open & ~np.isnan(needed)
-        print(
-            f"further movements, {name}: {was_open.sum()} of {len(faults)} open after {FIRST}; mean "
-            f"{told.mean():.2f} (+- {told.std() / np.sqrt(len(told)):.2f}), healthy "
-            f"{np.where(np.isnan(needed), MOST, needed)[was_open & (truth == 0)].mean():.2f}, never "
-            f"in {MOST}: {int((was_open & np.isnan(needed)).sum())}; wrong at .99: "
-            f"{int((settled & ~right).sum())} of {int(settled.sum())}",
-            flush=True,
-        )
+        wrong, never = int((settled & ~right).sum()), int((was_open & np.isnan(needed)).sum())
+        said = f"{was_open.sum()} of {len(faults)} open after {FIRST}, settled by {told.mean():.2f}"
+        said += f" (+- {told.std() / np.sqrt(len(told)):.2f}) on average"
+        said += f", healthy {told[truth[was_open] == 0].mean():.2f}, never in {MOST}: {never}"
+        said += f", wrong at .99: {wrong} of {int(settled.sum())}"
+        print(f"further movements, {name}: {said}", flush=True)
 
 
 def promised(arms: int, seed: int) -> None:

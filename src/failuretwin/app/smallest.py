@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from failuretwin.app.checking import Checking
 from failuretwin.app.plots import clean, new_figure
 from failuretwin.app.tables import Table, figures_table
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision.test_motions.motions import Motions, read_motions
+from failuretwin.decision.test_motions.session import Checking
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.explanation import plain_name, size_words

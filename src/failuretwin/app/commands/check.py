@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,7 +19,7 @@ from failuretwin.app.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from failuretwin.app.checking import Checking
+    from failuretwin.decision.test_motions.session import Checking
 
 
 @dataclass(frozen=True)
@@ -33,9 +34,9 @@ class MotionOptions:
 
     def checking(self, calibration: Path | None, robot: str, seed: int) -> Checking:
         """Return what a check and a design need."""
-        from failuretwin.app.checking import Checking
         from failuretwin.app.inputs import parse_cli_hypotheses
         from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
+        from failuretwin.decision.test_motions.session import Checking
         from failuretwin.digital_model.calibrated_robot import load_calibration
 
         known = load_calibration(calibration, robot)
@@ -170,9 +171,9 @@ def check(
     Movements are chosen to tell most; each passes the gate of `act`. See docs/asking.md.
     """
     from failuretwin.app import check_report as report
-    from failuretwin.app.checking import carry_out
-    from failuretwin.app.live import EMULATED
+    from failuretwin.app.acting import commander_of, is_real
     from failuretwin.app.tables import show
+    from failuretwin.app.terminal import tell
     from failuretwin.decision.test_motions.motions import write_motions
 
     asking = motion.checking(calibration, robot, seed)
@@ -190,11 +191,13 @@ def check(
         write_motions(planned, arm, written)
         show(*report.motion_lines(planned, arm), f"written to {written}; nothing was moved")
         return
-    if not (move or place == EMULATED):
+    if is_real(place) and not move:
         show("nothing moves without --move; these are the motions")
         show(*report.motion_lines(planned, arm))
         return
-    result = carry_out(asking.health_check(planned, further), asking.known, place, faults, topics)
+    with ExitStack() as stack:
+        commander = commander_of(place, asking.known, faults, seed, topics, stack)
+        result = asking.health_check(planned, further).work(commander, tell)
     record = report.check_record(result, arm, planned.duration_s)
     show(*report.check_lines(result, arm, planned.duration_s))
     if keep is not None:

@@ -21,15 +21,18 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.rest import QUIET_S
 from failuretwin.decision.acting.safety import SafetyGate, Way
-from failuretwin.decision.test_motions.outlook import Asked, Outlook
+from failuretwin.decision.test_motions.outlook import Asked, Outlook, of_posterior
 from failuretwin.digital_model.inverse_kinematics import usable_limits
 from failuretwin.inference.evidence import SETTLING_S
 from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.posterior import Posterior
 
 POOL = 1024
 """Poses drawn at first."""
-CANDIDATES = 64
-"""Poses weighed for one movement."""
+CANDIDATES = (64, 512)
+"""Poses weighed for one movement: fewest and most."""
+PAIRS = 50_000
+"""Pairs of members at poses that are weighed for one movement."""
 NEARBY = 16
 """Poses drawn around the best of them."""
 NEARBY_SHARE = 0.08
@@ -146,7 +149,8 @@ class Designer:
             needed = np.array([self.gate.least_duration(pose - told[-1]) for pose in poses])
             return np.asarray((gained - outlook.information(nats)) / (needed + self.rest_s))
 
-        drawn = self._pool[self._rng.integers(len(self._pool), size=CANDIDATES)]
+        count = int(np.clip(PAIRS // len(outlook.members) ** 2, *CANDIDATES))
+        drawn = self._pool[self._rng.integers(len(self._pool), size=count)]
         score = score_of(drawn)
         width = NEARBY_SHARE * np.ptp(np.array(self.limits), axis=0)
         around = width * self._rng.standard_normal((NEARBY, len(start)))
@@ -197,3 +201,31 @@ class Designer:
         for held in np.eye(len(at), dtype=bool):
             ways.append((np.where(held, start, at), np.where(held, start, pose)))
         return ways
+
+
+def next_movement(
+    model: HealthyModel,
+    gate: SafetyGate,
+    posterior: Posterior,
+    at: FloatArray,
+    seed: int = 0,
+    row: int = 0,
+) -> Order | None:
+    """Return the movement that is expected to settle best what a posterior leaves open.
+
+    Args:
+        model: The healthy robot.
+        gate: What is safe.
+        posterior: Of one arm, or of several.
+        at: What its motors were told last, (motor,) [rad].
+        seed: Seed of the poses that are tried.
+        row: Which arm.
+
+    Returns:
+        The order; None: none is safe, or nothing is left to ask.
+    """
+    members = of_posterior(posterior, row)
+    if len({member.hypothesis for member in members}) < 2:
+        return None
+    found = Designer(gate, Outlook(model, members), seed).next(at)
+    return None if found is None else found.order

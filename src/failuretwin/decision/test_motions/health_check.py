@@ -20,9 +20,8 @@ from failuretwin.decision.acting.believed_arm import BelievedArm, Seen
 from failuretwin.decision.acting.planner import Standing
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.work import Work, first_standing
-from failuretwin.decision.test_motions.design import Designer
+from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.decision.test_motions.motions import Motions
-from failuretwin.decision.test_motions.outlook import Outlook, of_posterior
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.evidence import SettledEvidence
@@ -31,8 +30,15 @@ from failuretwin.inference.log_quality import LogQuality
 from failuretwin.inference.posterior import Posterior, log_prior
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.settings import ERROR_STEPS, WIDEST_ERROR
 from failuretwin.inference.shared_posterior import set_up_in_doubt, shared_posterior
 
+HEALTHY_TO_FAULTY = 4.0
+"""Odds that an arm is healthy that nobody suspects; assumed."""
+LEAST_SHARE = 0.5
+"""Where ranges of errors begin, in the least error that a profile states."""
+RANGES = 5
+"""So many ranges from there to the paper's."""
 SURE = 0.95
 """Probability from which a check names a motor, or says that all is well."""
 GREEN, RED, OPEN = "green", "red", "open"
@@ -42,17 +48,25 @@ LOOSE_RAD = 0.1
 """What zeros and play may be before anything is seen, their deviation [rad]."""
 
 
-def checking(hypotheses: Sequence[Hypothesis], priors: Priors | None = None) -> Priors:
-    """Return priors of who checks an arm that nobody suspects: healthy as likely as not.
+def checking(model: HealthyModel, hypotheses: Sequence[Hypothesis]) -> Priors:
+    """Return priors of who checks an arm that nobody suspects: 4 to 1 that it is healthy.
+
+    Movements that are chosen for it show smaller errors than others do: where a profile states the
+    least, ranges of errors begin at half of that, in even steps of the logarithm.
 
     Args:
+        model: The healthy robot.
         hypotheses: What may be the case.
-        priors: Other beliefs about faults; None: the usual ones.
     """
-    plain = replace(priors or Priors(), healthy_odds=1.0)
+    least = model.settings.least_error_rad
+    begin = np.geomspace(LEAST_SHARE, max(ERROR_STEPS), RANGES) * least
+    ranges = tuple((low, WIDEST_ERROR * low) for low in begin.tolist())
+    plain = Priors(error_ranges=ranges if least else None)
     prior = np.exp(log_prior(hypotheses, plain))
     own = sum(prior[i] for i, h in enumerate(hypotheses) if h.is_healthy)
-    return replace(plain, healthy_odds=float((1.0 - own) / own)) if 0.0 < own < 1.0 else plain
+    if not 0.0 < own < 1.0:
+        return plain
+    return replace(plain, healthy_odds=HEALTHY_TO_FAULTY * float((1.0 - own) / own))
 
 
 @dataclass(frozen=True)
@@ -277,31 +291,3 @@ class HealthCheck:
         """What the check found."""
         diagnosis = self.posterior.to_diagnosis(0, "check", LogQuality())
         return result_of(self.likelihood, diagnosis, self._added)
-
-
-def next_movement(
-    model: HealthyModel,
-    gate: SafetyGate,
-    posterior: Posterior,
-    at: FloatArray,
-    seed: int = 0,
-    row: int = 0,
-) -> Order | None:
-    """Return the movement that is expected to settle best what a posterior leaves open.
-
-    Args:
-        model: The healthy robot.
-        gate: What is safe.
-        posterior: Of one arm, or of several.
-        at: What its motors were told last, (motor,) [rad].
-        seed: Seed of the poses that are tried.
-        row: Which arm.
-
-    Returns:
-        The order; None: none is safe, or nothing is left to ask.
-    """
-    members = of_posterior(posterior, row)
-    if len({member.hypothesis for member in members}) < 2:
-        return None
-    found = Designer(gate, Outlook(model, members), seed).next(at)
-    return None if found is None else found.order

@@ -1,18 +1,18 @@
-"""From the command line to a check or a design, and to the arm that makes the movements."""
+"""What a check or a design of one robot needs, put together."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
+from failuretwin.connection.links.commander import Commander
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.safety import SafetyGate
+from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
 from failuretwin.decision.test_motions.design import Designer
 from failuretwin.decision.test_motions.health_check import (
     CheckResult,
@@ -23,11 +23,15 @@ from failuretwin.decision.test_motions.health_check import (
 )
 from failuretwin.decision.test_motions.motions import Motions, read_motions
 from failuretwin.decision.test_motions.outlook import Outlook, of_priors
-from failuretwin.digital_model.calibrated_robot import CalibratedRobot
+from failuretwin.digital_model.calibrated_robot import (
+    CalibratedRobot,
+    HealthyLike,
+    RobotLike,
+    calibrated,
+)
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 
@@ -73,21 +77,21 @@ class Checking:
     @property
     def designer(self) -> Designer:
         """What chooses movements."""
-        members = of_priors(self.model, self.asked, Priors())
+        members = of_priors(self.model, self.asked, checking(self.model, self.asked))
         return Designer(self.gate, Outlook(self.model, members), self.seed, self.usual)
 
-    def motions(self, seconds: float, repeat: Path | None, most: int = 1000) -> Motions:
-        """Return the motions of a check: those of a file that is there, or designed anew.
+    def motions(self, seconds: float, repeat: Path | None = None, most: int = 1000) -> Motions:
+        """Return the motions of a check: those of a file, or designed anew.
 
         Args:
             seconds: Time for all of them [s].
-            repeat: The file; None: there is none.
+            repeat: The file; None: they are designed.
             most: So many at most.
 
         Raises:
             InputError: If the file cannot be read or is of another robot, or no movement is safe.
         """
-        if repeat is not None and repeat.exists():
+        if repeat is not None:
             return read_motions(repeat, self.known.robot)
         made = self.designer.sequence(self.home, seconds, most)
         return Motions.of(self.known.robot, made)
@@ -99,7 +103,7 @@ class Checking:
             self.gate,
             motions,
             self.hypotheses,
-            checking(self.hypotheses),
+            checking(self.model, self.hypotheses),
             further,
             self.seed,
         )
@@ -113,7 +117,7 @@ class Checking:
         from failuretwin.data_knowledge.read import read_runs
 
         runs = read_runs(list(paths), self.known.robot)
-        priors = checking(self.hypotheses)
+        priors = checking(self.model, self.hypotheses)
         diagnoser = BayesDiagnoser(
             self.known.twin, self.known.imperfections, self.hypotheses, priors
         )
@@ -124,20 +128,35 @@ class Checking:
         ]
 
 
-def carry_out(
-    check: HealthCheck, known: CalibratedRobot, place: str, faults: Sequence[str],
-    topics: Path | None,
-) -> CheckResult:  # fmt: skip
-    """Return what a check finds on an arm; the arm moves.
+def check(
+    commander: Commander,
+    robot: RobotLike = "armpi_fpv",
+    calibration: HealthyLike = None,
+    seconds: float = 20.0,
+    further: int = 0,
+    limits: SafetyLimits | None = None,
+    tell: Callable[[str], None] = print,
+) -> CheckResult:
+    """Check an arm by test movements; the arm moves.
+
+    Args:
+        commander: The arm.
+        robot: The robot, its name or its profile.
+        calibration: What `calibrate` learned of it, by name or path; None: what its profile names.
+        seconds: Time for the movements [s].
+        further: So many further movements at most, if it is still open then what is wrong.
+        limits: What orders must keep to; None: the usual limits.
+        tell: Called with what happens.
+
+    Returns:
+        What was found.
 
     Raises:
-        InputError: If the arm cannot be reached, or it is not known where it stands.
-        Halted: If somebody else commands it, or it falls silent.
+        InputError: If something cannot be read, no movement is safe, or it is not known where the
+            arm stands.
+        Halted: If somebody else commands the arm, or it falls silent.
         UnsafeOrderError: If an order must not be sent.
     """
-    from failuretwin.app.acting import commander_of
-    from failuretwin.app.terminal import tell
-
-    with ExitStack() as stack:
-        arm = commander_of(place, known, faults, check.seed, topics, stack)
-        return check.work(arm, tell)
+    known = calibrated(robot, calibration)
+    asking = Checking(known, SafetyGate(known.robot, limits or SafetyLimits()))
+    return asking.health_check(asking.motions(seconds), further).work(commander, tell)
