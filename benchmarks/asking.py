@@ -171,7 +171,7 @@ def checks(arms: int, seed: int, seconds: Sequence[float]) -> None:
             report(f"{length:.0f} s {name}, {len(made)} movements", robots, truth, found)
 
 
-SIZES_DEG = {"ur5e": (0.1, 0.2, 0.4), "panda": (0.1, 0.2, 0.4), "so101": (1.0, 2.0, 4.0)}
+SIZES_DEG = {"ur5e": (0.5, 1.0), "panda": (0.5, 1.0), "so101": (2.0, 4.0)}
 """Random errors of other arms [deg]."""
 
 

@@ -12,10 +12,14 @@ import numpy as np
 
 from failuretwin.app.tables import Table, figures_table
 from failuretwin.core.errors import InputError, counted
+from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision.test_motions.health_check import OPEN, CheckResult
 from failuretwin.decision.test_motions.motions import Motions
 from failuretwin.digital_model.robot import Robot
+from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.explanation import size_words
+from failuretwin.inference.isolability import IsolabilityReport
 
 CHANGED = 3.0
 """A zero or a play that differs from that of the check before by so many standard deviations has
@@ -38,6 +42,25 @@ def check_lines(result: CheckResult, robot: Robot, seconds: float) -> list[str |
     advice = [line for line in diagnosis.explanation if line.startswith("what to do")]
     low = ["" if not diagnosis.quality else "the log: " + "; ".join(diagnosis.quality)]
     return [head, *advice, made, *filter(None, low), _motor_table(result, robot)]
+
+
+def shown_line(found: IsolabilityReport, robot: Robot) -> str:
+    """Return what a green light rules out, and what it does not."""
+    sizes = [
+        f"{name.split(':')[0]} {told_size(name, size, found.largest[name], robot)}"
+        for name, size in found.isolated.items()
+    ]
+    said = "random errors that these motions show: " + ", ".join(sizes)
+    return f"{said}; smaller ones may be there"
+
+
+def told_size(name: str, size: float | None, largest: float, robot: Robot) -> str:
+    """Return a size in the unit that people read; where none is found, that the largest is not."""
+    fault = Hypothesis.parse(name).faults[0]
+    unit = robot.own_unit(fault.motor, MODES[fault.mode].unit)
+    told = size_words(fault, largest if size is None else size, unit).strip(" ()+")
+    told = told.removeprefix("by about ").removeprefix("by ").removeprefix("of ").lstrip("+")
+    return f"not even {told}" if size is None else told
 
 
 def _motor_table(result: CheckResult, robot: Robot) -> Table:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from failuretwin.app.check_report import told_size
 from failuretwin.app.plots import clean, new_figure
 from failuretwin.app.tables import Table, figures_table
 from failuretwin.core.hypothesis import Hypothesis
@@ -18,7 +19,7 @@ from failuretwin.decision.test_motions.motions import Motions, read_motions
 from failuretwin.decision.test_motions.session import Checking
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.explanation import plain_name, size_words
+from failuretwin.inference.explanation import plain_name
 from failuretwin.inference.isolability import IsolabilityReport
 from failuretwin.inference.isolability import isolability as isolability_of
 
@@ -79,8 +80,8 @@ def size_table(found: IsolabilityReport, robot: Robot) -> Table:
     rows = [
         [
             plain_name(Hypothesis.parse(name)),
-            _size(name, found.detected[name], found.largest[name], robot),
-            _size(name, found.isolated[name], found.largest[name], robot),
+            told_size(name, found.detected[name], found.largest[name], robot),
+            told_size(name, found.isolated[name], found.largest[name], robot),
         ]
         for name in found.isolated
     ]
@@ -90,16 +91,7 @@ def size_table(found: IsolabilityReport, robot: Robot) -> Table:
 
 
 def _said(found: IsolabilityReport, name: str, robot: Robot) -> str:
-    return _size(name, found.isolated[name], found.largest[name], robot)
-
-
-def _size(name: str, size: float | None, largest: float, robot: Robot) -> str:
-    """Return a size in the unit that people read; where none is found, that the largest is not."""
-    fault = Hypothesis.parse(name).faults[0]
-    unit = robot.own_unit(fault.motor, MODES[fault.mode].unit)
-    told = size_words(fault, largest if size is None else size, unit).strip(" ()+")
-    told = told.removeprefix("by about ").removeprefix("by ").removeprefix("of ").lstrip("+")
-    return f"not even {told}" if size is None else told
+    return told_size(name, found.isolated[name], found.largest[name], robot)
 
 
 def smallest_record(found: IsolabilityReport) -> Sequence[dict[str, Any]]:

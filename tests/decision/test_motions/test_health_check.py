@@ -66,10 +66,10 @@ def test_their_deviations_are_what_they_scatter_by(model, designed):
         assert np.all((scaled.std(axis=0) > 0.7) & (scaled.std(axis=0) < 1.1))
 
 
-def test_a_check_begins_with_four_to_one_that_all_is_well(model):
+def test_a_check_begins_with_two_to_one_that_all_is_well(model):
     hypotheses = faults_at_rest(model.motor_names)
     prior = np.exp(log_prior(hypotheses, checking(model, hypotheses)))
-    assert prior[hypotheses.index(HEALTHY)] == pytest.approx(0.8)
+    assert prior[hypotheses.index(HEALTHY)] == pytest.approx(2.0 / 3.0)
     assert {h.faults[0].mode for h in hypotheses if h.faults} == {
         "stuck", "steady_state_error", "backlash", "torque_loss", "encoder_bias", "encoder_scale",
     }  # fmt: skip

@@ -172,8 +172,10 @@ def check(
     """
     from failuretwin.app import check_report as report
     from failuretwin.app.acting import commander_of, is_real
+    from failuretwin.app.smallest import of_motions
     from failuretwin.app.tables import show
     from failuretwin.app.terminal import tell
+    from failuretwin.decision.test_motions.health_check import GREEN
     from failuretwin.decision.test_motions.motions import write_motions
 
     asking = motion.checking(calibration, robot, seed)
@@ -200,6 +202,8 @@ def check(
         result = asking.health_check(planned, further).work(commander, tell)
     record = report.check_record(result, arm, planned.duration_s)
     show(*report.check_lines(result, arm, planned.duration_s))
+    if result.light == GREEN:
+        show(report.shown_line(of_motions(asking, planned), arm))
     if keep is not None:
         before = report.kept_checks(keep) if keep.exists() else []
         show(*(report.changes(before[-1], record) if before else [f"kept in {keep}"]))

@@ -33,7 +33,7 @@ from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.settings import ERROR_STEPS, WIDEST_ERROR
 from failuretwin.inference.shared_posterior import set_up_in_doubt, shared_posterior
 
-HEALTHY_TO_FAULTY = 4.0
+HEALTHY_TO_FAULTY = 2.0
 """Odds that an arm is healthy that nobody suspects; assumed."""
 LEAST_SHARE = 0.5
 """Where ranges of errors begin, in the least error that a profile states."""
@@ -49,7 +49,7 @@ LOOSE_RAD = 0.1
 
 
 def checking(model: HealthyModel, hypotheses: Sequence[Hypothesis]) -> Priors:
-    """Return priors of who checks an arm that nobody suspects: 4 to 1 that it is healthy.
+    """Return priors of who checks an arm that nobody suspects: 2 to 1 that it is healthy.
 
     Movements that are chosen for it show smaller errors than others do: where a profile states the
     least, ranges of errors begin at half of that, in even steps of the logarithm.
