@@ -47,7 +47,7 @@ from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.shared_posterior import shared_posterior
 
 COUNT_RAD = float(np.deg2rad(0.24))
-AT_ONCE = 20
+AT_ONCE = 1
 """Arms judged at a time."""
 SURE = 0.99
 
@@ -72,7 +72,7 @@ class Robots:
     @property
     def hypotheses(self) -> Sequence[Hypothesis]:
         """What is weighed."""
-        return paper_hypotheses(self.names) if self.nine else faults_at_rest(self.names)
+        return paper_hypotheses(self.names) if self.nine else faults_at_rest(self.model)
 
     def designer(self, seed: int, *, usual: bool) -> Designer:
         """Return what chooses movements."""

@@ -63,11 +63,11 @@ def test_their_deviations_are_what_they_scatter_by(model, designed):
     # a Student t is expected, of which normal scatter is a narrow case
     for scaled in (np.array(zero), np.array(play)):
         assert np.all(np.abs(scaled.mean(axis=0)) < 0.3)
-        assert np.all((scaled.std(axis=0) > 0.7) & (scaled.std(axis=0) < 1.1))
+        assert np.all((scaled.std(axis=0) > 0.6) & (scaled.std(axis=0) < 1.1))
 
 
 def test_a_check_begins_with_two_to_one_that_all_is_well(model):
-    hypotheses = faults_at_rest(model.motor_names)
+    hypotheses = faults_at_rest(model)
     prior = np.exp(log_prior(hypotheses, checking(model, hypotheses)))
     assert prior[hypotheses.index(HEALTHY)] == pytest.approx(2.0 / 3.0)
     assert {h.faults[0].mode for h in hypotheses if h.faults} == {
@@ -75,10 +75,17 @@ def test_a_check_begins_with_two_to_one_that_all_is_well(model):
     }  # fmt: skip
 
 
+def test_a_motor_that_carries_nothing_is_not_asked_for_its_strength(model):
+    asked = [str(hypothesis) for hypothesis in faults_at_rest(model)]
+    assert model.settling.compliance[0] == 0.0
+    assert "motor_1:torque_loss" not in asked
+    assert "motor_2:torque_loss" in asked
+
+
 def carried_out(known, model, gate, designed, schedule, modes=None, further=0):
     emulation = Emulation(known.robot, known.imperfections, schedule, 3, modes or {})
     motions = Motions.of(known.robot, designed)
-    hypotheses = faults_at_rest(model.motor_names)
+    hypotheses = faults_at_rest(model)
     with CommandedArm(emulation) as arm:
         check = HealthCheck(model, gate, motions, hypotheses, checking(model, hypotheses), further)
         return check.work(arm, lambda _: None), check
@@ -106,7 +113,7 @@ def test_what_is_named_is_the_motor_whatever_its_mode(model, designed):
 
 def test_small_errors_of_each_motor_are_named(known, model, designed):
     """Errors of five counts, signs at random, on a scatter like the arm's own."""
-    hypotheses = faults_at_rest(model.motor_names)
+    hypotheses = faults_at_rest(model)
     rng = np.random.default_rng(5)
     windows, size = [], 5.0 * COUNT_RAD
     for motor in range(4):
@@ -142,7 +149,7 @@ def test_the_next_movement_settles_what_is_open(model, gate, designed):
 def test_further_movements_are_made_only_while_it_is_open(known, model, gate, designed):
     pytest.importorskip("mujoco")
     fault = ScheduledFault(Hypothesis.parse("motor_4:steady_state_error").faults[0], 0.0)
-    modes = dict(MODES) | {"steady_state_error": SteadyStateError(magnitude=(0.03, 0.03))}
+    modes = dict(MODES) | {"steady_state_error": SteadyStateError(magnitude=(0.02, 0.02))}
     emulation = (known, model, gate, designed[:3], (fault,), modes)
     result, check = carried_out(*emulation, further=6)
     assert result.further == len(check.window) - 3

@@ -165,10 +165,19 @@ def motor_probabilities(posterior: Mapping[str, float]) -> dict[str, float]:
     return found
 
 
-def faults_at_rest(motors: Sequence[str]) -> tuple[Hypothesis, ...]:
-    """Return healthy and every single fault that shows in where a motor settles."""
+def faults_at_rest(model: HealthyModel) -> tuple[Hypothesis, ...]:
+    """Return healthy and every single fault that can show in where a motor settles.
+
+    A motor that does not give way under load shows no loss of torque there.
+    """
     shown = (Signature.HELD, Signature.REDRAWN_OFFSET, Signature.OFFSET)
-    return single_faults(motors, [n for n, mode in MODES.items() if mode.signature in shown])
+    modes = [name for name, mode in MODES.items() if mode.signature in shown]
+    gives = dict(zip(model.motor_names, model.settling.compliance, strict=True))
+    return tuple(
+        hypothesis
+        for hypothesis in single_faults(model.motor_names, modes)
+        if all(gives[f.motor] or not MODES[f.mode].needs_compliance for f in hypothesis.faults)
+    )
 
 
 def judged(

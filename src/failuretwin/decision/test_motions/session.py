@@ -61,7 +61,7 @@ class Checking:
     @property
     def hypotheses(self) -> Sequence[Hypothesis]:
         """What is weighed."""
-        return self.named or faults_at_rest(self.model.motor_names)
+        return self.named or faults_at_rest(self.model)
 
     @property
     def asked(self) -> Sequence[Hypothesis]:
