@@ -45,7 +45,10 @@ MODES = {
 
 @dataclass(frozen=True)
 class TrueFault:
-    """The fault of one arm: a kind of `MODES` at a motor; size in the unit of its mode."""
+    """The fault of one arm: a kind of `MODES` at a motor; size in the unit of its mode.
+
+    Random errors without a size are drawn from `World.errors`.
+    """
 
     kind: str
     motor: int = 0
@@ -62,6 +65,7 @@ class World:
     engine: str
     redrawn_at_rest: bool = False
     onset: int = ONSET
+    errors: tuple[float, float] = ERROR_RAD
     count: int = 0
     lost: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
@@ -161,7 +165,8 @@ class World:
         elif fault.kind == "random":
             if self.redrawn_at_rest or not still[i, k] or self.error[i] == 0.0:
                 sign = 1.0 if luck[0] < 0.5 else -1.0
-                self.error[i] = sign * (ERROR_RAD[0] + luck[1] * (ERROR_RAD[1] - ERROR_RAD[0]))
+                drawn = self.errors[0] + luck[1] * (self.errors[1] - self.errors[0])
+                self.error[i] = sign * (drawn if np.isnan(fault.size) else fault.size)
             aim[i, k] += self.error[i]
         elif fault.kind == "bias":
             aim[i, k] += fault.size

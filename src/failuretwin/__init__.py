@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser
     from failuretwin.decision.streaming.fleet import StreamingFleet
     from failuretwin.decision.streaming.monitor import monitor
+    from failuretwin.decision.test_motions.health_check import CheckResult
+    from failuretwin.decision.test_motions.session import check
     from failuretwin.decision.training import train
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import Robot, load_robot
@@ -52,6 +54,7 @@ __version__ = "0.1.0"
 _HOME = {
     "BayesDiagnoser": "inference.diagnoser",
     "Calibration": "connection.calibration.result",
+    "CheckResult": "decision.test_motions.health_check",
     "Commander": "connection.links.commander",
     "Diagnoser": "inference.diagnoser",
     "Diagnosis": "core.hypothesis",
@@ -80,6 +83,7 @@ _HOME = {
     "act": "decision.acting.session",
     "advise": "decision.maintenance.expected_cost",
     "calibrate": "connection.calibration.calibrate",
+    "check": "decision.test_motions.session",
     "compare": "decision.evaluation",
     "diagnose": "inference.diagnoser",
     "emulated_arm": "app.acting",
@@ -106,6 +110,7 @@ _HOME = {
 __all__ = [
     "BayesDiagnoser",
     "Calibration",
+    "CheckResult",
     "Commander",
     "Diagnoser",
     "Diagnosis",
@@ -135,6 +140,7 @@ __all__ = [
     "act",
     "advise",
     "calibrate",
+    "check",
     "compare",
     "diagnose",
     "emulated_arm",

@@ -127,10 +127,10 @@ def test_a_table_that_makes_no_sense_is_refused(table, match):
         InferenceSettings.of(with_table(load_robot("ur5e"), **table))
 
 
-def test_errors_range_from_four_counts_to_the_papers_own():
+def test_errors_range_up_to_the_papers_own_in_even_steps_of_their_logarithm():
     low, high = np.array(InferenceSettings.of(load_robot("armpi_fpv")).error_ranges).T / COUNT_RAD
-    np.testing.assert_allclose(low, [4.0, 7.0, 10.0])
-    np.testing.assert_allclose(high, [20.0, 35.0, 50.0])
+    np.testing.assert_allclose(low, np.geomspace(3.0, 10.0, 4), rtol=0.02)
+    np.testing.assert_allclose(high, np.geomspace(15.0, 50.0, 4), rtol=0.02)
 
 
 def test_a_noisy_tool_rests_by_the_settings_of_its_sensor():

@@ -63,10 +63,10 @@ def surprise(posteriors, truths):
 @pytest.mark.parametrize(
     ("how", "whole", "right", "score"),
     [
-        ("measured", True, 89, 0.030427),
-        ("measured", False, 89, 0.034234),
-        ("published", True, 87, 0.129976),
-        ("published", False, 86, 0.142107),
+        ("measured", True, 90, 0.023742),
+        ("measured", False, 90, 0.027414),
+        ("published", True, 86, 0.144249),
+        ("published", False, 85, 0.155481),
     ],
 )
 def test_ninety_runs_with_the_bundled_calibration(told, how, whole, right, score):
@@ -92,10 +92,13 @@ def test_intervals_of_stuck_motors_hold_as_many_as_they_did(real, told, how, ang
 
 
 @pytest.mark.parametrize(
-    ("more", "right", "score"),
-    [((), 71, 0.024713), (("steady_state_error",), 71, 0.027115)],
+    ("more", "right", "healthy_kept", "score"),
+    [((), 71, 19, 0.024713), (("steady_state_error",), 71, 18, 0.026548)],
 )
-def test_older_campaign_with_the_bundled_calibration(campaign, twin, more, right, score):
+def test_older_campaign_with_the_bundled_calibration(
+    campaign, twin, more, right, healthy_kept, score
+):
+    """With small errors among the hypotheses one healthy run of another campaign has one."""
     listed, runs = campaign
     motors = twin.robot.motor_names
     faults = [f"{motor}:{mode}" for mode in (*OLDER_MODES, *more) for motor in motors]
@@ -106,4 +109,5 @@ def test_older_campaign_with_the_bundled_calibration(campaign, twin, more, right
     reached = surprise([d.posterior for d, _ in judged], [truth for _, truth in judged])
     assert reached == pytest.approx(score, rel=SCORE_BAND)
     healthy = [d.diagnosis for d, r in zip(diagnoses, listed, strict=True) if r.truth == "healthy"]
-    assert healthy == ["healthy"] * 19
+    assert len(healthy) == 19
+    assert healthy.count("healthy") == healthy_kept

@@ -119,6 +119,17 @@ def emulated_arm(
     )
 
 
+def is_real(place: str) -> bool:
+    """Return whether a place on the command line is a real arm, without looking for it.
+
+    Raises:
+        InputError: If it is none of `PLACES`.
+    """
+    if place != EMULATED and place != ROS1 and not place.startswith(f"{ROSBRIDGE}://"):
+        raise InputError(f"--on is {place!r}, expected {PLACES}.")
+    return place != EMULATED
+
+
 def commander_of(
     place: str,
     known: CalibratedRobot,
@@ -132,7 +143,7 @@ def commander_of(
     Raises:
         InputError: If it cannot be reached or is none of `PLACES`.
     """
-    if place == EMULATED:
+    if not is_real(place):
         return stack.enter_context(emulated_arm(known, faults, seed))
     if faults:
         raise InputError(
@@ -143,14 +154,24 @@ def commander_of(
         from failuretwin.connection.links.ros1 import Ros1Commander
 
         return stack.enter_context(Ros1Commander(known.robot, topics_of(topics)))
-    if place.startswith(f"{ROSBRIDGE}://"):
-        from failuretwin.connection.links import rosbridge
+    from failuretwin.connection.links import rosbridge
 
-        ros = rosbridge.connect(*address_of(place))
-        stack.callback(rosbridge.disconnect, ros)
-        made = rosbridge.RosbridgeCommander(known.robot, topics_of(topics), ros)
-        return stack.enter_context(made)
-    raise InputError(f"--on is {place!r}, expected {PLACES}.")
+    ros = rosbridge.connect(*address_of(place))
+    stack.callback(rosbridge.disconnect, ros)
+    return stack.enter_context(rosbridge.RosbridgeCommander(known.robot, topics_of(topics), ros))
+
+
+def _emulated(
+    known: CalibratedRobot, faults: Sequence[str], seed: int, stack: ExitStack
+) -> Commander:
+    from failuretwin.connection.commanded_arm import CommandedArm
+    from failuretwin.connection.emulated_arm import Emulation
+
+    own = emulated_faults(faults, known.robot)
+    emulation = Emulation(
+        known.robot, known.imperfections, own.schedule, seed, own.modes, own.start
+    )
+    return stack.enter_context(CommandedArm(emulation))
 
 
 # What is told.

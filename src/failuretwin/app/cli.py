@@ -15,6 +15,7 @@ import click
 from failuretwin import __version__
 from failuretwin.app.commands.act import act, stop
 from failuretwin.app.commands.advise import advise
+from failuretwin.app.commands.check import check, design, isolability
 from failuretwin.app.commands.data import import_, robot, simulate
 from failuretwin.app.commands.demo import demo
 from failuretwin.app.commands.diagnose import diagnose, evaluate
@@ -35,7 +36,8 @@ def cli() -> None:
 
 for command in (
     *(demo, import_, simulate, diagnose, evaluate, calibrate),
-    *(train, study, emulate, watch, act, stop, reach, advise, robot),
+    *(train, study, emulate, watch, act, stop, reach, check, design, isolability),
+    *(advise, robot),
 ):
     cli.add_command(command)
 

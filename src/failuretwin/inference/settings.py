@@ -29,8 +29,9 @@ Industrial arms come back to 0.05 to 0.1 mm, and a nominal geometry leaves more;
 NOISE_OF_FIT = 0.5
 """The same where the geometry is fitted, in what the fit leaves [-]: at least so much belongs to no
 motor, however their scatter was told apart from it; assumed."""
-ERROR_STEPS = (1.0, 1.75, 2.5)
-"""Where ranges of steady-state errors begin, in the least error that a profile states."""
+ERROR_STEPS = (0.75, 1.12, 1.67, 2.5)
+"""Where ranges of steady-state errors begin, in the least error that a profile states: even steps
+of the logarithm of a run's scale, from what several movements show together to the paper's."""
 WIDEST_ERROR = 5.0
 """Greatest size of a range, in its least one: the paper's 10 to 50 counts."""
 
@@ -72,8 +73,8 @@ class InferenceSettings(Bounded):
     def error_ranges(self) -> tuple[Range, ...]:
         """Run-level ranges of a steady-state error's size, where the profile states the least.
 
-        From just above the healthy scatter to the paper's own, of the ArmPi FPV 10 to 50 counts
-        [rad].
+        From what several movements show together to the paper's own, of the ArmPi FPV 10 to 50
+        counts [rad].
         """
         least = np.array(ERROR_STEPS) * self.least_error_rad
         return tuple((float(low), float(WIDEST_ERROR * low)) for low in least)

@@ -54,6 +54,13 @@ from failuretwin.app.terminal import tell
     help="Give a target up after so many.",
 )
 @click.option(
+    "--ask",
+    "questions",
+    type=click.IntRange(min=0),
+    default=0,
+    help="Make so many movements at most only to settle what is wrong, while that is open.",
+)
+@click.option(
     "--speed-share",
     type=click.FloatRange(min=0.0, max=1.0, min_open=True),
     default=0.5,
@@ -95,6 +102,7 @@ def act(
     strategy: str,
     move: bool,
     most_movements: int,
+    questions: int,
     speed_share: float,
     floor: float | None,
     radius: float | None,
@@ -126,7 +134,7 @@ def act(
         known,
         SafetyGate(known.robot, limits),
         strategy,
-        ActingSettings(most_movements=most_movements),
+        ActingSettings(most_movements=most_movements, questions=questions),
         None,
         seed,
     )

@@ -15,7 +15,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 PATH = click.Path(path_type=Path)
 
 
-def _gathered(kind: type, name: str, *options: Callable[[F], F]) -> Callable[[F], F]:
+def gathered(kind: type, name: str, *options: Callable[[F], F]) -> Callable[[F], F]:
     """Return a decorator that adds options; the command gets them as one argument, of `kind`."""
 
     def decorate(command: F) -> F:
@@ -99,7 +99,7 @@ class LogOptions:
     approximate: bool
 
 
-reading_options = _gathered(
+reading_options = gathered(
     LogOptions,
     "reading",
     click.option(
@@ -143,7 +143,7 @@ class LiveOptions:
     duration: float | None
 
 
-live_options = _gathered(
+live_options = gathered(
     LiveOptions,
     "live",
     click.option(

@@ -23,6 +23,7 @@ from failuretwin.decision.acting.planner import Plan, Planner, Standing
 from failuretwin.decision.acting.reactions import lost_command, probing, told
 from failuretwin.decision.acting.sparing import Effort
 from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, Target, Task
+from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.digital_model.inverse_kinematics import angle_between
 from failuretwin.failure_behavior.reaction import Reaction
 from failuretwin.inference.healthy_model import HealthyModel
@@ -30,6 +31,8 @@ from failuretwin.inference.healthy_model import HealthyModel
 SMALLEST_NEWS_RAD = 0.02
 """A held angle that is believed to lie so far from where it was planned with calls for a new plan
 [rad]."""
+LEFT_OPEN = 0.9
+"""What is wrong is open as long as nothing is more probable, healthy included."""
 HALVINGS = 3
 """A correction that is not safe is tried at half, a quarter and an eighth."""
 
@@ -46,6 +49,8 @@ class ActingSettings:
         most_repeats: So often a command that seems lost is sent again for one target.
         probe_every: A motor that is held is told to move once in so many targets, so that a
             repair is noticed.
+        questions: So many movements of the task at most are made only to settle what is wrong,
+            while that is open.
     """
 
     most_movements: int = 6
@@ -54,6 +59,7 @@ class ActingSettings:
     later_gain: float = 0.7
     most_repeats: int = 1
     probe_every: int = 8
+    questions: int = 0
 
 
 @dataclass(frozen=True)
@@ -95,6 +101,8 @@ class _Attempt:
     as_healthy: bool = False
     planned_with: BelievedFault | None = None
     first_error_m: float = np.nan
+    asks: bool = False
+    anew: bool = False
     pose: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
@@ -130,6 +138,8 @@ class Actor:
         self._attempt = _Attempt()
         self._since_probe = 0
         self.ways: list[tuple[Effort, ...]] = []  # as taken, and as if no motor were spared
+        self._judgement: Judgement | None = None
+        self._questions = settings.questions
 
     # What is known.
 
@@ -178,7 +188,7 @@ class Actor:
             self._command, self._previous, self._order.duration, start_s, rest_s, point
         )
         self.belief.add(self._seen)
-        self._attempt.movements += 1
+        self._attempt.movements += not self._attempt.asks
 
     def learn(self, judgement: Judgement | None) -> None:
         """Learn from the movement that was seen, and conclude the target if it is time to.
@@ -193,6 +203,10 @@ class Actor:
         if news:
             self._say(news)
             self._tell_reaction()
+        self._judgement = judgement
+        if self._attempt.asks:
+            self._attempt.asks, self._attempt.anew = False, True
+            return
         error = self._error_m(seen)
         if self._attempt.movements == 1:
             self._attempt.first_error_m = error
@@ -255,7 +269,9 @@ class Actor:
     def next(self) -> Order | None:
         """Return the next order; None: the task is over."""
         while not self.done:
-            order = self._begin() if self._plans_anew() else self._corrected()
+            order = self._question()
+            if order is None:
+                order = self._begin() if self._plans_anew() else self._corrected()
             if order is not None:
                 self._previous, self._command = self._command, order.target
                 self._order = order
@@ -265,7 +281,8 @@ class Actor:
     def _plans_anew(self) -> bool:
         """Return whether the target is new, or is looked at with other eyes than before."""
         attempt, believed = self._attempt, self.belief.believed
-        if attempt.movements == 0:
+        if attempt.movements == 0 or attempt.anew:
+            attempt.anew = False
             return True
         before = attempt.planned_with
         if believed is None or before is None:
@@ -276,6 +293,23 @@ class Actor:
         if attempt.as_healthy or believed.reaction is not Reaction.LOCK:
             return False
         return abs(believed.angle - before.angle) > SMALLEST_NEWS_RAD
+
+    def _question(self) -> Order | None:
+        """Return a movement that asks what is wrong, while that is open; None: none is made."""
+        judgement = self._judgement
+        if not self._questions or judgement is None or self.belief.believed is not None:
+            return None
+        if judgement.probability(judgement.best) >= LEFT_OPEN:
+            return None
+        gate = self._planner.gate
+        asked = (judgement.posterior, self._command, len(self.results), judgement.row)
+        order = next_movement(self._model, gate, *asked)
+        if order is None:
+            return None
+        self._questions -= 1
+        self._attempt.asks = True
+        self._say(f"it is open what is wrong ({judgement.best} the most probable): asked")
+        return order
 
     def _begin(self) -> Order | None:
         """Return the order that a new plan begins with; None where the target is given up."""

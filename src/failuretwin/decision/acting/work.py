@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -12,8 +13,10 @@ from failuretwin.connection.links.base import CommandSent, Reading
 from failuretwin.connection.links.commander import Commander, Order
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.actor import Actor
+from failuretwin.decision.acting.belief import Belief
+from failuretwin.decision.acting.believed_arm import BelievedArm, Seen
 from failuretwin.decision.acting.judging import Judge, Judgement
+from failuretwin.decision.acting.planner import Standing
 from failuretwin.decision.acting.rest import RestWatch
 from failuretwin.decision.acting.safety import SafetyGate, UnsafeOrderError
 
@@ -32,6 +35,46 @@ class Halted(InputError):  # noqa: N818 - it is no error of the user
     """Work was stopped before the task was over; nothing more is sent."""
 
 
+class Worker(Protocol):
+    """Says what to order next, by what was seen: an `Actor`, or a `HealthCheck`."""
+
+    @property
+    def arm(self) -> BelievedArm:
+        """The arm as it is worked with."""
+        ...
+
+    @property
+    def belief(self) -> Belief:
+        """What the arm is taken to be."""
+        ...
+
+    @property
+    def window(self) -> Sequence[Seen]:
+        """Movements that are to be weighed before `learn`."""
+        ...
+
+    @property
+    def said(self) -> Sequence[str]:
+        """What is to be told so far."""
+        ...
+
+    def standing(self) -> Standing:
+        """Return where the arm stands as far as is believed."""
+        ...
+
+    def next(self) -> Order | None:
+        """Return the next order; None: there is none."""
+        ...
+
+    def see(self, point: FloatArray | None, start_s: float, rest_s: float) -> None:
+        """Take where the tool came to rest after the last order, (3,) [m]; None: not seen."""
+        ...
+
+    def learn(self, judgement: Judgement | None) -> None:
+        """Learn from the movement that was seen."""
+        ...
+
+
 @dataclass
 class Work:
     """One task on one arm.
@@ -45,7 +88,7 @@ class Work:
         tell: Called with what is said, as it happens.
     """
 
-    actor: Actor
+    actor: Worker
     judge: Judge | None
     gate: SafetyGate
     commander: Commander

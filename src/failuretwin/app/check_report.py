@@ -1,0 +1,182 @@
+"""A health check and a design as lines, tables and JSON; what a robot's earlier checks found."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from failuretwin.app.tables import Table, figures_table
+from failuretwin.core.errors import InputError, counted
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.data_knowledge.store import replacing
+from failuretwin.decision.test_motions.health_check import OPEN, CheckResult
+from failuretwin.decision.test_motions.motions import Motions
+from failuretwin.digital_model.robot import Robot
+from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.explanation import size_words
+from failuretwin.inference.isolability import IsolabilityReport
+
+CHANGED = 3.0
+"""A zero or a play that differs from that of the check before by so many standard deviations has
+changed."""
+LIKELY = 0.05
+"""Motors are named where it is open from this probability on."""
+
+
+def check_lines(result: CheckResult, robot: Robot, seconds: float) -> list[str | Table]:
+    """Return the page of a check: the light, why, and what every motor showed."""
+    diagnosis = result.diagnosis
+    head = f"{result.light.upper()}: {diagnosis.verdict}"
+    if result.light == OPEN and not diagnosis.undecided:
+        names = [name for name, p in result.by_motor.items() if p >= LIKELY]
+        head = f"OPEN: cannot tell, because {diagnosis.verdict}"
+        head += f". Ask {' and '.join(names)} further: --further 6" if names else ""
+    made = counted(result.movements, "movement") + f" seen at rest, {seconds:.0f} s planned"
+    if result.further:
+        made += f", {counted(result.further, 'further movement')}"
+    advice = [line for line in diagnosis.explanation if line.startswith("what to do")]
+    low = ["" if not diagnosis.quality else "the log: " + "; ".join(diagnosis.quality)]
+    return [head, *advice, made, *filter(None, low), _motor_table(result, robot)]
+
+
+def shown_line(found: IsolabilityReport, robot: Robot) -> str:
+    """Return what a green light rules out, and what it does not."""
+    sizes = [
+        f"{name.split(':')[0]} {told_size(name, size, found.largest[name], robot)}"
+        for name, size in found.isolated.items()
+    ]
+    said = "random errors that these motions show: " + ", ".join(sizes)
+    return f"{said}; smaller ones may be there"
+
+
+def told_size(name: str, size: float | None, largest: float, robot: Robot) -> str:
+    """Return a size in the unit that people read; where none is found, that the largest is not."""
+    fault = Hypothesis.parse(name).faults[0]
+    unit = robot.own_unit(fault.motor, MODES[fault.mode].unit)
+    told = size_words(fault, largest if size is None else size, unit).strip(" ()+")
+    told = told.removeprefix("by about ").removeprefix("by ").removeprefix("of ").lstrip("+")
+    return f"not even {told}" if size is None else told
+
+
+def _motor_table(result: CheckResult, robot: Robot) -> Table:
+    """Return what each motor showed, zeros and play in degrees, of slides in millimetres."""
+    found, rows = result.offsets, []
+    for k, name in enumerate(robot.motor_names):
+        factor, unit = (1e3, "mm") if robot.slides[k] else (180.0 / np.pi, "deg")
+        rows.append([
+            name,
+            f"{result.by_motor.get(name, 0.0):.1%}",
+            *(f"{factor * value[k]:+.2f} +- {factor * deviation[k]:.2f} {unit}"
+              for value, deviation in ((found.zero, found.zero_sd), (found.play, found.play_sd))),
+        ])  # fmt: skip
+    return figures_table(["motor", "faulty", "zero off by", "play"], rows)
+
+
+def check_record(result: CheckResult, robot: Robot, seconds: float) -> dict[str, Any]:
+    """Return a check as a JSON object: its diagnosis, as of `diagnose --json`, and more."""
+    found = result.offsets
+    return {
+        **result.diagnosis.to_record(),
+        "robot": robot.name,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "light": result.light,
+        "motor": result.motor or None,
+        "movements": result.movements,
+        "further": result.further,
+        "seconds": seconds,
+        "motors": [
+            {
+                "motor": name,
+                "probability": result.by_motor.get(name, 0.0),
+                "zero": float(found.zero[k]),
+                "zero_deviation": float(found.zero_sd[k]),
+                "play": float(found.play[k]),
+                "play_deviation": float(found.play_sd[k]),
+                "unit": "m" if robot.slides[k] else "rad",
+            }
+            for k, name in enumerate(robot.motor_names)
+        ],
+    }
+
+
+def write_records(records: Sequence[dict[str, Any]], path: Path) -> None:
+    """Write JSON objects, a line each.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    with replacing(path) as partial:
+        text = "".join(json.dumps(record) + "\n" for record in records)
+        partial.write_text(text, encoding="utf-8")
+
+
+# Checks that are kept: the same motions again, and what has changed since.
+
+
+def kept_checks(path: Path) -> list[dict[str, Any]]:
+    """Return the checks of a kept file, the oldest first.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    try:
+        return list(json.loads(path.read_text(encoding="utf-8"))["checks"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path}: cannot be read as kept checks ({error}). Expected what `check --keep` wrote."
+        ) from error
+
+
+def keep_check(path: Path, motions: Motions, record: dict[str, Any]) -> None:
+    """Add a check to a kept file, or begin one.
+
+    Raises:
+        InputError: If it cannot be read.
+        OutputError: If it cannot be written.
+    """
+    before = kept_checks(path) if path.exists() else []
+    write_records([{"motions": motions.record(), "checks": [*before, record]}], path)
+
+
+def changes(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    """Return what has changed since a check of the same motions, a line each."""
+    lines = []
+    for old, new in zip(before["motors"], now["motors"], strict=True):
+        for what in ("zero", "play"):
+            moved = new[what] - old[what]
+            spread = float(np.hypot(new[f"{what}_deviation"], old[f"{what}_deviation"]))
+            if abs(moved) > CHANGED * spread:
+                factor, unit = (1e3, "mm") if new["unit"] == "m" else (180.0 / np.pi, "deg")
+                lines.append(
+                    f"since {before['date'][:10]}: {what} of {new['motor']} changed by "
+                    f"{factor * moved:+.2f} {unit} ({abs(moved) / spread:.1f} deviations)"
+                )
+    return lines or [
+        f"since {before['date'][:10]}: no zero and no play changed by more than {CHANGED:.0f} "
+        "deviations"
+    ]
+
+
+# Designs.
+
+
+def motion_lines(motions: Motions, robot: Robot) -> list[str | Table]:
+    """Return what is told to the motors, a row a movement, angles in degrees."""
+    factor = np.where(robot.slides, 1e3, 180.0 / np.pi)
+    rows = [
+        [f"{k + 1}", f"{begin:.1f}", f"{ramp:.2f}", *(f"{x:.1f}" for x in factor * target)]
+        for k, (begin, ramp, target) in enumerate(
+            zip(motions.start_s, motions.ramp_s, motions.target, strict=True)
+        )
+    ]
+    units = ["mm" if slides else "deg" for slides in robot.slides]
+    heads = [f"{name} [{unit}]" for name, unit in zip(robot.motor_names, units, strict=True)]
+    return [
+        f"{counted(len(rows), 'movement')} in {motions.duration_s:.1f} s",
+        figures_table(["", "at [s]", "ramp [s]", *heads], rows),
+    ]

@@ -1,0 +1,288 @@
+"""`failuretwin check`, `design` and `isolability`: movements that are made to be told something."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from failuretwin.app.commands.options import (
+    PATH,
+    HypothesesOption,
+    calibration_option,
+    common_options,
+    gathered,
+    plugin_option,
+)
+
+if TYPE_CHECKING:
+    from failuretwin.decision.test_motions.session import Checking
+
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """Which movements are allowed, as the help texts of `motion_options` say it."""
+
+    hypotheses: str | None
+    usual: bool
+    speed_share: float
+    floor: float | None
+    radius: float | None
+
+    def checking(self, calibration: Path | None, robot: str, seed: int) -> Checking:
+        """Return what a check and a design need."""
+        from failuretwin.app.inputs import parse_cli_hypotheses
+        from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
+        from failuretwin.decision.test_motions.session import Checking
+        from failuretwin.digital_model.calibrated_robot import load_calibration
+
+        known = load_calibration(calibration, robot)
+        limits = SafetyLimits(
+            speed_share=self.speed_share, floor_m=self.floor, radius_m=self.radius
+        )
+        named = parse_cli_hypotheses(self.hypotheses, known.robot)
+        return Checking(known, SafetyGate(known.robot, limits), named, self.usual, seed)
+
+
+motion_options = gathered(
+    MotionOptions,
+    "motion",
+    click.option(
+        "--hypotheses",
+        cls=HypothesesOption,
+        metavar="H,...",
+        help="What may be the case. Default: every single fault that shows at rest.",
+    ),
+    click.option(
+        "--usual",
+        is_flag=True,
+        help="Keep to the ranges of usual movements, not to the limits of the joints alone.",
+    ),
+    click.option(
+        "--speed-share",
+        type=click.FloatRange(min=0.0, max=1.0, min_open=True),
+        default=0.5,
+        help="Share of each motor's speed limit that may be used.",
+    ),
+    click.option(
+        "--floor", type=float, metavar="METRES", help="Height of the floor. Default: the base."
+    ),
+    click.option(
+        "--radius",
+        type=click.FloatRange(min=0.0),
+        metavar="METRES",
+        help="Radius of the links, for the distance that they keep. Default: by the arm's reach.",
+    ),
+)
+seconds_option = click.option(
+    "--seconds",
+    type=click.FloatRange(min=0.0, max=3600.0, min_open=True),
+    default=20.0,
+    help="Time for the movements.",
+)
+
+
+@click.command()
+@seconds_option
+@click.option(
+    "--on",
+    "place",
+    default="emulated",
+    metavar="emulated|ros1|rosbridge://HOST[:PORT]",
+    help="The arm.",
+)
+@click.option(
+    "--write",
+    "written",
+    type=PATH,
+    metavar="FILE",
+    help="Move nothing: write the motions (.json, .csv, .mcap) for an arm that we cannot command.",
+)
+@click.option(
+    "--log",
+    "logs",
+    multiple=True,
+    type=PATH,
+    metavar="INPUT",
+    help="Move nothing: say what the log of a check says that was recorded elsewhere. Can be given "
+    "several times.",
+)
+@click.option(
+    "--motions",
+    type=PATH,
+    metavar="FILE.json",
+    help="Make these motions. Default: they are designed anew.",
+)
+@click.option(
+    "--keep",
+    type=PATH,
+    metavar="FILE.json",
+    help="Keep motions and results of this robot there; if it exists, make the same motions again "
+    "and say what has changed.",
+)
+@click.option(
+    "--further",
+    type=click.IntRange(min=0),
+    default=0,
+    help="So many further movements at most, if it is still open then what is wrong.",
+)
+@click.option(
+    "--fault",
+    "faults",
+    multiple=True,
+    metavar="MOTOR:MODE[=SIZE][@START]",
+    help="A fault of an emulated arm, such as motor_3:stuck or motor_2:encoder_bias=0.1. Can be "
+    "given several times.",
+)
+@click.option(
+    "--move",
+    is_flag=True,
+    help="Really send orders. Without it a real arm is left alone and the motions are told. An "
+    "emulated arm needs no --move.",
+)
+@click.option("--json", "json_file", type=PATH, metavar="FILE", help="Write an object a line.")
+@click.option("--topics", type=PATH, metavar="FILE.toml", help="Names and types of ROS topics.")
+@motion_options
+@calibration_option
+@plugin_option
+@common_options
+def check(
+    seconds: float,
+    place: str,
+    written: Path | None,
+    logs: tuple[Path, ...],
+    motions: Path | None,
+    keep: Path | None,
+    further: int,
+    faults: tuple[str, ...],
+    move: bool,
+    json_file: Path | None,
+    topics: Path | None,
+    motion: MotionOptions,
+    calibration: Path | None,
+    robot: str,
+    seed: int,
+) -> None:
+    """Move an arm for 20 or 60 s and say whether it is healthy, or which motor is not.
+
+    Movements are chosen to tell most; each passes the gate of `act`. See docs/asking.md.
+    """
+    from failuretwin.app import check_report as report
+    from failuretwin.app.acting import commander_of, is_real
+    from failuretwin.app.smallest import of_motions
+    from failuretwin.app.tables import show
+    from failuretwin.app.terminal import tell
+    from failuretwin.decision.test_motions.health_check import GREEN
+    from failuretwin.decision.test_motions.motions import write_motions
+
+    asking = motion.checking(calibration, robot, seed)
+    arm = asking.known.robot
+    if logs:
+        results = asking.of_logs(logs)
+        for result in results:
+            show(result.diagnosis.run, *report.check_lines(result, arm, 0.0), "")
+        if json_file is not None:
+            report.write_records([report.check_record(r, arm, 0.0) for r in results], json_file)
+        return
+    repeat = keep if keep is not None and keep.exists() else motions
+    planned = asking.motions(seconds, repeat)
+    if written is not None:
+        write_motions(planned, arm, written)
+        show(*report.motion_lines(planned, arm), f"written to {written}; nothing was moved")
+        return
+    if is_real(place) and not move:
+        show("nothing moves without --move; these are the motions")
+        show(*report.motion_lines(planned, arm))
+        return
+    with ExitStack() as stack:
+        commander = commander_of(place, asking.known, faults, seed, topics, stack)
+        result = asking.health_check(planned, further).work(commander, tell)
+    record = report.check_record(result, arm, planned.duration_s)
+    show(*report.check_lines(result, arm, planned.duration_s))
+    if result.light == GREEN:
+        show(report.shown_line(of_motions(asking, planned), arm))
+    if keep is not None:
+        before = report.kept_checks(keep) if keep.exists() else []
+        show(*(report.changes(before[-1], record) if before else [f"kept in {keep}"]))
+        report.keep_check(keep, planned, record)
+    if json_file is not None:
+        report.write_records([record], json_file)
+
+
+@click.command()
+@seconds_option
+@click.option("--movements", type=click.IntRange(min=1), default=1000, help="So many at most.")
+@click.option("--write", "written", type=PATH, metavar="FILE", help="Write .json, .csv or .mcap.")
+@motion_options
+@calibration_option
+@plugin_option
+@common_options
+def design(
+    seconds: float,
+    movements: int,
+    written: Path | None,
+    motion: MotionOptions,
+    calibration: Path | None,
+    robot: str,
+    seed: int,
+) -> None:
+    """Choose movements that tell most, and say which faults they show, beside random ones."""
+    from failuretwin.app.check_report import motion_lines
+    from failuretwin.app.smallest import smallest_beside_random
+    from failuretwin.app.tables import show
+    from failuretwin.decision.test_motions.motions import write_motions
+
+    asking = motion.checking(calibration, robot, seed)
+    planned = asking.motions(seconds, None, movements)
+    if written is not None:
+        write_motions(planned, asking.known.robot, written)
+    show(*motion_lines(planned, asking.known.robot), *smallest_beside_random(asking, planned))
+
+
+@click.command()
+@click.argument("name", metavar="ROBOT")
+@click.option(
+    "--motions",
+    type=PATH,
+    required=True,
+    metavar="FILE",
+    help="Motions that `design` or `check` wrote (.json), or any log or run set.",
+)
+@click.option(
+    "--hypotheses",
+    cls=HypothesesOption,
+    metavar="H,...",
+    help="What is laid beside each other. Default: the paper's nine classes.",
+)
+@click.option("--plot", type=PATH, metavar="FILE.png", help="Draw the smallest sizes.")
+@click.option("--json", "json_file", type=PATH, metavar="FILE", help="Write the table.")
+@calibration_option
+@plugin_option
+def isolability(
+    name: str,
+    motions: Path,
+    hypotheses: str | None,
+    plot: Path | None,
+    json_file: Path | None,
+    calibration: Path | None,
+) -> None:
+    """Say the smallest fault of each motor and mode that motions of ROBOT can show.
+
+    ROBOT is a bundled robot, or the TOML profile of another.
+    """
+    from failuretwin.app.check_report import write_records
+    from failuretwin.app.reports import group_lines
+    from failuretwin.app.smallest import save_picture, size_table, smallest_of, smallest_record
+    from failuretwin.app.tables import show
+
+    options = MotionOptions(hypotheses, False, 0.5, None, None)
+    asking = options.checking(calibration, name, 0)
+    found = smallest_of(asking, motions)
+    show(size_table(found, asking.known.robot), *group_lines(found, asking.known.robot))
+    if json_file is not None:
+        write_records(smallest_record(found), json_file)
+    if plot is not None:
+        save_picture(found, asking.known.robot, plot)

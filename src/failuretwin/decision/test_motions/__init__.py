@@ -1,0 +1,1 @@
+"""Test motions: movements that are made to be told something, and what they tell."""

@@ -1,0 +1,302 @@
+"""A health check: test movements made, what they say of every motor, and whether that is enough.
+
+    green: P(healthy) >= 0.95;    red: P(motor k), the sum over its modes, >= 0.95;    else open
+
+Section: docs/asking.md#what-a-check-says
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from failuretwin.connection.links.commander import Commander, Order
+from failuretwin.core.hypothesis import HEALTHY, Diagnosis, Hypothesis, single_faults
+from failuretwin.core.types import FloatArray
+from failuretwin.decision.acting.belief import Belief, NoBelief, settled_evidence_of
+from failuretwin.decision.acting.believed_arm import BelievedArm, Seen
+from failuretwin.decision.acting.planner import Standing
+from failuretwin.decision.acting.safety import SafetyGate
+from failuretwin.decision.acting.work import Work, first_standing
+from failuretwin.decision.test_motions.design import next_movement
+from failuretwin.decision.test_motions.motions import Motions
+from failuretwin.failure_behavior.mode import Signature
+from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.evidence import SettledEvidence
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.log_quality import LogQuality
+from failuretwin.inference.posterior import Posterior, log_prior
+from failuretwin.inference.priors import Priors
+from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.settings import ERROR_STEPS, WIDEST_ERROR
+from failuretwin.inference.shared_posterior import set_up_in_doubt, shared_posterior
+
+HEALTHY_TO_FAULTY = 2.0
+"""Odds that an arm is healthy that nobody suspects; assumed."""
+LEAST_SHARE = 0.5
+"""Where ranges of errors begin, in the least error that a profile states."""
+RANGES = 5
+"""So many ranges from there to the paper's."""
+SURE = 0.95
+"""Probability from which a check names a motor, or says that all is well."""
+GREEN, RED, OPEN = "green", "red", "open"
+ROUNDS = 8
+"""Steps in which movements that fit ill get less weight."""
+LOOSE_RAD = 0.1
+"""What zeros and play may be before anything is seen, their deviation [rad]."""
+
+
+def checking(model: HealthyModel, hypotheses: Sequence[Hypothesis]) -> Priors:
+    """Return priors of who checks an arm that nobody suspects: 2 to 1 that it is healthy.
+
+    Movements that are chosen for it show smaller errors than others do: where a profile states the
+    least, ranges of errors begin at half of that, in even steps of the logarithm.
+
+    Args:
+        model: The healthy robot.
+        hypotheses: What may be the case.
+    """
+    least = model.settings.least_error_rad
+    begin = np.geomspace(LEAST_SHARE, max(ERROR_STEPS), RANGES) * least
+    ranges = tuple((low, WIDEST_ERROR * low) for low in begin.tolist())
+    plain = Priors(error_ranges=ranges if least else None)
+    prior = np.exp(log_prior(hypotheses, plain))
+    own = sum(prior[i] for i, h in enumerate(hypotheses) if h.is_healthy)
+    if not 0.0 < own < 1.0:
+        return plain
+    return replace(plain, healthy_odds=HEALTHY_TO_FAULTY * float((1.0 - own) / own))
+
+
+@dataclass(frozen=True)
+class MotorOffsets:
+    """What settled movements say of each motor if nothing is wrong with the others.
+
+    Attributes:
+        zero: By how much it settles beside where it should, (motor,) [rad].
+        zero_sd: Standard deviation of that.
+        play: By how much that differs by the side it comes from, (motor,) [rad].
+        play_sd: Standard deviation of that.
+    """
+
+    zero: FloatArray
+    zero_sd: FloatArray
+    play: FloatArray
+    play_sd: FloatArray
+
+
+def motor_offsets(evidence: SettledEvidence, model: HealthyModel) -> MotorOffsets:
+    """Return offsets of all motors from one run, weighed by how well each movement fits.
+
+        r_m = J_m (b - d_m p / 2) + e_m,    e_m ~ Student t with scale S_m
+
+    Args:
+        evidence: Settled positions of one run.
+        model: The healthy robot.
+    """
+    movements, usable = evidence.movements, evidence.usable[0]
+    told = np.concatenate([movements.initial[:, None], movements.target], axis=1)[0]
+    command, travel = told[1:][usable], np.diff(told, axis=0)[usable]
+    direction = np.where(np.abs(travel) > 1e-9, np.sign(travel), 0.0)
+    pose = model.settle(command, direction, model.none_held)
+    error, jacobian, spread = model.residual(evidence.point[0][usable], pose, model.scatter)
+    design = np.concatenate([jacobian, -0.5 * jacobian * direction[:, None]], axis=-1)
+    count, channels, dof = design.shape[-1], error.shape[-1], model.settling.tail_dof
+    whitened = np.stack([spread.solve(design[..., i]) for i in range(count)], axis=-1)
+    weight = np.ones(len(error))
+    for _ in range(ROUNDS):
+        precision = (
+            np.einsum("m,maj,mai->ji", weight, whitened, design) + np.eye(count) / LOOSE_RAD**2
+        )
+        found = np.linalg.solve(precision, np.einsum("m,maj,ma->j", weight, whitened, error))
+        left = error - design @ found
+        if np.isfinite(dof):
+            weight = (dof + channels) / (dof + np.einsum("ma,ma->m", left, spread.solve(left)))
+    deviation = np.sqrt(np.diag(np.linalg.inv(precision)))
+    motors = count // 2
+    return MotorOffsets(found[:motors], deviation[:motors], found[motors:], deviation[motors:])
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """What a check found.
+
+    Attributes:
+        diagnosis: Of all movements together.
+        offsets: Zeros and play of the motors.
+        movements: Movements that were seen at rest.
+        further: How many of the movements made were not planned before.
+    """
+
+    diagnosis: Diagnosis
+    offsets: MotorOffsets
+    movements: int
+    further: int = 0
+
+    @property
+    def by_motor(self) -> Mapping[str, float]:
+        """Probability that something is wrong with each motor."""
+        return motor_probabilities(self.diagnosis.posterior)
+
+    @property
+    def motor(self) -> str:
+        """The motor that is named; empty: none."""
+        if self.diagnosis.undecided:
+            return ""
+        return next((name for name, p in self.by_motor.items() if p >= SURE), "")
+
+    @property
+    def light(self) -> str:
+        """``green``, ``red`` or ``open``."""
+        if self.diagnosis.undecided:
+            return OPEN
+        if self.diagnosis.posterior.get(str(HEALTHY), 0.0) >= SURE:
+            return GREEN
+        return RED if self.motor else OPEN
+
+
+def motor_probabilities(posterior: Mapping[str, float]) -> dict[str, float]:
+    """Return the probability that something is wrong with each motor, by its name."""
+    found: dict[str, float] = {}
+    for name, probability in posterior.items():
+        for fault in Hypothesis.parse(name).faults:
+            found[fault.motor] = found.get(fault.motor, 0.0) + probability
+    return found
+
+
+def faults_at_rest(model: HealthyModel) -> tuple[Hypothesis, ...]:
+    """Return healthy and every single fault that can show in where a motor settles.
+
+    A motor that does not give way under load shows no loss of torque there.
+    """
+    shown = (Signature.HELD, Signature.REDRAWN_OFFSET, Signature.OFFSET)
+    modes = [name for name, mode in MODES.items() if mode.signature in shown]
+    gives = dict(zip(model.motor_names, model.settling.compliance, strict=True))
+    return tuple(
+        hypothesis
+        for hypothesis in single_faults(model.motor_names, modes)
+        if all(gives[f.motor] or not MODES[f.mode].needs_compliance for f in hypothesis.faults)
+    )
+
+
+def judged(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+) -> Posterior:
+    """Return the posterior of runs, with what is doubted of the arm integrated out."""
+    in_doubt = set_up_in_doubt(likelihood, hypotheses, priors)
+    return shared_posterior(likelihood, hypotheses, priors, in_doubt)
+
+
+def result_of(likelihood: RunLikelihood, diagnosis: Diagnosis, further: int = 0) -> CheckResult:
+    """Return what one run says beyond its diagnosis.
+
+    Args:
+        likelihood: The run.
+        diagnosis: Its diagnosis.
+        further: How many of its movements were not planned.
+    """
+    evidence = likelihood.evidence
+    offsets = motor_offsets(evidence, likelihood.model)
+    return CheckResult(diagnosis, offsets, int(evidence.usable.sum()), further)
+
+
+@dataclass
+class HealthCheck:
+    """Makes planned movements on an arm, then further ones while they leave it open what is wrong.
+
+    Attributes:
+        model: The healthy arm.
+        gate: What is safe.
+        motions: What is planned.
+        hypotheses: What may be the case.
+        priors: Beliefs about faults.
+        further: Movements that may be added at most.
+        seed: Seed of the poses that are tried for those.
+        said: What is to be told.
+        window: Movements as they were seen.
+    """
+
+    model: HealthyModel
+    gate: SafetyGate
+    motions: Motions
+    hypotheses: Sequence[Hypothesis]
+    priors: Priors
+    further: int = 0
+    seed: int = 0
+    said: list[str] = field(default_factory=list)
+    window: list[Seen] = field(default_factory=list)
+    belief: Belief = field(default_factory=NoBelief)
+
+    def __post_init__(self) -> None:
+        self._orders = self.motions.orders
+        self._command = self._previous = self.motions.start
+        self._order: Order | None = None
+        self._added = 0
+
+    def work(self, commander: Commander, tell: Callable[[str], None]) -> CheckResult:
+        """Carry the check out on an arm and return what it found."""
+        standing = first_standing(commander)
+        self._command = self._previous = standing
+        travel = self.motions.start - standing
+        if np.abs(travel).max() > 1e-6:
+            ramp = np.full(len(standing), self.gate.least_duration(travel))
+            self._orders.insert(0, Order(self.motions.start, ramp))
+        Work(self, None, self.gate, commander, standing, tell).carry_out()
+        return self.result
+
+    # What `Work` asks.
+
+    @property
+    def arm(self) -> BelievedArm:
+        """The arm as it is worked with."""
+        return BelievedArm(self.model)
+
+    def standing(self) -> Standing:
+        """Return where the arm stands if it is healthy."""
+        pose = self.arm.settle(self._command, self._previous, 0.0)
+        return Standing(pose, self._command, 0.0)
+
+    def next(self) -> Order | None:
+        """Return the next order; None: the check is over."""
+        order = self._orders.pop(0) if self._orders else self._further_order()
+        if order is not None:
+            self._previous, self._command, self._order = self._command, order.target, order
+        return order
+
+    def see(self, point: FloatArray | None, start_s: float, rest_s: float) -> None:
+        """Take where the tool came to rest, (3,) [m]; None: it was not seen at rest."""
+        assert self._order is not None
+        told = (self._command, self._previous, self._order.duration)
+        self.window.append(Seen(*told, start_s, rest_s, point))
+
+    def learn(self, judgement: object) -> None:
+        """Learn nothing: all movements are judged together."""
+
+    def _further_order(self) -> Order | None:
+        if self._added >= self.further or self.result.light != OPEN:
+            return None
+        found = next_movement(self.model, self.gate, self.posterior, self._command, self.seed)
+        if found is None:
+            return None
+        self._added += 1
+        self.said.append(f"still open: further movement {self._added}")
+        return found
+
+    # What was found.
+
+    @property
+    def likelihood(self) -> RunLikelihood:
+        """What all movements say."""
+        return RunLikelihood(settled_evidence_of([self.window]), self.model)
+
+    @property
+    def posterior(self) -> Posterior:
+        """Of all hypotheses, by all movements."""
+        return judged(self.likelihood, self.hypotheses, self.priors)
+
+    @property
+    def result(self) -> CheckResult:
+        """What the check found."""
+        diagnosis = self.posterior.to_diagnosis(0, "check", LogQuality())
+        return result_of(self.likelihood, diagnosis, self._added)

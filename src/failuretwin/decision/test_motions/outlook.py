@@ -1,0 +1,281 @@
+"""Where the tool would come to rest under each fault of each size, before anything has moved.
+
+    e | member, command ~ N(path(settle(command) + offset), S),    S = J diag(s^2) J^T + sn^2 I
+
+A member is a hypothesis with one size of its fault. An error drawn anew for each movement is
+scatter, s_k^2 + size^2; a motor that is held stands at its angle and scatters as it gives; a
+movement that may be missed counts by its first two moments.
+
+Section: docs/asking.md#what-a-movement-is-expected-to-tell
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.decision.test_motions.information import (
+    expected_information,
+    pairwise_distance,
+)
+from failuretwin.digital_model.settling import sag
+from failuretwin.failure_behavior.fault import Arrival
+from failuretwin.failure_behavior.mode import FaultMode, Signature
+from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.command_loss import OUTLIER_RATE
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.posterior import Posterior, log_prior
+from failuretwin.inference.priors import Priors
+
+SIZES = 3
+"""Sizes of each fault that are laid beside each other."""
+HELD = 4
+"""Ways in which a motor may be held unseen: at the median of what it was told, always; where it was
+told to be first, half way, or last but one, from then on."""
+NEGLIGIBLE = 1e-3
+"""Hypotheses that are less probable are left out."""
+UNMOVED_RAD = 1e-9
+"""Commands nearer than this are the same [rad]."""
+
+
+@dataclass(frozen=True)
+class Member:
+    """A hypothesis with one size of its fault.
+
+    Attributes:
+        hypothesis: Healthy, or one fault.
+        size: In the unit of its mode; the held angle of a stuck motor, NaN: where it was told to be
+            (`Outlook.after`); NaN if healthy.
+        share: Its probability.
+        first: Number of the first movement that its fault spoils.
+    """
+
+    hypothesis: Hypothesis
+    size: float
+    share: float
+    first: int = 0
+
+    @property
+    def mode(self) -> FaultMode | None:
+        """The mode of its fault; None: healthy."""
+        return None if self.hypothesis.is_healthy else MODES[self.hypothesis.faults[0].mode]
+
+
+def of_priors(
+    model: HealthyModel, hypotheses: Sequence[Hypothesis], priors: Priors
+) -> list[Member]:
+    """Return members of hypotheses before anything was seen, with sizes evenly over their logs.
+
+    Args:
+        model: The healthy robot.
+        hypotheses: Healthy and single faults.
+        priors: Odds and ranges of sizes.
+    """
+    shares = np.exp(log_prior(hypotheses, priors))
+    members = []
+    for hypothesis, share in zip(hypotheses, shares.tolist(), strict=True):
+        sizes = _prior_sizes(model, hypothesis, priors)
+        members += [Member(hypothesis, size, share / len(sizes)) for size in sizes]
+    return members
+
+
+def _prior_sizes(model: HealthyModel, hypothesis: Hypothesis, priors: Priors) -> list[float]:
+    if hypothesis.is_healthy:
+        return [np.nan]
+    fault = hypothesis.faults[0]
+    mode, motor = MODES[fault.mode], model.motor_names.index(fault.motor)
+    if mode.signature is Signature.HELD:
+        return [np.nan] * HELD
+    low, high = priors.sizes_of(mode, model, motor).ends
+    sizes = np.geomspace(max(low, 0.02 * high), high, SIZES)
+    return [*(-sizes if mode.signed else []), *sizes]
+
+
+def of_posterior(posterior: Posterior, row: int) -> list[Member]:
+    """Return members of what is left after some movements, sizes at quantiles of what they say.
+
+    Args:
+        posterior: Of all hypotheses, for several arms.
+        row: Which of them.
+    """
+    members = []
+    for at, hypothesis in enumerate(posterior.hypotheses):
+        share = float(np.exp(posterior.log_posterior[row, at]))
+        if share < NEGLIGIBLE or not hypothesis.known or len(hypothesis.faults) > 1:
+            continue
+        size = None if hypothesis.is_healthy else posterior.weights[at].estimate(row).size
+        sizes = [np.nan] if size is None else size.quantiles(tuple(_levels(SIZES).tolist()))
+        members += [Member(hypothesis, float(each), share / len(sizes)) for each in sizes]
+    return members
+
+
+def _levels(count: int) -> FloatArray:
+    return (np.arange(count) + 0.5) / count
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Movements that are made, or might be.
+
+    Attributes:
+        command: What motors are told, (movement, motor) [rad].
+        previous: What they were told before, (movement, motor) [rad].
+        since_s: How long faults have been there by then, (movement,) [s].
+        number: Which movement it is, from 0, (movement,).
+    """
+
+    command: FloatArray
+    previous: FloatArray
+    since_s: FloatArray
+    number: IntArray
+
+    @classmethod
+    def of(cls, told: FloatArray, since_s: FloatArray) -> Asked:
+        """Return movements one after the other.
+
+        Args:
+            told: What motors are told, the start first, (movement + 1, motor) [rad].
+            since_s: When each movement is over, (movement,) [s].
+        """
+        return cls(told[1:], told[:-1], since_s, np.arange(len(told) - 1))
+
+    @classmethod
+    def one_of(cls, poses: FloatArray, made: Asked, at: FloatArray, since_s: float) -> Asked:
+        """Return each of some poses (movement, motor) as the next movement after others."""
+        count = len(poses)
+        number = np.full(count, len(made.command))
+        return cls(poses, np.tile(at, (count, 1)), np.full(count, since_s), number)
+
+    def __getitem__(self, some: IntArray) -> Asked:
+        return Asked(self.command[some], self.previous[some], self.since_s[some], self.number[some])
+
+    @property
+    def direction(self) -> FloatArray:
+        """Sign of the travel of each motor, (movement, motor)."""
+        travel = self.command - self.previous
+        return np.where(np.abs(travel) > UNMOVED_RAD, np.sign(travel), 0.0)
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """What is expected of members on a robot.
+
+    Attributes:
+        model: The healthy robot and its sensors.
+        members: What may be the case.
+    """
+
+    model: HealthyModel
+    members: Sequence[Member]
+
+    @property
+    def log_share(self) -> FloatArray:
+        """Log probability of each member, (member,); they sum to 1."""
+        share = np.array([member.share for member in self.members])
+        return np.asarray(np.log(share / share.sum()))
+
+    @property
+    def kind(self) -> IntArray:
+        """Index of the hypothesis of each member, (member,)."""
+        kinds = list(dict.fromkeys(member.hypothesis for member in self.members))
+        return np.array([kinds.index(member.hypothesis) for member in self.members])
+
+    @property
+    def most_nats(self) -> float:
+        """What one movement can tell at most [nats]: that it was not one which says nothing.
+
+        Minus the log of how often a command is lost, or the tool is anywhere.
+        """
+        lost = sum(entry.rate for entry in self.model.imperfections.lost_commands or ())
+        return -float(np.log(min(0.5, OUTLIER_RATE + lost)))
+
+    def after(self, told: FloatArray) -> Outlook:
+        """Return the same with motors that are held where movements would show it least.
+
+        Args:
+            told: What motors were told, the start first, (movement, motor) [rad].
+        """
+        last = max(len(told) - 2, 0)
+        begin = (0, 0, len(told) // 2, last)
+        angles = np.stack([np.median(told, axis=0), *told[list(begin[1:])]])
+        members, count = list(self.members), 0
+        for at, member in enumerate(members):
+            if member.mode is None or not np.isnan(member.size):
+                continue
+            k = self.model.motor_names.index(member.hypothesis.faults[0].motor)
+            way = count % HELD
+            members[at] = replace(member, size=float(angles[way, k]), first=begin[way])
+            count += 1
+        return Outlook(self.model, members)
+
+    def expected(self, asked: Asked) -> tuple[FloatArray, FloatArray]:
+        """Return mean and covariance of what is seen at rest.
+
+        Returns:
+            (movement, member, channel) [m] and (movement, member, channel, channel) [m2].
+        """
+        command = asked.command
+        healthy = self.model.settle(command, asked.direction, self.model.none_held)
+        pose = np.repeat(healthy[:, None], len(self.members), axis=1)
+        scatter = np.broadcast_to(self.model.scatter, pose.shape).copy()
+        for at, member in enumerate(self.members):
+            struck = np.flatnonzero(asked.number >= member.first)
+            if member.mode is not None and len(struck):
+                pose[struck, at], scatter[struck, at] = self._struck(
+                    member, asked[struck], pose[struck, at], scatter[struck, at]
+                )
+        mean, jacobian = self.model.sensors.expected(pose)
+        root = jacobian * scatter[..., None, :]
+        noise = self.model.path_noise**2 * np.eye(mean.shape[-1])
+        return mean, root @ np.swapaxes(root, -1, -2) + noise
+
+    def distances(self, asked: Asked) -> FloatArray:
+        """Return how far members are apart by each movement, (movement, member, member) [nats]."""
+        mean, spread = self.expected(asked)
+        return pairwise_distance(mean, spread, self.model.settling.tail_dof, self.most_nats)
+
+    def information(self, nats: FloatArray) -> FloatArray:
+        """Return what distances (..., member, member) tell about the hypothesis, (...) [nats]."""
+        return expected_information(nats, self.log_share, self.kind)
+
+    def _struck(
+        self, member: Member, asked: Asked, pose: FloatArray, scatter: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return where motors settle with a fault, and how they scatter, (movement, motor) [rad].
+
+        Args:
+            member: The fault.
+            asked: Movements that it spoils.
+            pose: Where they settle without it.
+            scatter: How they scatter without it.
+        """
+        mode, size = member.mode, member.size
+        k = self.model.motor_names.index(member.hypothesis.faults[0].motor)
+        if mode is None or np.isnan(size):
+            return pose, scatter
+        pose, scatter = pose.copy(), scatter.copy()
+        missed = asked.previous[:, k] - asked.command[:, k]
+        if mode.signature is Signature.HELD:
+            held = np.arange(scatter.shape[1]) == k
+            pose = self.model.settle(np.where(held, size, asked.command), asked.direction, held)
+            scatter[:, k] = self.model.held_scatter[k]
+        elif mode.signature is Signature.REDRAWN_OFFSET:
+            scatter[:, k] = np.hypot(scatter[:, k], size)
+        elif mode.signature is Signature.MISSED:
+            pose[:, k] += size * missed
+            scatter[:, k] = np.hypot(scatter[:, k], np.sqrt(size * (1.0 - size)) * missed)
+        else:
+            load = self._load(pose, k) if mode.needs_compliance else np.zeros(len(pose))
+            told = (asked.previous[:, k], asked.command[:, k], asked.direction[:, k])
+            pose[:, k] += mode.settled_offset(np.array(size), Arrival(*told, asked.since_s, load))
+        return pose, scatter
+
+    def _load(self, pose: FloatArray, k: int) -> FloatArray:
+        """Return how far the load moves motor k, (movement,) [rad]."""
+        settling = self.model.settling
+        give = np.asarray(settling.compliance)
+        return np.asarray(sag(self.model.twin.robot, pose, give, settling.payload)[:, k])

@@ -1,0 +1,162 @@
+"""What a check or a design of one robot needs, put together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from failuretwin.connection.links.commander import Commander
+from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
+from failuretwin.core.types import FloatArray
+from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
+from failuretwin.decision.test_motions.design import Designer
+from failuretwin.decision.test_motions.health_check import (
+    CheckResult,
+    HealthCheck,
+    checking,
+    faults_at_rest,
+    result_of,
+)
+from failuretwin.decision.test_motions.motions import Motions, read_motions
+from failuretwin.decision.test_motions.outlook import Outlook, of_priors
+from failuretwin.digital_model.calibrated_robot import (
+    CalibratedRobot,
+    HealthyLike,
+    RobotLike,
+    calibrated,
+)
+from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.evidence import Evidence
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.run_likelihood import RunLikelihood
+
+
+@dataclass(frozen=True)
+class Checking:
+    """What a check and a design need.
+
+    Attributes:
+        known: The robot as it is known.
+        gate: What is safe.
+        named: Hypotheses that the user names; None: all faults that show at rest.
+        usual: Whether poses keep to the ranges of usual movements.
+        seed: Seed of the poses that are tried.
+    """
+
+    known: CalibratedRobot
+    gate: SafetyGate
+    named: Sequence[Hypothesis] | None = None
+    usual: bool = False
+    seed: int = 0
+
+    @cached_property
+    def model(self) -> HealthyModel:
+        """The healthy robot."""
+        return HealthyModel.of(self.known.twin, self.known.imperfections)
+
+    @property
+    def hypotheses(self) -> Sequence[Hypothesis]:
+        """What is weighed."""
+        return self.named or faults_at_rest(self.model)
+
+    @property
+    def asked(self) -> Sequence[Hypothesis]:
+        """What movements are chosen to tell apart."""
+        return self.named or paper_hypotheses(self.model.motor_names)
+
+    @property
+    def home(self) -> FloatArray:
+        """Where an arm is taken to stand that is not asked, (motor,) [rad]."""
+        motors = self.known.robot.motors
+        return np.array([float(np.clip(0.0, *motor.movement_range)) for motor in motors])
+
+    @property
+    def designer(self) -> Designer:
+        """What chooses movements."""
+        members = of_priors(self.model, self.asked, checking(self.model, self.asked))
+        return Designer(self.gate, Outlook(self.model, members), self.seed, self.usual)
+
+    def motions(self, seconds: float, repeat: Path | None = None, most: int = 1000) -> Motions:
+        """Return the motions of a check: those of a file, or designed anew.
+
+        Args:
+            seconds: Time for all of them [s].
+            repeat: The file; None: they are designed.
+            most: So many at most.
+
+        Raises:
+            InputError: If the file cannot be read or is of another robot, or no movement is safe.
+        """
+        if repeat is not None:
+            return read_motions(repeat, self.known.robot)
+        made = self.designer.sequence(self.home, seconds, most)
+        return Motions.of(self.known.robot, made)
+
+    def health_check(self, motions: Motions, further: int) -> HealthCheck:
+        """Return a check that has not begun."""
+        return HealthCheck(
+            self.model,
+            self.gate,
+            motions,
+            self.hypotheses,
+            checking(self.model, self.hypotheses),
+            further,
+            self.seed,
+        )
+
+    def of_logs(self, paths: Sequence[Path]) -> list[CheckResult]:
+        """Return what logs of a check say that was made elsewhere, a result a run.
+
+        Raises:
+            InputError: If they cannot be read.
+        """
+        from failuretwin.data_knowledge.read import read_runs
+
+        runs = read_runs(list(paths), self.known.robot)
+        priors = checking(self.model, self.hypotheses)
+        diagnoser = BayesDiagnoser(
+            self.known.twin, self.known.imperfections, self.hypotheses, priors
+        )
+        settled = Evidence(runs, self.model.settings).sound.settled
+        return [
+            result_of(RunLikelihood(settled[row : row + 1], self.model), diagnosis)
+            for row, diagnosis in enumerate(diagnoser.diagnose(runs))
+        ]
+
+
+def check(
+    commander: Commander,
+    robot: RobotLike = "armpi_fpv",
+    calibration: HealthyLike = None,
+    seconds: float = 20.0,
+    further: int = 0,
+    limits: SafetyLimits | None = None,
+    tell: Callable[[str], None] = print,
+) -> CheckResult:
+    """Check an arm by test movements; the arm moves.
+
+    Args:
+        commander: The arm.
+        robot: The robot, its name or its profile.
+        calibration: What `calibrate` learned of it, by name or path; None: what its profile names.
+        seconds: Time for the movements [s].
+        further: So many further movements at most, if it is still open then what is wrong.
+        limits: What orders must keep to; None: the usual limits.
+        tell: Called with what happens.
+
+    Returns:
+        What was found.
+
+    Raises:
+        InputError: If something cannot be read, no movement is safe, or it is not known where the
+            arm stands.
+        Halted: If somebody else commands the arm, or it falls silent.
+        UnsafeOrderError: If an order must not be sent.
+    """
+    known = calibrated(robot, calibration)
+    asking = Checking(known, SafetyGate(known.robot, limits or SafetyLimits()))
+    return asking.health_check(asking.motions(seconds), further).work(commander, tell)

@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from failuretwin import load_robot
+
+pytest.importorskip("mujoco")
+
+
+def test_a_check_names_the_motor_and_what_to_do(failuretwin, tmp_path):
+    out, kept = tmp_path / "out.json", tmp_path / "kept.json"
+    arguments = ("check", "--seconds", 14, "--seed", 2, "--keep", kept)
+    healthy = failuretwin(*arguments)
+    assert healthy.returncode == 0, healthy.stderr
+    assert healthy.stdout.startswith("GREEN: healthy")
+    fault = ("--fault", "motor_2:encoder_bias=0.08", "--json", out)
+    answer = failuretwin(*arguments, *fault)
+    assert answer.returncode == 0, answer.stderr
+    assert answer.stdout.startswith("RED: motor 2")
+    assert "what to do: " in answer.stdout
+    assert "zero of motor_2 changed by +4." in answer.stdout
+    record = json.loads(out.read_text())
+    assert (record["light"], record["motor"]) == ("red", "motor_2")
+    assert sum(record["posterior"].values()) == pytest.approx(1.0)
+    zeros = {row["motor"]: row["zero"] for row in record["motors"]}
+    assert zeros["motor_2"] == pytest.approx(0.08, abs=0.02)
+    checks = json.loads(kept.read_text())
+    assert [row["light"] for row in checks["checks"]] == ["green", "red"]
+    assert len(checks["motions"]["ramp_s"]) == checks["checks"][0]["movements"]
+
+
+def test_motions_are_written_and_nothing_moves(failuretwin, tmp_path):
+    path, picture = tmp_path / "motions.json", tmp_path / "smallest.png"
+    answer = failuretwin("check", "--seconds", 8, "--write", path)
+    assert answer.returncode == 0, answer.stderr
+    assert "nothing was moved" in answer.stdout
+    target = np.array(json.loads(path.read_text())["target_rad"])
+    robot = load_robot("armpi_fpv")
+    counts = robot.servo_units.to_counts(target)
+    np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
+    said = failuretwin(
+        "isolability", "armpi_fpv", "--motions", path, "--plot", picture, "--json", tmp_path / "s",
+        "--hypotheses", "motor_3:stuck,motor_3:steady_state_error,motor_4:steady_state_error",
+    )  # fmt: skip
+    assert said.returncode == 0, said.stderr
+    assert "told from all others" in said.stdout
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    rows = [json.loads(line) for line in (tmp_path / "s").read_text().splitlines()]
+    sizes = {row["hypothesis"]: row["isolated"] for row in rows}
+    assert 0.01 < sizes["motor_3:steady_state_error"] < 0.05
+
+
+def test_a_log_of_a_check_made_elsewhere(failuretwin, tmp_path):
+    runs = tmp_path / "runs.nc"
+    made = failuretwin(
+        "simulate", "--runs-per-class", 1, "--hypotheses", "healthy,motor_3:stuck", "--out", runs
+    )
+    assert made.returncode == 0, made.stderr
+    out = tmp_path / "out.json"
+    answer = failuretwin("check", "--log", runs, "--json", out)
+    assert answer.returncode == 0, answer.stderr
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [row["truth"] for row in rows] == ["healthy", "motor_3:stuck"]
+    assert rows[1]["motor"] == "motor_3"
+
+
+def test_a_design_beside_random_movements(failuretwin):
+    answer = failuretwin(
+        "design", "--seconds", 8, "--movements", 4, "--hypotheses",
+        "healthy,motor_3:steady_state_error,motor_4:steady_state_error",
+    )  # fmt: skip
+    assert answer.returncode == 0, answer.stderr
+    assert "random, usual ranges" in answer.stdout
+    assert "4 movements in" in answer.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("check", "--on", "ros2"), "expected emulated, ros1 or rosbridge"),
+        (("check", "--seconds", 0.2), "no safe movement"),
+        (("check", "--fault", "motor_9:stuck"), "motor_9"),
+        (("check", "--write", "motions.bag"), "expected .json, .csv, .mcap"),
+        (("check", "--motions", "nothing.json"), "cannot be read as motions"),
+        (("check", "--floor", 2.0), "--floor"),
+        (("isolability", "armpi_fpv", "--motions", "nothing.json"), "cannot be read as motions"),
+    ],
+)
+def test_what_is_refused(failuretwin, arguments, said):
+    answer = failuretwin(*arguments)
+    assert answer.returncode == 2
+    assert said in answer.stderr
+
+
+def test_a_real_arm_is_left_alone_without_move(failuretwin):
+    answer = failuretwin("check", "--seconds", 6, "--on", "rosbridge://localhost")
+    assert answer.returncode == 0, answer.stderr
+    assert "nothing moves without --move" in answer.stdout

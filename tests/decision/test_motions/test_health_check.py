@@ -1,0 +1,214 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import failuretwin as ft
+from failuretwin.connection.commanded_arm import CommandedArm
+from failuretwin.connection.emulated_arm import Emulation
+from failuretwin.connection.links.commander import Order
+from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
+from failuretwin.decision.acting.belief import settled_evidence_of
+from failuretwin.decision.acting.believed_arm import Seen
+from failuretwin.decision.test_motions.design import next_movement
+from failuretwin.decision.test_motions.health_check import (
+    CheckResult,
+    HealthCheck,
+    checking,
+    faults_at_rest,
+    judged,
+    motor_offsets,
+)
+from failuretwin.decision.test_motions.motions import Motions, read_motions, write_motions
+from failuretwin.failure_behavior.injection import ScheduledFault
+from failuretwin.failure_behavior.modes import SteadyStateError
+from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.posterior import log_prior
+from failuretwin.inference.run_likelihood import RunLikelihood
+
+COUNT_RAD = np.deg2rad(0.24)
+
+
+def seen_of(model, designed, off=0.0, play=0.0, noise=None):
+    """Return movements as seen if motors are off by (motor,) [rad], and have play (motor,)."""
+    window, time = [], 0.0
+    for i, movement in enumerate(designed):
+        direction = np.sign(movement.order.target - movement.previous)
+        pose = model.settle(movement.order.target, direction, model.none_held) + off
+        pose = pose - 0.5 * play * direction + (0.0 if noise is None else noise[i])
+        told = (movement.order.target, movement.previous, movement.order.duration)
+        end = time + movement.seconds
+        window.append(Seen(*told, time, end - 0.1, model.twin.path(pose)))
+        time = end
+    return window
+
+
+def test_zeros_and_play_are_found_from_both_sides(model, designed):
+    off, play = np.deg2rad([0.5, -0.4, 0.0, 0.6]), np.deg2rad([0.0, 1.0, 0.5, 0.0])
+    found = motor_offsets(settled_evidence_of([seen_of(model, designed, off, play)]), model)
+    np.testing.assert_allclose(found.zero, off, atol=np.deg2rad(0.08))
+    np.testing.assert_allclose(found.play, play, atol=np.deg2rad(0.08))
+
+
+def test_their_deviations_are_what_they_scatter_by(model, designed):
+    rng = np.random.default_rng(0)
+    zero, play = [], []
+    for _ in range(200):
+        noise = model.scatter * rng.standard_normal((len(designed), 4))
+        found = motor_offsets(settled_evidence_of([seen_of(model, designed, noise=noise)]), model)
+        zero.append(found.zero / found.zero_sd)
+        play.append(found.play / found.play_sd)
+    # a Student t is expected, of which normal scatter is a narrow case
+    for scaled in (np.array(zero), np.array(play)):
+        assert np.all(np.abs(scaled.mean(axis=0)) < 0.3)
+        assert np.all((scaled.std(axis=0) > 0.6) & (scaled.std(axis=0) < 1.1))
+
+
+def test_a_check_begins_with_two_to_one_that_all_is_well(model):
+    hypotheses = faults_at_rest(model)
+    prior = np.exp(log_prior(hypotheses, checking(model, hypotheses)))
+    assert prior[hypotheses.index(HEALTHY)] == pytest.approx(2.0 / 3.0)
+    assert {h.faults[0].mode for h in hypotheses if h.faults} == {
+        "stuck", "steady_state_error", "backlash", "torque_loss", "encoder_bias", "encoder_scale",
+    }  # fmt: skip
+
+
+def test_a_motor_that_carries_nothing_is_not_asked_for_its_strength(model):
+    asked = [str(hypothesis) for hypothesis in faults_at_rest(model)]
+    assert model.settling.compliance[0] == 0.0
+    assert "motor_1:torque_loss" not in asked
+    assert "motor_2:torque_loss" in asked
+
+
+def carried_out(known, model, gate, designed, schedule, modes=None, further=0):
+    emulation = Emulation(known.robot, known.imperfections, schedule, 3, modes or {})
+    motions = Motions.of(known.robot, designed)
+    hypotheses = faults_at_rest(model)
+    with CommandedArm(emulation) as arm:
+        check = HealthCheck(model, gate, motions, hypotheses, checking(model, hypotheses), further)
+        return check.work(arm, lambda _: None), check
+
+
+def test_an_arm_without_a_fault_is_green(known, model, gate, designed):
+    pytest.importorskip("mujoco")
+    result, check = carried_out(known, model, gate, designed, ())
+    assert (result.light, result.motor) == ("green", "")
+    assert result.movements == len(designed) == len(check.window)
+    assert sum(result.by_motor.values()) < 0.05
+
+
+def test_what_is_named_is_the_motor_whatever_its_mode(model, designed):
+    """Two modes that share the probability are one motor."""
+    diagnosis = ft.Diagnosis(
+        "check", {"healthy": 0.02, "motor_2:encoder_bias": 0.5, "motor_2:steady_state_error": 0.48}
+    )
+    offsets = motor_offsets(settled_evidence_of([seen_of(model, designed)]), model)
+    assert CheckResult(diagnosis, offsets, 5).motor == "motor_2"
+    assert CheckResult(diagnosis, offsets, 5).light == "red"
+    open_one = ft.Diagnosis("check", {"healthy": 0.3, "motor_2:stuck": 0.4, "motor_3:stuck": 0.3})
+    assert CheckResult(open_one, offsets, 5).light == "open"
+
+
+def test_small_errors_of_each_motor_are_named(known, model, designed):
+    """Errors of five counts, signs at random, on a scatter like the arm's own."""
+    hypotheses = faults_at_rest(model)
+    rng = np.random.default_rng(5)
+    windows, size = [], 5.0 * COUNT_RAD
+    for motor in range(4):
+        noise = 0.8 * model.scatter * rng.standard_normal((len(designed), 4))
+        noise[:, motor] += size * rng.choice([-1.0, 1.0], len(designed))
+        windows.append(seen_of(model, designed, noise=noise))
+    likelihood = RunLikelihood(settled_evidence_of(windows), model)
+    found = judged(likelihood, hypotheses, checking(model, hypotheses))
+    best = [str(hypotheses[i]) for i in np.argmax(found.log_posterior, axis=1)]
+    assert [name.split(":")[0] for name in best] == model.motor_names
+
+
+def test_the_next_movement_settles_what_is_open(model, gate, designed):
+    """Whether motor 3 or 4 is off: the movement chosen tells more of it than usual ones do."""
+    nine = paper_hypotheses(model.motor_names)
+    rng = np.random.default_rng(2)
+    noise = np.zeros((2, 4))
+    noise[:, 3] = 6.0 * COUNT_RAD
+    seen = seen_of(model, designed[:2], noise=noise)
+    likelihood = RunLikelihood(settled_evidence_of([seen]), model)
+    posterior = judged(likelihood, nine, checking(model, nine))
+    at = designed[1].order.target
+    order = next_movement(model, gate, posterior, at)
+    assert isinstance(order, Order)
+    assert not gate.wrong(order, [(at, order.target)])
+    same = next_movement(model, gate, posterior, at)
+    np.testing.assert_array_equal(order.target, same.target)
+    assert np.any(np.abs(order.target - rng.uniform(-0.5, 0.5, 4)) > 0.01)
+    sure = judged(likelihood, [HEALTHY], checking(model, [HEALTHY]))
+    assert next_movement(model, gate, sure, at) is None
+
+
+def test_further_movements_are_made_only_while_it_is_open(known, model, gate, designed):
+    pytest.importorskip("mujoco")
+    fault = ScheduledFault(Hypothesis.parse("motor_4:steady_state_error").faults[0], 0.0)
+    modes = dict(MODES) | {"steady_state_error": SteadyStateError(magnitude=(0.02, 0.02))}
+    emulation = (known, model, gate, designed[:3], (fault,), modes)
+    result, check = carried_out(*emulation, further=6)
+    assert result.further == len(check.window) - 3
+    assert 1 <= result.further <= 6
+    assert result.light != "open" or result.further == 6
+    settled, _ = carried_out(known, model, gate, designed, (), further=6)
+    assert (settled.light, settled.further) == ("green", 0)
+
+
+@pytest.mark.parametrize("suffix", [".json", ".csv", ".mcap"])
+def test_motions_are_written(armpi, designed, tmp_path, suffix):
+    if suffix == ".mcap":
+        pytest.importorskip("mcap")
+    motions, path = Motions.of(armpi, designed), tmp_path / f"motions{suffix}"
+    write_motions(motions, armpi, path)
+    if suffix == ".json":
+        again = read_motions(path, armpi)
+        np.testing.assert_array_equal(again.target, motions.target)
+        np.testing.assert_array_equal(again.seconds, motions.seconds)
+    elif suffix == ".csv":
+        table = np.genfromtxt(path, delimiter=",", names=True)
+        time, command = motions.reference()
+        drawn = np.interp(time, table["time_s"], table["motor_3_rad"])
+        np.testing.assert_allclose(drawn, command[:, 2], atol=0.02)
+    else:
+        assert path.read_bytes().startswith(b"\x89MCAP0")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("nonsense", "cannot be read as motions"),
+        ("{}", "holds no motions"),
+        ('{"robot": "x", "motors": ["a"], "start_rad": [0], "target_rad": [[0]], "ramp_s": [1], '
+         '"seconds": [1]}', "has motions of the motors a"),
+    ],
+)  # fmt: skip
+def test_files_that_hold_no_motions_of_this_arm(armpi, tmp_path, text, said):
+    path = tmp_path / "motions.json"
+    path.write_text(text)
+    with pytest.raises(ft.InputError, match=said):
+        read_motions(path, armpi)
+
+
+def test_ramps_that_make_no_sense(armpi, designed, tmp_path):
+    record = Motions.of(armpi, designed).record()
+    path = tmp_path / "motions.json"
+    path.write_text(json.dumps({**record, "ramp_s": [-1.0] * len(designed)}))
+    with pytest.raises(ft.InputError, match="each time as long as its ramp"):
+        read_motions(path, armpi)
+    with pytest.raises(ft.InputError, match=r"expected \.json, "):
+        write_motions(Motions.of(armpi, designed), armpi, tmp_path / "motions.bag")
+
+
+def test_in_one_call(known):
+    pytest.importorskip("mujoco")
+    fault = Hypothesis.parse("motor_3:stuck")
+    schedule = (ScheduledFault(fault.faults[0], 0.0),)
+    with CommandedArm(Emulation(known.robot, known.imperfections, schedule, 1)) as arm:
+        found = ft.check(arm, seconds=8.0, tell=lambda _: None)
+    assert (found.light, found.motor) == ("red", "motor_3")
+    assert found.diagnosis.diagnosis == "motor_3:stuck"
