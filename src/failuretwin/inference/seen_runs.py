@@ -1,0 +1,130 @@
+"""Runs as a Bayesian diagnoser sees them, under one set-up or several.
+
+    p(h | run) = sum over w of p(w | runs) p(h | run, w)
+
+Section: docs/set_up.md
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.numerics import log_sum
+from failuretwin.inference.evidence import Evidence, TransientSamples
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.posterior import Posterior
+from failuretwin.inference.priors import Priors
+from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.set_up_weighing import ANOTHER, SetUpPosterior, SetUpWeighing
+from failuretwin.inference.shared_posterior import set_up_in_doubt, shared_posterior
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+JUDGED_RUNS = 32
+"""So many runs of a set, evenly spread, tell whether its set-up may be off."""
+TOLD = 0.1
+"""Probability of a wrong set-up from which it is told."""
+SURE = 0.9
+"""Probability from which it is told as a finding."""
+
+
+@dataclass(frozen=True)
+class SeenRuns:
+    """Runs under one set-up.
+
+    Attributes:
+        runs: The run set, as it fits the profile.
+        model: The healthy robot.
+        hypotheses: What may be the case.
+        priors: Beliefs about faults and set-ups.
+    """
+
+    runs: xr.Dataset
+    model: HealthyModel
+    hypotheses: Sequence[Hypothesis]
+    priors: Priors
+
+    @cached_property
+    def evidence(self) -> Evidence:
+        """What the runs say at system level."""
+        return Evidence(self.runs, self.model.settings, self.model.sensors)
+
+    @cached_property
+    def sample(self) -> RunLikelihood:
+        """Some of the runs by their settled positions."""
+        settled = self.evidence.sound.settled
+        count = len(settled.usable)
+        some = np.unique(np.linspace(0, count - 1, JUDGED_RUNS).astype(np.int64))
+        return RunLikelihood(settled[some], self.model)
+
+    @cached_property
+    def in_doubt(self) -> bool:
+        """Whether the sensor may stand a little elsewhere than the profile says."""
+        return set_up_in_doubt(self.sample, self.hypotheses, self.priors)
+
+    def set_ups(self) -> SetUpPosterior:
+        """Return what is believed of the set-up."""
+        weighing = SetUpWeighing(self.sample, self.hypotheses, self.priors)
+        return weighing.posterior() if self.model.sensors.tool_alone else weighing.taken_as_told()
+
+    def posterior(self, rows: slice, moving: TransientSamples | None) -> Posterior:
+        """Return what some of the runs say.
+
+        Args:
+            rows: Which.
+            moving: Readings on the way of all runs; None: they are left aside.
+        """
+        way = None if moving is None else moving[rows]
+        likelihood = RunLikelihood(self.evidence.sound.settled[rows], self.model, way)
+        return shared_posterior(likelihood, self.hypotheses, self.priors, self.in_doubt)
+
+
+def mixed(posteriors: Sequence[Posterior], set_ups: SetUpPosterior) -> Posterior:
+    """Return the posterior of runs whose set-up is believed to be one of several.
+
+    Sizes and onsets are those behind the most probable set-up.
+
+    Args:
+        posteriors: Of the same runs behind each.
+        set_ups: What is believed of the set-up.
+    """
+    likeliest, weight = posteriors[0], np.log(set_ups.probability)
+    if len(posteriors) > 1:
+        stacked = np.stack([one.log_posterior for one in posteriors]) + weight[:, None, None]
+        likeliest = replace(likeliest, log_posterior=log_sum(stacked, axis=0))
+    remark = set_up_remark(set_ups)
+    if not remark:
+        return likeliest
+    count = len(likeliest.log_posterior)
+    known = likeliest.set_up or [""] * count
+    said = ["; ".join(filter(None, (remark, one))) for one in known]
+    return replace(likeliest, set_up=said, no_verdict="" if set_ups.fits else ANOTHER)
+
+
+def set_up_remark(set_ups: SetUpPosterior) -> str:
+    """Return what is to be said of a set-up; empty if nothing is."""
+    if set_ups.wrong < TOLD:
+        return ""
+    pairs = zip(set_ups.found, set_ups.probability, strict=True)
+    named = [(one.set_up, float(share)) for one, share in pairs if one.set_up.what]
+    if not set_ups.fits:
+        return f"the log does not fit the profile: {ANOTHER}"
+    kept, total = [], 0.0
+    for set_up, share in named:
+        kept.append(set_up.told)
+        total += share
+        if total > SURE * set_ups.wrong:
+            break
+    ways = "; or ".join(kept)
+    if set_ups.wrong < SURE:
+        return f"the log may not fit the profile ({set_ups.wrong:.0%}): {ways}"
+    return (
+        f"the log does not fit the profile ({set_ups.wrong:.1%}): {ways}; judged with that undone"
+    )
