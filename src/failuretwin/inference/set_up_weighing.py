@@ -20,6 +20,7 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import FloatArray
+from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.log_correction import LogCorrection
 from failuretwin.inference.posterior import log_prior, marginal_likelihoods
 from failuretwin.inference.priors import Priors
@@ -35,12 +36,11 @@ Runs of real arms with faults stay below 0.35 each and below 0.25 in the mean; w
 reversed all but those in which it is stuck are above 0.4."""
 FEW = 8
 """Runs that set-ups are weighed by, evenly spread: five name what shows."""
-FINALISTS = 3
-"""Set-ups that are looked at with a sensor that may stand a little elsewhere, and behind which a
-second mistake is looked for."""
-COARSE = 0.026
-"""Noise with which they are chosen, as a share of the reach: what a sensor a little off leaves must
-not look like outliers."""
+FINALISTS = 2
+"""Mistakes that are looked at with a sensor that may stand a little elsewhere too."""
+NEAR, PROMISING = 0.15, 8
+"""Of two mistakes at once so many are weighed: those that bring most movements nearest, within this
+share of the reach."""
 FAR = 0.08
 """A frame that moves the tool by less than this share of the reach is a matter of registration."""
 CHOICE_NATS = 12.0
@@ -149,35 +149,49 @@ class SetUpWeighing:
         rates = self.priors.setup.wrong_rate
         return rates[1] if layout_of(self.likelihood.model).offsets else rates[0]
 
+    @property
+    def log_rate(self) -> float:
+        """Log of that."""
+        return float(log_of(self.rate))
+
+    @property
+    def robot(self) -> Robot:
+        """The robot."""
+        return self.likelihood.model.twin.robot
+
     @cached_property
     def log_odds(self) -> FloatArray:
         """Log prior of each hypothesis, (hypothesis,)."""
         return log_prior(self.hypotheses, self.priors)
 
-    def behind(self, set_ups: Sequence[SetUp], noise_m: float = 0.0) -> RunLikelihood:
-        """Return the runs with each of some set-ups undone, one after the other.
-
-        Args:
-            set_ups: The set-ups.
-            noise_m: Noise of the sensor that nobody told of [m].
-        """
-        if noise_m == 0.0 and len(set_ups) == 1 and set_ups[0].correction.is_none:
+    def behind(self, set_ups: Sequence[SetUp]) -> RunLikelihood:
+        """Return the runs with each of some set-ups undone, one after the other."""
+        if len(set_ups) == 1 and set_ups[0].correction.is_none:
             return self.likelihood
         evidence, count = self.likelihood.evidence, len(self.likelihood.usable)
         undone = evidence[np.tile(np.arange(count), len(set_ups))]
         for i, set_up in enumerate(set_ups):
             undone.put(slice(i * count, (i + 1) * count), set_up.correction.evidence(evidence))
-        return RunLikelihood(undone, replace(self.likelihood.model, untold_noise_m=noise_m))
+        return RunLikelihood(undone, self.likelihood.model)
 
-    def weigh(self, set_ups: Sequence[SetUp], noise_m: float = 0.0) -> list[WeighedSetUp]:
-        """Return what the runs say of set-ups, with the sensor where the profile has it."""
+    def weigh(self, set_ups: Sequence[SetUp], everything: bool = False) -> list[WeighedSetUp]:
+        """Return what the runs say of set-ups, with the sensor where the profile has it.
+
+        Args:
+            set_ups: The set-ups.
+            everything: Whether pairs of faults and the unknown one count: they take long. Without
+                them a set-up is called no more probable than it is.
+        """
         found, count = [], len(self.likelihood.usable)
+        asked = [i for i, h in enumerate(self.hypotheses) if everything or len(h.faults) < 2]
+        asked = [i for i in asked if everything or self.hypotheses[i].known] or asked
+        hypotheses, log_odds = [self.hypotheses[i] for i in asked], self.log_odds[asked]
         at_a_time = max(1, CHUNK_RUNS // count)
         for first in range(0, len(set_ups), at_a_time):
             some = set_ups[first : first + at_a_time]
-            likelihood = self.behind(some, noise_m)
-            says = marginal_likelihoods(likelihood, self.hypotheses, self.priors)
-            log_joint = np.stack([one.log_evidence for one in says], axis=1) + self.log_odds
+            likelihood = self.behind(some)
+            says = marginal_likelihoods(likelihood, hypotheses, self.priors)
+            log_joint = np.stack([one.log_evidence for one in says], axis=1) + log_odds
             found += _weighed(some, likelihood, log_sum(log_joint, axis=1))
         return found
 
@@ -197,6 +211,8 @@ class SetUpWeighing:
         if self.rate == 0.0 or not self.likelihood.usable.any():
             return self.taken_as_told()
         told = self.weigh([self.as_told])
+        if not told[0].fits:
+            told = self.weigh([self.as_told], everything=True)
         if told[0].fits:
             return SetUpPosterior.of([*told, *self.zeros(self.as_told)])
         return self.few.searched()
@@ -218,42 +234,45 @@ class SetUpWeighing:
     def searched(self) -> SetUpPosterior:
         """Return what is believed of the set-up of runs that do not fit it.
 
-        One mistake is tried, then a sensor that stands a little elsewhere, then both, then two
-        mistakes, until something explains the runs.
+        One mistake is tried, then a sensor that stands a little elsewhere, then two mistakes, then
+        a mistake with such a sensor, until something explains the runs.
         """
-        found = self.mistakes_behind(self.as_told)
-        fitting = [one for one in found if one.fits]
+        single = self.options(self.as_told)
+        found = [
+            *self.weigh([self.as_told], everything=True),
+            *self.weigh(single),
+            *self.zeros(self.as_told),
+        ]
+        fitting = any(one.fits for one in found)
         found.append(self.weigh_moved(self.as_told))
         if fitting or found[-1].fits:
             return SetUpPosterior.of(found)
-        best = sorted(found[:-1], key=lambda one: one.misfit)[:FINALISTS]
-        found += [self.weigh_moved(one.set_up) for one in best]
-        if any(one.fits for one in found):
-            return SetUpPosterior.of(found)
-        for first in self.coarsely_best(self.as_told):
-            found += self.mistakes_behind(first)
+        likely = self.nearest([two.beside(one) for one in mistakes(self.robot) for two in single])
+        found += self.weigh(likely)
+        for first in self.nearest(single)[:FINALISTS]:
+            found += self.zeros(first)
         if not any(one.fits for one in found):
-            least = min(found, key=lambda one: one.misfit)
-            found.append(self.weigh_moved(least.set_up))
+            found += [self.weigh_moved(s) for s in self.nearest(single)[:FINALISTS]]
         return SetUpPosterior.of(found)
 
     def options(self, first: SetUp) -> list[SetUp]:
         """Return every mistake behind one that is undone."""
-        known, log_rate = self.likelihood.model.twin.robot, float(np.log(self.rate))
-        found = [*mistakes(known), *self.frames(first)]
-        return [replace(s, log_prior=s.log_prior + log_rate).beside(first) for s in found]
+        found = [*mistakes(self.robot), *self.frames(first)]
+        return [replace(s, log_prior=s.log_prior + self.log_rate).beside(first) for s in found]
 
-    def coarsely_best(self, first: SetUp) -> list[SetUp]:
-        """Return mistakes that explain the runs best where no small thing counts."""
-        noise_m = COARSE * self.likelihood.model.twin.robot.reach
-        weighed = self.weigh(self.options(first), noise_m)
-        weighed.sort(key=lambda one: -one.log_joint)
-        return [one.set_up for one in weighed[:FINALISTS]]
+    def nearest(self, set_ups: Sequence[SetUp]) -> list[SetUp]:
+        """Return the set-ups that bring the tool nearest to where healthy commands would have it.
 
-    def mistakes_behind(self, first: SetUp) -> list[WeighedSetUp]:
-        """Return what the runs say of one more mistake behind one that is undone, or none."""
-        told = [first] if first is self.as_told else []
-        return [*self.weigh([*told, *self.options(first)]), *self.zeros(first)]
+        Movements that stay far off count alike, however far: some may be faulty.
+        """
+        evidence, usable = self.likelihood.evidence, self.likelihood.usable
+        told, point = evidence.movements.target[usable], evidence.point[usable]
+        commands = np.stack([s.correction.command(told) for s in set_ups])
+        expected = self.likelihood.model.twin.path(commands)
+        seen = np.stack([s.correction.point(point) for s in set_ups])
+        away = np.linalg.norm(seen - expected, axis=-1) / (NEAR * self.robot.reach)
+        score = np.minimum(away, 1.0).mean(axis=1)
+        return [set_ups[i] for i in np.argsort(score, kind="stable")[:PROMISING]]
 
     # Mistakes with numbers of their own.
 
@@ -271,7 +290,7 @@ class SetUpWeighing:
     def zeros(self, first: SetUp) -> list[WeighedSetUp]:
         """Return the zeros that many movements agree on behind a mistake."""
         likelihood, model = self.behind([first]), self.likelihood.model
-        log_rate, found = float(np.log(self.rate)), []
+        found = []
         for k, width in enumerate(model.least_visible):
             says = likelihood.profile(k)
             seen = likelihood.usable & (says.min_distance2[..., 0] < EXPLAINED)
@@ -283,18 +302,16 @@ class SetUpWeighing:
             zero = float(np.median(off[members]))
             agree = members.sum() >= max(LEAST_AGREEING, AGREEING * likelihood.usable.sum())
             if agree and abs(zero) > CLUSTER * width:
-                found.append(self._zero(first, k, zero, float(width), log_rate))
+                found.append(self._zero(first, k, zero, float(width)))
         return found
 
-    def _zero(
-        self, first: SetUp, motor: int, zero: float, width: float, log_rate: float
-    ) -> WeighedSetUp:
+    def _zero(self, first: SetUp, motor: int, zero: float, width: float) -> WeighedSetUp:
         """Return what the runs say of a zero near some value, the value integrated out."""
-        robot = self.likelihood.model.twin.robot
+        robot = self.robot
 
         def at(value: float) -> SetUp:
             known = zero_off(robot, motor, value)
-            return replace(known, log_prior=known.log_prior + log_rate).beside(first)
+            return replace(known, log_prior=known.log_prior + self.log_rate).beside(first)
 
         for _ in range(ROUNDS):
             low, middle, high = (
