@@ -17,6 +17,7 @@ from failuretwin.app.commands.act import act, stop
 from failuretwin.app.commands.advise import advise
 from failuretwin.app.commands.data import import_, robot, simulate
 from failuretwin.app.commands.diagnose import diagnose, evaluate
+from failuretwin.app.commands.doctor import doctor
 from failuretwin.app.commands.learn import calibrate, study, train
 from failuretwin.app.commands.live import emulate, watch
 from failuretwin.app.commands.reach import reach
@@ -33,7 +34,7 @@ def cli() -> None:
 
 
 for command in (
-    *(import_, simulate, diagnose, evaluate, calibrate),
+    *(import_, doctor, simulate, diagnose, evaluate, calibrate),
     *(train, study, emulate, watch, act, stop, reach, advise, robot),
 ):
     cli.add_command(command)

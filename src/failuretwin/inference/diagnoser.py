@@ -156,18 +156,9 @@ class BayesDiagnoser:
                 to be believed, or no run holds a movement.
         """
         runs = as_runs(runs, self.twin.robot)
-        self._check(runs)
-        model = self.healthy_model.seen_by(sensing_of(runs, self.sensing))
-        self._check_shown(model)
-        told = SeenRuns(runs, model, self.hypothesis_set, self.priors)
-        if told.evidence.sound.settled.movements.start.shape[1] == 0:
-            raise InputError(
-                "no run holds a movement: `command` never leaves its first value. Expected runs "
-                "of one movement at least."
-            )
+        told = self.seen(runs)
         set_ups = told.set_ups()
-        undone = [one.set_up.correction for one in set_ups.found]
-        seen = [told if each.is_none else replace(told, runs=each.runs(runs)) for each in undone]
+        seen = [told.under(one.set_up.correction) for one in set_ups.found]
         moving = [self._moving(one) for one in seen]
         names, faults = [str(name) for name in runs["run"].values], truth_of(runs)
         truth: list[str | None] = [None] * len(names) if faults is None else list(faults)
@@ -182,6 +173,19 @@ class BayesDiagnoser:
                     posterior_of_runs.to_diagnosis(at - first, names[at], quality[at], truth[at])
                 )
         return results
+
+    def seen(self, runs: xr.Dataset) -> SeenRuns:
+        """Return runs as this diagnoser sees them, set up as told; raises as `diagnose` does."""
+        self._check(runs)
+        model = self.healthy_model.seen_by(sensing_of(runs, self.sensing))
+        self._check_shown(model)
+        found = SeenRuns(runs, model, self.hypothesis_set, self.priors)
+        if found.evidence.sound.settled.movements.start.shape[1] == 0:
+            raise InputError(
+                "no run holds a movement: `command` never leaves its first value. Expected runs "
+                "of one movement at least."
+            )
+        return found
 
     def _moving(self, seen: SeenRuns) -> TransientSamples | None:
         """Return the readings on the way that count; None: none do."""

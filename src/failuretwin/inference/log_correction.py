@@ -15,9 +15,29 @@ from dataclasses import dataclass, replace
 import numpy as np
 import xarray as xr
 
+from failuretwin.core.errors import InputError
 from failuretwin.core.runs import time_step
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.inference.evidence import SettledEvidence
+
+
+@dataclass(frozen=True)
+class CorrectionTable:
+    """A correction as a file states it, see `LogCorrection`.
+
+    Attributes:
+        commands: C, a row a motor [-].
+        zero: z [rad, m of a slide].
+        tool: M, a row an axis [-].
+        origin: t [m].
+        late_s: How much later than the commands' the clock of the tool is [s].
+    """
+
+    commands: tuple[tuple[float, ...], ...]
+    zero: tuple[float, ...]
+    tool: tuple[tuple[float, ...], ...]
+    origin: tuple[float, float, float]
+    late_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -42,6 +62,39 @@ class LogCorrection:
     def none(cls, motors: int) -> LogCorrection:
         """Return that of a log that fits a robot of so many motors."""
         return cls(np.eye(motors), np.zeros(motors), np.eye(3), np.zeros(3))
+
+    @classmethod
+    def from_file(cls, table: CorrectionTable, motors: int, where: str) -> LogCorrection:
+        """Return that which a file states.
+
+        Raises:
+            InputError: If it is of a robot with another number of motors, or cannot be undone.
+        """
+        rows = [len(row) for row in (*table.commands, table.zero)]
+        if rows != [motors] * (motors + 1) or [len(row) for row in table.tool] != [3, 3, 3]:
+            raise InputError(
+                f"{where}: expected {motors} rows of {motors} numbers in commands, {motors} in "
+                "zero, and 3 rows of 3 in tool. Let `failuretwin doctor LOG --out FILE` write it."
+            )
+        found = cls(
+            *(np.array(part) for part in (table.commands, table.zero)),
+            *(np.array(part) for part in (table.tool, table.origin)),
+            table.late_s,
+        )
+        if not min(abs(np.linalg.det(found.C)), abs(np.linalg.det(found.M))) > 0.0:
+            raise InputError(f"{where}: commands or tool cannot be undone: a row says nothing.")
+        return found
+
+    def text(self, says: str) -> str:
+        """Return the table of a file that states it.
+
+        Args:
+            says: What it undoes, for the comment.
+        """
+        rows = {"commands": self.C.tolist(), "zero": self.z.tolist()}
+        rows |= {"tool": self.M.tolist(), "origin": self.t.tolist(), "late_s": self.late_s}
+        lines = [f"{name} = {value}" for name, value in rows.items()]
+        return "\n".join([f"# {says}", "[correction]", *lines]) + "\n"
 
     def after(self, first: LogCorrection) -> LogCorrection:
         """Return what doing `first` and then this comes to."""

@@ -18,6 +18,7 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
 from failuretwin.inference.evidence import Evidence, TransientSamples
 from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.log_correction import LogCorrection
 from failuretwin.inference.posterior import Posterior
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
@@ -73,6 +74,10 @@ class SeenRuns:
         """Return what is believed of the set-up."""
         weighing = SetUpWeighing(self.sample, self.hypotheses, self.priors)
         return weighing.posterior() if self.model.sensors.tool_alone else weighing.taken_as_told()
+
+    def under(self, correction: LogCorrection) -> SeenRuns:
+        """Return the same runs with a wrong set-up undone."""
+        return self if correction.is_none else replace(self, runs=correction.runs(self.runs))
 
     def posterior(self, rows: slice, moving: TransientSamples | None) -> Posterior:
         """Return what some of the runs say.

@@ -52,8 +52,8 @@ ROUNDS = 2
 """Newton steps to the zero that explains the runs best."""
 CHUNK_RUNS = 64
 """Runs that are weighed at a time, whatever the set-up."""
-NEGLIGIBLE = 1e-4
-"""Set-ups less probable than this are left out."""
+NEGLIGIBLE = 0.003
+"""Set-ups less probable than this are left out; it bounds what they could change."""
 ANOTHER = "the set-up is wrong, and not in one way that is known"
 """What is said where no set-up explains the runs."""
 
@@ -104,6 +104,8 @@ class SetUpPosterior:
         log_joint = np.array([one.log_joint for one in weighed])
         share = np.exp(log_joint - log_sum(log_joint, axis=0))
         order = [i for i in np.argsort(-share, kind="stable") if share[i] > NEGLIGIBLE]
+        if not weighed[order[0]].fits:  # no verdict is had behind it
+            order = order[:1]
         return cls([weighed[i] for i in order], share[order] / share[order].sum())
 
     @property
