@@ -50,6 +50,11 @@ def print_diagnoses(diagnoses: Sequence[Diagnosis]) -> None:
     for d in diagnoses if len(diagnoses) <= MAX_EXPLAINED else ():
         lines = (*d.explanation, *(f"the log: {remark}" for remark in d.quality))
         show(f"\n{d.run}", *(f"  - {line}" for line in lines))
+    if len(diagnoses) > MAX_EXPLAINED:
+        shared = [
+            line for line in diagnoses[0].quality if all(line in d.quality for d in diagnoses)
+        ]
+        show(*(f"\nevery log: {line}" for line in shared))
     show(f"\n{diagnoses[0].method}")
 
 

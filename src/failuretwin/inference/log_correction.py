@@ -76,11 +76,9 @@ class LogCorrection:
                 f"{where}: expected {motors} rows of {motors} numbers in commands, {motors} in "
                 "zero, and 3 rows of 3 in tool. Let `failuretwin doctor LOG --out FILE` write it."
             )
-        found = cls(
-            *(np.array(part) for part in (table.commands, table.zero)),
-            *(np.array(part) for part in (table.tool, table.origin)),
-            table.late_s,
-        )
+        C, z = np.array(table.commands), np.array(table.zero)
+        M, t = np.array(table.tool), np.array(table.origin)
+        found = cls(C, z, M, t, table.late_s)
         if not min(abs(np.linalg.det(found.C)), abs(np.linalg.det(found.M))) > 0.0:
             raise InputError(f"{where}: commands or tool cannot be undone: a row says nothing.")
         return found
