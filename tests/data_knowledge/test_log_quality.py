@@ -146,7 +146,7 @@ WITHOUT_EVIDENCE = {
     "millimetres": (lambda r: scaled(r, 1000.0), "tool positions look like millimetres"),
     "mirrored": (
         lambda r: scaled(r, -1.0),
-        "nowhere near where it should be: x and y and z of the tool seem to point the other way",
+        "nowhere near where it should be: x and y and z of the tool point the other way",
     ),
     "cut early": (lambda r: cut(r, 0.5), "not seen at rest after any movement"),
 }

@@ -16,6 +16,8 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
+from failuretwin.core.types import as_floats
+from failuretwin.inference.clock import clock_posterior
 from failuretwin.inference.evidence import Evidence, TransientSamples
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.log_correction import LogCorrection
@@ -23,6 +25,7 @@ from failuretwin.inference.posterior import Posterior
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.set_up_weighing import ANOTHER, SetUpPosterior, SetUpWeighing
+from failuretwin.inference.set_ups import SetUp, clocks_apart, gross_unit
 from failuretwin.inference.shared_posterior import set_up_in_doubt, shared_posterior
 
 if TYPE_CHECKING:
@@ -30,6 +33,8 @@ if TYPE_CHECKING:
 
 JUDGED_RUNS = 32
 """So many runs of a set, evenly spread, tell whether its set-up may be off."""
+LOOKS = 20
+"""Runs by which the unit of a log is told, and readings of each."""
 TOLD = 0.1
 """Probability of a wrong set-up from which it is told."""
 SURE = 0.9
@@ -71,9 +76,36 @@ class SeenRuns:
         return set_up_in_doubt(self.sample, self.hypotheses, self.priors)
 
     def set_ups(self) -> SetUpPosterior:
-        """Return what is believed of the set-up."""
-        weighing = SetUpWeighing(self.sample, self.hypotheses, self.priors)
-        return weighing.posterior() if self.model.sensors.tool_alone else weighing.taken_as_told()
+        """Return what is believed of the set-up: unit and clock first, then all else."""
+        told = SetUpWeighing(self.sample, self.hypotheses, self.priors)
+        if told.rate == 0.0 or not self.model.sensors.tool_alone:
+            return told.taken_as_told()
+        first, seen = told.as_told, self
+        for look in (SeenRuns.unit, SeenRuns.clock):
+            found = look(seen)
+            if found is not None:
+                first = found.beside(first)
+                seen = self.under(first.correction)
+        posterior = SetUpWeighing(seen.sample, self.hypotheses, self.priors).posterior()
+        return posterior.beside(first) if first.what else posterior
+
+    def unit(self) -> SetUp | None:
+        """Return the unit that the log is in; None: that of the profile."""
+        command, point = (as_floats(self.runs[n].values) for n in ("command", "measured"))
+        runs = np.unique(np.linspace(0, len(point) - 1, LOOKS).astype(np.int64))
+        run, time = np.nonzero(np.isfinite(point[runs]).all(axis=-1))
+        some = np.linspace(0, len(run) - 1, LOOKS**2).astype(np.int64)
+        if len(run) < LOOKS:
+            return None
+        at = runs[run[some]], time[some]
+        return gross_unit(self.model.twin, command[at], point[at])
+
+    def clock(self) -> SetUp | None:
+        """Return by how much the clocks are apart; None where that is not sure."""
+        found = clock_posterior(self.evidence.sound, self.model)
+        if found.apart < SURE:
+            return None
+        return clocks_apart(self.model.twin.robot, found.late_s)
 
     def under(self, correction: LogCorrection) -> SeenRuns:
         """Return the same runs with a wrong set-up undone."""
@@ -130,6 +162,5 @@ def set_up_remark(set_ups: SetUpPosterior) -> str:
     ways = "; or ".join(kept)
     if set_ups.wrong < SURE:
         return f"the log may not fit the profile ({set_ups.wrong:.0%}): {ways}"
-    return (
-        f"the log does not fit the profile ({set_ups.wrong:.1%}): {ways}; judged with that undone"
-    )
+    sure = "over 99.9 %" if set_ups.wrong > 0.999 else f"{100.0 * set_ups.wrong:.1f} %"
+    return f"the log does not fit the profile ({sure} sure): {ways}; judged with that undone"

@@ -100,13 +100,25 @@ class SetUpPosterior:
 
     @classmethod
     def of(cls, weighed: Sequence[WeighedSetUp]) -> SetUpPosterior:
-        """Return the posterior over set-ups that were weighed by the same runs."""
+        """Return the posterior over set-ups that were weighed by the same runs.
+
+        Two ways to say the same count once.
+        """
+        weighed = _distinct(weighed)
         log_joint = np.array([one.log_joint for one in weighed])
         share = np.exp(log_joint - log_sum(log_joint, axis=0))
         order = [i for i in np.argsort(-share, kind="stable") if share[i] > NEGLIGIBLE]
         if not weighed[order[0]].fits:  # no verdict is had behind it
             order = order[:1]
         return cls([weighed[i] for i in order], share[order] / share[order].sum())
+
+    def beside(self, first: SetUp) -> SetUpPosterior:
+        """Return the same where something else is wrong for sure."""
+        both = [
+            replace(w, set_up=w.set_up.beside(first) if w.set_up.what else first)
+            for w in self.found
+        ]
+        return SetUpPosterior(both, self.probability)
 
     @property
     def best(self) -> WeighedSetUp:
@@ -354,6 +366,16 @@ def _weighed(
         WeighedSetUp(set_up, row, float(share))
         for set_up, row, share in zip(set_ups, says, misfit, strict=True)
     ]
+
+
+def _distinct(weighed: Sequence[WeighedSetUp]) -> list[WeighedSetUp]:
+    """Return the set-ups with each correction once, as it was weighed best."""
+    found: dict[bytes, WeighedSetUp] = {}
+    for one in sorted(weighed, key=lambda w: -w.log_joint):
+        undo = one.set_up.correction
+        parts = [np.round(part, 9) + 0.0 for part in (undo.C, undo.z, undo.M, undo.t)]
+        found.setdefault(b"".join(part.tobytes() for part in parts), one)
+    return list(found.values())
 
 
 def highest_and_outlier(likelihood: RunLikelihood) -> tuple[FloatArray, FloatArray]:

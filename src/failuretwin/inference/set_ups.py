@@ -15,6 +15,7 @@ import numpy as np
 
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.robot import Robot, shown_unit
+from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.log_correction import LogCorrection
 from failuretwin.inference.registration import align, offset
 
@@ -36,7 +37,7 @@ class SetUp:
         mend: What to do about it, a clause.
         correction: What makes such a log fit the profile.
         log_prior: Log of its probability, for zeros and frames with what they were chosen from.
-        kind: One of `SHARES`; empty: nothing is wrong.
+        kind: One of `SHARES`, or clock; empty: nothing is wrong.
     """
 
     what: str
@@ -133,6 +134,53 @@ def _axes(robot: Robot) -> list[SetUp]:
         correction = replace(none, M=none.M[list(order)])
         found.append(SetUp(what, "exchange them", correction, kind="axes"))
     return found
+
+
+# Mistakes that hide where the tool rests, so that nothing else can be asked before.
+
+UNIT_FACTOR = 8.0
+"""Extents that differ by so much are no matter of senses: the unit of lengths is another [-]."""
+MOST_RAD = 20.0
+"""Commands beyond three turns are no angles in rad."""
+LEAST_RAD = 0.05
+"""Commands that stay within this of their middle are hardly all in rad."""
+
+
+def extent(point: FloatArray) -> float:
+    """Return the median distance of points (pose, 3) from their middle [m]."""
+    return float(np.median(np.linalg.norm(point - np.median(point, axis=0), axis=1)))
+
+
+def gross_unit(twin: DigitalTwin, command: FloatArray, point: FloatArray) -> SetUp | None:
+    """Return the unit that commands or tool positions are in; None: that of the profile.
+
+    Args:
+        twin: Kinematics as the profile has them.
+        command: Commands, (time, motor) [rad].
+        point: Where the tool was seen about then, (time, 3) [m].
+    """
+    units = {one.what: one for one in mistakes(twin.robot) if one.kind == "unit"}
+    lengths = {
+        factor: units[f"tool positions look like {unit}"] for factor, unit in LENGTHS.items()
+    }
+    turns = not twin.robot.slides.any()
+    if turns and np.abs(command).max(initial=0.0) > MOST_RAD:
+        return units["commands look like degrees"]
+    ratio = extent(point) / max(extent(twin.path(command)), 1e-9)
+    if 1.0 / UNIT_FACTOR < ratio < UNIT_FACTOR:
+        return None
+    if turns and np.abs(command - np.median(command, axis=0)).max() < LEAST_RAD:
+        return units["commands look like radians taken for degrees"]
+    factor = min(LENGTHS, key=lambda known: abs(np.log(ratio / known)))
+    return lengths[factor] if abs(np.log(ratio / factor)) < np.log(UNIT_FACTOR) / 2.0 else None
+
+
+def clocks_apart(robot: Robot, late_s: float) -> SetUp:
+    """Return the mistake that the tool's clock is late by so much [s]."""
+    what = f"the tool's clock is {abs(late_s):.2g} s {'behind' if late_s > 0 else 'ahead of'} the "
+    none = LogCorrection.none(len(robot.motors))
+    mend = "bring both to one clock"
+    return SetUp(f"{what}commands'", mend, replace(none, late_s=late_s), kind="clock")
 
 
 # Mistakes that have numbers, which poses tell.
