@@ -167,7 +167,7 @@ def gross_unit(twin: DigitalTwin, command: FloatArray, point: FloatArray) -> Set
     if turns and np.abs(command).max(initial=0.0) > MOST_RAD:
         return units["commands look like degrees"]
     ratio = extent(point) / max(extent(twin.path(command)), 1e-9)
-    if 1.0 / UNIT_FACTOR < ratio < UNIT_FACTOR:
+    if 1.0 / UNIT_FACTOR < ratio < UNIT_FACTOR or ratio == 0.0:  # zero: it never moves
         return None
     if turns and np.abs(command - np.median(command, axis=0)).max() < LEAST_RAD:
         return units["commands look like radians taken for degrees"]
