@@ -289,7 +289,7 @@ class Posterior:
         log_posterior: (run, hypothesis).
         weights: What the runs say of each hypothesis, in their order.
         set_up: What is to be said of the set-up of each run; empty: nothing of any.
-        no_verdict: Why none of the runs allows a verdict; empty: some may.
+        no_verdict: Why no set-up allows a verdict on each run; empty: nothing keeps from any.
     """
 
     likelihood: RunLikelihood
@@ -298,7 +298,7 @@ class Posterior:
     log_posterior: FloatArray
     weights: Sequence[MarginalLikelihood]
     set_up: Sequence[str] = ()
-    no_verdict: str = ""
+    no_verdict: Sequence[str] = ()
 
     def undecided(self, run: int, quality: LogQuality) -> str:
         """Return why a run allows no verdict, empty if it does.
@@ -308,8 +308,8 @@ class Posterior:
             quality: Defects of its log.
         """
         best = int(np.argmax(self.log_posterior[run]))
-        if self.no_verdict and not quality.fatal:
-            return self.no_verdict
+        if self.no_verdict and self.no_verdict[run] and not quality.fatal:
+            return self.no_verdict[run]
         return abstention_reason(
             quality,
             self.likelihood.evidence,

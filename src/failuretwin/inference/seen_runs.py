@@ -24,7 +24,13 @@ from failuretwin.inference.log_correction import LogCorrection
 from failuretwin.inference.posterior import Posterior
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.set_up_weighing import ANOTHER, SetUpPosterior, SetUpWeighing
+from failuretwin.inference.set_up_weighing import (
+    ANOTHER,
+    FITS,
+    SetUpPosterior,
+    SetUpWeighing,
+    run_misfit,
+)
 from failuretwin.inference.set_ups import SetUp, clocks_apart, gross_unit
 from failuretwin.inference.shared_posterior import set_up_in_doubt, shared_posterior
 
@@ -136,13 +142,16 @@ def mixed(posteriors: Sequence[Posterior], set_ups: SetUpPosterior) -> Posterior
     if len(posteriors) > 1:
         stacked = np.stack([one.log_posterior for one in posteriors]) + weight[:, None, None]
         likeliest = replace(likeliest, log_posterior=log_sum(stacked, axis=0))
-    remark = set_up_remark(set_ups)
-    if not remark:
+    remark, count = set_up_remark(set_ups), len(likeliest.log_posterior)
+    if remark:
+        known = likeliest.set_up or [""] * count
+        said = ["; ".join(filter(None, (remark, one))) for one in known]
+        likeliest = replace(likeliest, set_up=said)
+    if set_ups.fits:
         return likeliest
-    count = len(likeliest.log_posterior)
-    known = likeliest.set_up or [""] * count
-    said = ["; ".join(filter(None, (remark, one))) for one in known]
-    return replace(likeliest, set_up=said, no_verdict="" if set_ups.fits else ANOTHER)
+    everywhere = bool(set_ups.best.set_up.what)
+    lost = [everywhere or run_misfit(likeliest, run) > FITS for run in range(count)]
+    return replace(likeliest, no_verdict=[ANOTHER if one else "" for one in lost])
 
 
 def set_up_remark(set_ups: SetUpPosterior) -> str:

@@ -22,7 +22,7 @@ from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.log_correction import LogCorrection
-from failuretwin.inference.posterior import log_prior, marginal_likelihoods
+from failuretwin.inference.posterior import Posterior, log_prior, marginal_likelihoods
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.set_ups import FEWEST_TO_TURN, SetUp, mistakes, turned, zero_off
@@ -54,7 +54,7 @@ CHUNK_RUNS = 64
 """Runs that are weighed at a time, whatever the set-up."""
 NEGLIGIBLE = 0.003
 """Set-ups less probable than this are left out; it bounds what they could change."""
-ANOTHER = "the set-up is wrong, and not in one way that is known"
+ANOTHER = "no fault explains it, and the set-up is not wrong in one way that is known"
 """What is said where no set-up explains the runs."""
 
 
@@ -389,3 +389,11 @@ def highest_and_outlier(likelihood: RunLikelihood) -> tuple[FloatArray, FloatArr
     _, _, spread = model.residual(evidence.point, healthy, model.scatter)
     highest = np.where(likelihood.usable, spread.log_norm(model.settling.tail_dof), 0.0)
     return highest.sum(axis=1), likelihood.usable.sum(axis=1) * model.outlier_log_density
+
+
+def run_misfit(posterior: Posterior, run: int) -> float:
+    """Return the misfit of one run under its most probable hypothesis, as of `WeighedSetUp`."""
+    highest, outlier = highest_and_outlier(posterior.likelihood[run])
+    best = int(np.argmax(posterior.log_posterior[run]))
+    says = float(posterior.weights[best].settled(run).sum())
+    return float((highest[0] - says) / max(highest[0] - outlier[0], 1.0))
