@@ -45,7 +45,7 @@ FAR = 0.08
 """A frame that moves the tool by less than this share of the reach is a matter of registration."""
 CHOICE_NATS = 12.0
 """What seven numbers of a registration, chosen anew for each run, cost of its evidence [nats]."""
-EXPLAINED, CLUSTER, LEAST_AGREEING, AGREEING = 25.0, 3.0, 3, 0.2
+EXPLAINED, CLUSTER, LEAST_AGREEING, AGREEING = 25.0, 3.0, 2, 0.2
 """A zero is weighed where so many movements, and such a share, agree on it within so many
 deviations, and it is further off: only movements count that one motor explains, by D0^2."""
 ROUNDS = 2
