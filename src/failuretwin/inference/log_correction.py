@@ -11,14 +11,17 @@ Section: docs/set_up.md
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import time_step
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.inference.evidence import SettledEvidence
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 @dataclass(frozen=True)
