@@ -91,6 +91,23 @@ def test_what_contradicts_itself_is_refused(runs, tmp_path, monkeypatch, options
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("option", ["--self-calibrate", "--track"])
+def test_runs_without_a_tool_position_are_refused(armpi, tmp_path, option):
+    made = simulate(
+        Plan(armpi, ["healthy"], 1, 4, Imperfections("a", "b"), sensors=["accelerometer"])
+    )
+    save_run_set(made.assign(measured=made["measured"] * float("nan")), tmp_path / "runs.nc")
+    with pytest.raises(InputError, match="no tool position, but only what accelerometer read"):
+        diagnose(tmp_path / "runs.nc", option)
+
+
+def test_errors_that_were_ruled_out_are_told(runs, armpi, tmp_path):
+    narrow = diagnose(runs, "--error-range", "0.01", "0.02", "deg")
+    assert "would look otherwise without the range of errors that was given" in narrow.stderr
+    assert "motor 3 misses its targets" in narrow.stderr
+    assert "look otherwise" not in diagnose(runs, "--error-range", "2", "15", "deg").stderr
+
+
 def test_a_network_cannot_be_told_to(runs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "network.npz").write_bytes(b"")

@@ -407,6 +407,16 @@ def test_senses_of_the_profile_are_confirmed(settle, armpi):
         assert f"{sense} as in the profile" in remark
 
 
+def test_motors_that_do_not_give_way_do_not_tell_their_sense(settle, armpi):
+    """Runs of a simulation without imperfections: nothing sags, either way."""
+    ideal = replace(TYPICAL, bias=(0.0,) * 4, compliance=(0.0,) * 4, friction=(0.0,) * 4)
+    for scatter in (1e-6, 2e-3):
+        seen = settle(replace(ideal, scatter=(scatter,) * 4), seed=9)
+        for remark in sense_remarks(sort_and_fit(seen, armpi), armpi):
+            assert "check it" not in remark
+            assert "as in the profile" not in remark
+
+
 def test_a_wrong_sense_is_found_and_blames_no_other_motor(settle, armpi):
     motors = tuple(replace(motor, sense=1.0) for motor in armpi.motors)
     straight = replace(armpi, profile=replace(armpi.profile, motors=motors))

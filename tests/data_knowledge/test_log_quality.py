@@ -143,11 +143,6 @@ WITHOUT_EVIDENCE = {
     "empty": (empty, "holds no readings of the tool"),
     "frozen": (frozen, "stands still though motors are told to move"),
     "never at rest": (never_at_rest, "not seen at rest after any movement"),
-    "millimetres": (lambda r: scaled(r, 1000.0), "tool positions look like millimetres"),
-    "mirrored": (
-        lambda r: scaled(r, -1.0),
-        "nowhere near where it should be: x and y and z of the tool seem to point the other way",
-    ),
     "cut early": (lambda r: cut(r, 0.5), "not seen at rest after any movement"),
 }
 

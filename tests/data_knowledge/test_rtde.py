@@ -63,6 +63,15 @@ def test_without_a_tcp_the_path_comes_from_the_encoders(tmp_path):
     assert runs.attrs["source"].endswith("tool path = forward kinematics of the readings")
 
 
+def test_an_accelerometer_is_enough(tmp_path):
+    force = " ".join(f"actual_tool_accelerometer_{i}" for i in range(3))
+    header = f"timestamp {' '.join(f'target_q_{i}' for i in range(6))} {force}"
+    rows = [f"{1000 + 0.002 * k:.3f} {ZERO} 0 0 9.81" for k in range(50)]
+    runs = read_runs(write(tmp_path, header, rows), "ur5e")
+    np.testing.assert_allclose(runs["accelerometer"][0, 7], [0.0, 0.0, 9.81])
+    assert not np.isfinite(runs["measured"]).any()
+
+
 def test_a_map_wins_over_the_header(tmp_path):
     names = tuple(f"actual_q_{k}" for k in range(5))
     mapping = ColumnMap(

@@ -33,17 +33,17 @@ def reversed_motor(target, motor):
 MISTAKES = {
     "millimetres": (lambda q, p: (q, 1e3 * p), "tool positions look like millimetres"),
     "degrees": (lambda q, p: (np.degrees(q), p), "commands look like degrees"),
-    "sense": (lambda q, p: (reversed_motor(q, 1), p), "motor 2 seems to turn the other way"),
+    "sense": (lambda q, p: (reversed_motor(q, 1), p), "motor 2 turns the other way"),
     "swapped": (
         lambda q, p: (q[:, [0, 2, 1, *range(3, q.shape[1])]], p),
-        "the commands of motor 2 and motor 3 seem to be swapped",
+        "the commands of motor 2 and motor 3 are swapped",
     ),
     "shift": (
         lambda q, p: (q, p + np.array([0.0, 0.83, 0.0])),
         "off by the same 830 mm after every movement",
     ),
     "turn": (lambda q, p: (q, TURN.apply(p) + 0.6), "in a frame turned by"),
-    "columns": (lambda q, p: (q, p[:, [1, 0, 2]]), "columns x, y, z seem to hold y, x, z"),
+    "columns": (lambda q, p: (q, p[:, [1, 0, 2]]), "columns x, y, z hold y, x, z"),
 }
 
 

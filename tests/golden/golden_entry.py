@@ -26,8 +26,7 @@ from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import LostCommand, Readings
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference import diagnoser as bayes
-from failuretwin.inference import shared_posterior
+from failuretwin.inference import seen_runs, shared_posterior
 from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.expected_bayes_factors import expected_log_bayes_factors
 from failuretwin.inference.log_quality import log_quality
@@ -92,7 +91,7 @@ def with_log_evidence(diagnoser, runs):
         kept.append(shared_posterior.shared_posterior(*arguments))
         return kept[-1]
 
-    with mock.patch.object(bayes, "shared_posterior", weighed):
+    with mock.patch.object(seen_runs, "shared_posterior", weighed):
         diagnoses = diagnoser.diagnose(runs)
     says = [np.stack([weight.log_evidence for weight in j.weights], axis=1) for j in kept]
     return diagnoses, np.concatenate(says)

@@ -161,19 +161,6 @@ def commander_of(
     return stack.enter_context(rosbridge.RosbridgeCommander(known.robot, topics_of(topics), ros))
 
 
-def _emulated(
-    known: CalibratedRobot, faults: Sequence[str], seed: int, stack: ExitStack
-) -> Commander:
-    from failuretwin.connection.commanded_arm import CommandedArm
-    from failuretwin.connection.emulated_arm import Emulation
-
-    own = emulated_faults(faults, known.robot)
-    emulation = Emulation(
-        known.robot, known.imperfections, own.schedule, seed, own.modes, own.start
-    )
-    return stack.enter_context(CommandedArm(emulation))
-
-
 # What is told.
 
 

@@ -19,6 +19,7 @@ from failuretwin.app.commands.check import check, design, isolability
 from failuretwin.app.commands.data import import_, robot, simulate
 from failuretwin.app.commands.demo import demo
 from failuretwin.app.commands.diagnose import diagnose, evaluate
+from failuretwin.app.commands.doctor import doctor
 from failuretwin.app.commands.learn import calibrate, study, train
 from failuretwin.app.commands.live import emulate, watch
 from failuretwin.app.commands.reach import reach
@@ -35,7 +36,7 @@ def cli() -> None:
 
 
 for command in (
-    *(demo, import_, simulate, diagnose, evaluate, calibrate),
+    *(demo, import_, doctor, simulate, diagnose, evaluate, calibrate),
     *(train, study, emulate, watch, act, stop, reach, check, design, isolability),
     *(advise, robot),
 ):

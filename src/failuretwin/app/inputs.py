@@ -15,7 +15,7 @@ from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.core.hypothesis import Hypothesis, parse_hypotheses
 from failuretwin.data_knowledge.bags import BagTopics
 from failuretwin.data_knowledge.column_guess import column_map_text, guess_columns
-from failuretwin.data_knowledge.csv_log import read_column_map
+from failuretwin.data_knowledge.csv_log import CORRECTION, read_column_map
 from failuretwin.data_knowledge.lerobot import LeRobotAngles, is_lerobot, lerobot_map_text
 from failuretwin.data_knowledge.matlab import RECOVERY_ERROR, RECOVERY_WORST
 from failuretwin.data_knowledge.raw_sessions import As
@@ -26,6 +26,7 @@ from failuretwin.digital_model.arm_classes import GENERIC_NAME
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser, Diagnoser, diagnoser_from_text
+from failuretwin.inference.log_correction import CorrectionTable, LogCorrection
 from failuretwin.inference.posterior import check_diagnosable
 
 if TYPE_CHECKING:
@@ -39,12 +40,16 @@ REPORTED_ERROR_M = 1e-6
 
 def read_inputs(sources: Sequence[Path], robot: Robot, reading: LogOptions) -> xr.Dataset:
     """Return the runs of all inputs as one run set."""
+    correction = None
     options = ReadOptions(
         cast(As, reading.how), reading.published_labels, approximate=reading.approximate
     )
     if reading.columns is not None:
         options = _with_map(options, reading.columns, sources, robot)
+        correction = _correction(reading.columns, robot)
     runs = read_runs(list(sources), robot, options)
+    if correction is not None:
+        runs = correction.runs(runs)
     error = float(runs.attrs.get(RECOVERY_ERROR, 0.0))
     if error > REPORTED_ERROR_M:
         tell(
@@ -53,6 +58,16 @@ def read_inputs(sources: Sequence[Path], robot: Robot, reading: LogOptions) -> x
             err=True,
         )
     return runs
+
+
+def _correction(path: Path, robot: Robot) -> LogCorrection | None:
+    """Return how a wrong set-up of the log is undone, where a map says it."""
+    table = read_toml(path).get(CORRECTION)
+    if table is None:
+        return None
+    where = f"{path}: {CORRECTION}"
+    stated = from_table(CorrectionTable, table, where)
+    return LogCorrection.from_file(stated, len(robot.motors), where)
 
 
 def warn_mismatch(runs: xr.Dataset, expected: str) -> None:
@@ -84,6 +99,8 @@ def _with_map(
         if "lerobot" in table:
             angles = from_table(LeRobotAngles, table["lerobot"], f"{path}: lerobot")
             return replace(options, lerobot=angles)
+        if set(table) == {CORRECTION}:
+            return options
         return replace(options, columns=read_column_map(path, robot))
     log = next((s for s in sources if is_lerobot(s) or (s.suffix == ".csv" and s.is_file())), None)
     if log is None:

@@ -31,7 +31,7 @@ from failuretwin.digital_model.urdf import UrdfJoint
 from failuretwin.digital_model.urdf_report import JointReport, UrdfReport
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser
-from failuretwin.inference.explanation import plain_name, size_words
+from failuretwin.inference.explanation import joint_names_in, plain_name, size_words
 from failuretwin.inference.isolability import IsolabilityReport, isolability
 from failuretwin.inference.wear_limits import wear_unit
 
@@ -50,6 +50,11 @@ def print_diagnoses(diagnoses: Sequence[Diagnosis]) -> None:
     for d in diagnoses if len(diagnoses) <= MAX_EXPLAINED else ():
         lines = (*d.explanation, *(f"the log: {remark}" for remark in d.quality))
         show(f"\n{d.run}", *(f"  - {line}" for line in lines))
+    if len(diagnoses) > MAX_EXPLAINED:
+        shared = [
+            line for line in diagnoses[0].quality if all(line in d.quality for d in diagnoses)
+        ]
+        show(*(f"\nevery log: {line}" for line in shared))
     show(f"\n{diagnoses[0].method}")
 
 
@@ -277,7 +282,8 @@ def isolability_summary(runs: xr.Dataset, diagnoser: BayesDiagnoser) -> list[str
         onset_s=diagnoser.priors.onset.known_s or 0.0,
     )
     robot = diagnoser.twin.robot
-    return group_lines(found, robot) + size_lines(found, robot) + left_out
+    lines = group_lines(found, robot) + size_lines(found, robot)
+    return [joint_names_in(line, robot) for line in lines] + left_out
 
 
 def _left_out_lines(others: Sequence[Hypothesis]) -> list[str]:

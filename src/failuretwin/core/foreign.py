@@ -9,6 +9,7 @@ text only (`printable`, `as_cell`).
 from __future__ import annotations
 
 import errno
+import fnmatch
 import os
 import unicodedata
 from collections.abc import Iterator
@@ -29,6 +30,22 @@ MEMORY_BYTES = 4_000 * MB
 """Free memory where the system does not tell [bytes]: that of a small computer."""
 TEXT_BYTES = 64 * MB
 """Longest text, such as a profile or a URDF, that is read whole [bytes]."""
+
+
+def files_below(folder: Path, pattern: str) -> list[Path]:
+    """Return the files at or below a folder whose name fits a pattern, links to folders followed.
+
+    A folder that a link leads back to is searched once.
+    """
+    found, seen = [], set[str]()
+    for here, folders, names in os.walk(folder, followlinks=True):
+        real = os.path.realpath(here)
+        if real in seen:
+            folders.clear()
+            continue
+        seen.add(real)
+        found += [Path(here) / name for name in fnmatch.filter(names, pattern)]
+    return found
 
 
 @contextmanager

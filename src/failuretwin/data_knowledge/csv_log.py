@@ -27,6 +27,8 @@ SERVO = "servo"
 ISO = "iso"
 CSV_EXPANSION = 30
 """What a byte of a CSV file takes while its cells are text: a cell of two bytes takes sixty."""
+CORRECTION = "correction"
+"""Table of a column map that is not about columns: how a wrong set-up of any log is undone."""
 BLANKS = r"\s+"
 """Separator of columns with any number of blanks between them."""
 
@@ -153,7 +155,8 @@ def read_column_map(path: Path, robot: Robot) -> ColumnMap:
         InputError: If the file is wrong or does not name what the robot needs.
     """
     where = str(path)
-    mapping = from_table(ColumnMap, read_toml(path), where)
+    table = {name: part for name, part in read_toml(path).items() if name != CORRECTION}
+    mapping = from_table(ColumnMap, table, where)
     _check_unit(mapping.time.unit, [*TIME_UNITS, ISO], f"{where}: time")
     command = mapping.command
     if command.kind not in ("sampled", "target"):

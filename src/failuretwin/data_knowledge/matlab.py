@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from failuretwin.core.errors import InputError, unknown_name
-from failuretwin.core.foreign import as_cell, reading
+from failuretwin.core.foreign import as_cell, files_below, reading
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.runs import AXES, RunTable, Truth, truth_of
@@ -75,7 +75,7 @@ def hypothesis_of_label(label: str, robot: Robot) -> str | None:
 
 def find_matlab_files(folder: Path) -> list[Path]:
     """Return the files of runs at or below `folder`: cell arrays and first halves of pairs."""
-    files = sorted(folder.rglob("*.mat"), key=_natural_order)
+    files = sorted(files_below(folder, "*.mat"), key=_natural_order)
     return [path for path in files if not path.name.startswith("hidden_")]
 
 

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from failuretwin.core.errors import InputError, unknown_name
-from failuretwin.core.foreign import check_memory
+from failuretwin.core.foreign import check_memory, files_below
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable, Truth, padded_bytes
@@ -62,7 +62,7 @@ def find_sessions(path: Path) -> list[Path]:
     Raises:
         InputError: If a folder holds some but not all of the three files.
     """
-    folders = sorted({file.parent for name in SESSION_FILES for file in path.rglob(name)})
+    folders = sorted({file.parent for name in SESSION_FILES for file in files_below(path, name)})
     for folder in folders:
         missing = [name for name in SESSION_FILES if not (folder / name).is_file()]
         if missing:

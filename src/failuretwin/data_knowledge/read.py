@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias, cast
 
 from failuretwin import __version__
 from failuretwin.core.errors import InputError
+from failuretwin.core.foreign import files_below
 from failuretwin.core.runs import RunTable, concatenate
 from failuretwin.data_knowledge.bags import BagTopics, is_bag, read_bag
 from failuretwin.data_knowledge.column_guess import told_columns
@@ -142,10 +143,14 @@ def _lerobot_unit(options: ReadOptions) -> str:
 def _read_folder(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
     found = [_session_dataset(folder, robot, options) for folder in find_sessions(path)]
     found += [_matlab_dataset(file, robot, options) for file in find_matlab_files(path)]
-    sets = sorted(file.parents[1] for file in path.rglob(str(INFO_FILE)))
+    sets = sorted(
+        file.parents[1]
+        for file in files_below(path, INFO_FILE.name)
+        if file.parent.name == INFO_FILE.parent.name
+    )
     found += [part for folder in sets for part in _read_source(folder, robot, options)]
     if not found and options.columns is not None:
-        files = sorted(path.rglob("*.csv"))
+        files = sorted(files_below(path, "*.csv"))
         found = [part for file in files for part in _read_text(file, robot, options)]
     if not found:
         raise InputError(

@@ -72,10 +72,11 @@ def read_rtde(path: Path, robot: Robot) -> TimedLog:
             f"{path}: an RTDE recording without {', '.join(lacking)}. Add target_q to the recipe."
         )
     has_tool, has_actual = set(tool) <= set(names), set(actual) <= set(names)
-    if not has_tool and not has_actual:
+    has_force = set(force) <= set(names)
+    if not (has_tool or has_actual or has_force):
         raise InputError(
-            f"{path}: an RTDE recording with neither actual_TCP_pose nor actual_q of every joint. "
-            "Add one of them to the recipe."
+            f"{path}: an RTDE recording with neither actual_TCP_pose nor actual_q of every joint "
+            "nor actual_tool_accelerometer. Add one of them to the recipe."
         )
     mapping = ColumnMap(
         time=TimeColumn(TIME),
@@ -83,7 +84,7 @@ def read_rtde(path: Path, robot: Robot) -> TimedLog:
         tool=ToolColumns((tool[0], tool[1], tool[2])) if has_tool else None,
         position=AngleColumns(tuple(actual)) if has_actual else None,
         separator=BLANKS,
-        sensors=(SensorColumns("accelerometer", force),) if set(force) <= set(names) else (),
+        sensors=(SensorColumns("accelerometer", force),) if has_force else (),
     )
     log = read_mapped_csv(path, mapping, robot)[0]
     _check_tcp(log, robot, path)

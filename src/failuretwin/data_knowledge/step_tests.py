@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from failuretwin.core.errors import InputError
+from failuretwin.core.foreign import files_below
 from failuretwin.core.types import MS_PER_S, BoolArray, FloatArray, ServoUnits, frozen_array
 from failuretwin.data_knowledge.csv_log import load_csv, numbers
 from failuretwin.digital_model.robot import Robot
@@ -130,7 +131,7 @@ def is_step_test(path: Path) -> bool:
 
 def find_step_tests(path: Path) -> list[Path]:
     """Return every step test at or below `path`, in order of their names."""
-    files = sorted(path.rglob("*.csv")) if path.is_dir() else [path]
+    files = sorted(files_below(path, "*.csv")) if path.is_dir() else [path]
     return [file for file in files if is_step_test(file)]
 
 

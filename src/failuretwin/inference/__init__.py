@@ -23,6 +23,9 @@ section of docs/diagnosis.md or docs/shared_unknowns.md (words and symbols: docs
     missed_movements         faults that leave a motor where it was: a chain of places
     double_faults, two_joint_likelihood, unknown    two motors; what no hypothesis explains
     registration, wrong_setup    the simple mistake that explains a log which fits nothing
+    set_ups, log_correction  wrong set-ups, and what undoes each
+    clock, set_up_weighing   how probable each is, with all faults behind it
+    seen_runs                runs under one set-up or several, from evidence to posterior
     posterior                evidence times prior; the diagnosis of each run
     shared_unknowns, linear_response    theta: where the sensor stands and motors rest
     shared_likelihood, shared_posterior    theta integrated out under each hypothesis

@@ -26,7 +26,7 @@ from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, c
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.sensors import Encoders
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.inference.evidence import Evidence
+from failuretwin.inference.evidence import TransientSamples
 from failuretwin.inference.explanation import worded
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.posterior import (
@@ -34,15 +34,12 @@ from failuretwin.inference.posterior import (
     shows_in_transients,
 )
 from failuretwin.inference.priors import Priors
-from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.seen_runs import SeenRuns, mixed
 from failuretwin.inference.sensors import SensorStack, parse_sensing, sensing_of
-from failuretwin.inference.shared_posterior import set_up_in_doubt, shared_posterior
 
 if TYPE_CHECKING:
     import xarray as xr
 
-JUDGED_RUNS = 32
-"""So many runs of a set, evenly spread, tell whether its set-up may be off."""
 OF_ENCODERS = ("encoder_bias", "encoder_scale")
 """Faults that make the reading of a motor wrong."""
 CHUNK_RUNS = 64
@@ -159,41 +156,43 @@ class BayesDiagnoser:
                 to be believed, or no run holds a movement.
         """
         runs = as_runs(runs, self.twin.robot)
+        told = self.seen(runs)
+        set_ups = told.set_ups()
+        seen = [told.under(one.set_up.correction) for one in set_ups.found]
+        moving = [self._moving(one) for one in seen]
+        names, faults = [str(name) for name in runs["run"].values], truth_of(runs)
+        truth: list[str | None] = [None] * len(names) if faults is None else list(faults)
+        results, quality = [], seen[0].evidence.quality
+        chunk = _runs_at_a_time(seen[0].evidence.settled.movements.start.shape[1])
+        for first in range(0, len(names), chunk):
+            rows = slice(first, first + chunk)
+            says = [one.posterior(rows, way) for one, way in zip(seen, moving, strict=True)]
+            posterior_of_runs = mixed(says, set_ups)
+            for at in range(len(names))[rows]:
+                results.append(
+                    posterior_of_runs.to_diagnosis(at - first, names[at], quality[at], truth[at])
+                )
+        return results
+
+    def seen(self, runs: xr.Dataset) -> SeenRuns:
+        """Return runs as this diagnoser sees them, set up as told; raises as `diagnose` does."""
         self._check(runs)
         model = self.healthy_model.seen_by(sensing_of(runs, self.sensing))
         self._check_shown(model)
-        seen = Evidence(runs, model.settings, model.sensors)
-        evidence, moving = seen.sound.settled, None
-        if evidence.movements.start.shape[1] == 0:
+        found = SeenRuns(runs, model, self.hypothesis_set, self.priors)
+        if found.evidence.sound.settled.movements.start.shape[1] == 0:
             raise InputError(
                 "no run holds a movement: `command` never leaves its first value. Expected runs "
                 "of one movement at least."
             )
-        if self.uses_transients:
-            mask = self.transient_mask(evidence.usable, model.sensors)
-            moving = seen.sound.transient.where(mask)
-        names = [str(name) for name in runs["run"].values]
-        faults = truth_of(runs)
-        truth: list[str | None] = [None] * len(names) if faults is None else list(faults)
-        results = []
-        some = np.unique(np.linspace(0, len(names) - 1, JUDGED_RUNS).astype(np.int64))
-        sample = RunLikelihood(evidence[some], model)
-        in_doubt = set_up_in_doubt(sample, self.hypothesis_set, self.priors)
-        chunk = _runs_at_a_time(evidence.movements.start.shape[1])
-        for first in range(0, len(names), chunk):
-            rows = slice(first, first + chunk)
-            way = None if moving is None else moving[rows]
-            likelihood = RunLikelihood(evidence[rows], model, way)
-            posterior_of_runs = shared_posterior(
-                likelihood, self.hypothesis_set, self.priors, in_doubt
-            )
-            for at in range(len(names))[rows]:
-                results.append(
-                    posterior_of_runs.to_diagnosis(
-                        at - first, names[at], seen.quality[at], truth[at]
-                    )
-                )
-        return results
+        return found
+
+    def _moving(self, seen: SeenRuns) -> TransientSamples | None:
+        """Return the readings on the way that count; None: none do."""
+        if not self.uses_transients:
+            return None
+        sound = seen.evidence.sound
+        return sound.transient.where(self.transient_mask(sound.settled.usable, seen.model.sensors))
 
     def _check_shown(self, model: HealthyModel) -> None:
         """Refuse faults that say that a sensor which is believed is wrong."""

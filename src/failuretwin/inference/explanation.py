@@ -66,13 +66,17 @@ def with_joint_names(diagnosis: Diagnosis, robot: Robot) -> Diagnosis:
         diagnosis: With its verdict in words.
         robot: The robot; joints of it that are only counted say nothing more.
     """
-    text = diagnosis.verdict
+    return replace(diagnosis, verdict=joint_names_in(diagnosis.verdict, robot))
+
+
+def joint_names_in(text: str, robot: Robot) -> str:
+    """Return a text with the joint named beside the first mention of each motor; see above."""
     for motor in robot.motors:
         if COUNTED_MOTOR.fullmatch(motor.name) and not COUNTED_JOINT.fullmatch(motor.joint.lower()):
             plain = motor.joint.removesuffix("_joint").replace("_", " ")
             name = motor.name.replace("_", " ")
-            text = re.sub(rf"\b{name}\b", f"{name} ({plain})", text, count=1)
-    return replace(diagnosis, verdict=text)
+            text = re.sub(rf"\b{name}\b(?! \()", f"{name} ({plain})", text, count=1)
+    return text
 
 
 def plain_name(hypothesis: Hypothesis) -> str:

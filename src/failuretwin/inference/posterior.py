@@ -291,6 +291,7 @@ class Posterior:
         set_up: What is to be said of the set-up of each run; empty: nothing of any.
         explained: Log density of each settled position given all before it, (run, movement), where
             more is known than the runs say; None: what the best hypothesis makes of it counts.
+        no_verdict: Why no set-up allows a verdict on each run; empty: nothing keeps from any.
     """
 
     likelihood: RunLikelihood
@@ -300,6 +301,7 @@ class Posterior:
     weights: Sequence[MarginalLikelihood]
     set_up: Sequence[str] = ()
     explained: FloatArray | None = None
+    no_verdict: Sequence[str] = ()
 
     def undecided(self, run: int, quality: LogQuality) -> str:
         """Return why a run allows no verdict, empty if it does.
@@ -309,6 +311,8 @@ class Posterior:
             quality: Defects of its log.
         """
         best = int(np.argmax(self.log_posterior[run]))
+        if self.no_verdict and self.no_verdict[run] and not quality.fatal:
+            return self.no_verdict[run]
         known = self.explained
         explained = self.weights[best].settled(run) if known is None else known[run]
         return abstention_reason(

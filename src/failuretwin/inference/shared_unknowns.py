@@ -175,6 +175,9 @@ class SetupPrior(Bounded):
         scale_rate: Probability that the scale alone is off.
         all_rate: Probability that all three are off.
         noise_rate: Probability that the noise is larger, shared by both deviations.
+        wrong_rate: Probability that the log does not fit the profile in some other way, such as a
+            motor that turns the other way: with a calibration that fitted this robot, and of an
+            arm whose logs are seen for the first time.
     """
 
     origin: tuple[float, float] = (0.0065, 0.026)
@@ -186,6 +189,7 @@ class SetupPrior(Bounded):
     scale_rate: Share = 0.07
     all_rate: Share = 0.08
     noise_rate: Share = 0.08
+    wrong_rate: tuple[float, float] = (0.01, 0.3)
 
     @property
     def doubt(self) -> float:
@@ -196,7 +200,14 @@ class SetupPrior(Bounded):
     @classmethod
     def known(cls) -> SetupPrior:
         """Return the belief that the sensor is registered exactly, with the noise that is known."""
-        return cls(origin_rate=0.0, turn_rate=0.0, scale_rate=0.0, all_rate=0.0, noise_rate=0.0)
+        return cls(
+            origin_rate=0.0,
+            turn_rate=0.0,
+            scale_rate=0.0,
+            all_rate=0.0,
+            noise_rate=0.0,
+            wrong_rate=(0.0, 0.0),
+        )
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from failuretwin.core.hypothesis import Diagnosis
     from failuretwin.digital_model.twin import DigitalTwin
     from failuretwin.inference.diagnoser import BayesDiagnoser
+    from failuretwin.inference.priors import Priors
 
 
 @click.command()
@@ -130,7 +131,6 @@ def diagnose(
     recording, or a CSV file, with --columns where its column names do not tell enough.
     """
     del seed  # nothing here is drawn by chance
-    import numpy as np
 
     from failuretwin.app import reports
     from failuretwin.app.inputs import (
@@ -146,8 +146,6 @@ def diagnose(
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.inference.diagnoser import BayesDiagnoser
-    from failuretwin.inference.fault_course import FaultCourse
-    from failuretwin.inference.posterior import log_prior
     from failuretwin.inference.priors import priors_of
     from failuretwin.inference.sensors import TOOL_ALONE, sensing_of
 
@@ -170,10 +168,13 @@ def diagnose(
         "--onset": onset,
         "--sensing": sensing,
     }
+    together = track or self_calibrate
     diagnoser = chosen_diagnoser(method, bayes, settings)
     _check_together(calibration, track, self_calibrate, out, independent, sensing)
     history = _history(bayes, calibration, out) if track else None
     runs = read_inputs(inputs, model, reading)
+    if together:
+        _check_tool(sensing_of(runs, sensing))
     warn_mismatch(runs, expected_name(diagnoser, bayes))
     tracked = learned = None
     if history is not None:
@@ -185,6 +186,8 @@ def diagnose(
         diagnoses = list(learned.diagnoses)
     else:
         diagnoses = diagnoser.diagnose(runs)
+    if (sse_range or error_range) and diagnoser is bayes:
+        _tell_ruled_out(runs, bayes, diagnoses, priors_of(model, None, onset))
     _write(runs, diagnoses, known.twin, json_file, csv_file, plot)
     if tracked is not None:
         _keep(tracked, runs, out)
@@ -192,15 +195,76 @@ def diagnose(
     if method == "bayes" and sensing_of(runs, sensing) == TOOL_ALONE:
         show(*reports.isolability_summary(runs, bayes))
     reports.print_scores(Judged.of(diagnoses))
-    prior = np.exp(log_prior(bayes.hypothesis_set, bayes.priors))
-    lines = []
-    if (tracked or learned) is not None and not independent:
-        lines = [f"over all runs: {line}" for line in FaultCourse.of(diagnoses, prior).verdict]
+    lines = [] if independent or not together else _course_lines(diagnoses, bayes)
     if learned is not None:
         lines += [f"self-calibrated: {line}" for line in learned.remarks]
     if tracked is not None:
         lines.append(reports.tracking_line(tracked))
     show(*(["", *lines] if lines else []))
+
+
+def _course_lines(diagnoses: list[Diagnosis], bayes: BayesDiagnoser) -> list[str]:
+    """Return what runs that were weighed together say of the course of their robot."""
+    import numpy as np
+
+    from failuretwin.inference.explanation import joint_names_in
+    from failuretwin.inference.fault_course import FaultCourse
+    from failuretwin.inference.posterior import log_prior
+
+    prior = np.exp(log_prior(bayes.hypothesis_set, bayes.priors))
+    course = FaultCourse.of(diagnoses, prior).verdict
+    return [f"over all runs: {joint_names_in(line, bayes.twin.robot)}" for line in course]
+
+
+def _check_tool(sensing: tuple[str, ...]) -> None:
+    """Refuse to weigh runs together that do not show the tool's position."""
+    from failuretwin.core.errors import InputError
+    from failuretwin.inference.sensors import TOOL_ALONE
+
+    if sensing != TOOL_ALONE:
+        raise InputError(
+            f"the runs hold no tool position, but only what {' and '.join(sensing)} read. --track "
+            "and --self-calibrate learn from the tool's position: leave them out, or give logs "
+            "with one."
+        )
+
+
+def _tell_ruled_out(
+    runs: xr.Dataset, bayes: BayesDiagnoser, diagnoses: list[Diagnosis], usual: Priors
+) -> None:
+    """Tell where runs show errors of a size that the user has ruled out.
+
+    Args:
+        runs: The runs.
+        bayes: What diagnosed them, with a range of errors.
+        diagnoses: Of each run.
+        usual: Beliefs without that range.
+    """
+    from dataclasses import replace
+
+    from failuretwin.app.terminal import tell
+    from failuretwin.core.errors import counted
+    from failuretwin.inference.explanation import joint_names_in
+
+    free = replace(bayes, priors=usual).diagnose(runs)
+    others = [
+        d
+        for d, told in zip(free, diagnoses, strict=True)
+        if str(d.diagnosis).endswith(":steady_state_error")
+        and d.diagnosis != told.diagnosis
+        and max(d.posterior.values()) > SURE
+    ]
+    if others:
+        said = joint_names_in(others[0].verdict, bayes.twin.robot)
+        tell(
+            f"note: {counted(len(others), 'run')} would look otherwise without the range of errors "
+            f"that was given, such as {others[0].run}: {said}",
+            err=True,
+        )
+
+
+SURE = 0.9
+"""Probability from which a run that looks otherwise is told."""
 
 
 def _check_together(

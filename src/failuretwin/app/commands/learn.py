@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -16,6 +17,11 @@ from failuretwin.app.commands.options import (
     reading_options,
 )
 from failuretwin.app.terminal import tell
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from failuretwin.digital_model.robot import Robot
 
 
 @click.command()
@@ -75,6 +81,7 @@ def calibrate(
     source = ", ".join(str(log) for log in logs)
     found = learn(runs, model, name or out.stem, source, hold_out)
     found = step_parameters.with_step_tests(found, steps)
+    _tell_set_up(runs, model)
     if report is not None:
         from failuretwin.app.calibration_report import write_calibration_page
         from failuretwin.data_knowledge.store import filling
@@ -86,6 +93,21 @@ def calibrate(
     tell(f"written to {out}")
     if found.beats_uncalibrated is not False:
         tell(f"use it with `failuretwin diagnose --calibration {out}`")
+
+
+def _tell_set_up(runs: xr.Dataset, robot: Robot) -> None:
+    """Tell where logs do not fit the profile: a calibration would learn that as the robot."""
+    from failuretwin.inference.diagnoser import BayesDiagnoser
+    from failuretwin.inference.seen_runs import set_up_remark
+
+    set_ups = BayesDiagnoser(robot).seen(runs).set_ups()
+    remark = set_up_remark(set_ups)
+    if remark and set_ups.best.set_up.kind != "zero":  # that is what a calibration is for
+        tell(
+            f"warning: {remark}; what was learned here is not. Put it right first: `failuretwin "
+            "doctor LOG --out MAP.toml`",
+            err=True,
+        )
 
 
 def _pool(calibrations: tuple[Path, ...], out: Path, name: str | None, robot: str) -> None:

@@ -165,8 +165,8 @@ def save_calibration(calibration: Calibration, robot: Robot, path: Path) -> None
     table = record.pop("imperfections")
     origin = dict(zip(ORIGIN, (robot.name, __version__), strict=True))
     text = (
-        "# What a healthy robot does that the published twin does not, learned from its logs by\n"
-        "# `failuretwin calibrate`. Angles in rad in the sense of the logs, times in s.\n"
+        "# What a healthy robot does that its twin does not, learned from its logs: [calibration]\n"
+        "# says how. Angles in rad in the sense of the logs, times in s.\n"
         f"{tomli_w.dumps({**table, CALIBRATION_TABLE: {**origin, **record}})}"
     )
     with replacing(path) as partial:

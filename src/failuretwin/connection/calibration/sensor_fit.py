@@ -77,7 +77,7 @@ def fit_sensors(runs: xr.Dataset, model: HealthyModel) -> tuple[SensorFit, ...]:
 def _fit(runs: xr.Dataset, model: HealthyModel, sensor: Sensor) -> SensorFit | None:
     before = sensor.profile or SensorProfile(sensor.kind)
     plain = type(sensor)(sensor.twin, replace(before, bias=()))
-    seen, pose, noise = _at_rest(runs, model, plain)
+    seen, pose, noise, noise_sd = _at_rest(runs, model, plain)
     if len(seen) < LEAST_MOVEMENTS:
         return None
     value, jacobian = plain.expected(pose)
@@ -101,7 +101,7 @@ def _fit(runs: xr.Dataset, model: HealthyModel, sensor: Sensor) -> SensorFit | N
         turn_doubt=float(deviation[errors:].max(initial=0.0)),
         rpy=(float(roll), float(pitch), float(yaw)) if turns else before.rpy,
     )
-    return SensorFit(found, len(seen), _parameters(plain, estimate, deviation, noise))
+    return SensorFit(found, len(seen), _parameters(plain, estimate, deviation, (noise, noise_sd)))
 
 
 def _columns(sensor: Sensor, value: FloatArray, turns: bool) -> FloatArray:
@@ -120,8 +120,11 @@ def _columns(sensor: Sensor, value: FloatArray, turns: bool) -> FloatArray:
 
 def _at_rest(
     runs: xr.Dataset, model: HealthyModel, sensor: Sensor
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return settled channels (movement, channel), healthy poses (movement, motor), noise."""
+) -> tuple[FloatArray, FloatArray, float, float]:
+    """Return settled channels (movement, channel), healthy poses (movement, motor), noise.
+
+    Last the standard deviation of the noise, that of a median of so many stretches at rest.
+    """
     time = as_floats(runs["time"].values)
     movements = find_movements(as_floats(runs["command"].values), time)
     channels = sensor.to_channels(as_floats(runs[sensor.variable].values))
@@ -142,11 +145,12 @@ def _at_rest(
             spreads.append(square / (1.0 - 2.0 / (9.0 * free)) ** 3)  # the median of chi2 / free
             at.append(poses[run, number])
     if not points:
-        return np.zeros((0, sensor.channels)), np.zeros((0, len(model.scatter))), 0.0
+        return np.zeros((0, sensor.channels)), np.zeros((0, len(model.scatter))), 0.0, 0.0
     size = np.sqrt(spreads)
     still: BoolArray = size <= RESTLESS * np.median(size)
     noise = float(np.median(size[still]))
-    return np.array(points)[still], np.array(at)[still], max(noise, 1e-9)
+    doubt = float(MEDIAN_SPREAD * np.std(size[still]) / np.sqrt(still.sum()))
+    return np.array(points)[still], np.array(at)[still], max(noise, 1e-9), doubt
 
 
 def _robust(
@@ -181,7 +185,7 @@ def _robust(
 
 
 def _parameters(
-    sensor: Sensor, estimate: FloatArray, deviation: FloatArray, noise: float
+    sensor: Sensor, estimate: FloatArray, deviation: FloatArray, noise: tuple[float, float]
 ) -> tuple[Parameter, ...]:
     factor, unit = UNITS[sensor.kind]
     found = []
@@ -192,10 +196,13 @@ def _parameters(
         low, high = float(value - 1.96 * sd), float(value + 1.96 * sd)
         told = (scale * float(value), scale * low, scale * high)
         found.append(Parameter(f"{sensor.kind}: {name}", "", of, told[0], told[1], told[2]))
-    size = factor * noise
-    return (*found, Parameter(f"{sensor.kind}: noise", "", unit, size, size, size))
+    size, doubt = (factor * value for value in noise)
+    low, high = max(size - 1.96 * doubt, 0.0), size + 1.96 * doubt
+    return (*found, Parameter(f"{sensor.kind}: noise", "", unit, size, low, high))
 
 
+MEDIAN_SPREAD = float(np.sqrt(np.pi / 2.0))
+"""Standard deviation of the median of many normal numbers, in that of their mean."""
 DEG = float(np.rad2deg(1.0))
 UNITS = {
     "orientation": (DEG, "deg"),

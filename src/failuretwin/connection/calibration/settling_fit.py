@@ -307,10 +307,13 @@ def sense_remarks(part: SettlingFit, robot: Robot) -> list[str]:
     """
     loaded = np.flatnonzero(largest_load(robot, 0.0) > 1e-6).tolist()
     best, odds = _best_senses(part, robot, loaded)
+    sag = _largest_sag(part, best)
     remarks = []
     for k, motor in enumerate(robot.motors):
         sense = best.motors[k].sense
-        if k not in odds:
+        if k in odds and sag[k] < LEAST_SAG_RAD:
+            told = "cannot be told, the motor does not give way"
+        elif k not in odds:
             told = "cannot be told, gravity does not load it"
         elif odds[k] <= SURE_NATS:
             told = f"the logs do not tell ({odds[k]:+.1f} nats for {sense:+.0f})"
@@ -323,6 +326,13 @@ def sense_remarks(part: SettlingFit, robot: Robot) -> list[str]:
             )
         remarks.append(f"sense of {motor.name}: {told}")
     return remarks
+
+
+def _largest_sag(part: SettlingFit, robot: Robot) -> FloatArray:
+    """Return how far each motor gives way under its largest load, as fitted, (motor,) [rad]."""
+    seen, arrived = part.observations[part.fitted], part.arrived[part.fitted]
+    fit, n = settling_posterior(seen, robot, arrived, part.payload), len(robot.motors)
+    return np.asarray(np.abs(fit.mode[n : 2 * n]) * largest_load(robot, part.payload))
 
 
 def _best_senses(

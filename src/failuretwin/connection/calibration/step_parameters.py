@@ -18,6 +18,7 @@ from failuretwin.connection.calibration.servo_loops import (
     sizes_differ,
 )
 from failuretwin.core.errors import InputError
+from failuretwin.core.foreign import files_below
 from failuretwin.data_knowledge.matlab import find_matlab_files
 from failuretwin.data_knowledge.raw_sessions import SESSION_FILES
 from failuretwin.data_knowledge.step_tests import StepTest, find_step_tests, read_step_test
@@ -225,9 +226,9 @@ def split_step_tests(logs: Sequence[Path], columns: Path | None) -> tuple[list[P
 
 
 def _holds_more(folder: Path, tests: list[Path], columns: Path | None) -> bool:
-    if any(True for name in SESSION_FILES for _ in folder.rglob(name)):
+    if any(True for name in SESSION_FILES for _ in files_below(folder, name)):
         return True
-    if columns is not None and len(list(folder.rglob("*.csv"))) > len(tests):
+    if columns is not None and len(files_below(folder, "*.csv")) > len(tests):
         return True
     return bool(find_matlab_files(folder))
 

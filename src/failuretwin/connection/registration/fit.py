@@ -30,7 +30,8 @@ from failuretwin.digital_model.geometry import roll_pitch_yaw
 from failuretwin.digital_model.robot import Profile, Robot, load_robot
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.registration import align
-from failuretwin.inference.wrong_setup import NEAR, extent, wrong_setup
+from failuretwin.inference.set_ups import MOST_RAD, UNIT_FACTOR, extent
+from failuretwin.inference.wrong_setup import NEAR, wrong_setup
 
 Z_95 = 1.959963984540054
 LEARNED = 0.5
@@ -154,11 +155,6 @@ def _middle_mm(error: FloatArray) -> float:
 
 # Set-ups that no frame can mend.
 
-FACTOR = 8.0
-"""Extents that differ by so much are no matter of senses: the unit of lengths is another [-]."""
-MOST_RAD = 20.0
-"""Commands beyond three turns are no angles in rad."""
-
 
 def _refuse_units(poses: Poses, robot: Robot) -> None:
     expected = DigitalTwin(robot).path(poses.target)
@@ -169,8 +165,8 @@ def _refuse_units(poses: Poses, robot: Robot) -> None:
             f"commands reach {farthest:.0f} rad, so they look like degrees. Say "
             'unit = "deg" under [command] in the column map.'
         )
-    if ratio > FACTOR:
-        unit = "millimetres (mm)" if ratio > 30 * FACTOR else "centimetres (cm)"
+    if ratio > UNIT_FACTOR:
+        unit = "millimetres (mm)" if ratio > 30 * UNIT_FACTOR else "centimetres (cm)"
         raise InputError(
             f"tool positions spread over {extent(poses.point):.0f} m, expected about "
             f"{extent(expected):.2g} m: they look like {unit}. Say so as the unit under [tool] in "

@@ -21,7 +21,8 @@ from failuretwin.connection.registration.robust import Posterior, fit
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.geometry import with_tool
 from failuretwin.inference.registration import Frame, align
-from failuretwin.inference.wrong_setup import NEAR, extent
+from failuretwin.inference.set_ups import extent
+from failuretwin.inference.wrong_setup import NEAR
 
 COARSE_POSES = 80
 """So many poses are looked at while senses are searched for."""

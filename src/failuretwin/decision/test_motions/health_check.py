@@ -15,8 +15,9 @@ import numpy as np
 from failuretwin.connection.links.commander import Commander, Order
 from failuretwin.core.hypothesis import HEALTHY, Diagnosis, Hypothesis, single_faults
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.belief import Belief, NoBelief, settled_evidence_of
+from failuretwin.decision.acting.belief import Belief, NoBelief
 from failuretwin.decision.acting.believed_arm import BelievedArm, Seen
+from failuretwin.decision.acting.judging import settled_evidence_of
 from failuretwin.decision.acting.planner import Standing
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.work import Work, first_standing

@@ -1,0 +1,161 @@
+"""Wrong set-ups told from broken motors: real runs relabelled with one mistake, or two.
+
+    FAILURETWIN_DATA=DATA python benchmarks/setups.py [--arm armpi_fpv|ur10|ur5] [--size 1]
+        [--folders 10] [--only PART_OF_A_NAME ...]
+
+The measurements stay; what the log claims is changed by the correction that undoes each mistake,
+the other way round. Runs are judged in folders of --size, drawn at random: named is how many are
+said to be set up so, sure is how many runs are blamed on another motor above 90 %. The ArmPi has
+the 90 runs of DATA/real_robot_b_20241003 and its bundled calibration (in sample); UR10 and UR5 have
+the runs of benchmarks/real_arms.py and the calibration of other poses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from real_arms import POSES, _calibrated, _data, _reading, _relabelled
+from scipy.spatial.transform import Rotation
+
+import failuretwin as ft
+from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.data_knowledge.read import ReadOptions, read_runs
+from failuretwin.digital_model.profile_text import profile_text
+from failuretwin.digital_model.robot import Robot, load_robot
+from failuretwin.digital_model.urdf_check import check_urdf
+from failuretwin.inference.log_correction import LogCorrection
+from failuretwin.inference.set_ups import mistakes
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+SURE = 0.9
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A mistake that is made.
+
+    Attributes:
+        name: What it is.
+        words: What naming it says; empty: nothing may be said.
+        made: What makes such a log of one that fits.
+    """
+
+    name: str
+    words: tuple[str, ...]
+    made: LogCorrection
+
+
+def main() -> None:
+    """Print a row for each mistake."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--arm", default="armpi_fpv", choices=["armpi_fpv", *POSES])
+    parser.add_argument("--size", type=int, default=1, help="runs a folder")
+    parser.add_argument("--folders", type=int, default=10)
+    parser.add_argument("--only", nargs="+", default=[""], help="parts of names of mistakes")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        runs, diagnoser = _armpi() if options.arm == "armpi_fpv" else _ur(options.arm, Path(folder))
+    order = np.random.default_rng(1).permutation(runs.sizes["run"])
+    folders = [
+        np.sort(order[first : first + options.size])
+        for first in range(0, len(order) - options.size + 1, options.size)
+    ][: options.folders]
+    print("mistake | folders | named | right | nats | sure of another motor | no verdict | s a run")
+    for truth in _truths(diagnoser.twin.robot):
+        if any(part in truth.name for part in options.only):
+            print(_row(truth, runs, folders, diagnoser), flush=True)
+
+
+def _armpi() -> tuple[xr.Dataset, ft.BayesDiagnoser]:
+    _, poses = _data()
+    logs = poses.parent / "real_robot_b_20241003"
+    runs = read_runs(logs, options=ReadOptions(published_labels=True))
+    return runs, ft.BayesDiagnoser("armpi_fpv")
+
+
+def _ur(arm: str, folder: Path) -> tuple[xr.Dataset, ft.BayesDiagnoser]:
+    script, poses = _data()
+    made = _relabelled(script, poses / POSES[arm], arm, 0, (1, 30), folder / "runs")
+    profile = made / "arm.toml"
+    profile.write_text(profile_text(check_urdf(made / "arm.urdf"), profile), encoding="utf-8")
+    robot = load_robot(profile)
+    runs = read_runs(made / "test.csv", robot, _reading(made, robot))
+    with (made / "truth.csv").open(encoding="utf-8") as file:
+        truths = {row["run"]: row["truth"] for row in csv.DictReader(file)}
+    names = [truths[str(name).rpartition("/")[2]] for name in runs["run"].values]
+    return runs.assign(fault=("run", names)), ft.BayesDiagnoser(robot, _calibrated(made, robot))
+
+
+def _truths(robot: Robot) -> Iterator[Truth]:
+    none, one = LogCorrection.none(len(robot.motors)), np.eye(len(robot.motors))
+    yield Truth("nothing", (), none)
+    known = {m.what: m.correction.inverse for m in mistakes(robot) if m.kind != "axes"}
+    known |= {m.what: m.correction.inverse for m in mistakes(robot) if m.what[:2] in ("x ", "y ")}
+    for what, made in known.items():
+        # an arm is its own mirror image: x mirrored is motor 1 reversed
+        same = ("motor 1 turns the other way",) if what.startswith("x of") else ()
+        yield Truth(what, (what, *same), made)
+    for k in range(len(one)):
+        words = (f"motor {k + 1} stands", "in a frame turned", "not seem to stand")
+        yield Truth(f"zero of motor {k + 1}", words, replace(none, z=-np.deg2rad(5.0) * one[k]))
+    turn = Rotation.from_euler("xyz", [20.0, -30.0, 140.0], degrees=True).as_matrix()
+    frame = replace(none, M=turn, t=np.array([0.3, 0.4, 0.3]))
+    yield Truth("camera frame", ("in a frame turned",), frame)
+    yield Truth("z + 5 mm", ("not seem to stand",), replace(none, t=np.array([0.0, 0.0, 0.005])))
+    for late in (0.5, -0.2):
+        yield Truth(f"clock {late:+} s", ("clock",), replace(none, late_s=-late))
+    swapped = next(w for w in known if w.startswith("the commands of motor 3 and motor 4"))
+    two = known["motor 2 turns the other way"].after(known[swapped])
+    yield Truth("motor 2 reversed, motors 3 and 4 swapped", ("motor 2 turns", swapped), two)
+
+
+def _row(
+    truth: Truth, runs: xr.Dataset, folders: list[np.ndarray], diagnoser: ft.BayesDiagnoser
+) -> str:
+    logs, begun = truth.made.runs(runs), time.process_time()
+    found = [diagnoser.diagnose(logs.isel(run=rows)) for rows in folders]
+    spent = time.process_time() - begun
+    judged = [d for some in found for d in some]
+    told = [d for d in judged if not d.undecided]
+    nats = [-np.log(max(d.posterior[d.truth or ""], 1e-9)) for d in told]
+    named = sum(_named(truth, some[0]) for some in found)
+    right = sum(d.diagnosis == d.truth for d in told)
+    sure = sum(_sure_of_another(d) for d in told)
+    cells = (
+        truth.name,
+        str(len(folders)),
+        str(named),
+        f"{right} of {len(judged)}",
+        f"{np.mean(nats):.3f}" if nats else "-",
+        str(sure),
+        str(len(judged) - len(told)),
+        f"{spent / len(judged):.2f}",
+    )
+    return " | ".join(cells)
+
+
+def _named(truth: Truth, diagnosis: Diagnosis) -> bool:
+    """Return whether the mistake is named; of nothing wrong, whether nothing is named."""
+    said = " ".join(line for line in diagnosis.quality if "profile" in line)
+    return any(word in said for word in truth.words) if truth.words else "does not" not in said
+
+
+def _sure_of_another(diagnosis: Diagnosis) -> bool:
+    best = max(diagnosis.posterior, key=lambda name: diagnosis.posterior[name])
+    return best not in (diagnosis.truth, "healthy") and diagnosis.posterior[best] > SURE
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,119 @@
+"""`failuretwin doctor`: whether a log fits the profile of its robot, before anyone diagnoses it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from failuretwin.app.commands.options import (
+    PATH,
+    LogOptions,
+    calibration_option,
+    common_options,
+    reading_options,
+)
+from failuretwin.app.terminal import tell
+
+if TYPE_CHECKING:
+    from failuretwin.inference.seen_runs import SeenRuns
+    from failuretwin.inference.set_up_weighing import SetUpPosterior
+
+SHOWN = 5
+"""So many kinds of remarks on logs are listed."""
+
+
+@click.command()
+@click.argument("logs", nargs=-1, required=True, type=PATH, metavar="LOG...")
+@calibration_option
+@click.option(
+    "--out",
+    type=PATH,
+    metavar="MAP.toml",
+    help="Where to write what puts a wrong set-up right, beside what --columns says. Give it to "
+    "any command as --columns MAP.toml once you believe it.",
+)
+@reading_options
+@common_options
+def doctor(
+    logs: tuple[Path, ...],
+    calibration: Path | None,
+    out: Path | None,
+    reading: LogOptions,
+    robot: str,
+    seed: int,
+) -> None:
+    """Say whether logs fit the profile: senses, order, units, axes, zeros, frames, clocks, gaps.
+
+    LOG is whatever `diagnose` reads, faulty or not; all are taken to share one set-up. Every
+    mistake is weighed with every fault behind it, so that a broken motor is not taken for one.
+    """
+    del seed  # nothing here is drawn by chance
+    from failuretwin.app.inputs import read_inputs
+    from failuretwin.core.errors import InputError
+    from failuretwin.digital_model.calibrated_robot import load_calibration
+    from failuretwin.digital_model.robot import load_robot
+    from failuretwin.inference.diagnoser import BayesDiagnoser
+
+    if out is not None and (out.suffix != ".toml" or out.exists()):
+        raise InputError(f"{out}: expected a name that ends in .toml and is not taken yet.")
+    model = load_robot(robot)
+    known = load_calibration(calibration, model)
+    runs = read_inputs(logs, model, reading)
+    seen = BayesDiagnoser(known.twin, known.imperfections).seen(runs)
+    set_ups = seen.set_ups()
+    for line in (*_set_up_lines(set_ups), *_log_lines(seen, set_ups)):
+        tell(line)
+    if out is not None:
+        _write(set_ups, reading.columns, out)
+
+
+def _set_up_lines(set_ups: SetUpPosterior) -> list[str]:
+    from failuretwin.inference.seen_runs import set_up_remark
+    from failuretwin.inference.set_up_weighing import ANOTHER
+
+    remark = set_up_remark(set_ups)
+    if remark:
+        return [f"set-up: {remark}"]
+    if not set_ups.fits:
+        return [f"set-up: neither a fault nor a mistake explains the log: {ANOTHER}"]
+    return ["set-up: the log fits the profile"]
+
+
+def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior) -> list[str]:
+    """Return what the logs hold, and what is wrong with them."""
+    from failuretwin.core.errors import counted
+    from failuretwin.core.runs import measured_rate
+
+    usable = seen.evidence.settled.usable
+    lines = [
+        f"log: {counted(len(usable), 'run')}, {counted(int(usable.sum()), 'movement')} after which "
+        f"the tool is seen at rest, {measured_rate(seen.runs):.3g} readings a second"
+    ]
+    undone = seen.under(set_ups.best.set_up.correction)
+    remarks = [
+        line
+        for quality in undone.evidence.quality
+        for line in (*quality.remarks, *filter(None, [quality.fatal]))
+    ]
+    found = Counter(remarks).most_common()
+    lines += [f"log: {line}" + (f" ({n} runs)" if n > 1 else "") for line, n in found[:SHOWN]]
+    if len(found) > SHOWN:
+        lines.append(f"log: and {counted(len(found) - SHOWN, 'remark')} more")
+    return lines if found else [*lines, "log: nothing is wrong with the readings"]
+
+
+def _write(set_ups: SetUpPosterior, columns: Path | None, out: Path) -> None:
+    """Write what undoes a wrong set-up, beside the column map that the log was read with."""
+    from failuretwin.data_knowledge.store import replacing
+
+    best = set_ups.best
+    if not (best.set_up.what and set_ups.fits):
+        tell("nothing to put right, so nothing is written")
+        return
+    map_text = "" if columns is None else columns.read_text(encoding="utf-8").rstrip() + "\n\n"
+    with replacing(out) as partial:
+        partial.write_text(map_text + best.set_up.correction.text(best.set_up.what), "utf-8")
+    tell(f"written to {out}: what undoes it; once you believe it, use it with --columns {out}")

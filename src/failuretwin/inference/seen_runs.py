@@ -1,0 +1,175 @@
+"""Runs as a Bayesian diagnoser sees them, under one set-up or several.
+
+    p(h | run) = sum over w of p(w | runs) p(h | run, w)
+
+Section: docs/set_up.md
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.numerics import log_sum
+from failuretwin.core.types import as_floats
+from failuretwin.inference.clock import clock_posterior
+from failuretwin.inference.evidence import Evidence, TransientSamples
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.log_correction import LogCorrection
+from failuretwin.inference.posterior import Posterior
+from failuretwin.inference.priors import Priors
+from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.set_up_weighing import (
+    ANOTHER,
+    FITS,
+    SetUpPosterior,
+    SetUpWeighing,
+    run_misfit,
+)
+from failuretwin.inference.set_ups import SetUp, clocks_apart, gross_unit
+from failuretwin.inference.shared_posterior import set_up_in_doubt, shared_posterior
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+JUDGED_RUNS = 32
+"""So many runs of a set, evenly spread, tell whether its set-up may be off."""
+LOOKS = 20
+"""Runs by which the unit of a log is told, and readings of each."""
+TOLD = 0.1
+"""Probability of a wrong set-up from which it is told."""
+SURE = 0.9
+"""Probability from which it is told as a finding."""
+
+
+@dataclass(frozen=True)
+class SeenRuns:
+    """Runs under one set-up.
+
+    Attributes:
+        runs: The run set, as it fits the profile.
+        model: The healthy robot.
+        hypotheses: What may be the case.
+        priors: Beliefs about faults and set-ups.
+    """
+
+    runs: xr.Dataset
+    model: HealthyModel
+    hypotheses: Sequence[Hypothesis]
+    priors: Priors
+
+    @cached_property
+    def evidence(self) -> Evidence:
+        """What the runs say at system level."""
+        return Evidence(self.runs, self.model.settings, self.model.sensors)
+
+    @cached_property
+    def sample(self) -> RunLikelihood:
+        """Some of the runs by their settled positions."""
+        settled = self.evidence.sound.settled
+        count = len(settled.usable)
+        some = np.unique(np.linspace(0, count - 1, JUDGED_RUNS).astype(np.int64))
+        return RunLikelihood(settled[some], self.model)
+
+    @cached_property
+    def in_doubt(self) -> bool:
+        """Whether the sensor may stand a little elsewhere than the profile says."""
+        return set_up_in_doubt(self.sample, self.hypotheses, self.priors)
+
+    def set_ups(self) -> SetUpPosterior:
+        """Return what is believed of the set-up: unit and clock first, then all else."""
+        told = SetUpWeighing(self.sample, self.hypotheses, self.priors)
+        if told.rate == 0.0 or not self.model.sensors.tool_alone:
+            return told.taken_as_told()
+        first, seen = told.as_told, self
+        for look in (SeenRuns.unit, SeenRuns.clock):
+            found = look(seen)
+            if found is not None:
+                first = found.beside(first)
+                seen = self.under(first.correction)
+        posterior = SetUpWeighing(seen.sample, self.hypotheses, self.priors).posterior()
+        return posterior.beside(first) if first.what else posterior
+
+    def unit(self) -> SetUp | None:
+        """Return the unit that the log is in; None: that of the profile."""
+        command, point = (as_floats(self.runs[n].values) for n in ("command", "measured"))
+        runs = np.unique(np.linspace(0, len(point) - 1, LOOKS).astype(np.int64))
+        run, time = np.nonzero(np.isfinite(point[runs]).all(axis=-1))
+        some = np.linspace(0, len(run) - 1, LOOKS**2).astype(np.int64)
+        if len(run) < LOOKS:
+            return None
+        at = runs[run[some]], time[some]
+        return gross_unit(self.model.twin, command[at], point[at])
+
+    def clock(self) -> SetUp | None:
+        """Return by how much the clocks are apart; None where that is not sure."""
+        found = clock_posterior(self.evidence.sound, self.model)
+        if found.apart < SURE:
+            return None
+        return clocks_apart(self.model.twin.robot, found.late_s)
+
+    def under(self, correction: LogCorrection) -> SeenRuns:
+        """Return the same runs with a wrong set-up undone."""
+        return self if correction.is_none else replace(self, runs=correction.runs(self.runs))
+
+    def posterior(self, rows: slice, moving: TransientSamples | None) -> Posterior:
+        """Return what some of the runs say.
+
+        Args:
+            rows: Which.
+            moving: Readings on the way of all runs; None: they are left aside.
+        """
+        way = None if moving is None else moving[rows]
+        likelihood = RunLikelihood(self.evidence.sound.settled[rows], self.model, way)
+        return shared_posterior(likelihood, self.hypotheses, self.priors, self.in_doubt)
+
+
+def mixed(posteriors: Sequence[Posterior], set_ups: SetUpPosterior) -> Posterior:
+    """Return the posterior of runs whose set-up is believed to be one of several.
+
+    Sizes and onsets are those behind the most probable set-up.
+
+    Args:
+        posteriors: Of the same runs behind each.
+        set_ups: What is believed of the set-up.
+    """
+    likeliest, weight = posteriors[0], np.log(set_ups.probability)
+    if len(posteriors) > 1:
+        stacked = np.stack([one.log_posterior for one in posteriors]) + weight[:, None, None]
+        likeliest = replace(likeliest, log_posterior=log_sum(stacked, axis=0))
+    remark, count = set_up_remark(set_ups), len(likeliest.log_posterior)
+    if remark:
+        known = likeliest.set_up or [""] * count
+        said = ["; ".join(filter(None, (remark, one))) for one in known]
+        likeliest = replace(likeliest, set_up=said)
+    if set_ups.fits:
+        return likeliest
+    everywhere = bool(set_ups.best.set_up.what)
+    lost = [everywhere or run_misfit(likeliest, run) > FITS for run in range(count)]
+    return replace(likeliest, no_verdict=[ANOTHER if one else "" for one in lost])
+
+
+def set_up_remark(set_ups: SetUpPosterior) -> str:
+    """Return what is to be said of a set-up; empty if nothing is."""
+    if set_ups.wrong < TOLD:
+        return ""
+    pairs = zip(set_ups.found, set_ups.probability, strict=True)
+    named = [(one.set_up, float(share)) for one, share in pairs if one.set_up.what]
+    if not set_ups.fits:
+        return f"the log does not fit the profile: {ANOTHER}"
+    kept, total = [], 0.0
+    for set_up, share in named:
+        kept.append(set_up.told)
+        total += share
+        if total > SURE * set_ups.wrong:
+            break
+    ways = "; or ".join(kept)
+    if set_ups.wrong < SURE:
+        return f"the log may not fit the profile ({set_ups.wrong:.0%}): {ways}"
+    sure = "over 99.9 %" if set_ups.wrong > 0.999 else f"{100.0 * set_ups.wrong:.1f} %"
+    return f"the log does not fit the profile ({sure} sure): {ways}; judged with that undone"

@@ -1,0 +1,399 @@
+"""Which set-up a log was made with, weighed with every hypothesis behind each.
+
+    p(w | runs) ~ p(w) prod over runs i of sum over h of p(h) p(run_i | w, h)
+
+The sum over hypotheses inside and the product over runs outside tell a set-up, which all runs
+share, from faults, which some have. What explains the runs as well as a healthy model says it
+should is not looked behind: a log that fits costs nothing.
+
+Section: docs/set_up.md
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.numerics import log_of, log_sum
+from failuretwin.core.types import FloatArray
+from failuretwin.digital_model.robot import Robot
+from failuretwin.inference.log_correction import LogCorrection
+from failuretwin.inference.posterior import Posterior, log_prior, marginal_likelihoods
+from failuretwin.inference.priors import Priors
+from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.set_ups import FEWEST_TO_TURN, SetUp, mistakes, turned, zero_off
+from failuretwin.inference.shared_posterior import Mixture
+from failuretwin.inference.shared_unknowns import layout_of
+from failuretwin.inference.shared_weighing import SharedWeighing
+
+FITS = 0.3
+"""Misfit up to which a set-up explains runs, as a share of that of a tool that may be anywhere.
+Runs of real arms with faults stay below 0.35 each and below 0.25 in the mean; with a motor
+reversed all but those in which it is stuck are above 0.4."""
+FEW = 8
+"""Runs that set-ups are weighed by, evenly spread: five name what shows."""
+FINALISTS = 2
+"""Mistakes that are looked at with a sensor that may stand a little elsewhere too."""
+NEAR, PROMISING = 0.15, 8
+"""Of two mistakes at once so many are weighed: those that bring most movements nearest, within this
+share of the reach."""
+FAR = 0.08
+"""A frame that moves the tool by less than this share of the reach is a matter of registration."""
+CHOICE_NATS = 12.0
+"""What seven numbers of a registration, chosen anew for each run, cost of its evidence [nats]."""
+EXPLAINED, CLUSTER, LEAST_AGREEING, AGREEING = 25.0, 3.0, 2, 0.2
+"""A zero is weighed where so many movements, and such a share, agree on it within so many
+deviations, and it is further off: only movements count that one motor explains, by D0^2."""
+ROUNDS = 2
+"""Newton steps to the zero that explains the runs best."""
+CHUNK_RUNS = 64
+"""Runs that are weighed at a time, whatever the set-up."""
+NEGLIGIBLE = 0.003
+"""Set-ups less probable than this are left out; it bounds what they could change."""
+ANOTHER = "no fault explains it, and the set-up is not wrong in one way that is known"
+"""What is said where no set-up explains the runs."""
+
+
+@dataclass(frozen=True)
+class WeighedSetUp:
+    """What runs say of a set-up.
+
+    Attributes:
+        set_up: The set-up.
+        log_evidence: log sum over h of p(h) p(run | w, h), (run,).
+        misfit: How much worse the best hypotheses explain the runs than the density of a healthy
+            arm at its best, as a share of what a tool that may be anywhere would be.
+        moved: Whether the sensor may stand a little elsewhere too.
+    """
+
+    set_up: SetUp
+    log_evidence: FloatArray
+    misfit: float
+    moved: bool = False
+
+    @property
+    def log_joint(self) -> float:
+        """Log of prior times evidence."""
+        return float(self.set_up.log_prior + self.log_evidence.sum())
+
+    @property
+    def fits(self) -> bool:
+        """Whether it explains the runs as the healthy model says."""
+        return self.misfit <= FITS
+
+
+@dataclass(frozen=True)
+class SetUpPosterior:
+    """What is believed of the set-up of some runs.
+
+    Attributes:
+        found: Set-ups that are not negligible, the most probable first.
+        probability: Of each.
+    """
+
+    found: Sequence[WeighedSetUp]
+    probability: FloatArray
+
+    @classmethod
+    def of(cls, weighed: Sequence[WeighedSetUp]) -> SetUpPosterior:
+        """Return the posterior over set-ups that were weighed by the same runs.
+
+        Two ways to say the same count once.
+        """
+        weighed = _distinct(weighed)
+        log_joint = np.array([one.log_joint for one in weighed])
+        share = np.exp(log_joint - log_sum(log_joint, axis=0))
+        order = [i for i in np.argsort(-share, kind="stable") if share[i] > NEGLIGIBLE]
+        if not weighed[order[0]].fits:  # no verdict is had behind it
+            order = order[:1]
+        return cls([weighed[i] for i in order], share[order] / share[order].sum())
+
+    def beside(self, first: SetUp) -> SetUpPosterior:
+        """Return the same where something else is wrong for sure."""
+        both = [
+            replace(w, set_up=w.set_up.beside(first) if w.set_up.what else first)
+            for w in self.found
+        ]
+        return SetUpPosterior(both, self.probability)
+
+    @property
+    def best(self) -> WeighedSetUp:
+        """The most probable set-up."""
+        return self.found[0]
+
+    @property
+    def wrong(self) -> float:
+        """Probability that the set-up is not as told."""
+        pairs = zip(self.found, self.probability, strict=True)
+        return float(sum(share for one, share in pairs if one.set_up.what))
+
+    @property
+    def fits(self) -> bool:
+        """Whether the most probable set-up explains the runs."""
+        return self.best.fits
+
+
+@dataclass(frozen=True)
+class SetUpWeighing:
+    """Some runs that share a set-up.
+
+    Attributes:
+        likelihood: Runs by their settled positions, as they were seen.
+        hypotheses: What may be the case.
+        priors: Beliefs about faults and set-ups.
+    """
+
+    likelihood: RunLikelihood
+    hypotheses: Sequence[Hypothesis]
+    priors: Priors
+
+    @cached_property
+    def as_told(self) -> SetUp:
+        """The set-up that nothing is wrong with."""
+        none = LogCorrection.none(len(self.likelihood.model.scatter))
+        return SetUp("", "", none, float(log_of(1.0 - self.rate)))
+
+    @cached_property
+    def rate(self) -> float:
+        """Probability that the set-up is wrong: small where healthy logs fitted the profile."""
+        rates = self.priors.setup.wrong_rate
+        return rates[1] if layout_of(self.likelihood.model).offsets else rates[0]
+
+    @property
+    def log_rate(self) -> float:
+        """Log of that."""
+        return float(log_of(self.rate))
+
+    @property
+    def robot(self) -> Robot:
+        """The robot."""
+        return self.likelihood.model.twin.robot
+
+    @cached_property
+    def log_odds(self) -> FloatArray:
+        """Log prior of each hypothesis, (hypothesis,)."""
+        return log_prior(self.hypotheses, self.priors)
+
+    def behind(self, set_ups: Sequence[SetUp]) -> RunLikelihood:
+        """Return the runs with each of some set-ups undone, one after the other."""
+        if len(set_ups) == 1 and set_ups[0].correction.is_none:
+            return self.likelihood
+        evidence, count = self.likelihood.evidence, len(self.likelihood.usable)
+        undone = evidence[np.tile(np.arange(count), len(set_ups))]
+        for i, set_up in enumerate(set_ups):
+            undone.put(slice(i * count, (i + 1) * count), set_up.correction.evidence(evidence))
+        return RunLikelihood(undone, self.likelihood.model)
+
+    def weigh(self, set_ups: Sequence[SetUp], everything: bool = False) -> list[WeighedSetUp]:
+        """Return what the runs say of set-ups, with the sensor where the profile has it.
+
+        Args:
+            set_ups: The set-ups.
+            everything: Whether pairs of faults and the unknown one count: they take long. Without
+                them a set-up is called no more probable than it is.
+        """
+        found, count = [], len(self.likelihood.usable)
+        asked = [i for i, h in enumerate(self.hypotheses) if everything or len(h.faults) < 2]
+        asked = [i for i in asked if everything or self.hypotheses[i].known] or asked
+        hypotheses, log_odds = [self.hypotheses[i] for i in asked], self.log_odds[asked]
+        at_a_time = max(1, CHUNK_RUNS // count)
+        for first in range(0, len(set_ups), at_a_time):
+            some = set_ups[first : first + at_a_time]
+            likelihood = self.behind(some)
+            says = marginal_likelihoods(likelihood, hypotheses, self.priors)
+            log_joint = np.stack([one.log_evidence for one in says], axis=1) + log_odds
+            found += _weighed(some, likelihood, log_sum(log_joint, axis=1))
+        return found
+
+    def weigh_moved(self, set_up: SetUp) -> WeighedSetUp:
+        """Return the same of one with a sensor that may stand a little elsewhere."""
+        likelihood = self.behind([set_up])
+        weighing = SharedWeighing(likelihood, self.hypotheses, self.priors)
+        mixture = Mixture.of(weighing, weighing.candidates)
+        log_joint = log_sum(mixture.log_evidence, axis=1) + self.log_odds
+        found = _weighed([set_up], likelihood, log_sum(log_joint, axis=1), CHOICE_NATS)[0]
+        return replace(found, moved=True)
+
+    # Which set-ups are weighed.
+
+    def posterior(self) -> SetUpPosterior:
+        """Return what is believed of the set-up; as told at once where that fits."""
+        if self.rate == 0.0 or not self.likelihood.usable.any():
+            return self.taken_as_told()
+        told = self.weigh([self.as_told])
+        if not told[0].fits:
+            told = self.weigh([self.as_told], everything=True)
+        if told[0].fits:
+            return SetUpPosterior.of([*told, *self.zeros(self.as_told)])
+        return self.few.searched()
+
+    def taken_as_told(self) -> SetUpPosterior:
+        """Return the belief that nothing is wrong, whatever the runs say."""
+        nothing = np.zeros(len(self.likelihood.usable))
+        return SetUpPosterior([WeighedSetUp(self.as_told, nothing, 0.0)], np.ones(1))
+
+    @cached_property
+    def few(self) -> SetUpWeighing:
+        """The same by few of the runs."""
+        count = len(self.likelihood.usable)
+        if count <= FEW:
+            return self
+        some = np.unique(np.linspace(0, count - 1, FEW).astype(np.int64))
+        return replace(self, likelihood=self.likelihood[some])
+
+    def searched(self) -> SetUpPosterior:
+        """Return what is believed of the set-up of runs that do not fit it.
+
+        One mistake is tried, then a sensor that stands a little elsewhere, then two mistakes, then
+        a mistake with such a sensor, until something explains the runs.
+        """
+        single = self.options(self.as_told)
+        found = [
+            *self.weigh([self.as_told], everything=True),
+            *self.weigh(single),
+            *self.zeros(self.as_told),
+        ]
+        fitting = any(one.fits for one in found)
+        found.append(self.weigh_moved(self.as_told))
+        if fitting or found[-1].fits:
+            return SetUpPosterior.of(found)
+        likely = self.nearest([two.beside(one) for one in mistakes(self.robot) for two in single])
+        found += self.weigh(likely)
+        for first in self.nearest(single)[:FINALISTS]:
+            found += self.zeros(first)
+        if not any(one.fits for one in found):
+            found += [self.weigh_moved(s) for s in self.nearest(single)[:FINALISTS]]
+        return SetUpPosterior.of(found)
+
+    def options(self, first: SetUp) -> list[SetUp]:
+        """Return every mistake behind one that is undone."""
+        found = [*mistakes(self.robot), *self.frames(first)]
+        return [replace(s, log_prior=s.log_prior + self.log_rate).beside(first) for s in found]
+
+    def nearest(self, set_ups: Sequence[SetUp]) -> list[SetUp]:
+        """Return the set-ups that bring the tool nearest to where healthy commands would have it.
+
+        Movements that stay far off count alike, however far: some may be faulty.
+        """
+        evidence, usable = self.likelihood.evidence, self.likelihood.usable
+        told, point = evidence.movements.target[usable], evidence.point[usable]
+        commands = np.stack([s.correction.command(told) for s in set_ups])
+        expected = self.likelihood.model.twin.path(commands)
+        seen = np.stack([s.correction.point(point) for s in set_ups])
+        away = np.linalg.norm(seen - expected, axis=-1) / (NEAR * self.robot.reach)
+        score = np.minimum(away, 1.0).mean(axis=1)
+        return [set_ups[i] for i in np.argsort(score, kind="stable")[:PROMISING]]
+
+    # Mistakes with numbers of their own.
+
+    def frames(self, first: SetUp) -> list[SetUp]:
+        """Return the frame that explains settled poses best behind a mistake."""
+        likelihood, model = self.behind([first]), self.likelihood.model
+        usable, healthy = likelihood.usable, likelihood.findings.expected[:, :, 0]
+        if usable.sum() < FEWEST_TO_TURN:
+            return []
+        expected, point = model.twin.path(healthy[usable]), likelihood.evidence.point[usable]
+        found = turned(model.twin.robot, expected, point)
+        away = np.linalg.norm(found.correction.point(point) - point, axis=1)
+        return [found] if np.median(away) > FAR * model.twin.robot.reach else []
+
+    def zeros(self, first: SetUp) -> list[WeighedSetUp]:
+        """Return the zeros that many movements agree on behind a mistake."""
+        likelihood, model = self.behind([first]), self.likelihood.model
+        found = []
+        for k, width in enumerate(model.least_visible):
+            says = likelihood.profile(k)
+            seen = likelihood.usable & (says.min_distance2[..., 0] < EXPLAINED)
+            off = says.turned(says.mode - says.expected)[..., 0][seen]
+            together = np.abs(off[:, None] - off) < CLUSTER * width
+            if model.twin.robot.slides[k] or len(off) < LEAST_AGREEING:
+                continue
+            members = together[together.sum(axis=1).argmax()]
+            zero = float(np.median(off[members]))
+            agree = members.sum() >= max(LEAST_AGREEING, AGREEING * likelihood.usable.sum())
+            if agree and abs(zero) > CLUSTER * width:
+                found.append(self._zero(first, k, zero, float(width)))
+        return found
+
+    def _zero(self, first: SetUp, motor: int, zero: float, width: float) -> WeighedSetUp:
+        """Return what the runs say of a zero near some value, the value integrated out."""
+        robot = self.robot
+
+        def at(value: float) -> SetUp:
+            known = zero_off(robot, motor, value)
+            return replace(known, log_prior=known.log_prior + self.log_rate).beside(first)
+
+        for _ in range(ROUNDS):
+            low, middle, high = (
+                float(one.log_evidence.sum())
+                for one in self.weigh([at(zero + width * step) for step in (-1.0, 0.0, 1.0)])
+            )
+            curvature = max((2.0 * middle - low - high) / width**2, 0.1 / width**2)
+            zero += float(np.clip((high - low) / (2.0 * width * curvature), -width, width))
+            width = float(np.clip(curvature**-0.5, 0.1 * width, width))
+        best = self.weigh([at(zero)])[0]
+        volume = 0.5 * float(np.log(2.0 * np.pi / curvature))
+        known = replace(best.set_up, log_prior=best.set_up.log_prior + volume)
+        return replace(best, set_up=known)
+
+
+def _weighed(
+    set_ups: Sequence[SetUp],
+    likelihood: RunLikelihood,
+    log_evidence: FloatArray,
+    choice_nats: float = 0.0,
+) -> list[WeighedSetUp]:
+    """Return what runs say of set-ups; each in turn was undone on all of them.
+
+    Args:
+        set_ups: The set-ups.
+        likelihood: The runs behind each.
+        log_evidence: What these say, (set-up and run,).
+        choice_nats: What numbers that were chosen for each run cost, which is no misfit.
+    """
+    best, worst = highest_and_outlier(likelihood)
+    best = best - choice_nats
+    lost, most, says = (
+        values.reshape(len(set_ups), -1)
+        for values in (best - log_evidence, best - worst, log_evidence)
+    )
+    misfit = lost.sum(axis=1) / np.maximum(most.sum(axis=1), 1.0)
+    return [
+        WeighedSetUp(set_up, row, float(share))
+        for set_up, row, share in zip(set_ups, says, misfit, strict=True)
+    ]
+
+
+def _distinct(weighed: Sequence[WeighedSetUp]) -> list[WeighedSetUp]:
+    """Return the set-ups with each correction once, as it was weighed best."""
+    found: dict[bytes, WeighedSetUp] = {}
+    for one in sorted(weighed, key=lambda w: -w.log_joint):
+        undo = one.set_up.correction
+        parts = [np.round(part, 9) + 0.0 for part in (undo.C, undo.z, undo.M, undo.t)]
+        found.setdefault(b"".join(part.tobytes() for part in parts), one)
+    return list(found.values())
+
+
+def highest_and_outlier(likelihood: RunLikelihood) -> tuple[FloatArray, FloatArray]:
+    """Return the log density of each run at its best, and of a tool that may be anywhere, (run,).
+
+    Args:
+        likelihood: Runs by their settled positions.
+    """
+    model, evidence = likelihood.model, likelihood.evidence
+    healthy = likelihood.findings.expected[:, :, 0]
+    _, _, spread = model.residual(evidence.point, healthy, model.scatter)
+    highest = np.where(likelihood.usable, spread.log_norm(model.settling.tail_dof), 0.0)
+    return highest.sum(axis=1), likelihood.usable.sum(axis=1) * model.outlier_log_density
+
+
+def run_misfit(posterior: Posterior, run: int) -> float:
+    """Return the misfit of one run under its most probable hypothesis, as of `WeighedSetUp`."""
+    highest, outlier = highest_and_outlier(posterior.likelihood[run])
+    best = int(np.argmax(posterior.log_posterior[run]))
+    says = float(posterior.weights[best].settled(run).sum())
+    return float((highest[0] - says) / max(highest[0] - outlier[0], 1.0))

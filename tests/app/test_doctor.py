@@ -1,0 +1,58 @@
+"""`failuretwin doctor`, and other verbs on logs that do not fit the profile."""
+
+from __future__ import annotations
+
+import pytest
+
+from failuretwin.data_knowledge.store import load_run_set, save_run_set
+
+WRONG = "set-up: the log does not fit the profile (over 99.9 % sure): motor 2 turns the other way"
+
+
+@pytest.fixture(scope="module")
+def reversed_log(simulated, tmp_path_factory):
+    """Three runs of a log in which motor 2 turns the other way."""
+    runs = load_run_set(simulated).isel(run=[0, 2, 7])
+    command = runs["command"].values.copy()
+    command[..., 1] *= -1.0
+    path = tmp_path_factory.mktemp("reversed") / "log.nc"
+    save_run_set(runs.assign(command=(runs["command"].dims, command)), path)
+    return path
+
+
+def test_a_log_that_fits_is_said_to_fit(failuretwin, simulated):
+    answer = failuretwin("doctor", simulated)
+    assert answer.returncode == 0, answer.stderr
+    assert "set-up: the log fits the profile" in answer.stdout
+    assert "log: 9 runs" in answer.stdout
+
+
+def test_what_is_found_can_be_accepted(failuretwin, reversed_log, tmp_path):
+    fix = tmp_path / "map.toml"
+    answer = failuretwin("doctor", reversed_log, "--out", fix)
+    assert answer.returncode == 0, answer.stderr
+    assert WRONG in answer.stdout
+    assert "fits the profile" in failuretwin("doctor", reversed_log, "--columns", fix).stdout
+    accepted = failuretwin("diagnose", reversed_log, "--columns", fix)
+    alone = failuretwin("diagnose", reversed_log)
+    assert "does not fit" not in accepted.stdout
+    assert "does not fit" in alone.stdout
+    assert "3 of 3 runs right" in accepted.stdout
+    assert "3 of 3 runs right" in alone.stdout
+
+
+def test_a_file_that_exists_is_left_alone(failuretwin, reversed_log, tmp_path):
+    taken = tmp_path / "map.toml"
+    taken.write_text("mine")
+    answer = failuretwin("doctor", reversed_log, "--out", taken)
+    assert answer.returncode == 2
+    assert "not taken yet" in answer.stderr
+    assert taken.read_text() == "mine"
+
+
+def test_a_correction_of_another_robot_is_refused(failuretwin, reversed_log, tmp_path):
+    fix = tmp_path / "map.toml"
+    fix.write_text("[correction]\ncommands = [[1]]\nzero = [0]\ntool = [[1,0,0]]\norigin = [0,0,0]")
+    answer = failuretwin("diagnose", reversed_log, "--columns", fix)
+    assert answer.returncode == 2
+    assert "expected 4 rows of 4 numbers in commands" in answer.stderr

@@ -1,0 +1,207 @@
+"""Wrong set-ups: named as such, undone, and told from faults."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from failuretwin import BayesDiagnoser, SetupPrior
+from failuretwin.core.errors import InputError
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.failure_behavior.random_movements import RandomMovements
+from failuretwin.inference.evidence import Evidence
+from failuretwin.inference.log_correction import CorrectionTable, LogCorrection
+from failuretwin.inference.priors import Priors
+from failuretwin.inference.set_up_weighing import ANOTHER, SetUpPosterior, WeighedSetUp
+from failuretwin.inference.set_ups import SetUp, mistakes, zero_off
+
+TRUTHS = ["healthy", "motor_2:stuck", "motor_3:steady_state_error"]
+NONE = LogCorrection.none(4)
+I4 = np.eye(4)
+FITS = "fit the profile"
+
+
+@pytest.fixture(scope="module")
+def known(armpi):
+    return load_calibration("armpi_fpv", armpi).imperfections
+
+
+@pytest.fixture(scope="module")
+def runs(armpi, known):
+    return simulate(Plan(armpi, TRUTHS, 1, 3, known, RandomMovements(count=6)))
+
+
+@pytest.fixture(scope="module")
+def as_told(twin, runs):
+    return BayesDiagnoser(twin).diagnose(runs)
+
+
+def made(robot, words):
+    """Return what makes a log with a mistake of one that fits."""
+    return next(one.correction.inverse for one in mistakes(robot) if words in one.what)
+
+
+def remarks(diagnosis):
+    return [line for line in diagnosis.quality if FITS in line]
+
+
+def same_verdicts(found, expected):
+    for one, other in zip(found, expected, strict=True):
+        assert one.diagnosis == other.diagnosis
+        assert one.posterior == pytest.approx(other.posterior, abs=0.03)
+
+
+# Corrections.
+
+
+def some_correction():
+    C, M = I4[[1, 0, 3, 2]] * [-1.0, 1.0, 1.0, -1.0], np.eye(3)[[2, 0, 1]] * [1e-3, -1e-3, 1e-3]
+    return LogCorrection(C, np.array([0.1, 0.0, -0.2, 0.3]), M, np.array([0.3, -0.1, 0.2]), 0.5)
+
+
+def test_a_mistake_that_is_undone_is_gone(runs):
+    there = some_correction()
+    back = there.inverse.runs(there.runs(runs))
+    np.testing.assert_allclose(back["command"], runs["command"], atol=1e-12)
+    seen = np.isfinite(back["measured"].values)
+    np.testing.assert_allclose(
+        back["measured"].values[seen], runs["measured"].values[seen], atol=1e-12
+    )
+    assert seen.sum() > 500
+
+
+def test_one_after_the_other_is_both():
+    first, then = some_correction(), replace(some_correction(), z=np.ones(4), t=np.ones(3))
+    u, s = np.array([0.3, -0.4, 0.5, 1.0]), np.array([0.1, 0.2, -0.3])
+    both = then.after(first)
+    np.testing.assert_allclose(both.command(u), then.command(first.command(u)))
+    np.testing.assert_allclose(both.point(s), then.point(first.point(s)))
+    assert both.late_s == 1.0
+    assert pytest.approx(I4) == first.after(first.inverse).C
+
+
+def test_evidence_is_corrected_as_its_runs_are(runs):
+    there = replace(some_correction(), late_s=0.0)
+    from_runs, corrected = (
+        Evidence(there.runs(runs)).settled,
+        there.evidence(Evidence(runs).settled),
+    )
+    np.testing.assert_allclose(from_runs.movements.target, corrected.movements.target, atol=1e-6)
+    ramps = corrected.movements.ramp_duration
+    np.testing.assert_allclose(from_runs.movements.ramp_duration, ramps, atol=0.02)
+
+
+def test_a_correction_is_read_as_it_is_written():
+    import tomllib
+
+    table = tomllib.loads(some_correction().text("all wrong"))["correction"]
+    rows = {k: tuple(map(tuple, v)) if k in ("commands", "tool") else v for k, v in table.items()}
+    read = LogCorrection.from_file(CorrectionTable(**rows), 4, "map.toml: correction")
+    for name in ("C", "z", "M", "t", "late_s"):
+        np.testing.assert_allclose(getattr(read, name), getattr(some_correction(), name))
+    with pytest.raises(InputError, match="expected 5 rows of 5 numbers"):
+        LogCorrection.from_file(CorrectionTable(**rows), 5, "map.toml: correction")
+
+
+def test_a_correction_that_forgets_a_motor_is_refused():
+    table = CorrectionTable(((1.0, 0.0), (1.0, 0.0)), (0.0, 0.0), ((1, 0, 0),) * 3, (0, 0, 0))
+    with pytest.raises(InputError, match="cannot be undone"):
+        LogCorrection.from_file(table, 2, "map.toml: correction")
+
+
+# What is believed.
+
+
+def test_belief_is_prior_times_evidence():
+    """Bayes' rule by hand; two ways to undo the same count once."""
+    undo = replace(NONE, z=I4[0])
+    ways = [
+        WeighedSetUp(SetUp("", "", NONE, np.log(0.7)), np.array([-3.0, -4.0]), 0.1),
+        WeighedSetUp(SetUp("a", "", undo, np.log(0.2)), np.array([-2.0, -4.0]), 0.1),
+        WeighedSetUp(SetUp("b", "", undo, np.log(0.1)), np.array([-2.0, -4.0]), 0.1),
+    ]
+    found = SetUpPosterior.of(ways)
+    assert found.wrong == pytest.approx(0.2 * np.e / (0.7 + 0.2 * np.e))
+    assert [one.set_up.what for one in found.found] == ["", "a"]
+
+
+def test_the_prior_of_a_zero_has_a_narrow_half_and_a_wide_one(armpi):
+    angle = np.linspace(-np.pi, np.pi, 20001)
+    density = np.exp([zero_off(armpi, 1, z).log_prior for z in angle])
+    total = np.trapezoid(density, angle)
+    assert total == pytest.approx(0.25 / 4, rel=0.01)
+    far = np.abs(angle) > np.deg2rad(30.0)
+    assert np.trapezoid(np.where(far, density, 0.0), angle) / total == pytest.approx(
+        0.418, abs=0.02
+    )
+
+
+def test_a_log_that_fits_is_judged_as_if_no_set_up_was_asked(twin, runs, as_told):
+    sure = Priors(setup=replace(SetupPrior(), wrong_rate=(0.0, 0.0)))
+    for one, other in zip(BayesDiagnoser(twin, priors=sure).diagnose(runs), as_told, strict=True):
+        assert one.posterior == pytest.approx(other.posterior, abs=1e-9)
+        assert not remarks(other)
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["motor 2 turns", "motor 2 and motor 3 are swapped", "y of the tool", "millimetres", "degrees"],
+)
+def test_a_mistake_is_named_and_the_diagnosis_goes_on(twin, runs, as_told, words):
+    found = BayesDiagnoser(twin).diagnose(made(twin.robot, words).runs(runs))
+    same_verdicts(found, as_told)
+    assert all(words in remarks(d)[0] and "does not fit" in remarks(d)[0] for d in found)
+
+
+def test_one_run_is_enough_for_a_sense(twin, runs, as_told):
+    (found,) = BayesDiagnoser(twin).diagnose(
+        made(twin.robot, "motor 2 turns").runs(runs.isel(run=[0]))
+    )
+    same_verdicts([found], as_told[:1])
+    assert "motor 2 turns the other way" in remarks(found)[0]
+
+
+def test_two_mistakes_at_once_are_named(twin, runs, as_told):
+    both = made(twin.robot, "motor 2 turns").after(made(twin.robot, "motor 3 and motor 4"))
+    found = BayesDiagnoser(twin).diagnose(both.runs(runs))
+    same_verdicts(found, as_told)
+    assert "motor 2 turns" in remarks(found[0])[0]
+    assert "motor 3 and motor 4" in remarks(found[0])[0]
+
+
+@pytest.mark.parametrize("late_s", [0.4, -0.3])
+def test_a_clock_that_is_apart_is_named_with_its_sign(twin, runs, as_told, late_s):
+    found = BayesDiagnoser(twin).diagnose(replace(NONE, late_s=-late_s).runs(runs))
+    told = re.search(r"clock is ([\d.]+) s (behind|ahead)", remarks(found[0])[0])
+    assert told is not None
+    assert float(told[1]) == pytest.approx(abs(late_s), abs=0.05)
+    assert told[2] == ("behind" if late_s > 0.0 else "ahead")
+    same_verdicts(found, as_told)
+
+
+def test_what_every_run_has_is_set_up_and_what_one_has_is_a_fault(twin, armpi, known):
+    runs = simulate(Plan(armpi, ["healthy"], 8, 5, known, RandomMovements(count=5)))
+    names = ["healthy", "motor_3:encoder_bias", "motor_3:steady_state_error", "motor_2:stuck"]
+    diagnoser = BayesDiagnoser(twin, hypotheses=names)
+    zero = replace(NONE, z=-0.12 * I4[2])
+    every = diagnoser.diagnose(zero.runs(runs))
+    assert all("motor 3 stands" in remarks(d)[0] for d in every)
+    right = diagnoser.diagnose(runs)
+    assert [d.diagnosis for d in every] == [d.diagnosis for d in right]
+    assert sum(d.diagnosis == "healthy" for d in every) > 5
+    one = runs.copy(deep=True)
+    one["command"].values[0] = zero.runs(runs)["command"].values[0]
+    found = diagnoser.diagnose(one)
+    assert found[0].diagnosis == "motor_3:encoder_bias"
+    assert not any(remarks(d) for d in found)
+
+
+def test_a_log_of_another_world_gets_no_motor(twin, runs):
+    """Tool positions that have nothing to do with the commands: no set-up, and no motor either."""
+    strange = runs.assign(measured=(runs["measured"].dims, np.roll(runs["measured"].values, 1, 0)))
+    for d in BayesDiagnoser(twin).diagnose(strange):
+        assert d.undecided == ANOTHER or "nowhere near" in d.undecided
