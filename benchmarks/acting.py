@@ -33,7 +33,7 @@ from acting_world import ERROR_RAD, MODES, ONSET, TrueFault, World
 from failuretwin.connection.links.commander import Order
 from failuretwin.core.hypothesis import Fault
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.decision.acting.actor import ActingSettings, Actor, TargetResult
+from failuretwin.decision.acting.actor import Actor
 from failuretwin.decision.acting.belief import (
     Belief,
     BeliefSettings,
@@ -42,6 +42,7 @@ from failuretwin.decision.acting.belief import (
 )
 from failuretwin.decision.acting.believed_arm import BelievedFault, Seen
 from failuretwin.decision.acting.judging import Judge, Judgement
+from failuretwin.decision.acting.outcome import ActingSettings, TargetResult
 from failuretwin.decision.acting.planner import Planner
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.task import Task

@@ -18,8 +18,9 @@ from failuretwin.connection.emulated_arm import Emulation
 from failuretwin.connection.links.base import Event
 from failuretwin.core.hypothesis import Fault
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.actor import ActingSettings, Actor
+from failuretwin.decision.acting.actor import Actor
 from failuretwin.decision.acting.judging import Judge
+from failuretwin.decision.acting.outcome import ActingSettings
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.session import Acting
 from failuretwin.decision.acting.work import Work, first_standing

@@ -122,7 +122,7 @@ def test_unknown_robot(refused, simulated):
     ("arguments", "words"),
     [
         (["diagnose", "--hypothesis", "healthy"], "Did you mean '--hypotheses'?"),
-        (["diagnos"], "Did you mean 'diagnose'?"),
+        (["evaluat"], "Did you mean 'evaluate'?"),
         (["diagnose"], "Missing argument"),
         (["diagnose", "x", "--as", "seen"], "'seen' is not one of 'measured', 'published'"),
         (["simulate", "--out", "x.nc", "--runs-per-class", "0"], "0 is not in the range"),

@@ -23,6 +23,7 @@ from failuretwin.digital_model.settling import Settling
 from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.priors import OnsetPrior, priors_of
+from failuretwin.inference.shared_unknowns import SetupPrior
 
 PATH_NOISE_M, OUTLIER_RATE = 0.001, 0.01
 
@@ -92,7 +93,7 @@ def test_posterior_of_an_error_is_that_of_brute_force(twin, run_of, motor, off):
     runs = run_of(TARGETS, points, MOTORS)
     fault = Hypothesis.parse(f"motor_{motor + 1}:steady_state_error", MOTORS)
     priors = priors_of(twin.robot, (10.0, 50.0), None)
-    priors = replace(priors, onset=OnsetPrior(prior_before_run=1.0))
+    priors = replace(priors, onset=OnsetPrior(prior_before_run=1.0), setup=SetupPrior.known())
     imperfections = Imperfections("made up", "test", settling=SETTLING, readings=READINGS)
 
     (diagnosis,) = BayesDiagnoser(twin, imperfections, (Hypothesis(), fault), priors).diagnose(runs)

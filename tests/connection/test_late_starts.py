@@ -98,7 +98,7 @@ def test_a_healthy_robot_that_loses_three_commands_in_a_row_is_healthy(armpi, kn
     runs = run_of(targets, twin.path(pose), MOTORS, rate=10.0)
     (found,) = diagnoser.diagnose(runs)
     assert found.diagnosis == "healthy"
-    assert found.posterior["healthy"] > 0.8
+    assert found.posterior["healthy"] > 0.5
     lost = [line for line in found.explanation if "did not get the command" in line]
     assert len(lost) == 3
 

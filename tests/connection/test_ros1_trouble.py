@@ -12,6 +12,7 @@ from failuretwin.connection.links import ros_messages as bulletin
 from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, EventQueue, Reading
 from failuretwin.connection.links.ros1 import Ros1Diagnostics, Ros1Robot, Ros1Source
 from failuretwin.connection.links.ros_messages import RosTopics
+from failuretwin.core.alarm import ALL_CLEAR, RAISED, Alarm, Episode
 from failuretwin.core.hypothesis import Diagnosis
 from little_logs import LOG_COLUMNS
 from ros_peer import RosPeer
@@ -192,6 +193,7 @@ def test_diagnostics_come_every_second_and_at_once_when_it_gets_worse(monkeypatc
         magnitude=0.5,
         magnitude_unit="rad",
     )
+    raised = Alarm(RAISED, "motor_2:stuck", Episode(1, "motor_2:stuck", 1002.5))
     now = [1000.0]
     monkeypatch.setattr(bulletin, "time", SimpleNamespace(monotonic=lambda: now[0]))
 
@@ -203,7 +205,8 @@ def test_diagnostics_come_every_second_and_at_once_when_it_gets_worse(monkeypatc
 
         def put(state, diagnosis):
             now[0] += 0.25
-            sink.put(Answer(now[0], state, diagnosis))
+            alarm = raised if diagnosis is stuck else ALL_CLEAR
+            sink.put(Answer(now[0], state, diagnosis, alarm))
 
         def heard():
             put(OK, healthy)

@@ -24,7 +24,7 @@ from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.nonidealities import Imperfections, LostCommand
 from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.inference import folder_posterior as folder
-from failuretwin.inference import runs_together, shared_unknowns
+from failuretwin.inference import habits, runs_together, shared_unknowns
 from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.folder_posterior import folder_posterior
 from failuretwin.inference.healthy_model import HealthyModel
@@ -124,7 +124,7 @@ def test_early_ones_do(twin, mixed, monkeypatch):
 
 def test_one_run_alone_is_judged_with_the_prior(twin, mixed, monkeypatch):
     """What it says itself of the robot does not count for its own hypothesis a second time."""
-    monkeypatch.setattr(runs_together, "SCATTER_SPREAD", 1e-6)
+    monkeypatch.setattr(habits, "SCATTER_SPREAD", 1e-6)
     for run in range(8):
         alone = mixed.isel(run=[run])
         theta, log_posterior, names = judged(twin, alone, priors=SURE)
@@ -196,7 +196,7 @@ def gaussian(twin):
     """
     one = drawn_from_its_model(scene(twin, "healthy", runs=5, seed=4))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runs_together, "SCATTER_SPREAD", 1e-6)
+        patch.setattr(habits, "SCATTER_SPREAD", 1e-6)
         patch.setattr(shared_unknowns, "ODD_FACTOR", 1.0)
         found = folder_posterior(RunLikelihood(one.evidence, one.model), HEALTHY, SURE)
     return one, found

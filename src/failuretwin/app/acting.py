@@ -17,7 +17,7 @@ from failuretwin.connection.links.commander import Commander
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.actor import TargetResult
+from failuretwin.decision.acting.outcome import TargetResult
 from failuretwin.decision.acting.sparing import wear_weights
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, RobotLike, calibrated
 from failuretwin.digital_model.robot import Robot

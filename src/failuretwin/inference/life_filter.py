@@ -24,11 +24,12 @@ from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.inference.evidence import SettledEvidence, TransientSamples
 from failuretwin.inference.folder_posterior import FolderPosterior
+from failuretwin.inference.habits import Habits
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.runs_together import Habits, RunsTogether
+from failuretwin.inference.runs_together import RunsTogether
 from failuretwin.inference.shared_belief import Belief, summed
 from failuretwin.inference.shared_likelihood import Normal
 from failuretwin.inference.shared_posterior import set_up_in_doubt
@@ -376,9 +377,8 @@ class LifeFilter:
         """Return what has changed more than wear can make it, or nothing.
 
         The latest runs by themselves are compared with what is behind them and with what that was a
-        horizon ago: a fault that grows slowly drags the belief along before it shows. Of a robot
-        that nothing was known of, fewer runs than these are no measure: a start that was judged
-        wrongly is outweighed, not defended.
+        horizon ago: a fault that grows slowly drags the belief along before it shows. Of an unknown
+        robot fewer runs than these are no measure: a wrong start is outweighed, not defended.
         """
         if window.runs < FEWEST:
             return ""
@@ -392,7 +392,7 @@ class LifeFilter:
         measured = self.habits is None or self.arrived >= 2 * WINDOW
         behind = (_state(self.base, self.unit), self.past[0]) if measured else ()
         fast = np.max([np.full_like(now, -np.inf), *(off(k, self.limits.reach) for k in behind)], 0)
-        begun = np.stack([np.zeros_like(wear), self._begun_deviation])
+        begun = np.stack([np.zeros_like(wear), self.unit[REGISTRATION:]])
         excess = np.maximum(fast, off(begun, self.limits.limit))
         over = np.divide(excess, wear, out=np.zeros_like(wear), where=wear > 0.0)
         worst = int(np.argmax(over))
@@ -403,11 +403,6 @@ class LifeFilter:
             "changes faster than by wear" if fast[worst] > 0.0 else "is worn beyond what is normal"
         )
         return f"{OFFSETS[kind]} of {self.model.motor_names[motor]} {how}"
-
-    @property
-    def _begun_deviation(self) -> FloatArray:
-        """What the offsets of the robot may differ by from what was told, (3 motor,)."""
-        return self.unit[REGISTRATION:]
 
     def _by_itself(self, window: RunsTogether, wear: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return offsets that the latest runs have if any are as good, and their deviation."""

@@ -143,15 +143,24 @@ def mixed(posteriors: Sequence[Posterior], set_ups: SetUpPosterior) -> Posterior
         stacked = np.stack([one.log_posterior for one in posteriors]) + weight[:, None, None]
         likeliest = replace(likeliest, log_posterior=log_sum(stacked, axis=0))
     remark, count = set_up_remark(set_ups), len(likeliest.log_posterior)
+    known = likeliest.set_up or [""] * count
     if remark:
-        known = likeliest.set_up or [""] * count
         said = ["; ".join(filter(None, (remark, one))) for one in known]
         likeliest = replace(likeliest, set_up=said)
     if set_ups.fits:
         return likeliest
     everywhere = bool(set_ups.best.set_up.what)
-    lost = [everywhere or run_misfit(likeliest, run) > FITS for run in range(count)]
+    lost = [everywhere or _unexplained(likeliest, run, known[run]) for run in range(count)]
     return replace(likeliest, no_verdict=[ANOTHER if one else "" for one in lost])
+
+
+def _unexplained(posterior: Posterior, run: int, set_up: str) -> bool:
+    """Return whether neither a hypothesis nor a sensor that stands a little elsewhere explains it.
+
+    The hypothesis that the fault is unknown says so itself.
+    """
+    best = posterior.hypotheses[int(np.argmax(posterior.log_posterior[run]))]
+    return best.known and not set_up and run_misfit(posterior, run) > FITS
 
 
 def set_up_remark(set_ups: SetUpPosterior) -> str:

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from failuretwin.core.hypothesis import Fault
-from failuretwin.decision.acting.actor import ActingSettings, Actor
+from failuretwin.decision.acting.actor import Actor
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault
 from failuretwin.decision.acting.judging import Judge
+from failuretwin.decision.acting.outcome import ActingSettings
 from failuretwin.decision.acting.planner import Planner
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.task import Target, Task

@@ -7,9 +7,9 @@ import pytest
 from small_world import SmallWorld, believed, carry_out, task_of
 
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.decision.acting.actor import ActingSettings
 from failuretwin.decision.acting.belief import LatchedBelief, NoBelief
 from failuretwin.decision.acting.believed_arm import BelievedArm
+from failuretwin.decision.acting.outcome import ActingSettings
 from failuretwin.failure_behavior.reaction import Reaction
 from failuretwin.failure_behavior.registry import MODES
 

@@ -10,8 +10,8 @@ from failuretwin.connection.commanded_arm import CommandedArm
 from failuretwin.connection.emulated_arm import Emulation
 from failuretwin.connection.links.commander import Order
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
-from failuretwin.decision.acting.belief import settled_evidence_of
 from failuretwin.decision.acting.believed_arm import Seen
+from failuretwin.decision.acting.judging import settled_evidence_of
 from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.decision.test_motions.health_check import (
     CheckResult,

@@ -121,7 +121,7 @@ def act(
     """
     from failuretwin.app.acting import commander_of, spared_of, table_lines, write_results
     from failuretwin.app.live import EMULATED
-    from failuretwin.decision.acting.actor import ActingSettings
+    from failuretwin.decision.acting.outcome import ActingSettings
     from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
     from failuretwin.decision.acting.session import Acting
     from failuretwin.decision.acting.task import read_task

@@ -19,6 +19,7 @@ from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault, Seen
 from failuretwin.decision.acting.judging import Judgement
+from failuretwin.decision.acting.outcome import USUAL, ActingSettings, TargetResult
 from failuretwin.decision.acting.planner import Plan, Planner, Standing
 from failuretwin.decision.acting.reactions import lost_command, probing, told
 from failuretwin.decision.acting.sparing import Effort
@@ -35,59 +36,6 @@ LEFT_OPEN = 0.9
 """What is wrong is open as long as nothing is more probable, healthy included."""
 HALVINGS = 3
 """A correction that is not safe is tried at half, a quarter and an eighth."""
-
-
-@dataclass(frozen=True)
-class ActingSettings:
-    """How a task is carried out.
-
-    Attributes:
-        most_movements: After so many a target is given up.
-        feedback: Whether what the tool misses is corrected; else each target has one movement.
-        first_gain: Share of the error that the first correction takes off.
-        later_gain: The same of those that follow.
-        most_repeats: So often a command that seems lost is sent again for one target.
-        probe_every: A motor that is held is told to move once in so many targets, so that a
-            repair is noticed.
-        questions: So many movements of the task at most are made only to settle what is wrong,
-            while that is open.
-    """
-
-    most_movements: int = 6
-    feedback: bool = True
-    first_gain: float = 1.0
-    later_gain: float = 0.7
-    most_repeats: int = 1
-    probe_every: int = 8
-    questions: int = 0
-
-
-@dataclass(frozen=True)
-class TargetResult:
-    """What became of a target.
-
-    Attributes:
-        target: The target.
-        reached: Whether the tool was seen within its tolerance.
-        error_m: How far it was from it in the end [m]; NaN: it was not seen.
-        error_rad: How far from its approach direction, as far as the believed arm tells [rad]; 0
-            where none is asked for.
-        first_error_m: The same after the first movement [m].
-        movements: Movements made.
-        reachable: Whether the last plan could reach it on the arm as it was believed to be.
-        believed: What was believed in the end; empty: no fault.
-        why: Why it was given up, empty if it was reached.
-    """
-
-    target: Target
-    reached: bool
-    error_m: float
-    error_rad: float
-    first_error_m: float
-    movements: int
-    reachable: bool
-    believed: str
-    why: str = ""
 
 
 @dataclass
@@ -125,7 +73,7 @@ class Actor:
         task: Task,
         belief: Belief,
         command: FloatArray,
-        settings: ActingSettings = ActingSettings(),
+        settings: ActingSettings = USUAL,
     ) -> None:
         self._planner, self._model, self._task = planner, model, task
         self.belief, self._settings = belief, settings

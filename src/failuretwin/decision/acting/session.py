@@ -13,10 +13,11 @@ import numpy as np
 from failuretwin.connection.links.commander import Commander
 from failuretwin.core.errors import unknown_name
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.actor import ActingSettings, Actor, TargetResult
+from failuretwin.decision.acting.actor import Actor
 from failuretwin.decision.acting.belief import Belief, LatchedBelief, NoBelief
 from failuretwin.decision.acting.believed_arm import BelievedArm
 from failuretwin.decision.acting.judging import Judge
+from failuretwin.decision.acting.outcome import ActingSettings, TargetResult
 from failuretwin.decision.acting.planner import Plan, Planner, Standing
 from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
 from failuretwin.decision.acting.sparing import sparing_lines, wear_weights
