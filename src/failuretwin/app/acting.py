@@ -18,7 +18,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.outcome import TargetResult
-from failuretwin.decision.acting.sparing import wear_weights
+from failuretwin.decision.acting.sparing import stopped_learning, wear_weights
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, RobotLike, calibrated
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.injection import ScheduledFault
@@ -229,6 +229,9 @@ def spared_of(
         weight = wear_weights(history, model)
         worn = [f"{names[k]} {weight[k]:.0%}" for k in np.flatnonzero(weight)]
         tell(f"worn, of what is allowed: {', '.join(worn) or 'no motor beyond doubt'}")
+        alarm = stopped_learning(history, model.twin.robot.name)
+        if alarm:
+            tell(f"that is from before the history stopped to learn: {alarm}")
     for text in texts:
         name, _, share = text.partition("=")
         Hypothesis.parse(f"{name}:stuck", names)

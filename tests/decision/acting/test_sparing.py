@@ -9,6 +9,7 @@ import pytest
 from small_world import SmallWorld, carry_out, task_of
 
 from failuretwin import InputError
+from failuretwin.app.acting import spared_of
 from failuretwin.decision.acting.belief import NoBelief
 from failuretwin.decision.acting.planner import Standing, turned_round
 from failuretwin.decision.acting.sparing import sparing_lines, wear_weights
@@ -53,6 +54,18 @@ def test_friction_that_grows_is_wear_too(model, tmp_path):
     friction = wear_unit(model)[8:]
     path = history(tmp_path / "a.history.jsonl", [row(0.0), row(0.0, friction=friction)])
     np.testing.assert_allclose(wear_weights(path, model), np.full(4, 1.0 / WearLimits().limit))
+
+
+def test_a_history_that_stopped_to_learn_is_told(model, tmp_path):
+    said = "bias of motor_2 changes faster than by wear"
+    path = history(tmp_path / "a.history.jsonl", [row(0.0), row(0.0) | {"alarm": said}])
+    told = []
+    assert spared_of((), path, model, told.append) is None
+    assert any(line.endswith(said) for line in told)
+    learns = history(tmp_path / "b.history.jsonl", [row(0.0), row(0.0) | {"alarm": ""}])
+    told.clear()
+    spared_of((), learns, model, told.append)
+    assert len(told) == 1
 
 
 def test_histories_of_others_are_refused(model, tmp_path):

@@ -48,6 +48,20 @@ def wear_weights(history: Path, model: HealthyModel) -> FloatArray:
     return np.asarray(np.minimum(worn.max(axis=0) / WearLimits().limit, 1.0))
 
 
+def stopped_learning(history: Path, robot: str) -> str:
+    """Return why a history learns no more: what changed as no wear does; empty if it learns.
+
+    Args:
+        history: CAL.history.jsonl.
+        robot: Name of the robot that it must be of.
+
+    Raises:
+        InputError: If it cannot be read or is of another robot.
+    """
+    rows = read_rows(history, robot)
+    return str(rows[-1].get("alarm", "")) if rows else ""
+
+
 def _change(rows: Sequence[Mapping[str, Any]], suffix: str) -> FloatArray:
     """Return last less first of what is tracked, or both deviations together, (3, motor)."""
     first, last = (
