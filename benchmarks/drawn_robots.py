@@ -138,9 +138,13 @@ def judge(robot: Robot, number: int, runs: int, engine: str, told: Told) -> None
     learned = ft.SelfCalibratingDiagnoser(robot).learn(made_runs)
     told.found["together"].extend(learned.diagnoses)
     told.found["alone"].extend(ft.BayesDiagnoser(robot, "generic").diagnose(made_runs))
-    calibration = ft.calibrate(healthy, robot)
-    diagnoser = ft.BayesDiagnoser(robot, calibration.imperfections)
-    told.found["own calibration"].extend(diagnoser.diagnose(made_runs))
+    try:
+        calibration = ft.calibrate(healthy, robot)
+    except ft.InputError as error:
+        print(f"robot {number}: its healthy runs are refused ({error})", flush=True)
+    else:
+        diagnoser = ft.BayesDiagnoser(robot, calibration.imperfections)
+        told.found["own calibration"].extend(diagnoser.diagnose(made_runs))
     if engine == "servo":
         inside, asked = held(learned.calibration, own, robot.motor_names)
         told.held, told.asked = told.held + inside, told.asked + asked
