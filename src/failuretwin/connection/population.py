@@ -51,11 +51,10 @@ from failuretwin.digital_model.nonidealities import (
 )
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling
+from failuretwin.inference.habits import SCATTER_SPREAD
 
 CLASS_ROBOTS = 3.0
 """Robots that the deviation of the class counts for; assumed."""
-SCATTER_SPREAD = 0.3
-"""Deviation of the logarithm of the scatter within a class; assumed."""
 RATE_SPREAD = 0.7
 """Deviation of the logarithm of loss rates within a class, a factor of two; assumed."""
 ROUNDS = 50

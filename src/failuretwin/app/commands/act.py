@@ -8,6 +8,12 @@ from pathlib import Path
 
 import click
 
+from failuretwin.app.commands.arm_options import (
+    ArmOptions,
+    SafetyOptions,
+    arm_options,
+    safety_options,
+)
 from failuretwin.app.commands.options import (
     PATH,
     calibration_option,
@@ -20,32 +26,11 @@ from failuretwin.app.terminal import tell
 @click.command()
 @click.argument("task", metavar="TASK.csv", type=PATH)
 @click.option(
-    "--on",
-    "place",
-    default="emulated",
-    metavar="emulated|ros1|rosbridge://HOST[:PORT]",
-    help="The arm.",
-)
-@click.option(
-    "--fault",
-    "faults",
-    multiple=True,
-    metavar="MOTOR:MODE[=SIZE][@START]",
-    help="A fault of an emulated arm, such as motor_3:stuck, motor_3:stuck=-0.4 or "
-    "motor_2:encoder_bias=0.1@20. Can be given several times.",
-)
-@click.option(
     "--strategy",
     type=click.Choice(["diagnose", "feedback", "open"]),
     default="diagnose",
     help="React to what is wrong; correct what the tool misses as if nothing were; or send each "
     "target once.",
-)
-@click.option(
-    "--move",
-    is_flag=True,
-    help="Really send orders. Without it a real arm is only listened to and what would be ordered "
-    "is told. An emulated arm needs no --move.",
 )
 @click.option(
     "--most-movements",
@@ -59,21 +44,6 @@ from failuretwin.app.terminal import tell
     type=click.IntRange(min=0),
     default=0,
     help="Make so many movements at most only to settle what is wrong, while that is open.",
-)
-@click.option(
-    "--speed-share",
-    type=click.FloatRange(min=0.0, max=1.0, min_open=True),
-    default=0.5,
-    help="Share of each motor's speed limit that may be used.",
-)
-@click.option(
-    "--floor", type=float, metavar="METRES", help="Height of the floor. Default: the base."
-)
-@click.option(
-    "--radius",
-    type=click.FloatRange(min=0.0),
-    metavar="METRES",
-    help="Radius of the links, for the distance that they keep. Default: by the arm's reach.",
 )
 @click.option(
     "--spare",
@@ -91,25 +61,21 @@ from failuretwin.app.terminal import tell
 @click.option(
     "--json", "json_file", type=PATH, metavar="FILE", help="Write a line for each target."
 )
-@click.option("--topics", type=PATH, metavar="FILE.toml", help="Names and types of ROS topics.")
+@arm_options
+@safety_options
 @calibration_option
 @plugin_option
 @common_options
 def act(
     task: Path,
-    place: str,
-    faults: tuple[str, ...],
     strategy: str,
-    move: bool,
     most_movements: int,
     questions: int,
-    speed_share: float,
-    floor: float | None,
-    radius: float | None,
     spare: tuple[str, ...],
     history: Path | None,
     json_file: Path | None,
-    topics: Path | None,
+    arm: ArmOptions,
+    safety: SafetyOptions,
     calibration: Path | None,
     robot: str,
     seed: int,
@@ -119,20 +85,17 @@ def act(
     What is wrong with the arm is found out on the way, told, and worked round. Every order passes a
     gate: limits, speed, floor, the arm's own links. Stop with Ctrl-C, or `failuretwin stop`.
     """
-    from failuretwin.app.acting import commander_of, spared_of, table_lines, write_results
-    from failuretwin.app.live import EMULATED
+    from failuretwin.app.acting import spared_of, table_lines, write_results
     from failuretwin.decision.acting.outcome import ActingSettings
-    from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
     from failuretwin.decision.acting.session import Acting
     from failuretwin.decision.acting.task import read_task
     from failuretwin.decision.acting.work import first_standing
     from failuretwin.digital_model.calibrated_robot import load_calibration
 
     known, wanted = load_calibration(calibration, robot), read_task(task)
-    limits = SafetyLimits(speed_share=speed_share, floor_m=floor, radius_m=radius)
     acting = Acting(
         known,
-        SafetyGate(known.robot, limits),
+        safety.gate(known.robot),
         strategy,
         ActingSettings(most_movements=most_movements, questions=questions),
         None,
@@ -140,12 +103,12 @@ def act(
     )
     acting = replace(acting, spared=spared_of(spare, history, acting.model, tell))
     with ExitStack() as stack:
-        arm = commander_of(place, known, faults, seed, topics, stack)
-        if move or place == EMULATED:
-            results = acting.work(wanted, arm, tell)
+        commander = arm.commander(known, seed, stack)
+        if arm.moves:
+            results = acting.work(wanted, commander, tell)
         else:
             tell("nothing moves without --move; this is what would be ordered")
-            results = acting.dry_run(wanted, first_standing(arm), tell)
+            results = acting.dry_run(wanted, first_standing(commander), tell)
     for line in table_lines(results):
         tell(line)
     if json_file is not None:

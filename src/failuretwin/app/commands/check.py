@@ -9,6 +9,12 @@ from typing import TYPE_CHECKING
 
 import click
 
+from failuretwin.app.commands.arm_options import (
+    ArmOptions,
+    SafetyOptions,
+    arm_options,
+    safety_options,
+)
 from failuretwin.app.commands.options import (
     PATH,
     HypothesesOption,
@@ -28,23 +34,18 @@ class MotionOptions:
 
     hypotheses: str | None
     usual: bool
-    speed_share: float
-    floor: float | None
-    radius: float | None
 
-    def checking(self, calibration: Path | None, robot: str, seed: int) -> Checking:
+    def checking(
+        self, safety: SafetyOptions, calibration: Path | None, robot: str, seed: int
+    ) -> Checking:
         """Return what a check and a design need."""
         from failuretwin.app.inputs import parse_cli_hypotheses
-        from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
         from failuretwin.decision.test_motions.session import Checking
         from failuretwin.digital_model.calibrated_robot import load_calibration
 
         known = load_calibration(calibration, robot)
-        limits = SafetyLimits(
-            speed_share=self.speed_share, floor_m=self.floor, radius_m=self.radius
-        )
         named = parse_cli_hypotheses(self.hypotheses, known.robot)
-        return Checking(known, SafetyGate(known.robot, limits), named, self.usual, seed)
+        return Checking(known, safety.gate(known.robot), named, self.usual, seed)
 
 
 motion_options = gathered(
@@ -61,21 +62,6 @@ motion_options = gathered(
         is_flag=True,
         help="Keep to the ranges of usual movements, not to the limits of the joints alone.",
     ),
-    click.option(
-        "--speed-share",
-        type=click.FloatRange(min=0.0, max=1.0, min_open=True),
-        default=0.5,
-        help="Share of each motor's speed limit that may be used.",
-    ),
-    click.option(
-        "--floor", type=float, metavar="METRES", help="Height of the floor. Default: the base."
-    ),
-    click.option(
-        "--radius",
-        type=click.FloatRange(min=0.0),
-        metavar="METRES",
-        help="Radius of the links, for the distance that they keep. Default: by the arm's reach.",
-    ),
 )
 seconds_option = click.option(
     "--seconds",
@@ -87,13 +73,6 @@ seconds_option = click.option(
 
 @click.command()
 @seconds_option
-@click.option(
-    "--on",
-    "place",
-    default="emulated",
-    metavar="emulated|ros1|rosbridge://HOST[:PORT]",
-    help="The arm.",
-)
 @click.option(
     "--write",
     "written",
@@ -129,39 +108,24 @@ seconds_option = click.option(
     default=0,
     help="So many further movements at most, if it is still open then what is wrong.",
 )
-@click.option(
-    "--fault",
-    "faults",
-    multiple=True,
-    metavar="MOTOR:MODE[=SIZE][@START]",
-    help="A fault of an emulated arm, such as motor_3:stuck or motor_2:encoder_bias=0.1. Can be "
-    "given several times.",
-)
-@click.option(
-    "--move",
-    is_flag=True,
-    help="Really send orders. Without it a real arm is left alone and the motions are told. An "
-    "emulated arm needs no --move.",
-)
 @click.option("--json", "json_file", type=PATH, metavar="FILE", help="Write an object a line.")
-@click.option("--topics", type=PATH, metavar="FILE.toml", help="Names and types of ROS topics.")
+@arm_options
 @motion_options
+@safety_options
 @calibration_option
 @plugin_option
 @common_options
 def check(
     seconds: float,
-    place: str,
     written: Path | None,
     logs: tuple[Path, ...],
     motions: Path | None,
     keep: Path | None,
     further: int,
-    faults: tuple[str, ...],
-    move: bool,
     json_file: Path | None,
-    topics: Path | None,
+    arm: ArmOptions,
     motion: MotionOptions,
+    safety: SafetyOptions,
     calibration: Path | None,
     robot: str,
     seed: int,
@@ -171,39 +135,38 @@ def check(
     Movements are chosen to tell most; each passes the gate of `act`. See docs/asking.md.
     """
     from failuretwin.app import check_report as report
-    from failuretwin.app.acting import commander_of, is_real
     from failuretwin.app.smallest import of_motions
     from failuretwin.app.tables import show
     from failuretwin.app.terminal import tell
     from failuretwin.decision.test_motions.health_check import GREEN
     from failuretwin.decision.test_motions.motions import write_motions
 
-    asking = motion.checking(calibration, robot, seed)
-    arm = asking.known.robot
+    asking = motion.checking(safety, calibration, robot, seed)
+    model = asking.known.robot
     if logs:
         results = asking.of_logs(logs)
         for result in results:
-            show(result.diagnosis.run, *report.check_lines(result, arm, 0.0), "")
+            show(result.diagnosis.run, *report.check_lines(result, model, 0.0), "")
         if json_file is not None:
-            report.write_records([report.check_record(r, arm, 0.0) for r in results], json_file)
+            report.write_records([report.check_record(r, model, 0.0) for r in results], json_file)
         return
     repeat = keep if keep is not None and keep.exists() else motions
     planned = asking.motions(seconds, repeat)
     if written is not None:
-        write_motions(planned, arm, written)
-        show(*report.motion_lines(planned, arm), f"written to {written}; nothing was moved")
+        write_motions(planned, model, written)
+        show(*report.motion_lines(planned, model), f"written to {written}; nothing was moved")
         return
-    if is_real(place) and not move:
+    if not arm.moves:
         show("nothing moves without --move; these are the motions")
-        show(*report.motion_lines(planned, arm))
+        show(*report.motion_lines(planned, model))
         return
     with ExitStack() as stack:
-        commander = commander_of(place, asking.known, faults, seed, topics, stack)
+        commander = arm.commander(asking.known, seed, stack)
         result = asking.health_check(planned, further).work(commander, tell)
-    record = report.check_record(result, arm, planned.duration_s)
-    show(*report.check_lines(result, arm, planned.duration_s))
+    record = report.check_record(result, model, planned.duration_s)
+    show(*report.check_lines(result, model, planned.duration_s))
     if result.light == GREEN:
-        show(report.shown_line(of_motions(asking, planned), arm))
+        show(report.shown_line(of_motions(asking, planned), model))
     if keep is not None:
         before = report.kept_checks(keep) if keep.exists() else []
         show(*(report.changes(before[-1], record) if before else [f"kept in {keep}"]))
@@ -217,6 +180,7 @@ def check(
 @click.option("--movements", type=click.IntRange(min=1), default=1000, help="So many at most.")
 @click.option("--write", "written", type=PATH, metavar="FILE", help="Write .json, .csv or .mcap.")
 @motion_options
+@safety_options
 @calibration_option
 @plugin_option
 @common_options
@@ -225,6 +189,7 @@ def design(
     movements: int,
     written: Path | None,
     motion: MotionOptions,
+    safety: SafetyOptions,
     calibration: Path | None,
     robot: str,
     seed: int,
@@ -235,7 +200,7 @@ def design(
     from failuretwin.app.tables import show
     from failuretwin.decision.test_motions.motions import write_motions
 
-    asking = motion.checking(calibration, robot, seed)
+    asking = motion.checking(safety, calibration, robot, seed)
     planned = asking.motions(seconds, None, movements)
     if written is not None:
         write_motions(planned, asking.known.robot, written)
@@ -278,8 +243,7 @@ def isolability(
     from failuretwin.app.smallest import save_picture, size_table, smallest_of, smallest_record
     from failuretwin.app.tables import show
 
-    options = MotionOptions(hypotheses, False, 0.5, None, None)
-    asking = options.checking(calibration, name, 0)
+    asking = MotionOptions(hypotheses, False).checking(SafetyOptions(), calibration, name, 0)
     found = smallest_of(asking, motions)
     show(size_table(found, asking.known.robot), *group_lines(found, asking.known.robot))
     if json_file is not None:

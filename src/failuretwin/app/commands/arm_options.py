@@ -1,0 +1,114 @@
+"""Options of commands that move an arm: which one, with what wrong, within which limits."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from failuretwin.app.commands.options import PATH, gathered
+
+if TYPE_CHECKING:
+    from failuretwin.connection.links.commander import Commander
+    from failuretwin.decision.acting.safety import SafetyGate
+    from failuretwin.digital_model.calibrated_robot import CalibratedRobot
+    from failuretwin.digital_model.robot import Robot
+
+SPEED_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class ArmOptions:
+    """Which arm is moved, as the help texts of `arm_options` say it."""
+
+    place: str
+    faults: tuple[str, ...]
+    move: bool
+    topics: Path | None
+
+    @property
+    def moves(self) -> bool:
+        """Whether orders are really sent.
+
+        Raises:
+            InputError: If there is no such place.
+        """
+        from failuretwin.app.acting import is_real
+
+        return not is_real(self.place) or self.move
+
+    def commander(self, known: CalibratedRobot, seed: int, stack: ExitStack) -> Commander:
+        """Return the arm; it is left alone again when the stack closes."""
+        from failuretwin.app.acting import commander_of
+
+        return commander_of(self.place, known, self.faults, seed, self.topics, stack)
+
+
+arm_options = gathered(
+    ArmOptions,
+    "arm",
+    click.option(
+        "--on",
+        "place",
+        default="emulated",
+        metavar="emulated|ros1|rosbridge://HOST[:PORT]",
+        help="The arm.",
+    ),
+    click.option(
+        "--fault",
+        "faults",
+        multiple=True,
+        metavar="MOTOR:MODE[=SIZE][@START]",
+        help="A fault of an emulated arm, such as motor_3:stuck, motor_3:stuck=-0.4 or "
+        "motor_2:encoder_bias=0.1@20. Can be given several times.",
+    ),
+    click.option(
+        "--move",
+        is_flag=True,
+        help="Really send orders. Without it a real arm gets none, and what would be ordered is "
+        "told. An emulated arm needs no --move.",
+    ),
+    click.option("--topics", type=PATH, metavar="FILE.toml", help="Names and types of ROS topics."),
+)
+
+
+@dataclass(frozen=True)
+class SafetyOptions:
+    """Which orders are allowed, as the help texts of `safety_options` say it."""
+
+    speed_share: float = SPEED_SHARE
+    floor: float | None = None
+    radius: float | None = None
+
+    def gate(self, robot: Robot) -> SafetyGate:
+        """Return what every order has to pass."""
+        from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
+
+        limits = SafetyLimits(
+            speed_share=self.speed_share, floor_m=self.floor, radius_m=self.radius
+        )
+        return SafetyGate(robot, limits)
+
+
+safety_options = gathered(
+    SafetyOptions,
+    "safety",
+    click.option(
+        "--speed-share",
+        type=click.FloatRange(min=0.0, max=1.0, min_open=True),
+        default=SPEED_SHARE,
+        help="Share of each motor's speed limit that may be used.",
+    ),
+    click.option(
+        "--floor", type=float, metavar="METRES", help="Height of the floor. Default: the base."
+    ),
+    click.option(
+        "--radius",
+        type=click.FloatRange(min=0.0),
+        metavar="METRES",
+        help="Radius of the links, for the distance that they keep. Default: by the arm's reach.",
+    ),
+)
