@@ -40,8 +40,8 @@ WARMING = 2
 """Passes in which scatter and rates stay as believed: until the offsets are nearly found, what is
 left of a movement is no scatter."""
 DAMPING = 0.5
-"""Share of new habits that is taken: two motors that the tool tells apart badly would hand their
-scatter to and fro."""
+"""Share of new sites and habits that is taken: what the tool tells apart badly would be handed to
+and fro between motors."""
 MOST_PASSES, CONVERGED = 30, 0.02
 """Passes over the runs at most; they end when nothing moves by this share of its deviation, or a
 logarithm by this much."""
@@ -241,7 +241,8 @@ def fitted_to(
     for count in range(passes):
         before = together.here / together.unit, together.model.settling
         together.habits = habits if count >= WARMING else None
-        together.learn(together.judge(rows), of_habits=1.0 if count <= WARMING else DAMPING)
+        sites, told = (1.0 if count <= first else DAMPING for first in (0, WARMING))
+        together.learn(together.judge(rows), sites, told)
         if count > WARMING and _moved(together, *before) < CONVERGED:
             break
     found = SettlingFit(observations, together)
