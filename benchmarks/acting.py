@@ -321,7 +321,9 @@ def compare(
 
 
 def forced(known: CalibratedRobot, told: argparse.Namespace) -> dict[str, dict[str, float]]:
-    """Print shares reached by truth and wrong belief of the nine classes, and by feedback alone.
+    """Print shares reached by truth and wrong belief, and by feedback alone.
+
+    Truths are the nine classes, beliefs these and a motor that sticks now and then.
 
     The belief is there from the start, and so is the fault. `checked`: it may be let go of, but no
     other is taken up; `diagnosed`: the product as it is.
@@ -330,7 +332,8 @@ def forced(known: CalibratedRobot, told: argparse.Namespace) -> dict[str, dict[s
     motors = range(len(robot.motors))
     kinds = [("healthy", 0), *((kind, m) for kind in ("stuck", "random") for m in motors)]
     rng = np.random.default_rng([told.seed, 9])
-    pairs = [(t, b) for t in kinds for b in kinds[1:] if t != b for _ in range(told.arms)]
+    wrong = [*kinds[1:], *(("intermittent", m) for m in motors)]
+    pairs = [(t, b) for t in kinds for b in wrong if t != b for _ in range(told.arms)]
     truths, beliefs = [TrueFault(*truth) for truth, _ in pairs], []
     for _, (kind, motor) in pairs:
         angle = float(rng.uniform(*robot.travel[motor])) if kind == "stuck" else np.nan
@@ -350,9 +353,10 @@ def forced(known: CalibratedRobot, told: argparse.Namespace) -> dict[str, dict[s
                 hit = row["error_m"] <= TOLERANCE_M
                 cells[_pair(truths[row["arm"]], beliefs[row["arm"]])][name].append(hit)
     found = {pair: {n: float(np.mean(hits)) for n, hits in c.items()} for pair, c in cells.items()}
+    found = {pair: shares | {"n": len(cells[pair]["feedback"])} for pair, shares in found.items()}
     for pair, shares in found.items():
         texts = "  ".join(f"{name} {share:.3f}" for name, share in shares.items())
-        print(f"  {pair:56s} {texts}  n {len(cells[pair]['feedback'])}", flush=True)
+        print(f"  {pair:56s} {texts}", flush=True)
     return found
 
 

@@ -31,6 +31,8 @@ UNMOVED_RAD = 1e-9
 NEWTON_STEPS = 5
 PROBE_RAD = 0.01
 """Step by which it is asked how far the faulty motor follows its command [rad]."""
+CLOSE_RAD = 1e-4
+"""A command is near enough once it changes by no more; the next change is a tenth of it [rad]."""
 LEAST_GAIN = 0.1
 """A motor that follows less than this share of its command is not inverted any further."""
 OUTLIER_RATE = 1e-3
@@ -199,15 +201,24 @@ class BelievedArm:
             previous: What they were told before, (motor,) [rad].
             time_s: When they will arrive [s].
         """
-        command = pose.copy()
+        command = self._nearly(pose, previous)
         for _ in range(NEWTON_STEPS):
             settled = self.settle(command, previous, time_s)
             gain = self._gain(command, previous, time_s, settled)
             step = np.where(self.held, 0.0, (pose - settled) / gain)
             command = command + step
-            if np.abs(step).max() < 1e-3 * PROBE_RAD:
+            if np.abs(step).max() < CLOSE_RAD:
                 break
         return self.rounded(self.with_rest(command, previous))
+
+    def _nearly(self, pose: FloatArray, previous: FloatArray) -> FloatArray:
+        """Return the command that leads to a pose without a fault, (motor,) [rad].
+
+        What gravity does there is known, for that is where the arm shall stand.
+        """
+        direction = np.sign(pose - previous)
+        offset = self.model.settling.offset(self.robot, pose, direction)
+        return np.where(self.held, pose, pose - offset)
 
     def gain(self, seen: Seen) -> FloatArray:
         """Return how far each motor follows a change of its command, (motor,) [-]."""
