@@ -71,6 +71,9 @@ class SmallWorld:
                 sign = 1.0 if self.rng.random() < 0.5 else -1.0
                 self.error = sign * self.rng.uniform(0.05, 0.2)
             pose[truth.motor] += self.error
+        if truth is not None and truth.fault.mode == "intermittent" and self.rng.random() < 0.35:
+            k = truth.motor  # it is held on its way, and goes on with the next movement
+            pose[k] = previous[k] + self.rng.random() * (target[k] - previous[k])
         self.command, self.pose = target, pose
         self.time_s += PERIOD_S
         return self.model.twin.path(pose)
