@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -107,6 +109,6 @@ def test_endless_episodes_are_the_same_in_slices():
         EndlessEpisodes(0.0, 0.4, (0.5, 2.0), np.random.default_rng(5)) for _ in range(2)
     )
     edges = np.linspace(0.0, 60.0, 601)
-    pieces = {e for a, b in zip(edges, edges[1:], strict=False) for e in sliced.within(a, b)}
+    pieces = {e for a, b in pairwise(edges) for e in sliced.within(a, b)}
     assert sorted(pieces) == list(whole.within(0.0, 60.0))
     assert whole.within(10.0, 20.0) == tuple(e for e in sorted(pieces) if e[1] > 10 and e[0] < 20)
