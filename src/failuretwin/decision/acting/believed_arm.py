@@ -31,7 +31,7 @@ UNMOVED_RAD = 1e-9
 NEWTON_STEPS = 5
 PROBE_RAD = 0.01
 """Step by which it is asked how far the faulty motor follows its command [rad]."""
-CLOSE_RAD = 1e-4
+CLOSE_RAD = 5e-4
 """A command is near enough once it changes by no more; the next change is a tenth of it [rad]."""
 LEAST_GAIN = 0.1
 """A motor that follows less than this share of its command is not inverted any further."""
