@@ -47,6 +47,7 @@ class SmallWorld:
     seed: int = 0
     truth: BelievedFault | None = None
     lost: set = field(default_factory=set)
+    losers: object = ...
     orders: list = field(default_factory=list)
 
     def __post_init__(self):
@@ -60,7 +61,7 @@ class SmallWorld:
         self.orders.append((self.command, order))
         previous, target = self.command, order.target.copy()
         if len(self.orders) in self.lost:
-            target = previous.copy()
+            target[self.losers] = previous[self.losers]
         arm = BelievedArm(self.model, self.truth)
         pose = arm.settle(target, previous, self.time_s)
         scatter = np.asarray(self.model.settling.scatter) * self.rng.standard_normal(len(pose))
