@@ -225,6 +225,7 @@ class Actor:
                 self._previous, self._command = self._command, order.target
                 self._order = order
                 return order
+        self._judgement = None  # it holds what was seen of every arm that was judged with this one
         return None
 
     def _plans_anew(self) -> bool:
