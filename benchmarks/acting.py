@@ -355,7 +355,7 @@ def forced(known: CalibratedRobot, told: argparse.Namespace) -> dict[str, dict[s
     found = {pair: {n: float(np.mean(hits)) for n, hits in c.items()} for pair, c in cells.items()}
     found = {pair: shares | {"n": len(cells[pair]["feedback"])} for pair, shares in found.items()}
     for pair, shares in found.items():
-        texts = "  ".join(f"{name} {share:.3f}" for name, share in shares.items())
+        texts = "  ".join(f"{name} {share:.3g}" for name, share in shares.items())
         print(f"  {pair:56s} {texts}", flush=True)
     return found
 
