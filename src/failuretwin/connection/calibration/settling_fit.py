@@ -28,6 +28,8 @@ from failuretwin.digital_model.twin import DigitalTwin
 
 POSE_ROUNDS = 3
 """Rounds in which the pose that gravity acts in and the fit settle together (tool path alone)."""
+MOST_DEVIATIONS = 30.0
+"""Prior deviations beyond which a search learns no more [-]: scatter there overflows."""
 
 
 @dataclass(frozen=True)
@@ -102,10 +104,12 @@ def _mode(
     from scipy.optimize import minimize
 
     unit = prior.deviation
+    low, high = prior.mean - MOST_DEVIATIONS * unit, prior.mean + MOST_DEVIATIONS * unit
 
     def cost(scaled: FloatArray) -> float:
         parameters = scaled * unit
-        return -problem.log_likelihood(parameters) - prior.log_density(parameters)
+        likelihood = problem.log_likelihood(np.clip(parameters, low, high))
+        return -likelihood - prior.log_density(parameters)
 
     found = minimize(cost, start / unit, method="BFGS", options={"gtol": 1e-4, "maxiter": 500})
     curvature = _hessian(cost, found.x)
@@ -293,6 +297,8 @@ def _odd(observations: Observations, robot: Robot, expected: FloatArray) -> Bool
 
 SURE_NATS = 5.0
 """Log odds from which one description of the robot is told to be better than another."""
+ELSEWHERE = 3.0
+"""A sense that puts a seen tool so many times farther off than the profile's is not it [-]."""
 LEAST_SAG_RAD = 1e-3
 """Sag below which nothing is said of a payload [rad]: a quarter of a servo count."""
 PAYLOADS_KG = (0.02, 0.1, 0.5, 2.0)
@@ -303,15 +309,18 @@ def sense_remarks(part: SettlingFit, robot: Robot) -> list[str]:
     """Return what the logs say of each motor's sense, in sentences.
 
     A motor that turns the other way sags the other way; where gravity hardly loads it, nothing can
-    be said.
+    be said. Where the tool alone was seen, its position tells senses that would put it elsewhere.
     """
-    loaded = np.flatnonzero(largest_load(robot, 0.0) > 1e-6).tolist()
-    best, odds = _best_senses(part, robot, loaded)
+    loaded = np.flatnonzero(largest_load(robot, 0.0) > 1e-6)
+    elsewhere = _far_if_turned(part, robot)
+    best, odds = _best_senses(part, robot, loaded[~elsewhere[loaded]].tolist())
     sag = _largest_sag(part, best)
     remarks = []
     for k, motor in enumerate(robot.motors):
         sense = best.motors[k].sense
-        if k in odds and sag[k] < LEAST_SAG_RAD:
+        if elsewhere[k]:
+            told = f"{sense:+.0f} as in the profile; the other way the tool would be elsewhere"
+        elif k in odds and sag[k] < LEAST_SAG_RAD:
             told = "cannot be told, the motor does not give way"
         elif k not in odds:
             told = "cannot be told, gravity does not load it"
@@ -326,6 +335,22 @@ def sense_remarks(part: SettlingFit, robot: Robot) -> list[str]:
             )
         remarks.append(f"sense of {motor.name}: {told}")
     return remarks
+
+
+def _far_if_turned(part: SettlingFit, robot: Robot) -> BoolArray:
+    """Return which motors, turned the other way, put the tool where it was not seen, (motor,).
+
+    Where motors were read, or the tool's path was computed from the log, none: all turns together.
+    """
+    seen, motors = part.observations[part.fitted], range(len(robot.motors))
+
+    def away(other: Robot) -> FloatArray:
+        return np.linalg.norm(DigitalTwin(other).path(seen.target) - seen.point, axis=-1)
+
+    if seen.position is not None:
+        return np.zeros(len(motors), dtype=bool)
+    turned = np.stack([away(_with_turned(robot, k)) for k in motors])
+    return np.asarray(np.median(turned, axis=-1) > ELSEWHERE * np.median(away(robot)))
 
 
 def _largest_sag(part: SettlingFit, robot: Robot) -> FloatArray:
