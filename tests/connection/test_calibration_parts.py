@@ -460,6 +460,16 @@ def test_a_wrong_sense_is_found_and_blames_no_other_motor(settle, armpi):
     assert "+1 as in the profile" in remarks[3]
 
 
+def test_a_tool_that_is_seen_tells_senses_that_would_put_it_elsewhere(settle, armpi):
+    """Turned the other way a motor moves the tool by hundreds of millimetres: no settling does."""
+    watched = replace(armpi, profile=replace(armpi.profile, sensor_pose="physical"))
+    seen = settle(TYPICAL, seed=9, readings=False, robot=watched)
+    remarks = sense_remarks(fit_settling(seen), watched)
+    for remark, motor in zip(remarks, watched.motors, strict=True):
+        sense = f"{motor.sense:+.0f}"
+        assert f"{sense} as in the profile; the other way the tool would be elsewhere" in remark
+
+
 def test_no_payload_is_told_where_there_is_none(settle, armpi):
     payload, told = best_payload(fit_settling(settle(TYPICAL, seed=10)), armpi)
     assert payload == 0.0

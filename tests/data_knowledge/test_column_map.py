@@ -11,6 +11,8 @@ from failuretwin.data_knowledge.column_guess import column_map_text, guess_colum
 from failuretwin.data_knowledge.csv_log import read_column_map
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.profile_text import profile_text
+from failuretwin.digital_model.urdf_check import check_urdf
 
 ARMS = ("armpi_fpv", "ur5e", "panda", "so101")
 MAP = """
@@ -234,6 +236,43 @@ def test_columns_of_all_joints_go_by_their_place_in_the_urdf(tmp_path):
     runs = read_runs(tmp_path / "log.csv", "ur5e")
 
     np.testing.assert_allclose(runs["command"][0, -1], [0.0, 0.19, 0.38, 0.57, 0.76], atol=1e-6)
+
+
+LIFT = """<robot name="lift">
+<link name="base"/><link name="column"/><link name="arm"/><link name="tool0"/>
+<joint name="lift" type="prismatic"><parent link="base"/><child link="column"/>
+<axis xyz="0 0 1"/><limit lower="0" upper="0.4" effort="9" velocity="1"/></joint>
+<joint name="shoulder_lift" type="revolute"><parent link="column"/><child link="arm"/>
+<axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="9" velocity="1"/></joint>
+<joint name="mount" type="fixed"><parent link="arm"/><child link="tool0"/>
+<origin xyz="0.5 0 0"/></joint></robot>"""
+
+
+def arm_on_a_lift(folder):
+    (folder / "lift.urdf").write_text(LIFT)
+    profile = folder / "lift.toml"
+    profile.write_text(profile_text(check_urdf(folder / "lift.urdf"), profile))
+    return load_robot(profile)
+
+
+@pytest.mark.parametrize("lead", ["cmd_", "target_"])
+def test_slides_have_a_unit_of_their_own_and_names_within_names_are_told_apart(tmp_path, lead):
+    """`lift` is part of `shoulder_lift`; one is in millimetres, the other in degrees."""
+    robot, time = arm_on_a_lift(tmp_path), np.arange(20) * 0.1
+    columns = {f"{lead}shoulder_lift_deg": 18.0 * time, f"{lead}lift_mm": 100.0 + 50.0 * time}
+    columns |= {"time": time, "x": time, "y": time, "z": time}
+    pd.DataFrame(columns).to_csv(tmp_path / "log.csv", index=False)
+
+    runs = read_runs(tmp_path / "log.csv", robot)
+
+    told = runs["command"].values[0]
+    np.testing.assert_allclose(told[[0, -1], 0], [0.1, 0.1 + 0.05 * 1.9], atol=1e-9)
+    np.testing.assert_allclose(told[-1, 1], np.deg2rad(18.0 * 1.9), atol=1e-9)
+    guess = guess_columns(tmp_path / "log.csv", robot)
+    (tmp_path / "map.toml").write_text(column_map_text(guess, "log.csv", robot))
+    mapped = ReadOptions(columns=read_column_map(tmp_path / "map.toml", robot))
+    again = read_runs(tmp_path / "log.csv", robot, mapped)
+    np.testing.assert_allclose(again["command"].values, runs["command"].values)
 
 
 def test_a_map_wins_over_names(armpi, twin, tmp_path):

@@ -41,6 +41,21 @@ def test_a_recording_is_known_by_its_header(tmp_path, name):
     assert "computed by the controller from its encoders" in runs.attrs["source"]
 
 
+def test_commas_may_stand_between_the_columns(tmp_path):
+    rows = [row.replace(" ", ",") for row in ROWS]
+    runs = read_runs(write(tmp_path, HEADER.replace(" ", ","), rows), "ur5e")
+    np.testing.assert_allclose(runs["measured"][0, 7], [-0.8172, -0.2329, 0.0628])
+
+
+@pytest.mark.parametrize(("wrist_3", "kept"), [(0.0, True), (0.02, False)])
+def test_an_accelerometer_that_a_joint_without_motor_turns_is_left_out(tmp_path, wrist_3, kept):
+    """Wrist 3 of the bundled arm moves no tool point, but it turns the flange."""
+    header = HEADER + "".join(f" actual_tool_accelerometer_{k}" for k in range(3))
+    told = [f"0 0 0 0 0 {wrist_3 * k:.2f}" for k in range(20)]
+    rows = [f"{0.1 * k:.1f} {q} {ZERO} {TCP} 0 -9.8 0" for k, q in enumerate(told)]
+    assert ("accelerometer" in read_runs(write(tmp_path, header, rows), "ur5e")) == kept
+
+
 def test_every_joint_goes_to_its_motor(tmp_path):
     moved = [
         f"{0.1 * k:.1f} {' '.join(str(0.01 * (j + 1) * k) for j in range(6))} {ZERO} {TCP}"
@@ -101,7 +116,7 @@ def test_a_recipe_that_lacks_something_is_told(tmp_path, change, message):
 def test_a_tcp_elsewhere_is_not_taken_for_the_flange(tmp_path):
     rows = [row.replace("-0.2329", "-0.3829") for row in ROWS]  # a gripper of 150 mm
 
-    with pytest.raises(InputError, match=r"TCP lies 150 mm from the tool point.*tool_link"):
+    with pytest.raises(InputError, match=r"TCP lies 150 mm from the tool point.*tool_xyz"):
         read_runs(write(tmp_path, rows=rows), "ur5e")
 
 

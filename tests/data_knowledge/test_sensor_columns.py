@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -9,6 +11,7 @@ import pytest
 import failuretwin as ft
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.csv_log import read_column_map
+from failuretwin.digital_model.sensor_profile import SensorProfile
 
 MAP = """
 [time]
@@ -32,9 +35,12 @@ def table():
     )
 
 
-def read(folder):
-    mapping = read_column_map(folder / "map.toml", ft.load_robot("armpi_fpv"))
-    return ft.read_runs(folder / "log.csv", "armpi_fpv", ft.ReadOptions(columns=mapping))
+def read(folder, anchor=(0.5, 0.0, 0.0)):
+    known = ft.load_robot("armpi_fpv")
+    wire = SensorProfile("wire", anchor=anchor)
+    robot = replace(known, profile=replace(known.profile, sensors=(wire,)))
+    mapping = read_column_map(folder / "map.toml", robot)
+    return ft.read_runs(folder / "log.csv", robot, ft.ReadOptions(columns=mapping))
 
 
 def test_a_log_with_an_accelerometer_alone_is_a_run_set(tmp_path):
@@ -53,6 +59,14 @@ def test_a_sensor_lacks_no_channel(tmp_path):
     (tmp_path / "map.toml").write_text(MAP.replace('"ax", ', ""))
     with pytest.raises(InputError, match="accelerometer: 2 columns, expected 3"):
         read(tmp_path)
+
+
+def test_a_wire_that_begins_nobody_knows_where_is_refused(tmp_path):
+    """The usual place is that of simulated wires; a real one taken to begin there looks faulty."""
+    table().to_csv(tmp_path / "log.csv", index=False)
+    (tmp_path / "map.toml").write_text(MAP)
+    with pytest.raises(InputError, match="does not say where it begins"):
+        read(tmp_path, anchor=())
 
 
 def test_rtde_recordings_bring_the_accelerometer_of_the_flange(tmp_path):

@@ -70,7 +70,8 @@ def test_an_arm_of_which_nothing_is_said_goes_by_sensor_and_reach():
     assert found.path_roughness_m == pytest.approx(0.0091)
     assert found.least_noise_m == pytest.approx(0.00026)
     assert InferenceSettings.of(robot, noisy(0.001)).same_place_m == pytest.approx(0.003)
-    small = InferenceSettings.of(with_reach(0.05), noisy(0.0))
+    counted = replace(NO_IMPERFECTIONS, readings=Readings(10.0, whole_counts=True))
+    small = InferenceSettings.of(with_reach(0.05), counted)
     assert small.moving_spread_m == pytest.approx(5e-5)
     assert InferenceSettings.of(with_reach(0.05)).moving_spread_m == 0.004
 
@@ -80,6 +81,15 @@ def test_rest_is_never_told_from_motion_by_less_than_the_noise():
     assert found.moving_spread_m == pytest.approx(0.04)
     assert found.nearly_still_m == found.same_place_m == pytest.approx(0.03)
     assert found.unmoved_m == pytest.approx(0.2)
+
+
+def test_a_sensor_that_nobody_has_measured_may_be_a_camera_of_a_millimetre():
+    """Calibrated motors say nothing of it: a reading in 34 lies beyond three deviations."""
+    unmeasured = InferenceSettings.of(load_robot("so101"), noisy(0.0))
+    assert unmeasured.moving_spread_m == unmeasured.nearly_still_m == pytest.approx(0.003)
+    assert unmeasured.same_place_m < 0.001
+    fitted = InferenceSettings.of(with_fit(load_robot("so101"), 0.002), noisy(0.0))
+    assert fitted.moving_spread_m == pytest.approx(0.006)
 
 
 def test_the_profile_has_the_last_word():

@@ -205,3 +205,14 @@ def test_a_log_of_another_world_gets_no_motor(twin, runs):
     strange = runs.assign(measured=(runs["measured"].dims, np.roll(runs["measured"].values, 1, 0)))
     for d in BayesDiagnoser(twin).diagnose(strange):
         assert d.undecided == ANOTHER or "nowhere near" in d.undecided
+
+
+def test_what_explains_nothing_is_not_undone():
+    """A wrong guess, such as kilometres, would make a tool that moves look dead."""
+    kilometres = replace(NONE, M=1e-3 * np.eye(3))
+    guess = SetUp("tool positions look like km", "", kilometres, kind="unit")
+    lost = SetUpPosterior.of([WeighedSetUp(guess, np.zeros(1), misfit=0.9)])
+    assert lost.best.set_up.what == guess.what
+    assert lost.best.set_up.correction.is_none
+    held = SetUpPosterior.of([WeighedSetUp(guess, np.zeros(1), misfit=0.1)])
+    np.testing.assert_array_equal(held.best.set_up.correction.M, 1e-3 * np.eye(3))

@@ -63,6 +63,7 @@ class Guess:
         separator: Between columns.
         names: Names of all columns.
         doubts: What the names leave open; empty where they tell all.
+        slide_unit: Of commands and readings of motors that slide.
     """
 
     time: tuple[str, str] = ("", "s")
@@ -74,6 +75,7 @@ class Guess:
     separator: str = ","
     names: tuple[str, ...] = field(default=())
     doubts: tuple[str, ...] = ()
+    slide_unit: str = "m"
 
 
 def told_columns(path: Path, robot: Robot) -> ColumnMap:
@@ -98,9 +100,12 @@ def told_columns(path: Path, robot: Robot) -> ColumnMap:
             guess.command[1],
             durations[0],
             durations[1],
+            slide_unit=guess.slide_unit,
         ),
         tool=ToolColumns((tool[0], tool[1], tool[2]), guess.tool[1]) if tool else None,
-        position=AngleColumns(position, guess.position[1]) if position else None,
+        position=AngleColumns(position, guess.position[1], slide_unit=guess.slide_unit)
+        if position
+        else None,
         run=guess.run or None,
         separator=guess.separator,
     )
@@ -115,10 +120,13 @@ def guess_columns(path: Path, robot: Robot) -> Guess:
     time = next(iter(found.time), "") or _increasing(table)
     command, position, tool = (_firsts(f) for f in (found.command, found.position, found.tool))
     duration = _firsts(found.duration)
+    turning = [_of_kind(columns, robot, False) for columns in (command, position)]
+    sliding = [_of_kind(columns, robot, True) for columns in (command, position)]
     return Guess(
         time=(time, _time_unit(table, time, words)),
-        command=(command, _angle_unit(table, command, words, robot)),
-        position=(position, _angle_unit(table, position, words, robot)),
+        command=(command, _angle_unit(table, turning[0], words, robot)),
+        position=(position, _angle_unit(table, turning[1], words, robot)),
+        slide_unit=_length_unit(table, sliding[0] or sliding[1], words),
         duration=(duration, _duration_unit(table, duration, words)),
         tool=(tool, _length_unit(table, tool, words)),
         run=next(iter(found.run), ""),
@@ -127,9 +135,16 @@ def guess_columns(path: Path, robot: Robot) -> Guess:
         doubts=(
             *_choices(found, robot),
             *_lacking(found, words),
-            *_unsaid(table, command, words, ANGLE_NAMES, LARGEST_RAD),
-            *_unsaid(table, position, words, ANGLE_NAMES, LARGEST_RAD),
-            *_unsaid(table, tool, words, LENGTH_NAMES, LARGEST_M),
+            *(
+                doubt
+                for columns in turning
+                for doubt in _unsaid(table, columns, words, ANGLE_NAMES, LARGEST_RAD)
+            ),
+            *(
+                doubt
+                for columns in (*sliding, tool)
+                for doubt in _unsaid(table, columns, words, LENGTH_NAMES, LARGEST_M)
+            ),
         ),
     )
 
@@ -197,11 +212,15 @@ def _by_motor(words: Mapping[str, set[str]], robot: Robot) -> list[list[str]]:
     """Return the columns that may be each motor's: by joint or motor name, else by number.
 
     Numbers count the motors, or all joints that move between base and tool where there are as many
-    of them. They begin at 0 if any column has a 0.
+    of them. They begin at 0 if any column has a 0. Of names that hold one another, such as `lift`
+    and `shoulder_lift`, the longest counts.
     """
+    joints = {_plain(joint.name) for joint in read_urdf(robot.urdf_file).joints if joint.has_motor}
     for key in ("joint", "name"):
-        named = [getattr(motor, key).lower().removesuffix("_joint") for motor in robot.motors]
-        hits = [[name for name in words if motor in name.lower()] for motor in named]
+        named = [_plain(getattr(motor, key)) for motor in robot.motors]
+        known = sorted(joints | set(named), key=len)
+        owner = {n: [one for one in known if one in n.lower()][-1:] for n in words}
+        hits = [[name for name, of in owner.items() if of == [motor]] for motor in named]
         if len(set(_firsts(hits))) == len(named):
             return hits
     numbers = {int(word) for found in words.values() for word in found if word.isdigit()}
@@ -211,6 +230,15 @@ def _by_motor(words: Mapping[str, set[str]], robot: Robot) -> list[list[str]]:
         [name for name, found in words.items() if str(start + place) in found]
         for place in _places(robot, count)
     ]
+
+
+def _plain(name: str) -> str:
+    return name.lower().removesuffix("_joint")
+
+
+def _of_kind(columns: Sequence[str], robot: Robot, slides: bool) -> tuple[str, ...]:
+    """Return the columns, one a motor if any, of those that slide, or of those that turn."""
+    return tuple(c for c, one in zip(columns, robot.slides, strict=False) if one == slides)
 
 
 def _places(robot: Robot, count: int) -> list[int]:
@@ -368,6 +396,7 @@ def column_map_text(guess: Guess, source: str, robot: Robot) -> str:
         f'kind = "{"target" if guess.duration[0] else "sampled"}"'
         "   # sampled (the reference at every row) or target (where to go)",
         f"unit = {_quote(guess.command[1])}      # rad, deg, or servo (counts of the profile)",
+        *([f"slide_unit = {_quote(guess.slide_unit)}"] if robot.slides.any() else []),
         *_duration_lines(guess),
         "# sign = [1, 1, -1, 1]   # where the log turns the other way",
         "# zero = [0, 0, 0, 0]    # value that the robot calls 0, in the unit above",
@@ -405,6 +434,10 @@ def _position_lines(guess: Guess) -> list[str]:
         f"{lead}[position]         # motor readings; only needed where there is no [tool]",
         f"{lead}columns = {_list(columns or ('q1', 'q2'))}",
         f"{lead}unit = {_quote(unit)}",
+        "",
+        "# [[sensors]]        # other sensors, SI units: accelerometer, gyroscope, wire, ...",
+        '# variable = "accelerometer"',
+        '# columns = ["ax", "ay", "az"]',
     ]
 
 

@@ -54,13 +54,15 @@ class AngleColumns:
         columns: Their names.
         unit: rad, deg, or servo for the counts of the robot's profile.
         sign: 1 or -1 for each motor, where the log turns the other way; empty: all 1.
-        zero: Value of each motor, in `unit`, that the robot calls 0; empty: all 0.
+        zero: Value of each motor, in its unit, that the robot calls 0; empty: all 0.
+        slide_unit: Of motors that slide: m, cm or mm.
     """
 
     columns: tuple[str, ...]
     unit: str = "rad"
     sign: tuple[float, ...] = ()
     zero: tuple[float, ...] = ()
+    slide_unit: str = "m"
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,7 @@ class CommandColumns:
         duration_s: For targets without such columns: the same time for every movement [s].
         sign: As for angles.
         zero: As for angles.
+        slide_unit: As for angles.
     """
 
     columns: tuple[str, ...]
@@ -86,6 +89,7 @@ class CommandColumns:
     duration_s: float | None = None
     sign: tuple[float, ...] = ()
     zero: tuple[float, ...] = ()
+    slide_unit: str = "m"
 
 
 @dataclass(frozen=True)
@@ -171,6 +175,7 @@ def read_column_map(path: Path, robot: Robot) -> ColumnMap:
         raise InputError(f"{where}: needs a [tool] table, or [position] to compute the path from.")
     if mapping.tool is not None:
         _check_unit(mapping.tool.unit, LENGTH_UNITS, f"{where}: tool")
+    _check_anchor(mapping.sensors, where, robot)
     for name, angles in (("command", command), ("position", mapping.position)):
         if angles is not None:
             _check_angles(angles, f"{where}: {name}", robot)
@@ -178,6 +183,15 @@ def read_column_map(path: Path, robot: Robot) -> ColumnMap:
     if mapping.tool is not None:
         _check_distinct(mapping.tool.columns, f"{where}: tool")
     return mapping
+
+
+def _check_anchor(sensors: Sequence[SensorColumns], where: str, robot: Robot) -> None:
+    anchored = any(one.kind == "wire" and one.anchor for one in robot.profile.sensors)
+    if any(one.variable == "wire" for one in sensors) and not anchored:
+        raise InputError(
+            f"{where}: a wire, but {robot.name!r} does not say where it begins. Add a table "
+            '[[sensors]] with kind = "wire" and anchor = [x, y, z] to its profile [m, base link].'
+        )
 
 
 def _check_distinct(columns: Sequence[str], where: str) -> None:
@@ -193,6 +207,7 @@ def _check_unit(unit: str, valid: Sequence[str] | dict[str, float], where: str) 
 
 def _check_angles(angles: CommandColumns | AngleColumns, where: str, robot: Robot) -> None:
     _check_unit(angles.unit, [*ANGLE_UNITS, SERVO], where)
+    _check_unit(angles.slide_unit, LENGTH_UNITS, where)
     count = len(robot.motors)
     for name in ("columns", "sign", "zero"):
         values = getattr(angles, name)
@@ -325,14 +340,15 @@ def _present(time: FloatArray, values: FloatArray) -> Samples:
 
 
 def _angles(values: FloatArray, columns: AngleColumns | CommandColumns, robot: Robot) -> FloatArray:
-    """Return angles [rad] in the robot's sense; servo counts out of range become NaN."""
+    """Return angles [rad, m of a slide] in the robot's sense; NaN for counts out of range."""
     if columns.unit == SERVO:
         units = robot.servo_units
         angle = np.where(units.valid(values), units.to_rad(values), np.nan)
         zero = units.to_rad(np.asarray(columns.zero)) if columns.zero else 0.0
     else:
-        angle = values * ANGLE_UNITS[columns.unit]
-        zero = np.asarray(columns.zero or 0.0) * ANGLE_UNITS[columns.unit]
+        turns, slides = ANGLE_UNITS[columns.unit], LENGTH_UNITS[columns.slide_unit]
+        scale = np.where(robot.slides, slides, turns)
+        angle, zero = values * scale, np.asarray(columns.zero or 0.0) * scale
     return as_floats((angle - zero) * np.asarray(columns.sign or 1.0))
 
 

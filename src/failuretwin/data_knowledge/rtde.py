@@ -1,9 +1,10 @@
-"""Universal Robots RTDE recordings: text with blanks between the columns, known by its header.
+"""Universal Robots RTDE recordings: text with blanks or commas, known by its header.
 
 The recorder writes one row each controller cycle, in SI units. ``target_q`` is where the joints are
 told to be, ``actual_q`` where their encoders are, and ``actual_TCP_pose`` what the controller
 computes from the encoders with the arm's own kinematic calibration: no second sensor. That of the
-tool flange is ``actual_tool_accelerometer`` [m/s2].
+tool flange is ``actual_tool_accelerometer`` [m/s2]; it is left out where a joint that is no motor
+of the profile moves and turns it.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from failuretwin.data_knowledge.csv_log import (
     SensorColumns,
     TimeColumn,
     ToolColumns,
+    load_csv,
+    numbers,
     read_mapped_csv,
 )
 from failuretwin.data_knowledge.timed_log import TimedLog
@@ -31,6 +34,8 @@ TIME, TARGET, ACTUAL, TCP = "timestamp", "target_q_", "actual_q_", "actual_TCP_p
 ACCELEROMETER = "actual_tool_accelerometer_"
 UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 """Joints of every Universal Robots arm in the order of `target_q`, by the names of its URDFs."""
+STILL_RAD = 0.01
+"""A joint that is told to go no farther stands still [rad]."""
 TCP_FAR_M = 0.02
 """A TCP this far from the profile's tool point [m] is another point: arms of one type differ from
 their common Denavit-Hartenberg table by millimetres."""
@@ -38,16 +43,20 @@ their common Denavit-Hartenberg table by millimetres."""
 
 def is_rtde(path: Path) -> bool:
     """Return whether a text file has the header of an RTDE recording."""
-    names = _header(path)
-    return TIME in names and any(name.startswith((TARGET, ACTUAL, TCP)) for name in names)
+    names, separator = _header(path)
+    leads = (TARGET, ACTUAL, TCP) if separator == BLANKS else (TCP,)
+    return TIME in names and any(name.startswith(leads) for name in names)
 
 
-def _header(path: Path) -> list[str]:
+def _header(path: Path) -> tuple[list[str], str]:
+    """Return the names of the columns, and what stands between them."""
     try:
         with path.open(encoding="utf-8") as file:
-            return file.readline().split()
+            line = file.readline()
     except (OSError, UnicodeDecodeError):
-        return []
+        return [], BLANKS
+    separator = next((mark for mark in ",;" if mark in line), BLANKS)
+    return line.replace(separator, " ").split(), separator
 
 
 def read_rtde(path: Path, robot: Robot) -> TimedLog:
@@ -61,7 +70,7 @@ def read_rtde(path: Path, robot: Robot) -> TimedLog:
         InputError: If it cannot be read, lacks `target_q` or all of what the arm did, the robot's
             joints are not those of the recording, or its TCP is not the robot's tool point.
     """
-    names = _header(path)
+    names, separator = _header(path)
     index = _joint_index(robot, path)
     target, actual = ([f"{lead}{i}" for i in index] for lead in (TARGET, ACTUAL))
     tool = [f"{TCP}{i}" for i in range(3)]
@@ -72,23 +81,34 @@ def read_rtde(path: Path, robot: Robot) -> TimedLog:
             f"{path}: an RTDE recording without {', '.join(lacking)}. Add target_q to the recipe."
         )
     has_tool, has_actual = set(tool) <= set(names), set(actual) <= set(names)
-    has_force = set(force) <= set(names)
+    has_force = set(force) <= set(names) and _held(path, separator, names, index)
     if not (has_tool or has_actual or has_force):
         raise InputError(
             f"{path}: an RTDE recording with neither actual_TCP_pose nor actual_q of every joint "
-            "nor actual_tool_accelerometer. Add one of them to the recipe."
+            "nor an actual_tool_accelerometer that motors of the profile alone turn. Add one of "
+            "them to the recipe."
         )
     mapping = ColumnMap(
         time=TimeColumn(TIME),
         command=CommandColumns(tuple(target)),
         tool=ToolColumns((tool[0], tool[1], tool[2])) if has_tool else None,
         position=AngleColumns(tuple(actual)) if has_actual else None,
-        separator=BLANKS,
+        separator=separator,
         sensors=(SensorColumns("accelerometer", force),) if has_force else (),
     )
     log = read_mapped_csv(path, mapping, robot)[0]
     _check_tcp(log, robot, path)
     return log
+
+
+def _held(path: Path, separator: str, names: list[str], index: list[int]) -> bool:
+    """Return whether joints that are no motors stand still: the flange turns with all of them."""
+    others = [f"{TARGET}{i}" for i in range(len(UR_JOINTS)) if i not in index]
+    others = [name for name in others if name in names]
+    if not others:
+        return True
+    told = numbers(load_csv(path, separator), others, path)
+    return bool(np.ptp(told, axis=0).max(initial=0.0) < STILL_RAD)
 
 
 def _joint_index(robot: Robot, path: Path) -> list[int]:
@@ -114,7 +134,7 @@ def _check_tcp(log: TimedLog, robot: Robot, path: Path) -> None:
     if off > TCP_FAR_M:
         raise InputError(
             f"{path}: its TCP lies {1000 * off:.0f} mm from the tool point of {robot.name!r} "
-            f"({robot.profile.tool_link!r}). Add the mounted tool to the URDF and name its tip as "
-            "tool_link, or leave actual_TCP_pose out of the recording: the path is then computed "
-            "from actual_q."
+            f"({robot.profile.tool_link!r}). Put where the TCP is in that link's frame into the "
+            "profile as tool_xyz = [x, y, z] [m], or leave actual_TCP_pose out of the recording: "
+            "the path is then computed from actual_q."
         )

@@ -85,6 +85,12 @@ class WeighedSetUp:
         """Whether it explains the runs as the healthy model says."""
         return self.misfit <= FITS
 
+    @property
+    def left_as_told(self) -> WeighedSetUp:
+        """The same with nothing undone: a wrong guess must not spoil what the log shows."""
+        none = LogCorrection.none(len(self.set_up.correction.z))
+        return replace(self, set_up=replace(self.set_up, correction=none))
+
 
 @dataclass(frozen=True)
 class SetUpPosterior:
@@ -102,14 +108,14 @@ class SetUpPosterior:
     def of(cls, weighed: Sequence[WeighedSetUp]) -> SetUpPosterior:
         """Return the posterior over set-ups that were weighed by the same runs.
 
-        Two ways to say the same count once.
+        Two ways to say the same count once. Nothing is undone where the most probable does not fit.
         """
         weighed = _distinct(weighed)
         log_joint = np.array([one.log_joint for one in weighed])
         share = np.exp(log_joint - log_sum(log_joint, axis=0))
         order = [i for i in np.argsort(-share, kind="stable") if share[i] > NEGLIGIBLE]
         if not weighed[order[0]].fits:  # no verdict is had behind it
-            order = order[:1]
+            return cls([weighed[order[0]].left_as_told], np.ones(1))
         return cls([weighed[i] for i in order], share[order] / share[order].sum())
 
     def beside(self, first: SetUp) -> SetUpPosterior:

@@ -99,9 +99,12 @@ class InferenceSettings(Bounded):
         least = 0.0 if readings is None else NOISE_FACTOR * readings.noise_m
         apart = max(noise, RESOLUTION * robot.reach)
         fitted = robot.profile.geometry.sensor_noise_m
+        # Readings that are no counts, and of which no noise is told, were not measured.
+        told = readings is not None and (readings.whole_counts or readings.noise_m > 0.0)
+        at_rest = NOISE_FACTOR * max(noise if told else UNKNOWN_NOISE_M, fitted)
         table = {
-            "moving_spread_m": max(4.0 * apart, least),
-            "nearly_still_m": max(3.0 * apart, least),
+            "moving_spread_m": max(4.0 * apart, at_rest),
+            "nearly_still_m": max(3.0 * apart, at_rest),
             "same_place_m": max(2.0 * apart, least),
             "unmoved_m": max(20.0 * apart, least),
             "update_m": 0.5 * apart,

@@ -223,7 +223,8 @@ def _glitch_parameters(glitches: Sequence[Rate] | None, robot: Robot) -> list[Pa
 # The whole procedure: fit, suspect, fit again what is trusted, and check.
 
 MOST_LEFT_OUT = 0.3
-"""Share of movements that may be left out before the logs are refused."""
+"""Share of movements that may be odd, or in which one motor may lose its command, before the logs
+are refused: a lossy bus loses commands of all motors."""
 
 MOST_SCATTER_RAD = 0.03
 """Settled scatter beyond which a motor is no healthy one [rad], three times what is assumed of a
@@ -356,7 +357,8 @@ def _refuse_suspects(runs: xr.Dataset, doubt: FloatArray) -> None:
 
 def _refuse_left_out(found: Calibration) -> None:
     movements = [entry for entry in found.left_out if entry.movement > 0]
-    if len(movements) > MOST_LEFT_OUT * max(found.movements, 1):
+    of = Counter(motor for entry in movements for motor in entry.motor.split(" and "))
+    if max(of.values(), default=0) > MOST_LEFT_OUT * max(found.movements, 1):
         reasons = Counter(f"{e.motor} {e.reason}".strip() for e in movements).most_common(3)
         told = "; ".join(f"{reason} ({count} times)" for reason, count in reasons)
         raise InputError(

@@ -22,6 +22,7 @@ from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, largest_load
+from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.habits import Habits
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.priors import Priors
@@ -285,6 +286,8 @@ def _refuse_few(kept: int, movements: int) -> None:
 
 SURE_NATS = 5.0
 """Log odds from which one description of the robot is told to be better than another."""
+ELSEWHERE = 3.0
+"""A sense that puts a seen tool so many times farther off than the profile's is not it [-]."""
 LEAST_SAG_RAD = 1e-3
 """Sag below which nothing is said of a payload [rad]: a quarter of a servo count."""
 PAYLOADS_KG = (0.02, 0.1, 0.5, 2.0)
@@ -295,15 +298,18 @@ def sense_remarks(part: SettlingFit, robot: Robot) -> list[str]:
     """Return what the logs say of each motor's sense, in sentences.
 
     A motor that turns the other way sags the other way; where gravity hardly loads it, nothing can
-    be said.
+    be said. Where the tool alone was seen, its position tells senses that would put it elsewhere.
     """
-    loaded = np.flatnonzero(largest_load(robot, 0.0) > 1e-6).tolist()
-    best, odds = _best_senses(part, robot, loaded)
+    loaded = np.flatnonzero(largest_load(robot, 0.0) > 1e-6)
+    elsewhere = _far_if_turned(part, robot)
+    best, odds = _best_senses(part, robot, loaded[~elsewhere[loaded]].tolist())
     sag = _largest_sag(part, best)
     remarks = []
     for k, motor in enumerate(robot.motors):
         sense = best.motors[k].sense
-        if k in odds and sag[k] < LEAST_SAG_RAD:
+        if elsewhere[k]:
+            told = f"{sense:+.0f} as in the profile; the other way the tool would be elsewhere"
+        elif k in odds and sag[k] < LEAST_SAG_RAD:
             told = "cannot be told, the motor does not give way"
         elif k not in odds:
             told = "cannot be told, gravity does not load it"
@@ -318,6 +324,23 @@ def sense_remarks(part: SettlingFit, robot: Robot) -> list[str]:
             )
         remarks.append(f"sense of {motor.name}: {told}")
     return remarks
+
+
+def _far_if_turned(part: SettlingFit, robot: Robot) -> BoolArray:
+    """Return which motors, turned the other way, put the tool where it was not seen, (motor,).
+
+    Where motors were read, or the tool's path was computed from the log, none: all turns together.
+    """
+    seen, motors = part.observations, range(len(robot.motors))
+    if seen.of_motors:
+        return np.zeros(len(motors), dtype=bool)
+    target, point = seen.target[part.fitted], seen.point[part.fitted]
+
+    def away(other: Robot) -> FloatArray:
+        return np.linalg.norm(DigitalTwin(other).path(target) - point, axis=-1)
+
+    turned = np.stack([away(_with_turned(robot, k)) for k in motors])
+    return np.asarray(np.median(turned, axis=-1) > ELSEWHERE * np.median(away(robot)))
 
 
 def _largest_sag(part: SettlingFit, robot: Robot) -> FloatArray:
