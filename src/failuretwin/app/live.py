@@ -32,13 +32,14 @@ from failuretwin.connection.links.statuses import (
     LEVEL_WARN,
     statuses,
 )
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, counted
 from failuretwin.core.foreign import printable
 from failuretwin.data_knowledge.bag_messages import BagTopics
 from failuretwin.decision.streaming.monitor import FaultMonitor, Fit
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.injection import ScheduledFault
+from failuretwin.inference.explanation import percent
 
 EMULATED, ROS1, ROSBRIDGE = "emulated", "ros1", "rosbridge"
 ROSBRIDGE_PORT = 9090
@@ -282,12 +283,12 @@ def watch_until_end(
 ) -> Changes:
     """Watch a robot until `until_s` of our monotonic clock [s], and return all that has changed.
 
-    With a monitor it is told if its calibration does not fit.
+    With a monitor it is told how well its calibration and the profile fit, once it has seen enough.
     On a terminal there is a live view, else a line for each change.
     """
     changes, view = Changes(motors), View(motors, source.name)
     live = Live(console=console, auto_refresh=False) if console.is_terminal else nullcontext()
-    begun_s, drawn_s = time.monotonic(), 0.0
+    begun_s, drawn_s, looked = time.monotonic(), 0.0, False
     with live as shown:
         going = True
         while going:
@@ -295,6 +296,9 @@ def watch_until_end(
             troubles = _troubles(shadow, source, sinks, time.monotonic() - begun_s)
             troubles += () if monitor is None else _misfit(monitor.fit)
             found = changes.notice(shadow.snapshot, source.counts, shadow.clock_jumps, troubles)
+            if monitor is not None and monitor.set_up is not None and not looked:
+                looked = True
+                found.append(changes.add(shadow.snapshot.stream_time, fit_of(monitor)))
             if shown is None:
                 for change in found:
                     tell(str(change))
@@ -315,6 +319,21 @@ def _misfit(fit: Fit) -> tuple[str, ...]:
         f"this robot does not do what calibration {fit.given!r} says: it is judged by what arms of "
         "its kind do and by what it teaches itself",
     )
+
+
+def fit_of(monitor: FaultMonitor) -> str:
+    """Return how well calibration and profile have fitted this robot, in one sentence."""
+    fit = monitor.fit
+    taught = f"{fit.learned} movements taught how this robot is"
+    if fit.given:
+        own = f"; {taught}" if fit.learned else ""
+        said = f"calibration {fit.given!r} is this robot's: {percent(fit.fits)} sure{own}"
+    else:
+        said = f"no calibration was given; {taught}"
+    if monitor.set_up is None:
+        return said
+    profile = monitor.set_up or "the log fits the profile"
+    return f"{said}; after {counted(fit.seen, 'movement')} {profile}"
 
 
 def _troubles(

@@ -233,6 +233,12 @@ class Changes:
         self.lines.extend(found)
         return found
 
+    def add(self, stream_time: float, text: str) -> Change:
+        """Note something else at a time of the stream [s], and return it."""
+        found = Change(stream_time, text)
+        self.lines.append(found)
+        return found
+
     def _silence(self, snapshot: Snapshot) -> list[str]:
         before, self._state = self._state, snapshot.answer.state
         if not before or before == self._state:

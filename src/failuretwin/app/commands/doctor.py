@@ -64,22 +64,16 @@ def doctor(
     runs = read_inputs(logs, model, reading)
     seen = BayesDiagnoser(known.twin, known.imperfections).seen(runs)
     set_ups = seen.set_ups()
-    for line in (*_set_up_lines(set_ups), *_log_lines(seen, set_ups)):
+    for line in (_set_up_line(set_ups), *_log_lines(seen, set_ups)):
         tell(line)
     if out is not None:
         _write(set_ups, reading.columns, out)
 
 
-def _set_up_lines(set_ups: SetUpPosterior) -> list[str]:
-    from failuretwin.inference.seen_runs import set_up_remark
-    from failuretwin.inference.set_up_weighing import ANOTHER
+def _set_up_line(set_ups: SetUpPosterior) -> str:
+    from failuretwin.inference.seen_runs import set_up_finding
 
-    remark = set_up_remark(set_ups)
-    if remark:
-        return [f"set-up: {remark}"]
-    if not set_ups.fits:
-        return [f"set-up: neither a fault nor a mistake explains the log: {ANOTHER}"]
-    return ["set-up: the log fits the profile"]
+    return f"set-up: {set_up_finding(set_ups) or 'the log fits the profile'}"
 
 
 def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior) -> list[str]:

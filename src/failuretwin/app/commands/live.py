@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,6 @@ from failuretwin.app.commands.options import (
 from failuretwin.app.terminal import tell
 
 if TYPE_CHECKING:
-    from failuretwin.decision.streaming.monitor import Fit
     from failuretwin.digital_model.nonidealities import Imperfections
     from failuretwin.failure_behavior.injection import ScheduledFault
 
@@ -65,7 +65,7 @@ def watch(
     """
     from contextlib import ExitStack
 
-    from failuretwin.app.live import connect, topics_of, watch_until_end
+    from failuretwin.app.live import connect, fit_of, topics_of, watch_until_end
     from failuretwin.app.shadow import Shadow
     from failuretwin.app.tables import console
     from failuretwin.connection.links.recording import Recorder
@@ -78,7 +78,8 @@ def watch(
     known, motors = load_calibration(calibration, model), model.motor_names
     diagnoser = monitor(known.twin, known.imperfections, budget)
     wait_s = topics_of(live.topics).wait_s
-    tell(_rests_on(known.imperfections) + _limit(known.imperfections, motors, budget))
+    when = "" if calibration is None else _written(calibration)
+    tell(_rests_on(known.imperfections, when) + _limit(known.imperfections, motors, budget))
     # An emulated robot ends by itself, a log when it is over.
     length = live.duration if live.duration and source != "emulated" else math.inf
     with ExitStack() as stack:
@@ -92,32 +93,28 @@ def watch(
         except KeyboardInterrupt:
             tell("stopped")
     arm = statuses(shadow.snapshot.answer, motors)[0]
-    tell(_fit(diagnoser.fit))
+    tell(fit_of(diagnoser))
     tell(f"last answer: {arm.message}")
 
 
-def _rests_on(known: Imperfections) -> str:
-    """Return what the answers rest on, in one sentence."""
+def _written(calibration: Path) -> str:
+    """Return when the file of a calibration was written; empty where it is none of a path."""
+    if not calibration.is_file():
+        return ""
+    return f", written {date.fromtimestamp(calibration.stat().st_mtime).isoformat()}"
+
+
+def _rests_on(known: Imperfections, when: str) -> str:
+    """Return what the answers rest on, in one sentence; `when` says of when it is."""
     from failuretwin.digital_model.arm_classes import GENERIC_NAME
 
     if known.name != GENERIC_NAME:
-        return f"healthy behaviour: {known.name} ({known.protocol}; {known.source})"
+        return f"healthy behaviour: {known.name} ({known.protocol}; {known.source}{when})"
     return (
         f"healthy behaviour: {known.name}; {known.source}. What this robot does is not known yet: "
         "it is learned as it works, and until then faults take longer to show. --calibration FILE "
         "uses what was learned before"
     )
-
-
-def _fit(fit: Fit) -> str:
-    """Return how well the calibration has fitted this robot, in one sentence."""
-    from failuretwin.inference.explanation import percent
-
-    taught = f"{fit.learned} movements taught how this robot is"
-    if not fit.given:
-        return f"no calibration was given; {taught}"
-    own = f"; {taught}" if fit.learned else ""
-    return f"calibration {fit.given!r} is this robot's: {percent(fit.fits)} sure{own}"
 
 
 def _limit(known: Imperfections, motors: Sequence[str], budget: float) -> str:

@@ -233,9 +233,20 @@ class StreamingFleet:
         """Return why nothing can be said of a robot that was not judged; None: it is too early."""
         if not self._odd[:, robot].any() or self._tracker.window.count[robot] > 0:
             return None
+        return self.undecided(robot, self._quality(robot).fatal)
+
+    def undecided(self, robot: int, reason: str, known: Diagnosis | None = None) -> Diagnosis:
+        """Return that nothing can be said of a robot's motors.
+
+        Args:
+            robot: Its index.
+            reason: Why.
+            known: What was said without that; its remarks on the readings stand.
+        """
         prior = dict(zip(self.hypotheses, self._prior.tolist(), strict=True))
-        reason = self._quality(robot).fatal
         nothing = Diagnosis(f"robot {robot}", prior, undecided=reason)
+        if known is not None:
+            nothing = replace(nothing, run=known.run, quality=known.quality)
         return worded(nothing, self.diagnoser.hypothesis_set)
 
     def seen(self, robot: int) -> tuple[RunLikelihood, StreamPosition] | None:

@@ -21,6 +21,7 @@ from failuretwin.decision.streaming.alarm_rule import AlarmRule
 from failuretwin.decision.streaming.diagnoser import reference_of
 from failuretwin.decision.streaming.fleet import StreamingFleet
 from failuretwin.decision.streaming.learning import LifeLearner
+from failuretwin.decision.streaming.set_up_watch import SetUpWatch
 from failuretwin.digital_model.arm_classes import GENERIC_NAME
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
@@ -45,11 +46,13 @@ class Fit:
         given: Name of the calibration that was given; empty: none of this robot.
         fits: Probability that it is this robot's; 0 without one.
         learned: Movements that this robot itself has taught.
+        seen: Movements that have begun.
     """
 
     given: str
     fits: float
     learned: int
+    seen: int = 0
 
 
 class FaultMonitor:
@@ -89,12 +92,19 @@ class FaultMonitor:
         self._movements = 0
         self._explained: dict[int, float] = {}
         self._diagnosis: Diagnosis | None = None
+        self._set_up = SetUpWatch(diagnoser)
+
+    @property
+    def set_up(self) -> str | None:
+        """What is to be said of the set-up; empty: the log fits the profile; None: not looked."""
+        return self._set_up.finding if self._set_up.looked else None
 
     @property
     def fit(self) -> Fit:
         """Whose healthy behaviour the robot has, so far."""
         fits = float(np.exp(self._concluded.log_weight[0, 0])) if self._given else 0.0
-        return Fit(self._given, fits, 0 if self._learner is None else self._learner.movements)
+        learned = 0 if self._learner is None else self._learner.movements
+        return Fit(self._given, fits, learned, self._set_up.movements)
 
     def update(
         self,
@@ -117,6 +127,7 @@ class FaultMonitor:
         point = None if measured is None else as_floats(measured)[None]
         if len(self._fleet.update(time, reference, point)):
             self._judge()
+        self._set_up.see(time, _row(reference), _row(point))
         return self._answer()
 
     def conclude(self) -> Answer:
@@ -126,8 +137,13 @@ class FaultMonitor:
         return self._answer()
 
     def _answer(self) -> Answer:
+        """Return what is believed; where the set-up is in doubt, no motor is blamed."""
         state = STALE if self._fleet.stale[0] else OK
-        return Answer(self._fleet.time, state, self._diagnosis, self._rule.alarm)
+        reason = self._set_up.against(self._rule.alarm)
+        if not reason:
+            return Answer(self._fleet.time, state, self._diagnosis, self._rule.alarm)
+        undecided = replace(self._fleet.undecided(0, reason, self._diagnosis), run="stream")
+        return Answer(self._fleet.time, state, undecided)
 
     def _judge(self) -> None:
         """Renew what is believed by what the last movements say."""
@@ -206,6 +222,11 @@ class FaultMonitor:
             if own > 0.5:
                 self._fleet.adopt(self._models[-1].imperfections)
                 self._models[-1] = self._fleet.diagnoser.healthy_model
+
+
+def _row(values: FloatArray | None) -> FloatArray | None:
+    """Return what there is of the robot."""
+    return None if values is None else as_floats(values[0])
 
 
 def monitor(
