@@ -23,6 +23,13 @@ from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.log_correction import LogCorrection
 from failuretwin.inference.posterior import Posterior
 from failuretwin.inference.priors import Priors
+from failuretwin.inference.rounding import (
+    Rounding,
+    command_rounding,
+    rounded,
+    told_of,
+    tool_rounding,
+)
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.set_up_weighing import (
     ANOTHER,
@@ -69,12 +76,40 @@ class SeenRuns:
         return Evidence(self.runs, self.model.settings, self.model.sensors)
 
     @cached_property
+    def healthy(self) -> HealthyModel:
+        """The healthy robot as these runs show it, with what was rounded off as noise."""
+        return rounded(self.model, self.tool_rounding, None)
+
+    @cached_property
+    def tool_rounding(self) -> Rounding | None:
+        """How coarsely tool positions were rounded; None: it does not matter."""
+        if not self.model.sensors.tool_alone:
+            return None
+        readings = self.evidence.readings
+        return tool_rounding(readings.point[readings.seen], self.model)
+
+    def rounding(self) -> list[str]:
+        """Return what is to be said of how coarsely the runs were written down, a line each."""
+        evidence = self.sample.evidence
+        command = command_rounding(evidence.movements.target[evidence.usable], self.model)
+        if command is None:
+            return told_of(self.tool_rounding, None, 0.0)
+        few = SetUpWeighing(self.sample, self.hypotheses, self.priors).few
+        coarse = replace(few.likelihood, model=rounded(self.healthy, None, command))
+        says = [
+            float(one.weigh([one.as_told])[0].log_evidence.sum())
+            for one in (few, SetUpWeighing(coarse, self.hypotheses, self.priors))
+        ]
+        share = float(np.exp(-np.logaddexp(0.0, says[0] - says[1])))
+        return told_of(self.tool_rounding, command if share > SURE else None, share)
+
+    @cached_property
     def sample(self) -> RunLikelihood:
         """Some of the runs by their settled positions."""
         settled = self.evidence.sound.settled
         count = len(settled.usable)
         some = np.unique(np.linspace(0, count - 1, JUDGED_RUNS).astype(np.int64))
-        return RunLikelihood(settled[some], self.model)
+        return RunLikelihood(settled[some], self.healthy)
 
     @cached_property
     def in_doubt(self) -> bool:
@@ -129,7 +164,7 @@ class SeenRuns:
             moving: Readings on the way of all runs; None: they are left aside.
         """
         way = None if moving is None else moving[rows]
-        likelihood = RunLikelihood(self.evidence.sound.settled[rows], self.model, way)
+        likelihood = RunLikelihood(self.evidence.sound.settled[rows], self.healthy, way)
         return shared_posterior(likelihood, self.hypotheses, self.priors, self.in_doubt)
 
     def elsewhere(self) -> str:

@@ -45,7 +45,7 @@ def doctor(
     robot: str,
     seed: int,
 ) -> None:
-    """Say whether logs fit the profile: senses, order, units, axes, zeros, frames, clocks, gaps.
+    """Say whether logs fit the profile: senses, order, units, axes, zeros, frames, clocks, grids.
 
     LOG is whatever `diagnose` reads, faulty or not; all are taken to share one set-up. Every
     mistake is weighed with every fault behind it, so that a broken motor is not taken for one.
@@ -87,6 +87,7 @@ def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior) -> list[str]:
         f"the tool is seen at rest, {measured_rate(seen.runs):.3g} readings a second"
     ]
     undone = seen.under(set_ups.best.set_up.correction)
+    lines += [f"log: {line}" for line in undone.rounding()]
     remarks = [
         line
         for quality in undone.evidence.quality

@@ -206,7 +206,7 @@ class SetUpWatch:
         again = self.movements if young else AGAIN * self._asked_at
         self._proven = self._proven and not new
         if new or not (young or self._proven) or self._asked_at < self.movements >= again:
-            self._ask(thorough=not young)
+            self._ask(thorough=new or not young)
             self._proven = not young
         if self.finding:
             return self.finding
