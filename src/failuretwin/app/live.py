@@ -10,6 +10,7 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -41,12 +42,14 @@ from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.injection import ScheduledFault
 from failuretwin.inference.explanation import percent
 
-EMULATED, ROS1, ROSBRIDGE = "emulated", "ros1", "rosbridge"
+EMULATED, ROS1, ROS2, ROSBRIDGE = "emulated", "ros1", "ros2", "rosbridge"
+NETWORKS = (ROS1, ROS2)
+"""Networks on which an emulated robot may speak."""
 ROSBRIDGE_PORT = 9090
 """Where rosbridge servers listen unless told otherwise."""
 SOURCES = (
-    f"{EMULATED}, {ROS1}, {ROSBRIDGE}://HOST[:PORT], a log (raw session, bag, .mcap), or a source "
-    "of your own, MODULE:CLASS"
+    f"{EMULATED}, {ROS1}, {ROS2}[://HOST[:PORT]], {ROSBRIDGE}://HOST[:PORT], a log (raw session, "
+    "bag, .mcap), or a source of your own, MODULE:CLASS"
 )
 OWN_CLASS = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(:.*)?")
 """How the class of a source of one's own is named, see `source_from_text`."""
@@ -101,6 +104,8 @@ def connect(
         )
     if text == ROS1:
         return _ros1(robot, topics, stack)
+    if text == ROS2 or text.startswith(f"{ROS2}://"):
+        return _ros2(text, robot, topics, stack)
     if text.startswith(f"{ROSBRIDGE}://"):
         return _rosbridge(text, robot, topics, stack)
     from failuretwin.connection.links.recording import replay
@@ -123,19 +128,65 @@ def _ros1(robot: Robot, topics: RosTopics, stack: ExitStack) -> tuple[Source, li
     return source, [stack.enter_context(Ros1Diagnostics(robot, topics))]
 
 
-def address_of(text: str) -> tuple[str, int]:
-    """Return host and port of a rosbridge server, such as ``rosbridge://HOST[:PORT]``.
+def _ros2(
+    text: str, robot: Robot, topics: RosTopics, stack: ExitStack
+) -> tuple[Source, list[Sink]]:
+    from failuretwin.connection.links import ros2
+
+    session = ros2_session(text)
+    stack.callback(session.close)
+    source = stack.enter_context(ros2.Ros2Source(robot, topics, session))
+    return source, [stack.enter_context(ros2.Ros2Diagnostics(robot, topics, session))]
+
+
+def robot_sink(target: str, robot: Robot, live: LiveOptions, stack: ExitStack) -> Sink:
+    """Return where an emulated robot speaks: a network, or a recording.
+
+    The stack closes it in the end.
+
+    Raises:
+        InputError: If it cannot be reached or written.
+    """
+    if target == ROS1:
+        from failuretwin.connection.links.ros1 import Ros1Robot
+
+        return stack.enter_context(Ros1Robot(robot, topics_of(live.topics)))
+    if target.partition("://")[0] == ROS2:
+        from failuretwin.connection.links.ros2 import Ros2Robot
+
+        session = ros2_session(target)
+        stack.callback(session.close)
+        return stack.enter_context(Ros2Robot(robot, topics_of(live.topics), session))
+    from failuretwin.connection.links.recording import Recorder
+
+    return stack.enter_context(Recorder(Path(target), robot))
+
+
+def ros2_session(text: str) -> Any:
+    """Return a session with the router that ``ros2`` or ``ros2://HOST[:PORT]`` stands for.
+
+    Raises:
+        InputError: If it is no such address, or no router answers there.
+    """
+    from failuretwin.connection.links import ros2
+
+    return ros2.connect() if text == ROS2 else ros2.connect(*address_of(text, ros2.ROUTER_PORT))
+
+
+def address_of(text: str, usual_port: int = ROSBRIDGE_PORT) -> tuple[str, int]:
+    """Return host and port of a server, such as ``rosbridge://HOST[:PORT]``.
 
     Raises:
         InputError: If it is no such address.
     """
     try:
         address = urlsplit(text)
-        host, port = address.hostname, address.port or ROSBRIDGE_PORT
+        host, port = address.hostname, address.port or usual_port
     except ValueError:
         host, port = None, 0
     if not host:
-        raise InputError(f"{text!r} is no address. Expected {ROSBRIDGE}://HOST[:PORT].")
+        kind = text.partition("://")[0]
+        raise InputError(f"{text!r} is no address. Expected {kind}://HOST[:PORT].")
     return host, port
 
 

@@ -22,7 +22,9 @@ from failuretwin.app.commands.options import (
 from failuretwin.app.terminal import tell
 
 if TYPE_CHECKING:
+    from failuretwin.connection.links.base import Sink, Source
     from failuretwin.digital_model.nonidealities import Imperfections
+    from failuretwin.digital_model.robot import Robot
     from failuretwin.failure_behavior.injection import ScheduledFault
 
 
@@ -58,9 +60,10 @@ def watch(
 ) -> None:
     """Watch a robot as a digital shadow: it listens, says what is wrong, and moves nothing.
 
-    SOURCE is `ros1`, `rosbridge://HOST[:PORT]`, `emulated` (a robot that exists only as physics),
-    a log to replay (a raw session, a bag, a recording), or a source of your own, MODULE:CLASS, made
-    as failuretwin.connection.links.base.Source says. On a ROS network the diagnosis is
+    SOURCE is `ros1`, `ros2[://HOST[:PORT]]` (over Zenoh), `rosbridge://HOST[:PORT]`, `emulated` (a
+    robot that exists only as physics), a log to replay (a raw session, a bag, a recording), or a
+    source of your own, MODULE:CLASS, made as failuretwin.connection.links.base.Source says. On a
+    ROS network the diagnosis is
     published on /diagnostics. Stop with Ctrl-C.
     """
     from contextlib import ExitStack
@@ -143,9 +146,10 @@ the last fault has begun or been repaired [s]."""
     "--to",
     "target",
     default="ros1",
-    metavar="ros1|FILE.mcap",
-    help="Publish as a ROS 1 node until interrupted, or write a recording at once: one minute, or "
-    "until 20 s after the last fault has begun or been repaired, unless --duration says otherwise.",
+    metavar="ros1|ros2|FILE.mcap",
+    help="Publish as a ROS 1 node, or on ROS 2 over Zenoh, until interrupted, or write a recording "
+    "at once: one minute, or until 20 s after the last fault has begun or been repaired, unless "
+    "--duration says otherwise.",
 )
 @click.option(
     "--obey",
@@ -187,49 +191,53 @@ def _obey(target: str, live: LiveOptions, robot: str, seed: int) -> None:
 
 def _play(target: str, live: LiveOptions, robot: str, seed: int) -> None:
     """Play a robot that moves at random."""
-    from failuretwin.app.live import emulated_robot, schedule_of, topics_of
-    from failuretwin.connection.links.base import AS_FAST_AS_POSSIBLE, Pace, Sink
-    from failuretwin.connection.links.recording import Recorder
+    from contextlib import ExitStack
+
+    from failuretwin.app.live import NETWORKS, emulated_robot, robot_sink, schedule_of
+    from failuretwin.connection.links.base import AS_FAST_AS_POSSIBLE, Pace
     from failuretwin.core.errors import InputError
     from failuretwin.digital_model.robot import load_robot
-    from failuretwin.failure_behavior.injection import state_at
 
     model = load_robot(robot)
     schedule = schedule_of(live, model)
-    zero, on_ros = time.time(), target == "ros1"
+    zero, on_ros = time.time(), target.partition("://")[0] in NETWORKS
     if not on_ros and Path(target).suffix != ".mcap":
-        raise InputError(f"--to is {target!r}, expected ros1 or a file that ends in .mcap.")
+        raise InputError(f"--to is {target!r}, expected ros1, ros2 or a file that ends in .mcap.")
     length = live.duration or (math.inf if on_ros else _file_length(schedule))
     pace = Pace(live.speed if on_ros else AS_FAST_AS_POSSIBLE)
     source = emulated_robot(model, live, seed, pace, length, zero)
-    sink: Sink
-    if on_ros:
-        from failuretwin.connection.links.ros1 import Ros1Robot
-
-        sink = Ros1Robot(model, topics_of(live.topics))
-    else:
-        sink = Recorder(Path(target), model)
-    state, trouble = "", ""
-    with source, sink:
-        try:
-            while not source.ended:
-                event = source.poll(1.0)
-                if event is None:
-                    continue
-                sink.put(event)
-                if sink.trouble != trouble:
-                    trouble = sink.trouble
-                    tell(trouble or "going on")
-                now = state_at(schedule, event.time - zero, model.motor_names)
-                if now != state:
-                    tell(f"{event.time - zero:8.1f} s  {now}")
-                    state = now
-        except KeyboardInterrupt:
-            tell("stopped")
+    with ExitStack() as stack:
+        sink = robot_sink(target, model, live, stack)
+        stack.enter_context(source)
+        _pass_on(source, sink, schedule, zero, model)
     if sink.trouble:
         raise InputError(sink.trouble)
     if source.ended and not on_ros:
         tell(f"{length:g} s written to {target}")
+
+
+def _pass_on(
+    source: Source, sink: Sink, schedule: Sequence[ScheduledFault], zero: float, robot: Robot
+) -> None:
+    """Say what a robot says, and tell the user of its faults, until it ends."""
+    from failuretwin.failure_behavior.injection import state_at
+
+    state, trouble = "", ""
+    try:
+        while not source.ended:
+            event = source.poll(1.0)
+            if event is None:
+                continue
+            sink.put(event)
+            if sink.trouble != trouble:
+                trouble = sink.trouble
+                tell(trouble or "going on")
+            now = state_at(schedule, event.time - zero, robot.motor_names)
+            if now != state:
+                tell(f"{event.time - zero:8.1f} s  {now}")
+                state = now
+    except KeyboardInterrupt:
+        tell("stopped")
 
 
 def _file_length(schedule: Sequence[ScheduledFault]) -> float:
