@@ -29,12 +29,11 @@ from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.alarm_rule import AlarmRule
 from failuretwin.decision.streaming.learning import LifeLearner
-from failuretwin.decision.streaming.monitor import FOREIGN
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections, vary
 from failuretwin.inference.fault_filter import FaultFilter
-from failuretwin.inference.healthy_mixture import HealthyMixture
+from failuretwin.inference.healthy_mixture import FOREIGN, HealthyMixture
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.joint_likelihood import movement_likelihoods
 from failuretwin.inference.priors import Priors

@@ -40,6 +40,7 @@ from failuretwin.decision.streaming.monitor import FaultMonitor, Fit
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.injection import ScheduledFault
+from failuretwin.inference.calibration_fit import MISFIT
 from failuretwin.inference.explanation import percent
 
 EMULATED, ROS1, ROS2, ROSBRIDGE = "emulated", "ros1", "ros2", "rosbridge"
@@ -317,8 +318,6 @@ REFRESH_S = 0.25
 """Time between two drawings [s]."""
 POLL_S = 0.1
 """Longest wait for an event [s]."""
-MISFIT = 0.05
-"""Probability below which it is told that a calibration does not fit."""
 LATE_S = 0.3
 """A command that comes later than this spoils the diagnosis, and the user is told [s]."""
 

@@ -80,6 +80,7 @@ def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior) -> list[str]:
     """Return what the logs hold, and what is wrong with them."""
     from failuretwin.core.errors import counted
     from failuretwin.core.runs import measured_rate
+    from failuretwin.inference.calibration_fit import calibration_told, fits_this_robot
 
     usable = seen.evidence.settled.usable
     lines = [
@@ -87,6 +88,9 @@ def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior) -> list[str]:
         f"the tool is seen at rest, {measured_rate(seen.runs):.3g} readings a second"
     ]
     undone = seen.under(set_ups.best.set_up.correction)
+    fits = fits_this_robot(undone) if set_ups.fits else None
+    if fits is not None:
+        lines.insert(0, f"set-up: {calibration_told(undone.model.imperfections.name, fits)}")
     lines += [f"log: {line}" for line in undone.rounding()]
     remarks = [
         line

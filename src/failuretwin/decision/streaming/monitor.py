@@ -27,15 +27,13 @@ from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.fault_filter import RATES, FaultFilter, FaultRates
-from failuretwin.inference.healthy_mixture import HealthyMixture
+from failuretwin.inference.healthy_mixture import FOREIGN, HealthyMixture
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.posterior import StreamPosition
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 WORTH_LEARNING = 0.01
 """Probability that the calibration that was given is not this robot's from which it learns."""
-FOREIGN = 0.1
-"""Probability that a calibration is of another robot, or no longer true; assumed."""
 
 
 @dataclass(frozen=True)
