@@ -46,6 +46,14 @@ if TYPE_CHECKING:
     metavar="N",
     help="False alarms that you allow in 100 hours of work; fewer come later.",
 )
+@click.option(
+    "--sensing",
+    type=click.Choice(["tool", "tool+encoders"]),
+    default="tool",
+    show_default=True,
+    help="Whether what the motors report of themselves, such as /joint_states, is believed beside "
+    "the tool's position: errors show sooner, but a wrong reading is taken for the motor.",
+)
 @live_options
 @plugin_option
 @common_options
@@ -54,6 +62,7 @@ def watch(
     calibration: Path | None,
     record: Path | None,
     budget: float,
+    sensing: str,
     live: LiveOptions,
     robot: str,
     seed: int,
@@ -79,7 +88,7 @@ def watch(
 
     model = load_robot(robot)
     known, motors = load_calibration(calibration, model), model.motor_names
-    diagnoser = monitor(known.twin, known.imperfections, budget)
+    diagnoser = monitor(known.twin, known.imperfections, budget, sensing)
     wait_s = topics_of(live.topics).wait_s
     when = "" if calibration is None else _written(calibration)
     tell(_rests_on(known.imperfections, when) + _limit(known.imperfections, motors, budget))

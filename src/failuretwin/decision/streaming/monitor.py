@@ -22,7 +22,7 @@ from failuretwin.decision.streaming.diagnoser import reference_of
 from failuretwin.decision.streaming.fleet import StreamingFleet
 from failuretwin.decision.streaming.learning import LifeLearner
 from failuretwin.decision.streaming.set_up_watch import SetUpWatch
-from failuretwin.digital_model.arm_classes import GENERIC_NAME
+from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.evidence import SettledEvidence
@@ -74,10 +74,14 @@ class FaultMonitor:
         self._fleet = StreamingFleet(diagnoser, 1)
         known = diagnoser.healthy_model
         ideal, cold = known.imperfections.settling is None, known.imperfections.name == GENERIC_NAME
-        self._learner = None if ideal else LifeLearner(diagnoser)
-        self._models: list[HealthyModel] = [] if cold else [known]
+        learns = known.sensors.tool_alone and not ideal
+        self._learner = LifeLearner(diagnoser) if learns else None
+        self._models: list[HealthyModel] = [] if cold and learns else [known]
         if self._learner is not None:
             self._models.append(self._learner.model)
+        elif not (cold or ideal):
+            kind = generic_imperfections(known.twin.robot)
+            self._models.append(HealthyModel.of(known.twin, kind).seen_by(known.sensing))
         hypotheses, priors = diagnoser.hypothesis_set, diagnoser.priors
         filters = [FaultFilter(model, hypotheses, priors, rates) for model in self._models]
         share = [1.0] if len(filters) == 1 else [1.0 - FOREIGN, FOREIGN]
@@ -109,6 +113,7 @@ class FaultMonitor:
         time: float,
         command: Mapping[str, float] | ArrayLike | None,
         measured: ArrayLike | None,
+        position: ArrayLike | None = None,
     ) -> Answer:
         """Take what is known at a time and return what is believed then.
 
@@ -116,6 +121,7 @@ class FaultMonitor:
             time: Time of the stream [s]; a sample may come late, as long as its movement lasts.
             command: Reference of every motor, by name or (motor,) [rad]; None: not known.
             measured: Tool position, (axis,) [m]; None or NaN: no reading.
+            position: What the motors report of themselves, (motor,) [rad], where that is believed.
 
         Raises:
             InputError: If a motor is missing, shapes do not fit or the time is not finite.
@@ -123,7 +129,8 @@ class FaultMonitor:
         motors = self._fleet.diagnoser.twin.robot.motor_names
         reference = None if command is None else reference_of(motors, command)[None]
         point = None if measured is None else as_floats(measured)[None]
-        if len(self._fleet.update(time, reference, point)):
+        motors_say = None if position is None else as_floats(position)[None]
+        if len(self._fleet.update(time, reference, point, motors_say)):
             self._judge()
         self._set_up.see(time, _row(reference), _row(point))
         return self._answer()
@@ -228,7 +235,10 @@ def _row(values: FloatArray | None) -> FloatArray | None:
 
 
 def monitor(
-    twin: RobotLike, imperfections: HealthyLike = None, false_alarms_per_100h: float = 1.0
+    twin: RobotLike,
+    imperfections: HealthyLike = None,
+    false_alarms_per_100h: float = 1.0,
+    sensing: str | None = None,
 ) -> FaultMonitor:
     """Return what watches a robot at work: settled poses, and faults are rare.
 
@@ -237,5 +247,7 @@ def monitor(
         imperfections: How the healthy robot differs from it, or a calibration by name or path;
             None: as its profile says.
         false_alarms_per_100h: False alarms that are allowed in 100 hours of work.
+        sensing: ``tool`` or ``tool+encoders``; None: the tool's position alone.
     """
-    return FaultMonitor(BayesDiagnoser(twin, imperfections, whole_run=False), false_alarms_per_100h)
+    diagnoser = BayesDiagnoser(twin, imperfections, whole_run=False, sensing=sensing)
+    return FaultMonitor(diagnoser, false_alarms_per_100h)
