@@ -175,7 +175,8 @@ class SetUpWatch:
         before = self._runs.begun
         self._runs.add(time, command, point)
         # A movement is over when the next one begins.
-        if self._runs.begun > before and self._runs.begun - 1 in ASKED_AT:
+        due = self._runs.begun > before and self._runs.begun - 1 in ASKED_AT
+        if due and not self._episode:  # else it is looked at with the alarm
             self._ask()
 
     def against(self, alarm: Alarm) -> str:
@@ -203,7 +204,8 @@ class SetUpWatch:
             if motor not in self._blamed[-1:]:
                 self._blamed.append(motor)
         young = self.movements <= PROOF
-        again = self.movements if young else AGAIN * self._asked_at
+        eager = young and not _is_held(alarm.cause)
+        again = self.movements if eager else AGAIN * self._asked_at
         self._proven = self._proven and not new
         if new or not (young or self._proven) or self._asked_at < self.movements >= again:
             self._ask(thorough=new or not young)
