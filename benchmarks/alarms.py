@@ -1,7 +1,8 @@
 """False alarms and delays of the watch: healthy hours and faults, robots drawn at random.
 
     python benchmarks/alarms.py [--hours 30] [--faults 200] [--seed 0] [--robot armpi_fpv]
-        [--of CALIBRATION] [--by CALIBRATION] [--robots N | --alone] [--picture FILE]
+        [--of CALIBRATION] [--by CALIBRATION] [--robots N | --alone] [--encoders]
+        [--picture FILE]
 
 Movements are seen at rest alone (`alarms_world.py`). Each healthy life is an hour of a robot of its
 own; with --robots N, N robots are drawn and each has taught the watch before. A fault is shown with
@@ -29,16 +30,16 @@ from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.alarm_rule import AlarmRule
 from failuretwin.decision.streaming.learning import LifeLearner
-from failuretwin.decision.streaming.monitor import FOREIGN
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections, vary
 from failuretwin.inference.fault_filter import FaultFilter
-from failuretwin.inference.healthy_mixture import HealthyMixture
+from failuretwin.inference.healthy_mixture import FOREIGN, HealthyMixture
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.joint_likelihood import movement_likelihoods
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.sensors import SensorStack, parse_sensing
 
 BUDGETS = (0.1, 1.0, 3.0, 10.0, 30.0, 100.0)
 """False alarms in 100 hours that are allowed."""
@@ -250,16 +251,21 @@ class Delays:
 
 
 def healthy_lives(
-    twin: ft.DigitalTwin, imperfections: Imperfections, hours: int, seed: int
+    twin: ft.DigitalTwin, imperfections: Imperfections, hours: int, seed: int, seen: SensorStack
 ) -> Iterator[Lives]:
     """Yield healthy lives of an hour."""
     for number in range(0, hours, AT_ONCE):
         count = min(AT_ONCE, hours - number)
-        yield live(twin, imperfections, ["healthy"] * count, MOVEMENTS, ONSET, seed + number)
+        faults = ["healthy"] * count
+        yield live(twin, imperfections, faults, MOVEMENTS, ONSET, seed + number, sensors=seen)
 
 
 def candidates(
-    known: CalibratedRobot, alone: bool, works: CalibratedRobot | None, seed: int
+    known: CalibratedRobot,
+    alone: bool,
+    works: CalibratedRobot | None,
+    seed: int,
+    sensing: tuple[str, ...],
 ) -> HealthyMixture:
     """Return what a watch believes that its robot may be.
 
@@ -268,6 +274,7 @@ def candidates(
         alone: Whether that is believed for sure.
         works: The robot that has taught it; None: none has, it knows arms of the kind.
         seed: Seed of what it was taught by.
+        sensing: What is believed.
     """
     hypotheses = paper_hypotheses(known.robot.motor_names)
     model, cold = HealthyModel.of(known), known.imperfections.name == GENERIC_NAME
@@ -278,7 +285,7 @@ def candidates(
         models = [own] if cold else [model, own]
     elif not (alone or cold):
         models.append(HealthyModel.of(known.twin, generic_imperfections(known.robot)))
-    filters = [FaultFilter(model, hypotheses, Priors()) for model in models]
+    filters = [FaultFilter(one.seen_by(sensing), hypotheses, Priors()) for one in models]
     share = np.array([1.0 - FOREIGN, FOREIGN] if len(filters) > 1 else [1.0])
     return HealthyMixture(filters, share)
 
@@ -289,9 +296,12 @@ def watched(
     """Return healthy hours and faults of a robot as they are seen; `counts` says how many."""
     names = [str(h) for h in paper_hypotheses(works.robot.motor_names)]
     hours, count = counts
-    healthy = healthy_lives(works.twin, works.imperfections, hours, seed)
+    seen = mixture.filters[0].model.sensors
+    healthy = healthy_lives(works.twin, works.imperfections, hours, seed, seen)
     faults = [names[1 + k % (len(names) - 1)] for k in range(count)]
-    broken = live(works.twin, works.imperfections, faults, FAULTY, ONSET, seed + 7_777)
+    broken = live(
+        works.twin, works.imperfections, faults, FAULTY, ONSET, seed + 7_777, sensors=seen
+    )
     return [look(lives, mixture) for lives in healthy], look(broken, mixture)
 
 
@@ -306,8 +316,20 @@ def main() -> None:
     parser.add_argument("--by", default=None, help="calibration that the watch uses")
     parser.add_argument("--robots", type=int, default=0, help="so many, which have taught")
     parser.add_argument("--alone", action="store_true", help="believe the calibration for sure")
+    parser.add_argument("--encoders", action="store_true", help="believe the motors' readings too")
     parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
+    curves: dict[str, list[tuple[float, float]]] = {}
+    for sensing in ("tool", "tool+encoders")[: 1 + options.encoders]:
+        study(options, sensing, curves)
+    if options.picture:
+        draw(curves, options.picture)
+
+
+def study(
+    options: argparse.Namespace, sensing: str, curves: dict[str, list[tuple[float, float]]]
+) -> None:
+    """Print the table of one kind of sensing, and add its points to the curves."""
     robot = ft.load_robot(options.robot)
     works, known = (load_calibration(name, robot) for name in (options.of, options.by))
     names = [str(h) for h in paper_hypotheses(robot.motor_names)]
@@ -319,32 +341,43 @@ def main() -> None:
         itself = vary(works.imperfections, rng) if options.robots else works.imperfections
         robot_itself = replace(works, imperfections=itself)
         seed = options.seed + 10_000 * group
-        mixture = candidates(known, options.alone, robot_itself if options.robots else None, seed)
+        taught_by = robot_itself if options.robots else None
+        mixture = candidates(known, options.alone, taught_by, seed, parse_sensing(sensing))
         usual, faulty = watched(robot_itself, mixture, counts, seed)
         healthy += usual
         broken_parts.append(faulty)
     broken, faults_per_h = joined(broken_parts), mixture.filters[0].faults_per_h
-    truth = broken.lives.truth
     hours = sum(float(seen.lives.hours.sum()) for seen in healthy)
-    print(f"{hours:.0f} h, {options.faults} faults, {time.process_time() - begun:.0f} s of a core")
-    curves: dict[str, list[tuple[float, float]]] = {}
-    everything = range(len(truth))
+    spent = time.process_time() - begun
+    print(f"{sensing}: {hours:.0f} h, {options.faults} faults, {spent:.0f} s of a core")
     for budget in BUDGETS:
         rows = [by_filter(seen, names, faults_per_h, budget) for seen in healthy]
         alarms = Told([r for t in rows for r in t.raised], [c for t in rows for c in t.cause])
         told = by_filter(broken, names, faults_per_h, budget)
-        delays = Delays.of_alarms(told, broken, everything)
-        _note(curves, "filter", alarms, hours, delays)
-        print(f"filter, {budget:5.1f} allowed: {false_alarms(alarms, hours)}; {delays}", flush=True)
-        if budget == 1.0:
-            which = [c for row in alarms.cause for c in row]
-            print(f"    false ones name {dict(Counter(which))}")
-            for name in names[1:]:
-                some = [i for i in everything if truth[i] == name]
-                print(f"    {name:30s} {Delays.of_alarms(told, broken, some)}")
-    by_residual(healthy, broken, curves)
-    if options.picture:
-        draw(curves, options.picture)
+        by_filter_told(sensing, budget, (alarms, told), broken, hours, curves)
+    if sensing == "tool":
+        by_residual(healthy, broken, curves)
+
+
+def by_filter_told(
+    sensing: str,
+    budget: float,
+    alarms_and_told: tuple[Told, Told],
+    broken: Seen,
+    hours: float,
+    curves: dict[str, list[tuple[float, float]]],
+) -> None:
+    """Print what the filter gives at one budget, and at the default each fault by itself."""
+    (alarms, told), truth = alarms_and_told, broken.lives.truth
+    delays = Delays.of_alarms(told, broken, range(len(truth)))
+    _note(curves, f"filter, {sensing}", alarms, hours, delays)
+    print(f"filter, {budget:5.1f} allowed: {false_alarms(alarms, hours)}; {delays}", flush=True)
+    if budget != 1.0:
+        return
+    print(f"    false ones name {dict(Counter(c for row in alarms.cause for c in row))}")
+    for name in sorted(set(truth)):
+        some = [i for i, fault in enumerate(truth) if fault == name]
+        print(f"    {name:30s} {Delays.of_alarms(told, broken, some)}")
 
 
 def by_residual(

@@ -25,6 +25,7 @@ from failuretwin.digital_model.settling import sag
 from failuretwin.digital_model.twin import SAG_ROUNDS, DigitalTwin
 from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
 from failuretwin.inference.evidence import JUST_AFTER_S, SETTLING_S, SettledEvidence
+from failuretwin.inference.sensors import SensorStack
 from failuretwin.inference.settings import InferenceSettings
 
 READ_S = 0.05
@@ -66,6 +67,7 @@ def live(
     onset: tuple[int, int],
     seed: int,
     gaps: bool = True,
+    sensors: SensorStack | None = None,
 ) -> Lives:
     """Return lives, each of a robot drawn anew from what the imperfections say of robots.
 
@@ -77,6 +79,7 @@ def live(
         onset: First and last movement that a fault may spoil first.
         seed: Seed of all chance.
         gaps: Whether a bus that stalls swallows the readings before a late start.
+        sensors: What is seen; None: the tool alone.
     """
     rng, robot = np.random.default_rng(seed), twin.robot
     own = [vary(imperfections, rng) for _ in faults]
@@ -101,6 +104,8 @@ def live(
         angle = units.to_rad(np.round(units.to_counts(angle)))
     noise_m = InferenceSettings.of(robot, imperfections).least_noise_m
     point = twin.path(angle) + rng.normal(0.0, noise_m, (*angle.shape[:2], 3))
+    if sensors is not None:
+        point = sensors.reading(point, angle)
     usable = np.ones(point.shape[:2], dtype=bool)
     late = chance.late > 0.0
     if gaps:

@@ -16,6 +16,7 @@ from failuretwin.connection.links.live_events import SampledCommands
 from failuretwin.connection.links.ros_messages import RosTopics
 from failuretwin.core.alarm import ALL_CLEAR, CLEAR, RAISED, SUSPECTED, Alarm, Episode
 from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.decision.streaming.monitor import FaultMonitor
 
 HEALTHY = Diagnosis("live", {"healthy": 0.99, "motor_3:stuck": 0.01}, verdict="healthy, 99 % sure")
 STUCK = Diagnosis("live", {"healthy": 0.01, "motor_3:stuck": 0.99}, verdict="motor 3 stuck")
@@ -129,6 +130,39 @@ def test_a_reading_without_a_tool_position_is_no_measurement(twin):
     notebook = Notebook()
     run(Shadow(Script([reading(0.0), reading(0.1, [np.nan] * 3)]), notebook, twin))
     assert notebook.told[1][2] is None
+
+
+class MotorNotebook(Notebook, FaultMonitor):
+    """A monitor that writes down what it is told."""
+
+    def __init__(self):
+        Notebook.__init__(self)
+
+    def update(self, time, command, measured, position=None):
+        self.told.append((time, measured is not None, position))
+        return Answer(time, OK, self.diagnosis)
+
+    conclude = Notebook.conclude
+
+
+def test_motor_readings_count_with_the_tools_reading_of_then(twin):
+    """They may come in messages of their own, a little earlier."""
+    nowhere, tool = np.full(3, np.nan), np.array([0.1, 0.0, 0.2])
+    angles = [np.full(4, 0.1 * k) for k in range(3)]
+    events = [
+        Reading(0.0, nowhere, angles[0]),
+        Reading(0.05, tool),
+        Reading(0.4, nowhere, angles[1]),
+        Reading(0.7, tool),
+        Reading(1.0, tool, angles[2]),
+    ]
+    notebook = MotorNotebook()
+    run(Shadow(Script(events), notebook, twin))
+    seen = [(t, position) for t, there, position in notebook.told if there]
+    assert [t for t, _ in seen] == pytest.approx([0.05, 0.7, 1.0])
+    assert seen[0][1] is angles[0]
+    assert seen[1][1] is None
+    assert seen[2][1] is angles[2]
 
 
 def test_commands_that_come_late_take_their_place(twin):

@@ -14,9 +14,12 @@ from numpy.testing import assert_allclose
 from bag_writers import MONITORING, MONITORING_TEXT, entry, write_bag
 from failuretwin.connection.emulated_arm import Emulation, emulated
 from failuretwin.connection.links import base as pace
+from failuretwin.connection.links import ros2
 from failuretwin.connection.links.base import CommandSent, Pace, Reading
 from failuretwin.connection.links.recording import replay
 from failuretwin.connection.links.ros1 import Ros1Source
+from failuretwin.connection.links.ros2 import Ros2Source
+from failuretwin.connection.links.ros2_messages import Ros2Types
 from failuretwin.connection.links.ros_messages import RosTopics
 from failuretwin.connection.links.rosbridge import RosbridgeSource, connect, disconnect
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
@@ -25,6 +28,7 @@ from little_logs import LOG_COLUMNS
 from ros_peer import RosPeer
 from roscores import free_port
 from waiting import WAIT_S, wait_for
+from zenoh_router import zenoh_router
 
 pytest.importorskip("rosbags")
 pytestmark = [
@@ -118,7 +122,29 @@ def rosbridge_link(robot, log):
         server.stop()
 
 
-LINKS = ["session", "ros1 bag", "ros2 bag", "mcap", "ros1", "rosbridge"]
+@contextmanager
+def ros2_link(robot, log):
+    pytest.importorskip("zenoh")
+    port = free_port()
+    with zenoh_router(port):
+        ours, theirs = (ros2.connect("127.0.0.1", port) for _ in range(2))
+        with Ros2Source(robot, RosTopics(), ours) as source:
+            types, sent = Ros2Types(), {}
+            for topic in ("position_monitoring", "condition_monitoring"):
+                # As rmw_zenoh of ROS 2 Humble names it, under a package we have never heard of.
+                key = f"0/{topic}/some_package::msg::dds_::Monitoring_/TypeHashNotSupported"
+                sent[topic] = theirs.declare_publisher(key)
+                matched = sent[topic]
+                wait_for(lambda matched=matched: matched.matching_status.matching)
+            for topic, t, fields in messages_of(log):
+                content = {"header": {"stamp": stamp(t), "frame_id": ""}, **fields}
+                sent[topic].put(types.to_bytes("some_package/Monitoring", content))
+            yield source
+        theirs.close()
+        ours.close()
+
+
+LINKS = ["session", "ros1 bag", "ros2 bag", "mcap", "ros1", "ros2", "rosbridge"]
 
 
 @pytest.fixture(params=LINKS)
@@ -128,6 +154,9 @@ def link(request, armpi, little_log, tmp_path):
         yield replay(session(little_log, tmp_path), armpi, Pace(0.0))
     elif request.param == "ros1":
         with ros1_link(armpi, little_log, request.getfixturevalue("roscore")) as source:
+            yield source
+    elif request.param == "ros2":
+        with ros2_link(armpi, little_log) as source:
             yield source
     elif request.param == "rosbridge":
         with rosbridge_link(armpi, little_log) as source:
@@ -193,6 +222,7 @@ def test_logs_end_and_networks_do_not(armpi, little_log, tmp_path):
     assert source.poll(0.1) is None
     assert source.ended
     assert not Ros1Source.ended
+    assert not Ros2Source.ended
     assert not RosbridgeSource.ended
 
 

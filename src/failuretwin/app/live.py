@@ -10,6 +10,7 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -32,20 +33,24 @@ from failuretwin.connection.links.statuses import (
     LEVEL_WARN,
     statuses,
 )
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, counted
 from failuretwin.core.foreign import printable
 from failuretwin.data_knowledge.bag_messages import BagTopics
 from failuretwin.decision.streaming.monitor import FaultMonitor, Fit
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.injection import ScheduledFault
+from failuretwin.inference.calibration_fit import MISFIT
+from failuretwin.inference.explanation import percent
 
-EMULATED, ROS1, ROSBRIDGE = "emulated", "ros1", "rosbridge"
+EMULATED, ROS1, ROS2, ROSBRIDGE = "emulated", "ros1", "ros2", "rosbridge"
+NETWORKS = (ROS1, ROS2)
+"""Networks on which an emulated robot may speak."""
 ROSBRIDGE_PORT = 9090
 """Where rosbridge servers listen unless told otherwise."""
 SOURCES = (
-    f"{EMULATED}, {ROS1}, {ROSBRIDGE}://HOST[:PORT], a log (raw session, bag, .mcap), or a source "
-    "of your own, MODULE:CLASS"
+    f"{EMULATED}, {ROS1}, {ROS2}[://HOST[:PORT]], {ROSBRIDGE}://HOST[:PORT], a log (raw session, "
+    "bag, .mcap), or a source of your own, MODULE:CLASS"
 )
 OWN_CLASS = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(:.*)?")
 """How the class of a source of one's own is named, see `source_from_text`."""
@@ -100,6 +105,8 @@ def connect(
         )
     if text == ROS1:
         return _ros1(robot, topics, stack)
+    if text == ROS2 or text.startswith(f"{ROS2}://"):
+        return _ros2(text, robot, topics, stack)
     if text.startswith(f"{ROSBRIDGE}://"):
         return _rosbridge(text, robot, topics, stack)
     from failuretwin.connection.links.recording import replay
@@ -122,19 +129,65 @@ def _ros1(robot: Robot, topics: RosTopics, stack: ExitStack) -> tuple[Source, li
     return source, [stack.enter_context(Ros1Diagnostics(robot, topics))]
 
 
-def address_of(text: str) -> tuple[str, int]:
-    """Return host and port of a rosbridge server, such as ``rosbridge://HOST[:PORT]``.
+def _ros2(
+    text: str, robot: Robot, topics: RosTopics, stack: ExitStack
+) -> tuple[Source, list[Sink]]:
+    from failuretwin.connection.links import ros2
+
+    session = ros2_session(text)
+    stack.callback(session.close)
+    source = stack.enter_context(ros2.Ros2Source(robot, topics, session))
+    return source, [stack.enter_context(ros2.Ros2Diagnostics(robot, topics, session))]
+
+
+def robot_sink(target: str, robot: Robot, live: LiveOptions, stack: ExitStack) -> Sink:
+    """Return where an emulated robot speaks: a network, or a recording.
+
+    The stack closes it in the end.
+
+    Raises:
+        InputError: If it cannot be reached or written.
+    """
+    if target == ROS1:
+        from failuretwin.connection.links.ros1 import Ros1Robot
+
+        return stack.enter_context(Ros1Robot(robot, topics_of(live.topics)))
+    if target.partition("://")[0] == ROS2:
+        from failuretwin.connection.links.ros2 import Ros2Robot
+
+        session = ros2_session(target)
+        stack.callback(session.close)
+        return stack.enter_context(Ros2Robot(robot, topics_of(live.topics), session))
+    from failuretwin.connection.links.recording import Recorder
+
+    return stack.enter_context(Recorder(Path(target), robot))
+
+
+def ros2_session(text: str) -> Any:
+    """Return a session with the router that ``ros2`` or ``ros2://HOST[:PORT]`` stands for.
+
+    Raises:
+        InputError: If it is no such address, or no router answers there.
+    """
+    from failuretwin.connection.links import ros2
+
+    return ros2.connect() if text == ROS2 else ros2.connect(*address_of(text, ros2.ROUTER_PORT))
+
+
+def address_of(text: str, usual_port: int = ROSBRIDGE_PORT) -> tuple[str, int]:
+    """Return host and port of a server, such as ``rosbridge://HOST[:PORT]``.
 
     Raises:
         InputError: If it is no such address.
     """
     try:
         address = urlsplit(text)
-        host, port = address.hostname, address.port or ROSBRIDGE_PORT
+        host, port = address.hostname, address.port or usual_port
     except ValueError:
         host, port = None, 0
     if not host:
-        raise InputError(f"{text!r} is no address. Expected {ROSBRIDGE}://HOST[:PORT].")
+        kind = text.partition("://")[0]
+        raise InputError(f"{text!r} is no address. Expected {kind}://HOST[:PORT].")
     return host, port
 
 
@@ -265,8 +318,6 @@ REFRESH_S = 0.25
 """Time between two drawings [s]."""
 POLL_S = 0.1
 """Longest wait for an event [s]."""
-MISFIT = 0.05
-"""Probability below which it is told that a calibration does not fit."""
 LATE_S = 0.3
 """A command that comes later than this spoils the diagnosis, and the user is told [s]."""
 
@@ -282,12 +333,12 @@ def watch_until_end(
 ) -> Changes:
     """Watch a robot until `until_s` of our monotonic clock [s], and return all that has changed.
 
-    With a monitor it is told if its calibration does not fit.
+    With a monitor it is told how well its calibration and the profile fit, once it has seen enough.
     On a terminal there is a live view, else a line for each change.
     """
     changes, view = Changes(motors), View(motors, source.name)
     live = Live(console=console, auto_refresh=False) if console.is_terminal else nullcontext()
-    begun_s, drawn_s = time.monotonic(), 0.0
+    begun_s, drawn_s, looked = time.monotonic(), 0.0, False
     with live as shown:
         going = True
         while going:
@@ -295,6 +346,9 @@ def watch_until_end(
             troubles = _troubles(shadow, source, sinks, time.monotonic() - begun_s)
             troubles += () if monitor is None else _misfit(monitor.fit)
             found = changes.notice(shadow.snapshot, source.counts, shadow.clock_jumps, troubles)
+            if monitor is not None and monitor.set_up is not None and not looked:
+                looked = True
+                found.append(changes.add(shadow.snapshot.stream_time, fit_of(monitor)))
             if shown is None:
                 for change in found:
                     tell(str(change))
@@ -315,6 +369,21 @@ def _misfit(fit: Fit) -> tuple[str, ...]:
         f"this robot does not do what calibration {fit.given!r} says: it is judged by what arms of "
         "its kind do and by what it teaches itself",
     )
+
+
+def fit_of(monitor: FaultMonitor) -> str:
+    """Return how well calibration and profile have fitted this robot, in one sentence."""
+    fit = monitor.fit
+    taught = f"{fit.learned} movements taught how this robot is"
+    if fit.given:
+        own = f"; {taught}" if fit.learned else ""
+        said = f"calibration {fit.given!r} is this robot's: {percent(fit.fits)} sure{own}"
+    else:
+        said = f"no calibration was given; {taught}"
+    if monitor.set_up is None:
+        return said
+    profile = monitor.set_up or "the log fits the profile"
+    return f"{said}; after {counted(fit.seen, 'movement')} {profile}"
 
 
 def _troubles(

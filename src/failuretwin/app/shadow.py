@@ -34,6 +34,8 @@ from failuretwin.inference.explanation import plain_name
 SILENCE_S = 5.0
 """Without a reading for so long on our own clock, the answer is stale [s]."""
 STUCK = "stuck"
+TOGETHER_S = 0.1
+"""Motor readings count with a reading of the tool that is no further away in time [s]."""
 TICK_S = 0.5
 """Time without an event after which the diagnoser is told that time goes on [s]."""
 
@@ -80,6 +82,7 @@ class Shadow:
         self._fed_s = time.monotonic()
         self._newest = 0.0
         self._computed = False
+        self._motors: tuple[float, FloatArray] | None = None
         self.snapshot = Snapshot(
             Answer(self._clock.stamp(0.0), STALE, None), 0.0, np.full(3, np.nan), 0.0
         )
@@ -136,6 +139,7 @@ class Shadow:
         self._fed_s = time.monotonic()
         if reading.position is not None and np.isfinite(reading.position).all():
             self._reference.start_at(reading.position)
+            self._motors = reading.time, reading.position
             self._computed = bool(np.allclose(reading.tool, self._twin.path(reading.position)))
         seen = reading.tool if np.isfinite(reading.tool).all() else None
         command = None
@@ -148,11 +152,20 @@ class Shadow:
         if seen is not None:
             expected = np.full(3, np.nan) if command is None else self._twin.path(command)
             residual = seen - expected
-        answer = self._diagnoser.update(reading.time, command, seen)
+        answer = self._update(reading.time, command, seen)
         self._fed_s = time.monotonic()  # what we take to think is no silence of the robot
         if seen is not None:
             self._read_s = self._fed_s
         self._publish(answer, residual)
+
+    def _update(self, time: float, command: FloatArray | None, seen: FloatArray | None) -> Answer:
+        """Tell the diagnoser of a reading, with what the motors said about then."""
+        if not isinstance(self._diagnoser, FaultMonitor):
+            return self._diagnoser.update(time, command, seen)
+        said = self._motors
+        there = said is not None and abs(time - said[0]) <= TOGETHER_S
+        position = said[1] if said is not None and there else None
+        return self._diagnoser.update(time, command, seen, position)
 
     def _publish(self, answer: Answer, residual: FloatArray) -> None:
         silent = time.monotonic() - self._read_s > SILENCE_S
@@ -231,6 +244,12 @@ class Changes:
         texts += self._diagnosis(snapshot)
         found = [Change(snapshot.stream_time, text) for text in texts]
         self.lines.extend(found)
+        return found
+
+    def add(self, stream_time: float, text: str) -> Change:
+        """Note something else at a time of the stream [s], and return it."""
+        found = Change(stream_time, text)
+        self.lines.append(found)
         return found
 
     def _silence(self, snapshot: Snapshot) -> list[str]:

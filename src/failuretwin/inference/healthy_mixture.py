@@ -25,6 +25,8 @@ from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import FloatArray
 from failuretwin.inference.fault_filter import FaultBelief, FaultEvidence, FaultFilter
 
+FOREIGN = 0.1
+"""Probability that a calibration is of another robot, or no longer true; assumed."""
 CHANGED = 1e-6
 """Probability that a robot has become another since the movement before: exchanged, readjusted;
 assumed."""

@@ -23,6 +23,13 @@ from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.log_correction import LogCorrection
 from failuretwin.inference.posterior import Posterior
 from failuretwin.inference.priors import Priors
+from failuretwin.inference.rounding import (
+    Rounding,
+    command_rounding,
+    rounded,
+    told_of,
+    tool_rounding,
+)
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.set_up_weighing import (
     ANOTHER,
@@ -32,7 +39,7 @@ from failuretwin.inference.set_up_weighing import (
     run_misfit,
 )
 from failuretwin.inference.set_ups import SetUp, clocks_apart, gross_unit
-from failuretwin.inference.shared_posterior import set_up_in_doubt, shared_posterior
+from failuretwin.inference.shared_posterior import ALLOWED_FOR, set_up_in_doubt, shared_posterior
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -69,20 +76,52 @@ class SeenRuns:
         return Evidence(self.runs, self.model.settings, self.model.sensors)
 
     @cached_property
+    def healthy(self) -> HealthyModel:
+        """The healthy robot as these runs show it, with what was rounded off as noise."""
+        return rounded(self.model, self.tool_rounding, None)
+
+    @cached_property
+    def tool_rounding(self) -> Rounding | None:
+        """How coarsely tool positions were rounded; None: it does not matter."""
+        if not self.model.sensors.tool_alone:
+            return None
+        readings = self.evidence.readings
+        return tool_rounding(readings.point[readings.seen], self.model)
+
+    def rounding(self) -> list[str]:
+        """Return what is to be said of how coarsely the runs were written down, a line each."""
+        evidence = self.sample.evidence
+        command = command_rounding(evidence.movements.target[evidence.usable], self.model)
+        if command is None:
+            return told_of(self.tool_rounding, None, 0.0)
+        few = SetUpWeighing(self.sample, self.hypotheses, self.priors).few
+        coarse = replace(few.likelihood, model=rounded(self.healthy, None, command))
+        says = [
+            float(one.weigh([one.as_told])[0].log_evidence.sum())
+            for one in (few, SetUpWeighing(coarse, self.hypotheses, self.priors))
+        ]
+        share = float(np.exp(-np.logaddexp(0.0, says[0] - says[1])))
+        return told_of(self.tool_rounding, command if share > SURE else None, share)
+
+    @cached_property
     def sample(self) -> RunLikelihood:
         """Some of the runs by their settled positions."""
         settled = self.evidence.sound.settled
         count = len(settled.usable)
         some = np.unique(np.linspace(0, count - 1, JUDGED_RUNS).astype(np.int64))
-        return RunLikelihood(settled[some], self.model)
+        return RunLikelihood(settled[some], self.healthy)
 
     @cached_property
     def in_doubt(self) -> bool:
         """Whether the sensor may stand a little elsewhere than the profile says."""
         return set_up_in_doubt(self.sample, self.hypotheses, self.priors)
 
-    def set_ups(self) -> SetUpPosterior:
-        """Return what is believed of the set-up: unit and clock first, then all else."""
+    def set_ups(self, thorough: bool = False) -> SetUpPosterior:
+        """Return what is believed of the set-up: unit and clock first, then all else.
+
+        Args:
+            thorough: Whether all set-ups are weighed, also where the one as told fits.
+        """
         told = SetUpWeighing(self.sample, self.hypotheses, self.priors)
         if told.rate == 0.0 or not self.model.sensors.tool_alone:
             return told.taken_as_told()
@@ -92,7 +131,7 @@ class SeenRuns:
             if found is not None:
                 first = found.beside(first)
                 seen = self.under(first.correction)
-        posterior = SetUpWeighing(seen.sample, self.hypotheses, self.priors).posterior()
+        posterior = SetUpWeighing(seen.sample, self.hypotheses, self.priors).posterior(thorough)
         return posterior.beside(first) if first.what else posterior
 
     def unit(self) -> SetUp | None:
@@ -125,8 +164,17 @@ class SeenRuns:
             moving: Readings on the way of all runs; None: they are left aside.
         """
         way = None if moving is None else moving[rows]
-        likelihood = RunLikelihood(self.evidence.sound.settled[rows], self.model, way)
+        likelihood = RunLikelihood(self.evidence.sound.settled[rows], self.healthy, way)
         return shared_posterior(likelihood, self.hypotheses, self.priors, self.in_doubt)
+
+    def elsewhere(self) -> str:
+        """Return that the sensor stands elsewhere, or is noisier, if most runs say so."""
+        if not self.in_doubt:
+            return ""
+        said = [one for one in self.posterior(slice(None), None).set_up if one]
+        if 2 * len(said) <= self.runs.sizes["run"]:
+            return ""
+        return said[-1].replace(ALLOWED_FOR, "")
 
 
 def mixed(posteriors: Sequence[Posterior], set_ups: SetUpPosterior) -> Posterior:
@@ -143,6 +191,8 @@ def mixed(posteriors: Sequence[Posterior], set_ups: SetUpPosterior) -> Posterior
         stacked = np.stack([one.log_posterior for one in posteriors]) + weight[:, None, None]
         likeliest = replace(likeliest, log_posterior=log_sum(stacked, axis=0))
     remark, count = set_up_remark(set_ups), len(likeliest.log_posterior)
+    if set_ups.fits and set_ups.wrong >= SURE:
+        remark = f"{remark}; judged with that undone"
     known = likeliest.set_up or [""] * count
     if remark:
         said = ["; ".join(filter(None, (remark, one))) for one in known]
@@ -181,4 +231,10 @@ def set_up_remark(set_ups: SetUpPosterior) -> str:
     if set_ups.wrong < SURE:
         return f"the log may not fit the profile ({set_ups.wrong:.0%}): {ways}"
     sure = "over 99.9 %" if set_ups.wrong > 0.999 else f"{100.0 * set_ups.wrong:.1f} %"
-    return f"the log does not fit the profile ({sure} sure): {ways}; judged with that undone"
+    return f"the log does not fit the profile ({sure} sure): {ways}"
+
+
+def set_up_finding(set_ups: SetUpPosterior) -> str:
+    """Return the same, also where neither a fault nor a mistake explains the runs."""
+    unexplained = "" if set_ups.fits else f"the log does not fit the profile: {ANOTHER}"
+    return set_up_remark(set_ups) or unexplained

@@ -278,6 +278,22 @@ class SensorStack:
             return MeasuredSamples(point, seen, none, np.zeros(len(seen), dtype=bool))
         return MeasuredSamples(point, seen, tool.assumed & seen, tool.filled)
 
+    def reading(self, tool: FloatArray, position: FloatArray) -> FloatArray:
+        """Return single readings of tool and motors at rest, (..., channel) [m].
+
+        NaN where one of those that are believed is missing.
+
+        Args:
+            tool: Position of the tool, (..., axis) [m].
+            position: Angles that the motors report, (..., motor) [rad].
+        """
+        if self.tool_alone:
+            return tool
+        told = {Tool.kind: tool, Encoders.kind: position}
+        parts = [sensor.to_channels(told[sensor.kind]) for sensor in self.at_rest]
+        point = np.concatenate(parts, axis=-1) * self._scale
+        return np.where(np.isfinite(point).all(axis=-1, keepdims=True), point, np.nan)
+
     def read_on_way(self, runs: xr.Dataset, readings: MeasuredSamples) -> FloatArray:
         """Return what is seen on the way, (run, time, channel) [m].
 

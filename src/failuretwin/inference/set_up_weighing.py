@@ -226,14 +226,19 @@ class SetUpWeighing:
 
     # Which set-ups are weighed.
 
-    def posterior(self) -> SetUpPosterior:
-        """Return what is believed of the set-up; as told at once where that fits."""
+    def posterior(self, thorough: bool = False) -> SetUpPosterior:
+        """Return what is believed of the set-up; as told at once where that fits.
+
+        Args:
+            thorough: Whether other set-ups are weighed also where it fits: a fault that fits the
+                runs need not be what explains them best.
+        """
         if self.rate == 0.0 or not self.likelihood.usable.any():
             return self.taken_as_told()
         told = self.weigh([self.as_told])
         if not told[0].fits:
             told = self.weigh([self.as_told], everything=True)
-        if told[0].fits:
+        if told[0].fits and not thorough:
             return SetUpPosterior.of([*told, *self.zeros(self.as_told)])
         return self.few.searched()
 

@@ -40,6 +40,8 @@ from failuretwin.inference.shared_weighing import Candidate, SharedWeighing
 
 SURE = 0.9
 """Probability of a wrong set-up from which it is told."""
+ALLOWED_FOR = "; allowed for"
+"""Said where verdicts count with it."""
 
 
 def set_up_in_doubt(
@@ -213,8 +215,8 @@ class Mixture:
             return ""
         return (
             f"the sensor does not seem to stand where the profile says ({share[moved].sum():.1%}): "
-            f"the tool appears about {self._distance_mm(run, share, moved):.2g} mm off; allowed "
-            "for. `failuretwin robot fit` on healthy runs finds its frame"
+            f"the tool appears about {self._distance_mm(run, share, moved):.2g} mm off"
+            f"{ALLOWED_FOR}. `failuretwin robot fit` on healthy runs finds its frame"
         )
 
     def _distance_mm(self, run: int, share: FloatArray, moved: BoolArray) -> float:

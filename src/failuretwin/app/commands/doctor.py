@@ -45,7 +45,7 @@ def doctor(
     robot: str,
     seed: int,
 ) -> None:
-    """Say whether logs fit the profile: senses, order, units, axes, zeros, frames, clocks, gaps.
+    """Say whether logs fit the profile: senses, order, units, axes, zeros, frames, clocks, grids.
 
     LOG is whatever `diagnose` reads, faulty or not; all are taken to share one set-up. Every
     mistake is weighed with every fault behind it, so that a broken motor is not taken for one.
@@ -64,28 +64,23 @@ def doctor(
     runs = read_inputs(logs, model, reading)
     seen = BayesDiagnoser(known.twin, known.imperfections).seen(runs)
     set_ups = seen.set_ups()
-    for line in (*_set_up_lines(set_ups), *_log_lines(seen, set_ups)):
+    for line in (_set_up_line(set_ups), *_log_lines(seen, set_ups)):
         tell(line)
     if out is not None:
         _write(set_ups, reading.columns, out)
 
 
-def _set_up_lines(set_ups: SetUpPosterior) -> list[str]:
-    from failuretwin.inference.seen_runs import set_up_remark
-    from failuretwin.inference.set_up_weighing import ANOTHER
+def _set_up_line(set_ups: SetUpPosterior) -> str:
+    from failuretwin.inference.seen_runs import set_up_finding
 
-    remark = set_up_remark(set_ups)
-    if remark:
-        return [f"set-up: {remark}"]
-    if not set_ups.fits:
-        return [f"set-up: neither a fault nor a mistake explains the log: {ANOTHER}"]
-    return ["set-up: the log fits the profile"]
+    return f"set-up: {set_up_finding(set_ups) or 'the log fits the profile'}"
 
 
 def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior) -> list[str]:
     """Return what the logs hold, and what is wrong with them."""
     from failuretwin.core.errors import counted
     from failuretwin.core.runs import measured_rate
+    from failuretwin.inference.calibration_fit import calibration_told, fits_this_robot
 
     usable = seen.evidence.settled.usable
     lines = [
@@ -93,6 +88,10 @@ def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior) -> list[str]:
         f"the tool is seen at rest, {measured_rate(seen.runs):.3g} readings a second"
     ]
     undone = seen.under(set_ups.best.set_up.correction)
+    fits = fits_this_robot(undone) if set_ups.fits else None
+    if fits is not None:
+        lines.insert(0, f"set-up: {calibration_told(undone.model.imperfections.name, fits)}")
+    lines += [f"log: {line}" for line in undone.rounding()]
     remarks = [
         line
         for quality in undone.evidence.quality

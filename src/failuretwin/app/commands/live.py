@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,8 +22,9 @@ from failuretwin.app.commands.options import (
 from failuretwin.app.terminal import tell
 
 if TYPE_CHECKING:
-    from failuretwin.decision.streaming.monitor import Fit
+    from failuretwin.connection.links.base import Sink, Source
     from failuretwin.digital_model.nonidealities import Imperfections
+    from failuretwin.digital_model.robot import Robot
     from failuretwin.failure_behavior.injection import ScheduledFault
 
 
@@ -44,6 +46,14 @@ if TYPE_CHECKING:
     metavar="N",
     help="False alarms that you allow in 100 hours of work; fewer come later.",
 )
+@click.option(
+    "--sensing",
+    type=click.Choice(["tool", "tool+encoders"]),
+    default="tool",
+    show_default=True,
+    help="Whether what the motors report of themselves, such as /joint_states, is believed beside "
+    "the tool's position: errors show sooner, but a wrong reading is taken for the motor.",
+)
 @live_options
 @plugin_option
 @common_options
@@ -52,20 +62,22 @@ def watch(
     calibration: Path | None,
     record: Path | None,
     budget: float,
+    sensing: str,
     live: LiveOptions,
     robot: str,
     seed: int,
 ) -> None:
     """Watch a robot as a digital shadow: it listens, says what is wrong, and moves nothing.
 
-    SOURCE is `ros1`, `rosbridge://HOST[:PORT]`, `emulated` (a robot that exists only as physics),
-    a log to replay (a raw session, a bag, a recording), or a source of your own, MODULE:CLASS, made
-    as failuretwin.connection.links.base.Source says. On a ROS network the diagnosis is
+    SOURCE is `ros1`, `ros2[://HOST[:PORT]]` (over Zenoh), `rosbridge://HOST[:PORT]`, `emulated` (a
+    robot that exists only as physics), a log to replay (a raw session, a bag, a recording), or a
+    source of your own, MODULE:CLASS, made as failuretwin.connection.links.base.Source says. On a
+    ROS network the diagnosis is
     published on /diagnostics. Stop with Ctrl-C.
     """
     from contextlib import ExitStack
 
-    from failuretwin.app.live import connect, topics_of, watch_until_end
+    from failuretwin.app.live import connect, fit_of, topics_of, watch_until_end
     from failuretwin.app.shadow import Shadow
     from failuretwin.app.tables import console
     from failuretwin.connection.links.recording import Recorder
@@ -76,9 +88,10 @@ def watch(
 
     model = load_robot(robot)
     known, motors = load_calibration(calibration, model), model.motor_names
-    diagnoser = monitor(known.twin, known.imperfections, budget)
+    diagnoser = monitor(known.twin, known.imperfections, budget, sensing)
     wait_s = topics_of(live.topics).wait_s
-    tell(_rests_on(known.imperfections) + _limit(known.imperfections, motors, budget))
+    when = "" if calibration is None else _written(calibration)
+    tell(_rests_on(known.imperfections, when) + _limit(known.imperfections, motors, budget))
     # An emulated robot ends by itself, a log when it is over.
     length = live.duration if live.duration and source != "emulated" else math.inf
     with ExitStack() as stack:
@@ -92,32 +105,28 @@ def watch(
         except KeyboardInterrupt:
             tell("stopped")
     arm = statuses(shadow.snapshot.answer, motors)[0]
-    tell(_fit(diagnoser.fit))
+    tell(fit_of(diagnoser))
     tell(f"last answer: {arm.message}")
 
 
-def _rests_on(known: Imperfections) -> str:
-    """Return what the answers rest on, in one sentence."""
+def _written(calibration: Path) -> str:
+    """Return when the file of a calibration was written; empty where it is none of a path."""
+    if not calibration.is_file():
+        return ""
+    return f", written {date.fromtimestamp(calibration.stat().st_mtime).isoformat()}"
+
+
+def _rests_on(known: Imperfections, when: str) -> str:
+    """Return what the answers rest on, in one sentence; `when` says of when it is."""
     from failuretwin.digital_model.arm_classes import GENERIC_NAME
 
     if known.name != GENERIC_NAME:
-        return f"healthy behaviour: {known.name} ({known.protocol}; {known.source})"
+        return f"healthy behaviour: {known.name} ({known.protocol}; {known.source}{when})"
     return (
         f"healthy behaviour: {known.name}; {known.source}. What this robot does is not known yet: "
         "it is learned as it works, and until then faults take longer to show. --calibration FILE "
         "uses what was learned before"
     )
-
-
-def _fit(fit: Fit) -> str:
-    """Return how well the calibration has fitted this robot, in one sentence."""
-    from failuretwin.inference.explanation import percent
-
-    taught = f"{fit.learned} movements taught how this robot is"
-    if not fit.given:
-        return f"no calibration was given; {taught}"
-    own = f"; {taught}" if fit.learned else ""
-    return f"calibration {fit.given!r} is this robot's: {percent(fit.fits)} sure{own}"
 
 
 def _limit(known: Imperfections, motors: Sequence[str], budget: float) -> str:
@@ -146,9 +155,10 @@ the last fault has begun or been repaired [s]."""
     "--to",
     "target",
     default="ros1",
-    metavar="ros1|FILE.mcap",
-    help="Publish as a ROS 1 node until interrupted, or write a recording at once: one minute, or "
-    "until 20 s after the last fault has begun or been repaired, unless --duration says otherwise.",
+    metavar="ros1|ros2|FILE.mcap",
+    help="Publish as a ROS 1 node, or on ROS 2 over Zenoh, until interrupted, or write a recording "
+    "at once: one minute, or until 20 s after the last fault has begun or been repaired, unless "
+    "--duration says otherwise.",
 )
 @click.option(
     "--obey",
@@ -190,49 +200,53 @@ def _obey(target: str, live: LiveOptions, robot: str, seed: int) -> None:
 
 def _play(target: str, live: LiveOptions, robot: str, seed: int) -> None:
     """Play a robot that moves at random."""
-    from failuretwin.app.live import emulated_robot, schedule_of, topics_of
-    from failuretwin.connection.links.base import AS_FAST_AS_POSSIBLE, Pace, Sink
-    from failuretwin.connection.links.recording import Recorder
+    from contextlib import ExitStack
+
+    from failuretwin.app.live import NETWORKS, emulated_robot, robot_sink, schedule_of
+    from failuretwin.connection.links.base import AS_FAST_AS_POSSIBLE, Pace
     from failuretwin.core.errors import InputError
     from failuretwin.digital_model.robot import load_robot
-    from failuretwin.failure_behavior.injection import state_at
 
     model = load_robot(robot)
     schedule = schedule_of(live, model)
-    zero, on_ros = time.time(), target == "ros1"
+    zero, on_ros = time.time(), target.partition("://")[0] in NETWORKS
     if not on_ros and Path(target).suffix != ".mcap":
-        raise InputError(f"--to is {target!r}, expected ros1 or a file that ends in .mcap.")
+        raise InputError(f"--to is {target!r}, expected ros1, ros2 or a file that ends in .mcap.")
     length = live.duration or (math.inf if on_ros else _file_length(schedule))
     pace = Pace(live.speed if on_ros else AS_FAST_AS_POSSIBLE)
     source = emulated_robot(model, live, seed, pace, length, zero)
-    sink: Sink
-    if on_ros:
-        from failuretwin.connection.links.ros1 import Ros1Robot
-
-        sink = Ros1Robot(model, topics_of(live.topics))
-    else:
-        sink = Recorder(Path(target), model)
-    state, trouble = "", ""
-    with source, sink:
-        try:
-            while not source.ended:
-                event = source.poll(1.0)
-                if event is None:
-                    continue
-                sink.put(event)
-                if sink.trouble != trouble:
-                    trouble = sink.trouble
-                    tell(trouble or "going on")
-                now = state_at(schedule, event.time - zero, model.motor_names)
-                if now != state:
-                    tell(f"{event.time - zero:8.1f} s  {now}")
-                    state = now
-        except KeyboardInterrupt:
-            tell("stopped")
+    with ExitStack() as stack:
+        sink = robot_sink(target, model, live, stack)
+        stack.enter_context(source)
+        _pass_on(source, sink, schedule, zero, model)
     if sink.trouble:
         raise InputError(sink.trouble)
     if source.ended and not on_ros:
         tell(f"{length:g} s written to {target}")
+
+
+def _pass_on(
+    source: Source, sink: Sink, schedule: Sequence[ScheduledFault], zero: float, robot: Robot
+) -> None:
+    """Say what a robot says, and tell the user of its faults, until it ends."""
+    from failuretwin.failure_behavior.injection import state_at
+
+    state, trouble = "", ""
+    try:
+        while not source.ended:
+            event = source.poll(1.0)
+            if event is None:
+                continue
+            sink.put(event)
+            if sink.trouble != trouble:
+                trouble = sink.trouble
+                tell(trouble or "going on")
+            now = state_at(schedule, event.time - zero, robot.motor_names)
+            if now != state:
+                tell(f"{event.time - zero:8.1f} s  {now}")
+                state = now
+    except KeyboardInterrupt:
+        tell("stopped")
 
 
 def _file_length(schedule: Sequence[ScheduledFault]) -> float:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from io import FileIO
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from failuretwin.connection.links.base import (
     Reading,
 )
 from failuretwin.connection.links.live_events import SampledCommands, motor_reading
+from failuretwin.connection.links.ros2_messages import ros2_object
 from failuretwin.connection.links.ros_messages import (
     DiagnosticsPublisher,
     Outgoing,
@@ -39,9 +40,6 @@ from failuretwin.data_knowledge.timed_log import Samples, Targets, TimedLog
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
-if TYPE_CHECKING:
-    from rosbags.typesys.store import Typestore
-
 # MCAP files that grow while they can be read, in ROS 2's encoding.
 
 CHUNK_BYTES = 16_384
@@ -53,8 +51,6 @@ _END = (
     + _MAGIC
 )
 """What makes a file whole whose data end early, see https://mcap.dev/spec."""
-_OWN_NAMES = {"sec": "secs", "nanosec": "nsecs"}
-"""What ROS 2 calls the parts of a time, and what `Outgoing` does."""
 
 
 class _Unbuffered:
@@ -129,7 +125,7 @@ class McapFile:
         type_ = message.type.replace("/", "/msg/")
         if message.topic not in self._channels:
             self._channels[message.topic] = self._register(message.topic, type_)
-        content = self._store.serialize_cdr(_build(self._store, type_, message.content), type_)
+        content = self._store.serialize_cdr(ros2_object(self._store, type_, message.content), type_)
         self._writer.add_message(
             self._channels[message.topic], time_ns, bytes(content), time_ns, sequence=0
         )
@@ -161,27 +157,6 @@ class McapFile:
         text, _ = self._store.generate_msgdef(type_, ros_version=2)
         schema = self._writer.register_schema(type_, "ros2msg", text.encode())
         return self._writer.register_channel(topic, "cdr", schema)
-
-
-def _build(store: Typestore, type_: str, content: dict[str, Any]) -> Any:
-    """Return a message object from plain values."""
-    _, fields = store.fielddefs[type_]
-    values = {
-        name: _value(store, kind, content[_OWN_NAMES.get(name, name)]) for name, kind in fields
-    }
-    return store.types[type_](**values)
-
-
-def _value(store: Typestore, description: Any, value: Any) -> Any:
-    kind, detail = description
-    if kind.name == "NAME":
-        return _build(store, detail, value)
-    if kind.name == "BASE":
-        return value
-    (item_kind, item), _ = detail
-    if item_kind.name == "NAME":
-        return [_build(store, item, part) for part in value]
-    return list(value) if item[0] == "string" else np.array(value, dtype=item[0])
 
 
 RECORDED = RosTopics(

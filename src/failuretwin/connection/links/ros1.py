@@ -14,19 +14,16 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from http.client import HTTPConnection, HTTPException
 from threading import Thread
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, get_args
 from xmlrpc.client import Error, ServerProxy, Transport
 
 from failuretwin.connection.links.base import (
-    Answer,
-    CommandSent,
     EventQueue,
-    Item,
-    Reading,
 )
 from failuretwin.connection.links.commander import Order
 from failuretwin.connection.links.live_events import NetworkSource
 from failuretwin.connection.links.network_commander import Commanding, Orders
+from failuretwin.connection.links.network_sinks import DiagnosticsSink, RobotSink
 from failuretwin.connection.links.ros1_import import Decoder, load_rospy, message_class
 from failuretwin.connection.links.ros_messages import (
     DIAGNOSTICS_TYPE,
@@ -294,10 +291,8 @@ class _Publishers:
             )
 
 
-class Ros1Robot:
-    """Plays a robot: publishes readings and commands as the robot itself would.
-
-    Whoever listens to the commands will move. Nothing but `emulate` makes use of it.
+class Ros1Robot(RobotSink):
+    """Plays a robot on ROS 1; see `RobotSink`.
 
     Args:
         robot: The robot.
@@ -307,37 +302,13 @@ class Ros1Robot:
         InputError: If rospy is missing, no master answers, or a type cannot be published.
     """
 
-    name = "ROS 1"
-
     def __init__(self, robot: Robot, topics: RosTopics) -> None:
-        self._writer = RosWriter(robot, topics)
-        self._publishers = _Publishers(self._writer.topics)
-
-    @property
-    def trouble(self) -> str:
-        """What keeps items from arriving just now."""
-        return self._publishers.trouble
-
-    def put(self, item: Item) -> None:
-        """Publish a reading or a command."""
-        if isinstance(item, Reading):
-            messages = self._writer.reading(item)
-        elif isinstance(item, CommandSent):
-            messages = self._writer.command(item)
-        else:
-            return
-        for message in messages:
-            self._publishers.send(message)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._publishers.close()
+        writer = RosWriter(robot, topics)
+        super().__init__("ROS 1", writer, _Publishers(writer.topics))
 
 
-class Ros1Diagnostics:
-    """Publishes answers as diagnostics: every second, and at once when a status gets worse.
+class Ros1Diagnostics(DiagnosticsSink):
+    """Publishes answers as diagnostics on ROS 1.
 
     Args:
         robot: The robot.
@@ -347,28 +318,9 @@ class Ros1Diagnostics:
         InputError: If rospy is missing or no master answers.
     """
 
-    name = "ROS 1 diagnostics"
-
     def __init__(self, robot: Robot, topics: RosTopics) -> None:
-        self._bulletin = DiagnosticsPublisher(robot, topics)
-        self._publishers = _Publishers([(topics.diagnostics, DIAGNOSTICS_TYPE)])
-
-    @property
-    def trouble(self) -> str:
-        """What keeps items from arriving just now."""
-        return self._publishers.trouble
-
-    def put(self, item: Item) -> None:
-        """Publish an answer if it is time to."""
-        message = self._bulletin.message(item) if isinstance(item, Answer) else None
-        if message is not None:
-            self._publishers.send(message)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._publishers.close()
+        publishers = _Publishers([(topics.diagnostics, DIAGNOSTICS_TYPE)])
+        super().__init__("ROS 1 diagnostics", DiagnosticsPublisher(robot, topics), publishers)
 
 
 class Ros1Commander(Commanding, Ros1Source):

@@ -36,12 +36,15 @@ from failuretwin.inference.posterior import (
     shows_in_transients,
 )
 from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.sensors import TOOL_ALONE
 
 MOVEMENTS = 5
 """Movements that are remembered, the present one included: as many as a run of the paper has."""
 SILENCE_S = 5.0
 """Without a reading for so long nothing is known of the present [s]; the bus of the ArmPi stalls
 for 4 s."""
+WITH_ENCODERS = (*TOOL_ALONE, "encoders")
+"""Sensors that a stream sees by beside the tool's position alone."""
 DEAD = LogQuality(
     fatal="the tool stands still though motors are told to move: the sensor or the arm is dead"
 )
@@ -105,24 +108,27 @@ class StreamingFleet:
                 f"a stream of {robots} robots, {movements} movements, {rate_hz} Hz. Expected one "
                 "robot and one movement at least, and a rate above 0 or None."
             )
-        if not diagnoser.healthy_model.sensors.tool_alone:
+        model = diagnoser.healthy_model
+        known = model.sensing in (TOOL_ALONE, WITH_ENCODERS)
+        if not known or (not model.sensors.tool_alone and diagnoser.whole_run):
             raise InputError(
-                f"sensing {diagnoser.sensing}: a stream sees by the tool's position alone. "
-                "Diagnose recorded runs, or leave sensing out."
+                f"sensing {diagnoser.sensing}: a stream sees by the tool's position, alone or with "
+                "encoders (tool+encoders, and whole_run=False). Diagnose recorded runs, or leave "
+                "sensing out."
             )
         self.diagnoser = diagnoser
         self.hypotheses = [str(hypothesis) for hypothesis in diagnoser.hypothesis_set]
         self.robots, self.rate_hz, self.movements = robots, rate_hz, movements
         self._zero: float | None = None
         self._now = -np.inf
-        model = diagnoser.healthy_model
         self._settings = model.settings
         self._tracker = MovementTracker(model, robots, movements, rate_hz)
         self._frozen = FrozenSensorDetector.empty(run=robots, axis=3, value=4, motor=motors)
         self._untold = UntoldMotion.empty(run=robots, axis=3)
         self._split = TwoPlaces.empty(run=robots, axis=3)
         self._prior = np.exp(log_prior(diagnoser.hypothesis_set, diagnoser.priors))
-        sizes = {"run": robots, "hypothesis": len(self._prior), "axis": 3}
+        channels = model.sensors.channels
+        sizes = {"run": robots, "hypothesis": len(self._prior), "axis": channels}
         self._beliefs = FleetPosterior.empty(**sizes)
         self._beliefs.posterior[:] = self._prior
         self._everything_counts = any(shows_in_transients(h) for h in diagnoser.hypothesis_set)
@@ -150,7 +156,11 @@ class StreamingFleet:
         return np.asarray(np.isinf(read_s) | (read_s < self._now - SILENCE_S))
 
     def update(
-        self, time: float, command: ArrayLike | None, measured: ArrayLike | None
+        self,
+        time: float,
+        command: ArrayLike | None,
+        measured: ArrayLike | None,
+        position: ArrayLike | None = None,
     ) -> IntArray:
         """Take a sample and return the robots of which something new is believed, (robot,).
 
@@ -158,6 +168,8 @@ class StreamingFleet:
             time: When it was taken [s]; a sample may come late, as long as its movement lasts.
             command: References of all motors, (robot, motor) [rad]; NaN or None: not known.
             measured: Tool positions, (robot, axis) [m]; NaN or None: no reading.
+            position: What the motors report of themselves, (robot, motor) [rad], where it is
+                believed; a reading counts where both are there.
 
         Raises:
             InputError: If the shapes do not fit, or the time is not finite or far older than the
@@ -170,12 +182,22 @@ class StreamingFleet:
         split = self._split.see(points, self._settings.unmoved_m)
         points = np.where(split[:, None], np.nan, points)
         away = self._astray(time, reference, points)
+        sensors = self.diagnoser.healthy_model.sensors
+        points = sensors.reading(points, self._reported(position))
         begun, at_rest = self._tracker.take(time, reference, points, away)
         self._beliefs.point[begun] = np.nan
         self._untold.begin(np.union1d(begun, np.flatnonzero(self._tracker.references.moved)))
         judged = self._judge(self._with_news(at_rest))
         odd = np.flatnonzero((self._odd != before).any(axis=0))
         return np.unique(np.concatenate([died, odd, judged]))
+
+    def _reported(self, position: ArrayLike | None) -> FloatArray:
+        """Return what the motors report, (robot, motor) [rad]; NaN where they do not."""
+        shape = self.robots, len(self.diagnoser.twin.robot.motors)
+        found = np.full(shape, np.nan) if position is None else as_floats(position)
+        if found.shape != shape:
+            raise InputError(f"motor readings have shape {found.shape}, expected {shape}.")
+        return found
 
     def _astray(self, time: float, reference: FloatArray, points: FloatArray) -> BoolArray:
         """Return tools that left where they rested without a command, (robot,)."""
@@ -233,9 +255,20 @@ class StreamingFleet:
         """Return why nothing can be said of a robot that was not judged; None: it is too early."""
         if not self._odd[:, robot].any() or self._tracker.window.count[robot] > 0:
             return None
+        return self.undecided(robot, self._quality(robot).fatal)
+
+    def undecided(self, robot: int, reason: str, known: Diagnosis | None = None) -> Diagnosis:
+        """Return that nothing can be said of a robot's motors.
+
+        Args:
+            robot: Its index.
+            reason: Why.
+            known: What was said without that; its remarks on the readings stand.
+        """
         prior = dict(zip(self.hypotheses, self._prior.tolist(), strict=True))
-        reason = self._quality(robot).fatal
         nothing = Diagnosis(f"robot {robot}", prior, undecided=reason)
+        if known is not None:
+            nothing = replace(nothing, run=known.run, quality=known.quality)
         return worded(nothing, self.diagnoser.hypothesis_set)
 
     def seen(self, robot: int) -> tuple[RunLikelihood, StreamPosition] | None:

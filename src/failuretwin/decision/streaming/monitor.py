@@ -21,20 +21,19 @@ from failuretwin.decision.streaming.alarm_rule import AlarmRule
 from failuretwin.decision.streaming.diagnoser import reference_of
 from failuretwin.decision.streaming.fleet import StreamingFleet
 from failuretwin.decision.streaming.learning import LifeLearner
-from failuretwin.digital_model.arm_classes import GENERIC_NAME
+from failuretwin.decision.streaming.set_up_watch import SetUpWatch
+from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.fault_filter import RATES, FaultFilter, FaultRates
-from failuretwin.inference.healthy_mixture import HealthyMixture
+from failuretwin.inference.healthy_mixture import FOREIGN, HealthyMixture
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.posterior import StreamPosition
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 WORTH_LEARNING = 0.01
 """Probability that the calibration that was given is not this robot's from which it learns."""
-FOREIGN = 0.1
-"""Probability that a calibration is of another robot, or no longer true; assumed."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +44,13 @@ class Fit:
         given: Name of the calibration that was given; empty: none of this robot.
         fits: Probability that it is this robot's; 0 without one.
         learned: Movements that this robot itself has taught.
+        seen: Movements that have begun.
     """
 
     given: str
     fits: float
     learned: int
+    seen: int = 0
 
 
 class FaultMonitor:
@@ -73,10 +74,14 @@ class FaultMonitor:
         self._fleet = StreamingFleet(diagnoser, 1)
         known = diagnoser.healthy_model
         ideal, cold = known.imperfections.settling is None, known.imperfections.name == GENERIC_NAME
-        self._learner = None if ideal else LifeLearner(diagnoser)
-        self._models: list[HealthyModel] = [] if cold else [known]
+        learns = known.sensors.tool_alone and not ideal
+        self._learner = LifeLearner(diagnoser) if learns else None
+        self._models: list[HealthyModel] = [] if cold and learns else [known]
         if self._learner is not None:
             self._models.append(self._learner.model)
+        elif not (cold or ideal):
+            kind = generic_imperfections(known.twin.robot)
+            self._models.append(HealthyModel.of(known.twin, kind).seen_by(known.sensing))
         hypotheses, priors = diagnoser.hypothesis_set, diagnoser.priors
         filters = [FaultFilter(model, hypotheses, priors, rates) for model in self._models]
         share = [1.0] if len(filters) == 1 else [1.0 - FOREIGN, FOREIGN]
@@ -89,18 +94,26 @@ class FaultMonitor:
         self._movements = 0
         self._explained: dict[int, float] = {}
         self._diagnosis: Diagnosis | None = None
+        self._set_up = SetUpWatch(diagnoser)
+
+    @property
+    def set_up(self) -> str | None:
+        """What is to be said of the set-up; empty: the log fits the profile; None: not looked."""
+        return self._set_up.finding if self._set_up.looked else None
 
     @property
     def fit(self) -> Fit:
         """Whose healthy behaviour the robot has, so far."""
         fits = float(np.exp(self._concluded.log_weight[0, 0])) if self._given else 0.0
-        return Fit(self._given, fits, 0 if self._learner is None else self._learner.movements)
+        learned = 0 if self._learner is None else self._learner.movements
+        return Fit(self._given, fits, learned, self._set_up.movements)
 
     def update(
         self,
         time: float,
         command: Mapping[str, float] | ArrayLike | None,
         measured: ArrayLike | None,
+        position: ArrayLike | None = None,
     ) -> Answer:
         """Take what is known at a time and return what is believed then.
 
@@ -108,6 +121,7 @@ class FaultMonitor:
             time: Time of the stream [s]; a sample may come late, as long as its movement lasts.
             command: Reference of every motor, by name or (motor,) [rad]; None: not known.
             measured: Tool position, (axis,) [m]; None or NaN: no reading.
+            position: What the motors report of themselves, (motor,) [rad], where that is believed.
 
         Raises:
             InputError: If a motor is missing, shapes do not fit or the time is not finite.
@@ -115,8 +129,10 @@ class FaultMonitor:
         motors = self._fleet.diagnoser.twin.robot.motor_names
         reference = None if command is None else reference_of(motors, command)[None]
         point = None if measured is None else as_floats(measured)[None]
-        if len(self._fleet.update(time, reference, point)):
+        motors_say = None if position is None else as_floats(position)[None]
+        if len(self._fleet.update(time, reference, point, motors_say)):
             self._judge()
+        self._set_up.see(time, _row(reference), _row(point))
         return self._answer()
 
     def conclude(self) -> Answer:
@@ -126,8 +142,13 @@ class FaultMonitor:
         return self._answer()
 
     def _answer(self) -> Answer:
+        """Return what is believed; where the set-up is in doubt, no motor is blamed."""
         state = STALE if self._fleet.stale[0] else OK
-        return Answer(self._fleet.time, state, self._diagnosis, self._rule.alarm)
+        reason = self._set_up.against(self._rule.alarm)
+        if not reason:
+            return Answer(self._fleet.time, state, self._diagnosis, self._rule.alarm)
+        undecided = replace(self._fleet.undecided(0, reason, self._diagnosis), run="stream")
+        return Answer(self._fleet.time, state, undecided)
 
     def _judge(self) -> None:
         """Renew what is believed by what the last movements say."""
@@ -208,8 +229,16 @@ class FaultMonitor:
                 self._models[-1] = self._fleet.diagnoser.healthy_model
 
 
+def _row(values: FloatArray | None) -> FloatArray | None:
+    """Return what there is of the robot."""
+    return None if values is None else as_floats(values[0])
+
+
 def monitor(
-    twin: RobotLike, imperfections: HealthyLike = None, false_alarms_per_100h: float = 1.0
+    twin: RobotLike,
+    imperfections: HealthyLike = None,
+    false_alarms_per_100h: float = 1.0,
+    sensing: str | None = None,
 ) -> FaultMonitor:
     """Return what watches a robot at work: settled poses, and faults are rare.
 
@@ -218,5 +247,7 @@ def monitor(
         imperfections: How the healthy robot differs from it, or a calibration by name or path;
             None: as its profile says.
         false_alarms_per_100h: False alarms that are allowed in 100 hours of work.
+        sensing: ``tool`` or ``tool+encoders``; None: the tool's position alone.
     """
-    return FaultMonitor(BayesDiagnoser(twin, imperfections, whole_run=False), false_alarms_per_100h)
+    diagnoser = BayesDiagnoser(twin, imperfections, whole_run=False, sensing=sensing)
+    return FaultMonitor(diagnoser, false_alarms_per_100h)

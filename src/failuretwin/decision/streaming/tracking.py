@@ -118,7 +118,8 @@ class MovementTracker:
         self, model: HealthyModel, robots: int, movements: int, rate_hz: float | None
     ) -> None:
         motors = len(model.scatter)
-        self.samples = SampleBuffer(robots, motors)
+        self._sensors = model.sensors
+        self.samples = SampleBuffer(robots, motors, self._sensors.channels)
         self.references = References.empty(run=robots, motor=motors)
         self.window = MovementWindow.of(model, robots, movements)
         self._twin, self._settings = model.twin, model.settings
@@ -138,7 +139,7 @@ class MovementTracker:
         Args:
             time: When it was taken [s].
             command: References, (robot, motor) [rad]; NaN where not known.
-            points: Tool positions, (robot, axis) [m]; NaN where there is none.
+            points: Readings, the tool's position first, (robot, channel) [m]; NaN: there is none.
             away: Tools that have left where they rested though no command came, (robot,): where
                 they go says nothing of the last one.
 
@@ -163,7 +164,7 @@ class MovementTracker:
         robots = np.arange(len(window.count))
         last = np.maximum(window.count - 1, 0)
         known = window.settled.usable[robots, last] & (window.count > 0) & ~self.references.moved
-        return np.where(known[:, None], window.settled.point[robots, last], np.nan)
+        return np.where(known[:, None], window.settled.point[robots, last, :3], np.nan)
 
     def find_movements(self, robot: int) -> None:
         """Add the movements of a reference, up to now."""
@@ -190,9 +191,9 @@ class MovementTracker:
         if len(at[0]) == 0:
             return at[0]
         samples, time, inside = self._readings(at[0], begin, end)
-        inside = _since_rest(samples, time, inside, self._settings.same_place_m)
-        found = estimate_rest(samples, inside, self._settings.moving_spread_m)
-        waits = self._under_way(at) | self._may_start_late(at, found.point)
+        inside = _since_rest(samples[..., :3], time, inside, self._settings.same_place_m)
+        found = estimate_rest(samples, inside, self._sensors.moving_spread_m(self._settings))
+        waits = self._under_way(at) | self._may_start_late(at, found.point[:, :3])
         found = replace(found, usable=found.usable & ~waits)
         self.window.settled.settle(at, found)
         return at[0][found.usable]
@@ -237,7 +238,7 @@ class MovementTracker:
         at, begin, end = self._due(at, end)
         if len(begin):
             samples, _, inside = self._readings(at[0], begin, end)
-            found = estimate_rest(samples, inside, self._settings.moving_spread_m)
+            found = estimate_rest(samples, inside, self._sensors.moving_spread_m(self._settings))
             self.window.settled.settle(at, found)
 
     def _due(self, at: Items, end: FloatArray) -> tuple[Items, FloatArray, FloatArray]:
@@ -251,7 +252,7 @@ class MovementTracker:
     def _readings(
         self, robots: IntArray, begin: FloatArray, end: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Return samples (robot, sample, axis) [m], their times (sample,) [s], which to take."""
+        """Return samples (robot, sample, channel) [m], their times (sample,) [s], which to take."""
         some = self.samples.since(float(begin.min()) - 1e-9)
         time = self.samples.time[some]
         inside = (time >= begin[:, None] - 1e-9) & (time < end[:, None] - 1e-9)
@@ -286,7 +287,7 @@ class MovementTracker:
         later = place > 0
         told = np.where(later[:, None], known.target[before], known.initial[robots])
         seen = (later & settled.usable[before])[:, None]
-        rested = np.where(seen, settled.point[before], self._twin.path(told))
+        rested = np.where(seen, settled.point[before][:, :3], self._twin.path(told))
         unmoved = np.linalg.norm(point - rested, axis=1) < self._settings.unmoved_m
         since = self.window.read_s[robots] - known.start[at]
         return np.asarray(unmoved & (since < self._latest_start_s))

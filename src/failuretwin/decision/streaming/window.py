@@ -51,7 +51,8 @@ class MovementWindow(ArrayStruct):
     @classmethod
     def of(cls, model: HealthyModel, robots: int, movements: int) -> MovementWindow:
         """Return windows of so many movements at most, without any yet."""
-        sizes = {"motor": len(model.scatter), "axis": 3, "reading": MOST_READINGS}
+        channels = model.sensors.channels
+        sizes = {"motor": len(model.scatter), "axis": channels, "reading": MOST_READINGS}
         settled = SettledEvidence.empty(run=0, movement=movements, **sizes)
         likelihoods = movement_likelihoods(settled, model)
         none = cls(
@@ -147,13 +148,14 @@ class SampleBuffer:
     Args:
         robots: How many robots there are.
         motors: How many motors each of them has.
+        channels: How many values a reading has.
     """
 
-    def __init__(self, robots: int, motors: int) -> None:
+    def __init__(self, robots: int, motors: int, channels: int = 3) -> None:
         self._first = self._stop = 0
         self._time = np.empty(FIRST_ROOM)
         self._command = np.empty((FIRST_ROOM, robots, motors))
-        self._measured = np.empty((FIRST_ROOM, robots, 3))
+        self._measured = np.empty((FIRST_ROOM, robots, channels))
 
     @property
     def time(self) -> FloatArray:
@@ -167,7 +169,7 @@ class SampleBuffer:
 
     @property
     def measured(self) -> FloatArray:
-        """Tool positions, (sample, robot, axis) [m]; NaN where there is none."""
+        """Readings, (sample, robot, channel) [m]; NaN where there is none."""
         return self._measured[self._first : self._stop]
 
     def add(self, time: float, command: FloatArray, measured: FloatArray) -> None:
@@ -176,7 +178,7 @@ class SampleBuffer:
         Args:
             time: When it was taken [s].
             command: References, (robot, motor) [rad]; NaN where not known.
-            measured: Tool positions, (robot, axis) [m]; NaN where there is none.
+            measured: Readings, (robot, channel) [m]; NaN where there is none.
         """
         self._make_room()
         at = self._stop

@@ -1,0 +1,124 @@
+"""A stream that does not fit the profile blames no motor; a fault in one that does is one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from failuretwin import BayesDiagnoser
+from failuretwin.core.alarm import CLEAR, RAISED, Alarm, Episode
+from failuretwin.core.runs import concatenate, run_set
+from failuretwin.decision.streaming.monitor import monitor
+from failuretwin.decision.streaming.set_up_watch import RUN, SetUpWatch, StreamRuns
+from failuretwin.inference.log_correction import LogCorrection
+from failuretwin.inference.seen_runs import set_up_finding
+from failuretwin.inference.set_ups import mistakes
+
+NONE = LogCorrection.none(4)
+I4 = np.eye(4)
+
+
+def made(robot, words):
+    """Return what makes a log with a mistake of one that fits."""
+    return next(one.correction.inverse for one in mistakes(robot) if words in one.what)
+
+
+def answers(watch, samples, wrong=NONE):
+    return [watch.update(t, wrong.command(c), wrong.point(p)) for t, c, p in samples]
+
+
+def blamed(told):
+    return {answer.alarm.cause for answer in told if answer.alarm.state == RAISED}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ("motor 2 turns", "motor 2 turns the other way"),
+        ("motor 3 and motor 4", "the commands of motor 3 and motor 4 are swapped"),
+        ("degrees", "commands look like degrees"),
+    ],
+)
+def test_a_mistake_is_named_and_no_motor_blamed(twin, work, wrong, words):
+    watch = monitor(twin)
+    told = answers(watch, work(13), made(twin.robot, wrong))
+    assert blamed(told) == set()
+    last = told[-1].diagnosis
+    assert last.undecided.startswith("the log does not fit the profile")
+    assert words in last.undecided
+    assert words in watch.set_up
+    assert last.run == "stream"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (replace(NONE, z=np.deg2rad(6.0) * I4[2]), "motor 3 stands -2"),
+        (replace(NONE, t=np.array([0.0, 0.0, 0.02])), "does not seem to stand where"),
+    ],
+)
+def test_zeros_and_frames_are_no_faults(twin, work, wrong, words):
+    watch = monitor(twin)
+    told = answers(watch, work(17), wrong)
+    assert blamed(told) == set()
+    assert words in told[-1].diagnosis.undecided
+
+
+def test_a_motor_that_sticks_from_the_first_movement_on_is_blamed(twin, work):
+    watch = monitor(twin)
+    told = answers(watch, work(13, stuck=[(1, 0, 13)]))
+    assert blamed(told) == {"motor_2:stuck"}
+    assert watch.set_up == ""
+
+
+def test_a_robot_that_fits_is_said_to(twin, work):
+    watch = monitor(twin)
+    samples = work(13)
+    told = answers(watch, samples[:100])
+    assert watch.set_up is None
+    told = answers(watch, samples[100:])
+    assert (watch.set_up, watch.fit.seen, told[-1].alarm.state) == ("", 13, CLEAR)
+
+
+def test_a_stream_is_asked_as_a_log_is(twin, work, armpi):
+    """Cut by hand into the same runs, the log has the same finding."""
+    wrong, step = made(armpi, "motor 2 turns"), 0.1
+    samples = [(t, wrong.command(c), wrong.point(p)) for t, c, p in work(2 * RUN)]
+    runs = StreamRuns()
+    for sample in samples:
+        runs.add(*sample)
+    found = runs.runs(armpi)
+    assert (found.sizes["run"], runs.begun) == (2, 2 * RUN)
+    time, command, point = (np.array(column) for column in zip(*samples, strict=True))
+    turns = np.flatnonzero(np.any(np.diff(command, axis=0), axis=1))
+    begins = turns[np.diff(turns, prepend=-9) > 1]
+    cut = begins[RUN]
+    parts = [
+        run_set(step * np.arange(len(time[rows])), command[rows], point[rows])
+        for rows in (slice(0, cut + 1), slice(cut, None))
+    ]
+    by_hand = concatenate(parts)
+    diagnoser = BayesDiagnoser(twin, whole_run=False)
+    said = [set_up_finding(diagnoser.seen(one).set_ups()) for one in (found, by_hand)]
+    assert said[0] == said[1]
+    assert "motor 2 turns the other way" in said[0]
+
+
+def test_an_alarm_that_changes_its_motor_is_none(twin):
+    watch = SetUpWatch(BayesDiagnoser(twin))
+    causes = ["motor_1:stuck", "motor_3:stuck", "motor_2:stuck"]
+    alarms = [Alarm(RAISED, c, Episode(k + 1, c, 9.0 * k)) for k, c in enumerate(causes)]
+    assert [watch.against(alarm) for alarm in alarms[:2]] == ["", ""]
+    assert "changes (motor 1, then motor 3, then motor 2)" in watch.against(alarms[2])
+    assert watch.against(Alarm()) == ""
+    assert watch.against(alarms[0]) == ""
+
+
+def test_an_error_is_not_blamed_on_the_first_movements(twin):
+    """A zero that is off looks like it; a motor that sticks looks like no set-up."""
+    watch = SetUpWatch(BayesDiagnoser(twin))
+    for cause, said in (("motor_1:steady_state_error", True), ("motor_1:stuck", False)):
+        alarm = Alarm(RAISED, cause, Episode(1, cause, 3.0))
+        assert ("a few movements more tell" in watch.against(alarm)) == said
