@@ -1,0 +1,13 @@
+"""Code of the pages, run as tests."""
+
+from __future__ import annotations
+
+from executed import blocks, setup, teardown
+from sybil import Sybil
+
+pytest_collect_file = Sybil(
+    parsers=[blocks],
+    patterns=["tutorials/*.md", "contributing/*.md", "reference/*.md"],
+    setup=setup,
+    teardown=teardown,
+).pytest()
