@@ -10,7 +10,7 @@ import failuretwin
 
 project = "failuretwin"
 author = "The failuretwin developers"
-copyright = "2026, the failuretwin developers"  # noqa: A001
+copyright = "2026, the failuretwin developers"
 release = version = failuretwin.__version__
 
 extensions = [

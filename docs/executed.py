@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any
 from sybil import Document, Example, Region
 
 TESTS = Path(__file__).parents[1] / "tests"
+"""Where the warm command line is, for pages that are run outside of pytest."""
 if TYPE_CHECKING:
     from warm_command import WarmCommand
 

@@ -33,7 +33,7 @@ def notebook_of(page: str) -> Any:
             cells.append(new_code_cell(f"%%writefile {saved[1]}\n{code.rstrip()}"))
         elif language == "sh":
             lines = re.sub(r"\\\n\s*", "", code).splitlines()
-            cells.append(new_code_cell("\n".join(f"!{line.partition('  #')[0]}" for line in lines)))
+            cells.append(new_code_cell("\n".join(f"!{line.partition(' #')[0].rstrip()}" for line in lines)))
         elif language == "python":
             cells.append(new_code_cell(code.rstrip()))
     cells += _markdown(page[at:])
