@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from executed import blocks, setup, teardown
 from sybil import Sybil
+
+from executed import blocks, setup, teardown
 
 pytest_collect_file = Sybil(
     parsers=[blocks],

@@ -32,8 +32,7 @@ def notebook_of(page: str) -> Any:
         if saved:
             cells.append(new_code_cell(f"%%writefile {saved[1]}\n{code.rstrip()}"))
         elif language == "sh":
-            lines = re.sub(r"\\\n\s*", "", code).splitlines()
-            cells.append(new_code_cell("\n".join(f"!{line.partition(' #')[0].rstrip()}" for line in lines)))
+            cells.append(new_code_cell(_commands(code)))
         elif language == "python":
             cells.append(new_code_cell(code.rstrip()))
     cells += _markdown(page[at:])
@@ -41,6 +40,11 @@ def notebook_of(page: str) -> Any:
         cell["id"] = f"cell-{number}"  # else they are drawn anew each time
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
     return new_notebook(cells=cells, metadata={"kernelspec": kernel})
+
+
+def _commands(code: str) -> str:
+    lines = re.sub(r"\\\n\s*", "", code).splitlines()
+    return "\n".join(f"!{line.partition(' #')[0].rstrip()}" for line in lines)
 
 
 def _markdown(text: str) -> list[Any]:
