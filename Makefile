@@ -4,7 +4,7 @@ BIN := .venv/bin
 # Small arrays gain nothing from threads, and threads of several processes get in each other's way.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test docs links pages wheel bench calibrations lint format clean
+.PHONY: demo test docs links notebooks pages wheel bench calibrations lint format clean
 
 demo: .venv/demo
 	$(BIN)/python examples/demo.py
@@ -26,6 +26,10 @@ pages: .venv/ready
 	$(BIN)/python docs/executed.py docs/tutorials/*.md docs/contributing/*.md docs/reference/*.md
 	$(BIN)/python docs/diagram.py
 	$(BIN)/python docs/notebooks.py
+
+# Every notebook, as Jupyter runs it.
+notebooks: .venv/ready
+	$(BIN)/pytest -n 0 tests/test_pages.py -k notebook
 
 # Source archive and wheel, looked at, then tried by a Python that has nothing else.
 wheel: .venv/release

@@ -182,9 +182,22 @@ __all__ = [
 ]
 
 
+_LEARNING = ("load_network", "train")
+"""Names that need the extra `learn` as soon as they are used."""
+
+
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'failuretwin' has no attribute {name!r}")
+    if name not in _LEARNING:
+        return _loaded(name)
+    from failuretwin.core.errors import needs_extra
+
+    with needs_extra("networks need PyTorch and scikit-learn", "learn"):
+        return _loaded(name)
+
+
+def _loaded(name: str) -> Any:
     return getattr(import_module(f"failuretwin.{_HOME[name]}"), name)
 
 
