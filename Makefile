@@ -61,11 +61,11 @@ format: .venv/ready
 	touch $@
 
 .venv/demo: EXTRA := plots
-.venv/demo: SIZE := 0.4 GB on disk, about a minute
+.venv/demo: SIZE := 0.5 GB on disk, a minute or two
 .venv/docs: EXTRA := docs
-.venv/docs: SIZE := 0.5 GB on disk, about a minute
+.venv/docs: SIZE := 0.7 GB on disk, a minute or two
 .venv/release: EXTRA := release
-.venv/release: SIZE := 0.4 GB on disk, about a minute
+.venv/release: SIZE := 0.5 GB on disk, a minute or two
 .venv/ready: EXTRA := dev
 .venv/ready: SIZE := 2.9 GB on disk, most of it PyTorch, some minutes
 .venv/demo .venv/docs .venv/release .venv/ready: pyproject.toml constraints.txt | .venv/made
