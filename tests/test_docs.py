@@ -156,7 +156,8 @@ def test_classes_on_the_page_exist(page, classes):
 
 @pytest.mark.parametrize("page", PAGES, ids=named)
 def test_files_on_the_page_exist(page):
-    files = [path.as_posix() for name in FOLDERS for path in (ROOT / name).rglob("*")]
+    below = [path for name in FOLDERS for path in (ROOT / name).rglob("*")]
+    files = [path.as_posix() for path in (*below, *ROOT.glob("*"))]
     for name in set(FILE.findall(page.read_text("utf-8"))) - READERS_OWN:
         assert any(path.endswith(f"/{name}") for path in files), name
 
