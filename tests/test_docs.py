@@ -233,3 +233,24 @@ def test_the_reference_has_every_public_name_once():
     assert sorted(told) == sorted(set(failuretwin.__all__) - {"__version__"})
     overview = (ROOT / "docs" / "reference" / "api.md").read_text("utf-8")
     assert sorted(re.findall(r"^   ([A-Za-z_]\w*)$", overview, re.MULTILINE)) == sorted(told)
+
+
+def sentences(text: str) -> list[str]:
+    """Return the sentences of a page, without code, tables and addresses of links."""
+    text = re.sub(r"\]\([^)]*\)", "]", FENCE.sub("\n\n", text))
+    parts = re.split(r"\n\s*\n|\n(?=[-|#]|\d\. )", text)
+    prose = [" ".join(part.split()) for part in parts if not part.startswith("|")]
+    return [s for part in prose for s in re.split(r"(?<=[.!?:])\s+", part) if s]
+
+
+@pytest.mark.parametrize(
+    "page", [p for p in DOCS if p.parent != ROOT / "docs"] + [ROOT / "CONTRIBUTING.md"], ids=named
+)
+def test_sentences_are_short(page):
+    text = page.read_text("utf-8")
+    assert len(sentences(text)) > 3
+    assert [s for s in sentences(text) if len(s.split()) >= 30] == []
+
+
+def test_a_long_sentence_is_noticed():
+    assert max(len(s.split()) for s in sentences(f"Short. {'word ' * 40}end.\n")) == 41
