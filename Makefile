@@ -67,7 +67,7 @@ format: .venv/ready
 .venv/release: EXTRA := release
 .venv/release: SIZE := 0.5 GB on disk, a minute or two
 .venv/ready: EXTRA := dev
-.venv/ready: SIZE := 2.9 GB on disk, most of it PyTorch, some minutes
+.venv/ready: SIZE := 2 to 6 GB on disk, by what comes with PyTorch; some minutes
 .venv/demo .venv/docs .venv/release .venv/ready: pyproject.toml constraints.txt | .venv/made
 	@echo "installing failuretwin[$(EXTRA)] into .venv: $(SIZE)"
 	$(BIN)/pip install --constraint constraints.txt --editable '.[$(EXTRA)]'
