@@ -31,7 +31,7 @@ import numpy as np
 from acting_world import ERROR_RAD, MODES, ONSET, TrueFault, World
 
 from failuretwin.connection.links.commander import Order
-from failuretwin.core.hypothesis import Fault
+from failuretwin.core.hypothesis import Fault, Hypothesis, single_faults
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.decision.acting.actor import Actor
 from failuretwin.decision.acting.belief import (
@@ -41,7 +41,7 @@ from failuretwin.decision.acting.belief import (
     NoBelief,
 )
 from failuretwin.decision.acting.believed_arm import BelievedFault, Seen
-from failuretwin.decision.acting.judging import Judge, Judgement
+from failuretwin.decision.acting.judging import ACTED_ON, Judge, Judgement
 from failuretwin.decision.acting.outcome import ActingSettings, TargetResult
 from failuretwin.decision.acting.planner import Planner
 from failuretwin.decision.acting.safety import SafetyGate
@@ -55,6 +55,7 @@ TOLERANCE_M = 0.005
 MOST_STEPS = 90
 SCALE = (0.1, 0.6)
 DRIFT = (0.01, 0.02)
+HELD_SHARE = (0.2, 0.6)
 STRATEGIES = ("open", "feedback", "diagnose", "oracle")
 NEVER = 2.0
 """A probability that is never reached."""
@@ -79,9 +80,9 @@ class Told:
         held = world.held[self.arm]
         angle = held if np.isfinite(held) else world.angle[self.arm, fault.motor]
         rests = np.nan if self.believed is None else self.believed.angle
-        stuck = fault.kind == "stuck"
+        stuck = bool(np.isfinite(held))
         self.believed = BelievedFault(
-            Fault(world.robot.motor_names[fault.motor], MODES[fault.kind]),
+            Fault(world.robot.motor_names[fault.motor], "stuck" if stuck else MODES[fault.kind]),
             fault.motor,
             float(angle) if stuck else fault.size,
             1e-4,
@@ -120,6 +121,7 @@ class Loop:
     strategy: str
     wrong: Sequence[BelievedFault] = ()
     new_diagnoses: bool = True
+    unweighed: Sequence[str] = ()
     rows: list[Row] = field(default_factory=list)
     judged_s: float = 0.0
     planned_s: float = 0.0
@@ -129,7 +131,7 @@ class Loop:
         self.world = World(trial.known, trial.faults, trial.seed, trial.engine,
                            trial.redrawn_at_rest, trial.onset)  # fmt: skip
         self.model = HealthyModel.of(trial.known.twin, trial.known.imperfections)
-        self.judge = Judge(self.model)
+        self.judge = Judge(self.model, hypotheses=self._weighed())
         planner = Planner(SafetyGate(trial.known.robot))
         settings = ActingSettings(feedback=self.strategy != "open")
         self.actors = [
@@ -138,6 +140,10 @@ class Loop:
         ]
         self.latched = np.full(len(self.actors), np.nan)
         self.told = np.zeros(len(self.actors), dtype=np.int64)
+
+    def _weighed(self) -> Sequence[Hypothesis]:
+        modes = [mode for mode in ACTED_ON if mode not in self.unweighed]
+        return single_faults(self.model.motor_names, modes)
 
     def _belief(self, arm: int) -> Belief:
         if self.strategy == "oracle":
@@ -187,8 +193,9 @@ class Loop:
         return True
 
     def _is_right(self, arm: int, believed: BelievedFault) -> bool:
-        fault = self.trial.faults[arm]
-        return (believed.motor, believed.fault.mode) == (fault.motor, MODES[fault.kind])
+        fault, stopped = self.trial.faults[arm], np.isfinite(self.world.held[arm])
+        modes = {MODES[fault.kind], "stuck"} if stopped else {MODES[fault.kind]}
+        return believed.motor == fault.motor and believed.fault.mode in modes
 
     def _note_latch(self, arm: int) -> None:
         believed, since = self.actors[arm].belief.believed, self.world.count - self.trial.onset
@@ -206,7 +213,9 @@ class Loop:
     def _of_arm(self, arm: int) -> Row:
         fault = self.trial.faults[arm]
         held, latched = float(self.world.held[arm]), float(self.latched[arm])
-        known = {"arm": arm, "fault": fault.kind, "motor": fault.motor + 1}
+        stopped = fault.kind == "intermittent" and np.isfinite(held)
+        kind = "stopped" if stopped else fault.kind
+        known = {"arm": arm, "fault": kind, "motor": fault.motor + 1}
         return known | {"held": held, "latched": latched}
 
     def _of_result(self, result: TargetResult, error: float) -> Row:
@@ -235,11 +244,12 @@ def faults_of(kind: str, robot: Robot, arms: int, seed: int) -> list[TrueFault]:
         "torque": (0.4, 0.7),
         "lost": (0.5, 0.5),
         "drift": DRIFT,
+        "intermittent": HELD_SHARE,
     }
     rng, found = np.random.default_rng([seed, 5]), []
     for motor in range(len(robot.motors)):
         for _ in range(arms):
-            sign = 1.0 if rng.random() < 0.5 or kind in ("torque", "lost") else -1.0
+            sign = 1.0 if rng.random() < 0.5 or kind in ("torque", "lost", "intermittent") else -1.0
             size = sign * rng.uniform(*ends[kind]) if kind in ends else np.nan
             found.append(TrueFault(kind, motor, float(size)))
     return found
@@ -267,7 +277,7 @@ def summary(robot: Robot, loop: Loop) -> dict[str, dict[str, float]]:
     for key in sorted({(r["fault"], r["motor"]) for r in rows}):
         mine = np.array([(r["fault"], r["motor"]) == key for r in rows])
         chosen = [r for r, m in zip(rows, mine, strict=True) if m]
-        arms = [r for r in loop.rows if "said" in r and (r["fault"], r["motor"]) == key]
+        arms = [r for r in loop.rows if "said" in r and r["motor"] == key[1]]
         hit = np.array([r["error_m"] <= TOLERANCE_M for r in chosen])
         latched = np.array([r["latched"] for r in arms])
         found[f"{key[0]} m{key[1]}"] = {
@@ -285,12 +295,14 @@ def summary(robot: Robot, loop: Loop) -> dict[str, dict[str, float]]:
     return found
 
 
-def compare(trial: Trial, strategies: Sequence[str], name: str) -> dict[str, Any]:
+def compare(
+    trial: Trial, strategies: Sequence[str], name: str, unweighed: Sequence[str] = ()
+) -> dict[str, Any]:
     """Run strategies on the same arms and print a table."""
     found = {}
     for strategy in strategies:
         began = time.monotonic()
-        loop = Loop(trial, strategy).run()
+        loop = Loop(trial, strategy, unweighed=unweighed).run()
         cells = summary(trial.known.robot, loop)
         found[strategy] = {"cells": cells, "rows": loop.rows}
         moves = max(sum(r.get("movements", 0) for r in loop.rows), 1)
@@ -309,7 +321,9 @@ def compare(trial: Trial, strategies: Sequence[str], name: str) -> dict[str, Any
 
 
 def forced(known: CalibratedRobot, told: argparse.Namespace) -> dict[str, dict[str, float]]:
-    """Print shares reached by truth and wrong belief of the nine classes, and by feedback alone.
+    """Print shares reached by truth and wrong belief, and by feedback alone.
+
+    Truths are the nine classes, beliefs these and a motor that sticks now and then.
 
     The belief is there from the start, and so is the fault. `checked`: it may be let go of, but no
     other is taken up; `diagnosed`: the product as it is.
@@ -318,7 +332,8 @@ def forced(known: CalibratedRobot, told: argparse.Namespace) -> dict[str, dict[s
     motors = range(len(robot.motors))
     kinds = [("healthy", 0), *((kind, m) for kind in ("stuck", "random") for m in motors)]
     rng = np.random.default_rng([told.seed, 9])
-    pairs = [(t, b) for t in kinds for b in kinds[1:] if t != b for _ in range(told.arms)]
+    wrong = [*kinds[1:], *(("intermittent", m) for m in motors)]
+    pairs = [(t, b) for t in kinds for b in wrong if t != b for _ in range(told.arms)]
     truths, beliefs = [TrueFault(*truth) for truth, _ in pairs], []
     for _, (kind, motor) in pairs:
         angle = float(rng.uniform(*robot.travel[motor])) if kind == "stuck" else np.nan
@@ -338,9 +353,10 @@ def forced(known: CalibratedRobot, told: argparse.Namespace) -> dict[str, dict[s
                 hit = row["error_m"] <= TOLERANCE_M
                 cells[_pair(truths[row["arm"]], beliefs[row["arm"]])][name].append(hit)
     found = {pair: {n: float(np.mean(hits)) for n, hits in c.items()} for pair, c in cells.items()}
+    found = {pair: shares | {"n": len(cells[pair]["feedback"])} for pair, shares in found.items()}
     for pair, shares in found.items():
-        texts = "  ".join(f"{name} {share:.3f}" for name, share in shares.items())
-        print(f"  {pair:56s} {texts}  n {len(cells[pair]['feedback'])}", flush=True)
+        texts = "  ".join(f"{name} {share:.3g}" for name, share in shares.items())
+        print(f"  {pair:56s} {texts}", flush=True)
     return found
 
 
@@ -360,6 +376,7 @@ def main() -> None:
     parser.add_argument("--arms", type=int, default=40)
     parser.add_argument("--targets", type=int, default=8)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--unweighed", nargs="*", default=[], help="modes that are not weighed")
     parser.add_argument("--redrawn-at-rest", action="store_true")
     parser.add_argument("--forced", action="store_true", help="wrong beliefs from the start")
     parser.add_argument("--json", type=Path)
@@ -372,7 +389,7 @@ def main() -> None:
         faults = faults_of(told.fault, known.robot, told.arms, told.seed)
         tasks = tasks_of(known.robot, len(faults), told.targets, told.seed)
         trial = Trial(known, faults, tasks, told.seed, told.engine, told.redrawn_at_rest)
-        found = compare(trial, told.strategy, f"{told.robot} {told.fault}")
+        found = compare(trial, told.strategy, f"{told.robot} {told.fault}", told.unweighed)
     if told.json:
         told.json.write_text(json.dumps(found))
 

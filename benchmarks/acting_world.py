@@ -18,6 +18,7 @@ from failuretwin.digital_model.nonidealities import Imperfections, vary
 from failuretwin.digital_model.physics_engine import LiveArms, PhysicsEngine
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, sag
+from failuretwin.failure_behavior.fault import EndlessEpisodes
 
 STEP_S = 0.01
 SETTLE_S = 0.8
@@ -40,7 +41,12 @@ MODES = {
     "torque": "torque_loss",
     "lost": "lost_commands",
     "drift": "drift",
+    "intermittent": "intermittent",
 }
+STOPS_AFTER = 12
+"""Movements that an intermittent motor still makes before it stops for good."""
+EPISODE_S = (0.5, 2.0)
+"""Lengths of the times in which an intermittent motor is held [s]."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +91,9 @@ class World:
         self.error = np.zeros(n)
         self.held = np.full(n, np.nan)
         self.time_s = self.struck_s = 0.0
+        self.episodes: list[EndlessEpisodes | None] = [None] * n
+        if any(f.kind == "intermittent" for f in self.faults) and self.engine != "physics":
+            raise SystemExit("an intermittent motor is held on its way: use --engine physics")
         if self.engine == "physics":
             self.arms = LiveArms(PhysicsEngine(robot), self.base, STEP_S, np.zeros(n))
             self.angle = self.arms.angle
@@ -158,9 +167,8 @@ class World:
         """Let the fault of an arm act on what it is told."""
         fault = self.faults[i]
         k = fault.motor
-        if fault.kind == "stuck":
-            if np.isnan(self.held[i]):
-                self.held[i] = self.angle[i, k]
+        if fault.kind == "stuck" or self._stops(i):
+            self.held[i] = self.angle[i, k] if np.isnan(self.held[i]) else self.held[i]
             held[i, k] = True
         elif fault.kind == "random":
             if self.redrawn_at_rest or not still[i, k] or self.error[i] == 0.0:
@@ -168,16 +176,27 @@ class World:
                 drawn = self.errors[0] + luck[1] * (self.errors[1] - self.errors[0])
                 self.error[i] = sign * (drawn if np.isnan(fault.size) else fault.size)
             aim[i, k] += self.error[i]
-        elif fault.kind == "bias":
-            aim[i, k] += fault.size
-        elif fault.kind == "scale":
-            aim[i, k] *= 1.0 + fault.size
-        elif fault.kind == "drift":
-            aim[i, k] += fault.size * (self.time_s - self.struck_s)
         elif fault.kind == "torque":
             weak[i, k] = fault.size
         elif fault.kind == "lost":
             self.lost[i, k] |= luck[2] < fault.size
+        else:
+            aim[i, k] += self._constant(fault, float(aim[i, k]))
+
+    def _constant(self, fault: TrueFault, aim: float) -> float:
+        """Return the offset of a fault that chance has no part in [rad]."""
+        by_kind = {"bias": 1.0, "scale": aim, "drift": self.time_s - self.struck_s}
+        return fault.size * by_kind[fault.kind] if fault.kind in by_kind else 0.0
+
+    def _stops(self, i: int) -> bool:
+        """Return whether a motor that stuck now and then has stopped for good; begin its times."""
+        fault = self.faults[i]
+        if fault.kind != "intermittent":
+            return False
+        if self.episodes[i] is None:
+            chance = np.random.default_rng([self.seed, i, 7])
+            self.episodes[i] = EndlessEpisodes(self.time_s, fault.size, EPISODE_S, chance)
+        return self.count > self.onset + STOPS_AFTER
 
     def _rest(self, held: BoolArray, weak: FloatArray | None = None) -> FloatArray:
         give = self.compliance / (1.0 - (0.0 if weak is None else weak))
@@ -200,9 +219,20 @@ class World:
         share = np.clip(t / ramp[:, None], 0.0, 1.0)
         reference = before[:, None] + share * (self.base - before)[:, None]
         steps = reference.shape[1]
-        brake = np.repeat(held[:, None], steps, axis=1) if held.any() else None
+        sticks = self._sticks(np.asarray(t[0, :, 0] + self.time_s - period))
+        stops = np.repeat(held[:, None], steps, axis=1) | sticks
+        brake = stops if stops.any() else None
         weakness = np.repeat(weak[:, None], steps, axis=1) if weak.any() else None
         self.angle = self.arms.follow(reference, brake, weakness)[:, -1]
+
+    def _sticks(self, time: FloatArray) -> BoolArray:
+        """Return when which intermittent motor is held, (arm, time, motor)."""
+        found = np.zeros((len(self.faults), len(time), self.m), dtype=bool)
+        for i, endless in enumerate(self.episodes):
+            if endless is not None:
+                for start, end in endless.within(float(time[0]), float(time[-1])):
+                    found[i, :, self.faults[i].motor] |= (start <= time) & (time < end)
+        return found
 
     def _seen(self, noise: FloatArray) -> FloatArray:
         readings, angle = self.known.imperfections.readings, self.angle

@@ -74,7 +74,7 @@ def table(real: object, simulated: object, robot: Robot) -> None:
     print(f"{'':44s} {'real':>9s} {'95 % interval':>20s} {'simulated':>10s}")
     errors = []
     for runs in (real, simulated):
-        seen = observe(runs)
+        seen = observe(runs, robot)
         assert seen.position is not None
         error = (seen.position - seen.target) / count
         errors.append(error[(np.abs(error) < 20.0).all(axis=1)])

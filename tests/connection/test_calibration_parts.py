@@ -8,7 +8,7 @@ from scipy import stats
 
 from failuretwin import DigitalTwin
 from failuretwin.connection.calibration.cross_validation import cross_validate, judge
-from failuretwin.connection.calibration.observations import Observations, lost_command, rounding
+from failuretwin.connection.calibration.observations import Observations, rounding, uncalibrated
 from failuretwin.connection.calibration.parameters import (
     Rate,
     glitch_rates,
@@ -18,9 +18,8 @@ from failuretwin.connection.calibration.parameters import (
 )
 from failuretwin.connection.calibration.settling_fit import (
     best_payload,
+    fit_settling,
     sense_remarks,
-    settling_posterior,
-    sort_and_fit,
 )
 from failuretwin.connection.calibration.timing_fit import (
     Transients,
@@ -34,6 +33,7 @@ from failuretwin.core.runs import RunTable
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.disturbances import lagged
 from failuretwin.digital_model.settling import Settling
+from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
 
 COUNT = np.deg2rad(0.24)
@@ -48,36 +48,76 @@ TYPICAL = Settling(
 )
 
 
+IN_A_RUN = 5
+"""Movements of a run."""
+
+
 @pytest.fixture(scope="module")
 def settle(armpi):
     """Draw settled movements from the model; motors are read in whole counts."""
 
-    def draw(settling, seed, movements=120, sessions=1, readings=True, robot=armpi):
+    def draw(
+        settling, seed, movements=120, sessions=1, readings=True, robot=armpi, stay=None, odd=()
+    ):
         rng = np.random.default_rng(seed)
-        low, high = np.array([motor.movement_range for motor in robot.motors]).T
-        angles = rng.uniform(low, high, (movements + 1, 4))
-        origin, target = angles[:-1], angles[1:]
-        unit = rng.standard_t(settling.tail_dof, (movements, 4))
-        wanted = target + np.asarray(settling.scatter) * unit
-        pose = wanted
-        for _ in range(6):  # the sag depends on the pose that it leads to
-            pose = wanted + settling.offset(robot, pose, np.sign(target - origin))
+        angles = random_angles(robot, movements, rng)
+        wide = np.sqrt(settling.tail_dof / rng.chisquare(settling.tail_dof, (movements, 1)))
+        wanted = np.asarray(settling.scatter) * wide * rng.standard_normal((movements, 4))
+        pose, target, came = np.empty((movements, 4)), angles[1:], angles[0]
+        for i in range(movements):
+            came = angles[i] if i % IN_A_RUN == 0 else came
+            here = np.zeros(4, dtype=bool) if stay is None else stay[i]
+            aimed, rest = target[i] + wanted[i], target[i] + wanted[i]
+            for _ in range(6):  # the sag depends on the pose that it leads to
+                rest = aimed + settling.offset(robot, rest, np.sign(target[i] - came))
+            pose[i] = np.where(here, pose[i - 1] if i % IN_A_RUN else angles[i], rest)
+            came = np.where(here, came, target[i])
         units = robot.servo_units
         pose = units.to_rad(np.rint(units.to_counts(pose)))
-        number = np.arange(movements)
-        return Observations(
-            run=number // 5,
-            session=number % sessions,
-            number=number % 5,
-            origin=origin,
-            target=target,
-            point=DigitalTwin(robot).path(pose),
-            position=pose if readings else None,
-            sessions=tuple(f"day_{i}" for i in range(sessions)),
-            runs=tuple(f"run_{i}" for i in range(movements // 5 + 1)),
-        )
+        pose[list(odd)] += 0.4
+        noise = wide * rng.standard_normal((movements, 3))
+        return observed(robot, angles, pose, sessions, readings, noise)
 
     return draw
+
+
+def random_angles(robot, movements, rng):
+    low, high = np.array([motor.movement_range for motor in robot.motors]).T
+    return rng.uniform(low, high, (movements + 1, 4))
+
+
+def observed(robot, angles, pose, sessions=1, readings=True, noise=0.0):
+    """Return observations of runs of five movements each, by the readings or by a noisy tool.
+
+    Scatter and noise of a movement are one multivariate Student t, as the model has them.
+    """
+    count = len(pose)
+    at = np.divmod(np.arange(count), IN_A_RUN)
+    shape = (at[0][-1] + 1, min(IN_A_RUN, count))
+    model = uncalibrated(robot, readings)
+    target, tool = np.full((*shape, 4), np.nan), np.zeros((*shape, 3))
+    point = np.zeros((*shape, 4 if readings else 3))
+    usable = np.zeros(shape, dtype=bool)
+    target[at], tool[at], usable[at] = angles[1:], DigitalTwin(robot).path(pose), True
+    point[at] = model.sensors.value(pose)
+    if not readings:
+        point[at] = tool[at] = tool[at] + model.path_noise * noise
+    start = np.where(usable, 2.0 * np.arange(shape[1]), np.nan)
+    ramp = np.where(usable[..., None], 0.8, np.nan) * np.ones(4)
+    evidence = replace(
+        SettledEvidence.empty(run=shape[0], movement=shape[1], motor=4, axis=point.shape[-1]),
+        movements=Movements(angles[:-1:IN_A_RUN], target, ramp, start),
+        point=point,
+        usable=usable,
+    )
+    return Observations(
+        evidence=evidence,
+        model=model,
+        tool=tool,
+        session=np.arange(shape[0]) % sessions,
+        sessions=tuple(f"day_{i}" for i in range(sessions)),
+        runs=tuple(f"run_{i}" for i in range(shape[0])),
+    )
 
 
 def random_settling(seed):
@@ -233,22 +273,24 @@ def test_spoilt_readings_are_counted_by_motor_among_the_rows_read():
 
 
 @pytest.mark.parametrize("readings", [True, False])
-def test_motors_that_stay_are_seen(settle, armpi, twin, readings):
-    seen = settle(TYPICAL, seed=5, movements=60)
-    clear = (np.abs(seen.target - seen.origin) > 0.3).all(axis=1)
-    seen = seen[clear]
-    held = np.zeros((len(seen), 4), dtype=bool)
-    held[0, 0] = held[1, 1] = held[2, 2] = held[3, :2] = True
-    pose = np.where(held, seen.origin, seen.position)
-    moved = replace(seen, point=twin.path(pose), position=pose if readings else None)
-    np.testing.assert_array_equal(lost_command(moved, armpi, seen.target), held)
+def test_motors_that_stay_are_seen(settle, readings):
+    clear = settle(TYPICAL, seed=5, movements=60)
+    far = np.flatnonzero((np.abs(clear.target - clear.origin) > 0.3).all(axis=1))
+    far = far[far % IN_A_RUN > 0]
+    held = np.zeros((60, 4), dtype=bool)
+    held[far[0], 0] = held[far[2], 1] = held[far[4], 2] = held[far[6], :2] = True
+    seen = settle(TYPICAL, seed=5, movements=60, readings=readings, stay=held)
+    np.testing.assert_array_equal(fit_settling(seen).sorted.lost, held)
 
 
-def test_a_motor_that_hardly_had_to_move_lost_nothing(settle, armpi):
-    seen = settle(TYPICAL, seed=5, movements=1)
-    target = seen.origin + np.array([[0.02, -0.02, 0.5, -0.5]])
-    near = replace(seen, target=target, position=seen.origin)
-    np.testing.assert_array_equal(lost_command(near, armpi, target), [[False, False, True, True]])
+def test_a_motor_that_hardly_had_to_move_lost_nothing(armpi):
+    angles = random_angles(armpi, 60, np.random.default_rng(5))
+    angles[:, 0] = 0.2 + 0.003 * (np.arange(61) % 2)
+    pose = angles[1:].copy()
+    pose[::3, 0] = angles[:-1][::3, 0]
+    part = fit_settling(observed(armpi, angles, pose))
+    rates = loss_rates(part.observations, part.sorted.lost, *np.ones((2, 12, 5), dtype=bool), NAMES)
+    assert all(rate.punctual.hits == 0 for rate in rates)
 
 
 # Where motors settle
@@ -257,8 +299,7 @@ def test_a_motor_that_hardly_had_to_move_lost_nothing(settle, armpi):
 @pytest.mark.parametrize(("readings", "shares"), [(True, 1.0), (False, 1.6)])
 def test_settling_of_a_known_robot_comes_back(settle, armpi, readings, shares):
     seen = settle(TYPICAL, seed=2, movements=600, readings=readings)
-    fit = settling_posterior(seen, armpi, np.ones((600, 4)))
-    found = fit.settling("fit")
+    found = fit_settling(seen).settling
     # Four standard errors of a mean, and of a slope over the loads that the movements meet.
     error = 4.0 * shares * np.asarray(TYPICAL.scatter) * np.sqrt(5.0 / 3.0) / np.sqrt(600)
     load = np.std(armpi.loads.torque(seen.target * armpi.sense, 0.0), axis=0)[1:]
@@ -267,79 +308,70 @@ def test_settling_of_a_known_robot_comes_back(settle, armpi, readings, shares):
     off = np.abs(np.subtract(found.compliance, TYPICAL.compliance))
     assert np.all(off[1:] < 1.5 * error[1:] / load)
     assert off[0] < 1e-6
-    np.testing.assert_allclose(found.scatter, TYPICAL.scatter, rtol=0.25)
+    np.testing.assert_allclose(found.scatter, TYPICAL.scatter, rtol=0.25 if readings else 0.5)
     assert 3.0 < found.tail_dof < 9.0
 
 
-@pytest.mark.parametrize(("readings", "draws"), [(True, 60), (False, 20)])
+@pytest.mark.parametrize(("readings", "draws"), [(True, 24), (False, 12)])
 def test_settling_intervals_hold_the_truth(settle, armpi, readings, draws):
     inside = []
     for seed in range(draws):
         truth = random_settling(seed)
         seen = settle(truth, 1000 + seed, movements=80, readings=readings)
-        fit = settling_posterior(seen, armpi, np.ones((80, 4)))
+        fit = fit_settling(seen).fit
         told = fit.deviation < 0.3 * fit.prior_deviation
         told[4] = False  # gravity does not load motor 1
         off = np.abs(fit.mode - as_vector(truth)) / fit.deviation
         inside += (off[told] < 1.96).tolist()
-    assert len(inside) > 13 * draws
+    assert len(inside) > 10 * draws
     assert 0.88 < np.mean(inside) < 0.995
 
 
-def test_what_the_logs_do_not_say_keeps_its_prior(settle, armpi):
-    fit = settling_posterior(settle(TYPICAL, seed=3, movements=40), armpi, np.ones((40, 4)))
+def test_what_the_logs_do_not_say_keeps_its_prior(settle):
+    fit = fit_settling(settle(TYPICAL, seed=3, movements=40)).fit
     share = fit.deviation / fit.prior_deviation
     assert share[4] == pytest.approx(1.0, rel=1e-3)  # compliance of motor 1
     assert share[[5, 6, 7]].max() < 0.3
-    idle = np.ones((40, 4))
-    idle[:, 2] = 0.0
-    fit = settling_posterior(settle(TYPICAL, seed=3, movements=40), armpi, idle)
-    share = (fit.deviation / fit.prior_deviation)[:-1].reshape(4, 4)
-    np.testing.assert_allclose(share[:, 2], 1.0, rtol=1e-3)
-    assert share[:, 3].max() < 0.4
 
 
-def test_lost_commands_and_odd_movements_do_not_bend_the_fit(settle, armpi, twin):
-    seen = settle(TYPICAL, seed=4, movements=80)
-    clean = sort_and_fit(seen, armpi)
-    pose = seen.position.copy()
-    far = np.flatnonzero(np.abs(seen.target - seen.origin)[:, 0] > 0.3)
+def test_lost_commands_and_odd_movements_do_not_bend_the_fit(settle, armpi):
+    clean = fit_settling(settle(TYPICAL, seed=4, movements=80))
+    way = np.abs(clean.observations.target - clean.observations.origin)[:, 0]
+    far = np.flatnonzero((way > 0.3) & (np.arange(80) % IN_A_RUN > 0))
     stay = far[np.append(True, np.diff(far) > 1)][:6]  # none missed two in a row
-    pose[stay, 0] = seen.origin[stay, 0]
-    odd = np.setdiff1d(np.arange(80), stay)[:5]
-    pose[odd, 2] += 0.2
-    part = sort_and_fit(replace(seen, position=pose, point=twin.path(pose)), armpi)
+    held = np.zeros((80, 4), dtype=bool)
+    held[stay, 0] = True
+    odd = np.setdiff1d(np.arange(4, 80, 5), stay)[:5]
+    part = fit_settling(settle(TYPICAL, seed=4, movements=80, stay=held, odd=odd))
     assert {(e.motor, e.reason) for e in part.left_out(armpi)} == {
         ("motor_1", "did not get its command"),
         ("", "is far off its target"),
     }
-    np.testing.assert_array_equal(np.flatnonzero(part.lost[:, 0]), stay)
-    np.testing.assert_array_equal(np.flatnonzero(part.odd), odd)
+    np.testing.assert_array_equal(np.flatnonzero(part.sorted.lost[:, 0]), stay)
+    np.testing.assert_array_equal(np.flatnonzero(part.sorted.odd), odd)
     assert np.all(np.abs(part.fit.mode - clean.fit.mode) < 2.0 * clean.fit.deviation + 1e-12)
 
 
-def test_commands_lost_on_short_ways_do_not_make_the_tails(settle, armpi):
+def test_commands_lost_on_short_ways_do_not_make_the_tails(settle):
     rigid = replace(TYPICAL, compliance=(0.0,) * 4)  # no motor's sag depends on where others are
-    seen = settle(rigid, seed=7, movements=200)
-    none_follows = {"run": np.arange(200), "number": np.zeros(200, dtype=int)}
-    seen = replace(seen, **none_follows)
-    clean = sort_and_fit(seen, armpi)
-    way = np.abs(seen.target - seen.origin)
-    rate = np.where(way < 25 * COUNT, 0.3, 0.15)
-    stay = (way > 8 * COUNT) & (np.random.default_rng(7).random((200, 4)) < rate)
+    clean = fit_settling(settle(rigid, seed=7, movements=200))
+    way = np.abs(clean.observations.target - clean.observations.origin)
+    rng = np.random.default_rng(7)
+    stay = (way > 8 * COUNT) & (rng.random((200, 4)) < np.where(way < 25 * COUNT, 0.3, 0.05))
+    stay &= (np.arange(200) % IN_A_RUN > 0)[:, None]
     short = stay & (way < 25 * COUNT)
     assert short.sum() > 8
-    pose = seen.position + np.where(stay, seen.origin - seen.target, 0.0)
-    part = sort_and_fit(replace(seen, position=pose), armpi)
-    assert np.mean(part.arrived[short]) < 0.2
-    assert np.mean(part.arrived[~stay]) > 0.98
+    part = fit_settling(settle(rigid, seed=7, movements=200, stay=stay))
+    lost = part.sorted.lost
+    assert np.mean(lost[short]) > 0.8
+    assert np.mean(lost[~stay]) < 0.02
     moved = np.abs(part.fit.mode - clean.fit.mode)[12:] / clean.fit.deviation[12:]
     assert moved.max() < 1.0
 
 
 def test_too_few_movements_are_refused(settle, armpi):
     with pytest.raises(InputError, match=r"only 5 of 5 movements .* expected 6 at least"):
-        sort_and_fit(settle(TYPICAL, seed=6, movements=5), armpi)
+        fit_settling(settle(TYPICAL, seed=6, movements=5))
 
 
 # Timing
@@ -401,7 +433,7 @@ def test_two_runs_tell_no_timing(armpi):
 
 
 def test_senses_of_the_profile_are_confirmed(settle, armpi):
-    remarks = sense_remarks(sort_and_fit(settle(TYPICAL, seed=9), armpi), armpi)
+    remarks = sense_remarks(fit_settling(settle(TYPICAL, seed=9)), armpi)
     assert remarks[0] == "sense of motor_1: cannot be told, gravity does not load it"
     for remark, sense in zip(remarks[1:], ("+1", "-1", "+1"), strict=True):
         assert f"{sense} as in the profile" in remark
@@ -412,7 +444,7 @@ def test_motors_that_do_not_give_way_do_not_tell_their_sense(settle, armpi):
     ideal = replace(TYPICAL, bias=(0.0,) * 4, compliance=(0.0,) * 4, friction=(0.0,) * 4)
     for scatter in (1e-6, 2e-3):
         seen = settle(replace(ideal, scatter=(scatter,) * 4), seed=9)
-        for remark in sense_remarks(sort_and_fit(seen, armpi), armpi):
+        for remark in sense_remarks(fit_settling(seen), armpi):
             assert "check it" not in remark
             assert "as in the profile" not in remark
 
@@ -420,8 +452,8 @@ def test_motors_that_do_not_give_way_do_not_tell_their_sense(settle, armpi):
 def test_a_wrong_sense_is_found_and_blames_no_other_motor(settle, armpi):
     motors = tuple(replace(motor, sense=1.0) for motor in armpi.motors)
     straight = replace(armpi, profile=replace(armpi.profile, motors=motors))
-    seen = settle(TYPICAL, seed=9, robot=straight)
-    remarks = sense_remarks(sort_and_fit(seen, armpi), armpi)
+    seen = settle(TYPICAL, seed=9, robot=straight).of(uncalibrated(armpi, of_motors=True))
+    remarks = sense_remarks(fit_settling(seen), armpi)
     assert "motor_3: the logs speak for +1" in remarks[2]
     assert "the profile says -1; check it" in remarks[2]
     assert "+1 as in the profile" in remarks[1]
@@ -429,14 +461,15 @@ def test_a_wrong_sense_is_found_and_blames_no_other_motor(settle, armpi):
 
 
 def test_no_payload_is_told_where_there_is_none(settle, armpi):
-    payload, told = best_payload(sort_and_fit(settle(TYPICAL, seed=10), armpi), armpi)
+    payload, told = best_payload(fit_settling(settle(TYPICAL, seed=10)), armpi)
     assert payload == 0.0
     assert "do not tell one from a softer motor" in told
 
 
 def test_a_heavy_payload_on_a_precise_arm_is_told(settle, armpi):
     loaded = replace(TYPICAL, compliance=(0.0, 0.05, 0.05, 0.05), scatter=(3e-4,) * 4, payload=0.5)
-    payload, told = best_payload(sort_and_fit(settle(loaded, seed=10, movements=300), armpi), armpi)
+    seen = settle(loaded, seed=10, movements=300, readings=False)
+    payload, told = best_payload(fit_settling(seen), armpi)
     assert payload == 0.5
     assert "about 0.5 kg at the tool point" in told
 
@@ -445,7 +478,9 @@ def test_a_heavy_payload_on_a_precise_arm_is_told(settle, armpi):
 
 
 def test_unseen_sessions_are_left_with_the_scatter_alone(settle, armpi):
-    entries = cross_validate(settle(TYPICAL, seed=11, movements=450, sessions=3), armpi)
+    entries = cross_validate(
+        fit_settling(settle(TYPICAL, seed=11, movements=450, sessions=3)), armpi
+    )
     assert [entry.session for entry in entries] == ["day_0", "day_1", "day_2"]
     # 1.48 times the median size of a Student t of this scale, plus what counts round off.
     size = 1.4826 * stats.t.ppf(0.75, TYPICAL.tail_dof)
@@ -458,7 +493,7 @@ def test_unseen_sessions_are_left_with_the_scatter_alone(settle, armpi):
 
 
 def test_gain_is_the_mean_difference_of_log_densities(settle, armpi, twin):
-    part = sort_and_fit(settle(TYPICAL, seed=12), armpi)
+    part = fit_settling(settle(TYPICAL, seed=12))
     seen = settle(TYPICAL, seed=13, movements=40)
     entry = judge(seen, part, armpi, "other day")
     kind = HealthyModel.of(twin, generic_imperfections(armpi))
@@ -487,7 +522,7 @@ def log_densities(seen, settling, robot, twin):
 
 
 def test_a_shift_of_the_whole_session_counts_as_error(settle, armpi, twin):
-    part = sort_and_fit(settle(TYPICAL, seed=12), armpi)
+    part = fit_settling(settle(TYPICAL, seed=12))
     shifted = replace(TYPICAL, bias=tuple(np.add(TYPICAL.bias, 0.03)))
     entry = judge(settle(shifted, seed=13), part, armpi, "shifted")
     np.testing.assert_allclose(entry.after, 0.03 * 1.4826, rtol=0.15)
@@ -497,13 +532,14 @@ def test_a_shift_of_the_whole_session_counts_as_error(settle, armpi, twin):
 def test_a_fit_to_another_robot_does_not_beat_none(settle, armpi):
     ideal = Settling((0.0,) * 4, (0.0,) * 4, (0.0,) * 4, (0.003,) * 4, 10.0, "straight")
     soft = replace(TYPICAL, compliance=(0.0, 0.3, 0.3, 0.3))
-    part = sort_and_fit(settle(soft, seed=14), armpi)
+    part = fit_settling(settle(soft, seed=14))
     entry = judge(settle(ideal, seed=15), part, armpi, "another robot")
     assert entry.gain + 1.96 * entry.gain_error < 0.0
 
 
 def test_one_session_or_one_movement_judges_nothing(settle, armpi):
     seen = settle(TYPICAL, seed=16)
-    assert cross_validate(seen, armpi) == ()
-    part = sort_and_fit(seen, armpi)
-    assert judge(seen[np.array([0])], part, armpi, "short") is None
+    part = fit_settling(seen)
+    assert cross_validate(part, armpi) == ()
+    one = settle(TYPICAL, seed=16, movements=1)
+    assert judge(one, part, armpi, "short") is None

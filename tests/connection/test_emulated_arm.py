@@ -115,9 +115,21 @@ def test_a_fault_that_never_ends_stays(armpi):
     assert np.ptp(position[time > 5.05, 0]) < np.deg2rad(1.0)
 
 
-def test_a_mode_that_comes_and_goes_by_itself_is_refused(armpi):
-    with pytest.raises(InputError, match="comes and goes by itself"):
-        life(armpi, NO_IMPERFECTIONS, ["motor_1:intermittent@5"])
+def test_a_motor_that_sticks_now_and_then_misses_some_movements_until_it_is_repaired(armpi):
+    fault = ["motor_1:intermittent@5-65"]
+    start, error = settled_errors(life(armpi, NO_IMPERFECTIONS, fault, seconds=100.0))
+    off = np.abs(error) > np.deg2rad(4.0)  # more than gravity and friction do
+    there = (start > 5.0) & (start < 63.0)
+    assert not off[:, 1:].any()
+    assert not off[~there & ((start < 3.0) | (start > 65.0)), 0].any()
+    assert 2 <= off[there, 0].sum() < 0.7 * there.sum()
+
+
+def test_a_fault_beside_one_that_comes_and_goes_has_the_luck_that_it_has_alone(armpi):
+    other = "motor_3:steady_state_error@0"
+    _, alone = settled_errors(life(armpi, NO_IMPERFECTIONS, [other], seconds=30.0))
+    both = life(armpi, NO_IMPERFECTIONS, [other, "motor_1:intermittent@0"], seconds=30.0)
+    assert_allclose(settled_errors(both)[1][:, 2], alone[:, 2], atol=np.deg2rad(1.0))
 
 
 @pytest.mark.parametrize("text", ["motor_3:stuck", "motor_3:stuck@", "motor_3@5", "@5", "x@1.2.3"])

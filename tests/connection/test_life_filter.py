@@ -104,7 +104,7 @@ def said_of_scatter(robot, evidence, factor=1.0, motor=0):
     settling = replace(SETTLING, scatter=tuple(scatter), tail_dof=dof)
     sharp = replace(CALIBRATION, settling=settling, variation=None)
     model = HealthyModel(DigitalTwin(robot), sharp)
-    response = LinearResponse.of(evidence, model, SharedLayout(4, offsets=True))
+    response = LinearResponse.of(evidence, model, SharedLayout(4, offsets=True), range(4))
     healthy = Hypothesis.parse("healthy")
     return local_likelihood(response, healthy, KNOWN, np.zeros((len(evidence.usable), 19)))
 

@@ -121,7 +121,9 @@ def test_a_file_holds_what_was_learned(own, armpi, tmp_path):
     rates = [[(e.rate, e.rate_when_late) for e in each.lost_commands] for each in (there, again)]
     np.testing.assert_allclose(rates[0], rates[1], rtol=1e-5)
     assert read_calibration(path, armpi).remarks == found.remarks
-    ours, theirs = (BayesDiagnoser(armpi, known).diagnose(runs) for known in (there, path))
+    ours, theirs = (
+        BayesDiagnoser(armpi, known).diagnose(runs) for known in (found.calibration, path)
+    )
     for one, other in zip(ours, theirs, strict=True):
         assert one.posterior == pytest.approx(other.posterior, abs=1e-4)
         assert one.diagnosis == one.truth

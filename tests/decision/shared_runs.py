@@ -40,7 +40,7 @@ class Scene:
     hypothesis: Hypothesis
 
     def response(self, layout=WHOLE):
-        return LinearResponse.of(self.evidence, self.model, layout)
+        return LinearResponse.of(self.evidence, self.model, layout, range(layout.motors))
 
 
 def scene(twin, name, runs=2, dof=np.inf, lost=(), count=6, seed=3, doubt=DOUBT):

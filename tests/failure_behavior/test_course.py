@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,7 +9,13 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.integrate import cumulative_trapezoid
 
-from failuretwin.failure_behavior.fault import Course, draw_episodes, exposures, severities
+from failuretwin.failure_behavior.fault import (
+    Course,
+    EndlessEpisodes,
+    draw_episodes,
+    exposures,
+    severities,
+)
 
 TIME = np.arange(1000) * 0.01
 EPISODES = ((2.0, 3.0), (4.5, 5.25), (9.0, 12.0))
@@ -83,3 +91,24 @@ def test_details_name_the_parameters():
         {"shape": "ramp", "rise_s": 4.0},
         {"shape": "intermittent", "episodes_s": [[2.0, 3.0], [4.5, 5.25], [9.0, 12.0]]},
     ]
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 1.0])
+def test_endless_episodes_fill_their_share_in_the_long_run(share):
+    endless = EndlessEpisodes(3.0, share, (0.5, 2.0), np.random.default_rng(1))
+    found = np.array(endless.within(0.0, 20_000.0))
+    assert found[0, 0] == 3.0
+    length = np.diff(found, axis=1)
+    assert np.all((length >= 0.5) & (length <= 2.0))
+    assert np.all(found[1:, 0] >= found[:-1, 1])
+    assert length.sum() / 20_000.0 == pytest.approx(share, rel=0.05)
+
+
+def test_endless_episodes_are_the_same_in_slices():
+    whole, sliced = (
+        EndlessEpisodes(0.0, 0.4, (0.5, 2.0), np.random.default_rng(5)) for _ in range(2)
+    )
+    edges = np.linspace(0.0, 60.0, 601)
+    pieces = {e for a, b in pairwise(edges) for e in sliced.within(a, b)}
+    assert sorted(pieces) == list(whole.within(0.0, 60.0))
+    assert whole.within(10.0, 20.0) == tuple(e for e in sorted(pieces) if e[1] > 10 and e[0] < 20)

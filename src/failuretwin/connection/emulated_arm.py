@@ -15,7 +15,6 @@ from itertools import takewhile
 import numpy as np
 
 from failuretwin.connection.links.base import CommandSent, Event, Pace, PacedSource, Reading
-from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model.disturbances import (
@@ -30,9 +29,10 @@ from failuretwin.digital_model.nonidealities import Imperfections, vary
 from failuretwin.digital_model.physics_engine import LiveArm, PhysicsEngine
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.failure_behavior.fault import FaultValue
+from failuretwin.failure_behavior.fault import INTERMITTENT, Course, EndlessEpisodes, FaultValue
 from failuretwin.failure_behavior.injection import Injection, ScheduledFault
 from failuretwin.failure_behavior.mode import FaultMode
+from failuretwin.failure_behavior.modes import Intermittent
 from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.failure_behavior.registry import MODES
 
@@ -42,8 +42,6 @@ FIRST_COMMAND_S = 1.0
 """Time at rest before the first command [s]."""
 MEMORY_S = 6.0
 """How long lags and play remember what they were told [s]; longer than any movement."""
-NOT_SCHEDULED = "intermittent"
-"""Comes and goes by itself; on a schedule it is a stuck motor that is repaired several times."""
 
 
 @dataclass(frozen=True)
@@ -65,14 +63,6 @@ class Emulation:
     seed: int = 0
     modes: Mapping[str, FaultMode] = field(default_factory=lambda: MODES)
     start: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        for scheduled in self.schedule:
-            if scheduled.fault.mode == NOT_SCHEDULED:
-                raise InputError(
-                    f"fault '{scheduled.fault}' comes and goes by itself and cannot be put on a "
-                    "schedule. Give a stuck motor several times instead."
-                )
 
 
 @dataclass(frozen=True)
@@ -115,6 +105,7 @@ class EmulatedArm:
         self._twin = DigitalTwin(emulation.robot)
         self._self = self._upcoming = self._draw()
         self._magnitude: dict[ScheduledFault, float] = {}
+        self._episodes: dict[ScheduledFault, EndlessEpisodes] = {}
         self._index = 0
         self._start = FIRST_COMMAND_S
         self._next_reading = 0.0
@@ -194,14 +185,33 @@ class EmulatedArm:
         robot, values = self._emulation.robot, []
         for scheduled in self._emulation.schedule:
             if scheduled.overlaps(begin_s, end_s):
-                values.append(self._fault_value(scheduled, end_s))
+                values.append(self._fault_value(scheduled, begin_s, end_s))
         return Injection([values], robot.motor_names, self._emulation.modes)
 
-    def _fault_value(self, scheduled: ScheduledFault, end_s: float) -> FaultValue:
+    def _fault_value(self, scheduled: ScheduledFault, begin_s: float, end_s: float) -> FaultValue:
         fault = scheduled.fault
-        drawn = self._emulation.modes[fault.mode].draw(fault.motor, 1, end_s, self._rng_of_faults)
+        mode = self._emulation.modes[fault.mode]
+        if isinstance(mode, Intermittent):
+            return self._coming_and_going(scheduled, mode, begin_s, end_s)
+        drawn = mode.draw(fault.motor, 1, end_s, self._rng_of_faults)
         magnitude = self._magnitude.setdefault(scheduled, drawn.magnitude)
         return replace(drawn, magnitude=magnitude, course=scheduled.course)
+
+    def _coming_and_going(
+        self, scheduled: ScheduledFault, mode: Intermittent, begin_s: float, end_s: float
+    ) -> FaultValue:
+        """Return a fault with its episodes between two times [s]; none after its repair."""
+        if scheduled not in self._episodes:
+            rng = self._rng_of_faults.spawn(1)[0]
+            share = float(rng.uniform(*mode.magnitude))
+            self._episodes[scheduled] = EndlessEpisodes(
+                scheduled.start_s, share, mode.episode_s, rng
+            )
+        endless, repaired = self._episodes[scheduled], scheduled.end_s
+        there = endless.within(begin_s, min(end_s, repaired))
+        there = tuple((start, min(end, repaired)) for start, end in there)
+        course = Course(INTERMITTENT, scheduled.start_s, episodes=there)
+        return FaultValue(scheduled.fault, endless.share, course)
 
     def _live_through(self, leg: _Leg) -> list[Event]:
         position = self._move(leg)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -78,10 +78,18 @@ class CalibratedRobot:
         return DigitalTwin(self.robot)
 
 
+@runtime_checkable
+class Learned(Protocol):
+    """What a calibration has found of a robot."""
+
+    def applied_to(self, robot: Robot) -> CalibratedRobot:
+        """Return the robot as the calibration knows it."""
+
+
 RobotLike = DigitalTwin | CalibratedRobot | Robot | str | Path
 """A robot in any form: a twin, what a calibration made of it, or a bundled name or profile."""
-HealthyLike = Imperfections | str | Path | None
-"""What a healthy robot does: figures, the name or path of a calibration, None: by its profile."""
+HealthyLike = Imperfections | Learned | str | Path | None
+"""What a healthy robot does: figures, a calibration, its name or path, None: by its profile."""
 
 
 def calibrated(robot: RobotLike, healthy: HealthyLike = None) -> CalibratedRobot:
@@ -99,6 +107,8 @@ def calibrated(robot: RobotLike, healthy: HealthyLike = None) -> CalibratedRobot
     model = robot.robot if isinstance(robot, DigitalTwin | CalibratedRobot) else load_robot(robot)
     if isinstance(healthy, Imperfections):
         return CalibratedRobot(model, healthy)
+    if isinstance(healthy, Learned):
+        return healthy.applied_to(model)
     return load_calibration(healthy, model)
 
 

@@ -95,19 +95,30 @@ class Clearance:
         Args:
             pose: Angles in the log's sense, (..., motor) [rad].
         """
-        if len(self.pairs) == 0:
-            return np.full(pose.shape[:-1], np.inf)
-        apart = self._distances(self.points(pose), self.pairs)
-        return np.asarray(apart.min(axis=-1) - 2.0 * self.radius_m)
+        return self._gap(self.points(pose))
 
     def height(self, pose: FloatArray) -> FloatArray:
         """Return how far the lowest moving joint or the tool is above the floor, (...) [m]."""
-        z = self.points(pose)[..., self._first_moved :, 2]
-        return np.asarray(z.min(axis=-1) - self.floor_m)
+        return self._height(self.points(pose))
+
+    def gap_and_height(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return both, each (...) [m], for poses (..., motor) [rad]."""
+        points = self.points(pose)
+        return self._gap(points), self._height(points)
 
     def margin(self, pose: FloatArray) -> FloatArray:
         """Return the lesser of gap and height, (...) [m]; below 0 a pose is not allowed."""
-        return np.minimum(self.gap(pose), self.height(pose))
+        return np.minimum(*self.gap_and_height(pose))
+
+    def _gap(self, points: FloatArray) -> FloatArray:
+        if len(self.pairs) == 0:
+            return np.full(points.shape[:-2], np.inf)
+        apart = self._distances(points, self.pairs)
+        return np.asarray(apart.min(axis=-1) - 2.0 * self.radius_m)
+
+    def _height(self, points: FloatArray) -> FloatArray:
+        z = points[..., self._first_moved :, 2]
+        return np.asarray(z.min(axis=-1) - self.floor_m)
 
     def _distances(self, points: FloatArray, pairs: IntArray) -> FloatArray:
         """Return how far the lines of pairs of links are apart, (..., pair) [m]."""

@@ -48,15 +48,13 @@ class ChainFrames:
             q: Joint values in the chain's own sense, (..., joint) [rad or m].
         """
         angle = np.where(self._slides, 0.0, q) if self._any_slides else q
-        moved = np.zeros((*q.shape, 4, 4))
-        cosine, sine = np.cos(angle), np.sin(angle)
-        moved[..., 0, 0] = moved[..., 1, 1] = cosine
-        moved[..., 1, 0] = sine
-        moved[..., 0, 1] = -sine
-        moved[..., 2, 2] = moved[..., 3, 3] = 1.0
+        cosine, sine = np.cos(angle)[..., None], np.sin(angle)[..., None]
+        step = np.empty((*q.shape, 4, 4))
+        x, y, step[..., 2], step[..., 3] = np.moveaxis(self._fixed, -1, 0)
+        step[..., 0] = cosine * x + sine * y  # a turn about z moves two columns alone
+        step[..., 1] = cosine * y - sine * x
         if self._any_slides:
-            moved[..., 2, 3] = np.where(self._slides, q, 0.0)
-        step = self._fixed @ moved
+            step[..., 3] += np.where(self._slides, q, 0.0)[..., None] * self._fixed[..., 2]
         found = np.empty_like(step)
         here = found[..., 0, :, :] = step[..., 0, :, :]
         for j in range(1, step.shape[-3]):

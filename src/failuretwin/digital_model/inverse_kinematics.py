@@ -27,7 +27,7 @@ MOST_STEPS = 60
 SLOWEST = 0.9
 """A search whose error has not fallen to this share in `PATIENCE` steps is stuck in a corner."""
 PATIENCE = 5
-ENOUGH = 0.5
+ENOUGH = 0.3
 """A goal that so many of its starts have come to is not searched for any longer."""
 LONGEST_STEP = 0.5
 """Longest step of a joint at a time [rad or m]."""

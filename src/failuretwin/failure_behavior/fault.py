@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -131,6 +132,44 @@ def draw_episodes(
     gap = rng.dirichlet(np.ones(count)) * (span - filled)
     start = onset_s + np.concatenate([[0.0], np.cumsum(length + gap)[:-1]])
     return tuple((float(s), float(s + n)) for s, n in zip(start, length, strict=True))
+
+
+@dataclass
+class EndlessEpisodes:
+    """Episodes of a fault that comes and goes for ever, drawn as time goes on.
+
+    The first begins at the onset. Lengths are uniform, gaps exponential with mean
+
+        E[gap] = E[length] (1 - share) / share
+
+    which is what `draw_episodes` comes to in a long run.
+
+    Attributes:
+        begin_s: Begin of the first [s].
+        share: Share of the time that they fill in the long run, in (0, 1].
+        length_s: Range of their lengths [s].
+        rng: Source of chance, of these alone.
+    """
+
+    begin_s: float
+    share: float
+    length_s: tuple[float, float]
+    rng: np.random.Generator
+
+    def __post_init__(self) -> None:
+        self._drawn: list[tuple[float, float]] = []
+        self._next_s = self.begin_s
+
+    def within(self, begin_s: float, end_s: float) -> tuple[tuple[float, float], ...]:
+        """Return those that are there at any time between two times, begin and end of each [s]."""
+        rate = (1.0 - self.share) / self.share
+        while self._next_s < end_s and self.share > 0.0:
+            length = float(self.rng.uniform(*self.length_s))
+            gap = float(self.rng.exponential(0.5 * sum(self.length_s) * rate)) if rate else 0.0
+            self._drawn.append((self._next_s, self._next_s + length))
+            self._next_s += length + gap
+        first = bisect_left(self._drawn, (begin_s - self.length_s[1],))
+        return tuple(e for e in self._drawn[first:] if e[1] > begin_s and e[0] < end_s)
 
 
 PerMovement = NDArray[np.float64 | np.bool_]

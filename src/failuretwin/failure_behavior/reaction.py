@@ -10,7 +10,7 @@ class Reaction(Enum):
 
     LOCK = "plan with the motor held where it is believed to stand"
     INVERT = "command what the fault turns into what is wanted"
-    PARK = "let the motor rest, find out where, and work with the others"
+    PARK = "let the motor rest in a known place, and work with the others"
     REPEAT = "look whether each command came, and send it again"
     WAIT = "give it the time that it takes"
     SPARE = "choose poses in which it carries little, and command against its sag"

@@ -7,7 +7,7 @@ Section: docs/self_calibration.md#scatter-and-loss-rates
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
@@ -41,12 +41,23 @@ class Habits:
     losses: FloatArray
 
     @classmethod
-    def believed(cls, given: Imperfections) -> Habits:
-        """Return what is believed of a robot before any run."""
+    def believed(
+        cls,
+        given: Imperfections,
+        scatter_spread: float = SCATTER_SPREAD,
+        tail_spread: float = TAIL_SPREAD,
+    ) -> Habits:
+        """Return what is believed of a robot before any run.
+
+        Args:
+            given: Its scatter, tails and rates, the most probable ones.
+            scatter_spread: Deviation of the logarithm of each scatter.
+            tail_spread: The same of the degrees of freedom.
+        """
         motors = 0 if given.settling is None else len(given.settling.scatter)
         rate = np.array([[e.rate, e.rate_when_late] for e in given.lost_commands]).reshape(-1, 2)
         losses = RATE_COUNT * np.stack([rate, np.ones_like(rate)], axis=-1)
-        spread = np.array([*[SCATTER_SPREAD] * motors, TAIL_SPREAD])
+        spread = np.array([*[scatter_spread] * motors, tail_spread])
         return cls(np.diag(spread**-2.0), np.zeros(motors + 1), losses)
 
     @classmethod
@@ -64,6 +75,11 @@ class Habits:
         """Write down what some of the runs say."""
         self.precision[rows], self.shift[rows] = told.precision, told.shift
         self.losses[rows] = told.losses
+
+    def toward(self, told: Habits, share: float) -> Habits:
+        """Return these, changed by a share of what they differ by from others."""
+        pairs = zip(astuple(self), astuple(told), strict=True)
+        return Habits(*(old + share * (new - old) for old, new in pairs))
 
     def plus(self, told: Habits) -> Habits:
         """Return these and those of some runs together."""

@@ -146,6 +146,7 @@ class LinearResponse:
         evidence: SettledEvidence,
         model: HealthyModel,
         layout: SharedLayout,
+        motors: Sequence[int],
         moving: TransientSamples | None = None,
     ) -> LinearResponse:
         """Return the response of some runs.
@@ -157,6 +158,7 @@ class LinearResponse:
             evidence: Settled positions, registered.
             model: The healthy robot; what theta holds of its doubt is no scatter.
             layout: What stands in theta.
+            motors: Those that may be faulty: none, or all in their order.
             moving: Readings on the way, registered; None: they are left aside.
         """
         usual, sharp = model.outcomes_as_seen(evidence), model
@@ -165,7 +167,7 @@ class LinearResponse:
         if layout.offsets:
             sharp = model.without_doubt
             explanation = sharp.explain(evidence, usual)
-        profiles = joint_likelihoods(evidence, sharp, outcomes, range(layout.motors))
+        profiles = joint_likelihoods(evidence, sharp, outcomes, motors)
         pose = sharp.settle(usual.base, usual.direction, sharp.none_held)
         place = _Place(evidence, sharp, layout)
         return cls(

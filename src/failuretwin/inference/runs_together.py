@@ -227,6 +227,17 @@ class RunsTogether:
         settling = offsets_of(theta, given)
         return replace(self.model, imperfections=replace(imperfections, settling=settling))
 
+    def of_runs(self, rows: IntArray) -> RunsTogether:
+        """Return the state of some of the runs alone, with what they have said so far."""
+        return replace(
+            self,
+            given=self.given[rows],
+            sites=Normal(self.sites.precision[rows], self.sites.shift[rows]),
+            told=self.told[rows],
+            start=self.start[rows],
+            counted=self.counted[rows],
+        )
+
     def judge(self, rows: IntArray, moving: TransientSamples | None = None) -> list[Judged]:
         """Return what some runs say, each with its cavity; so many at a time as fit.
 
@@ -237,12 +248,13 @@ class RunsTogether:
         parts = np.split(np.arange(len(rows)), np.arange(CHUNK_RUNS, len(rows), CHUNK_RUNS))
         return [self._judge(rows[p], None if moving is None else moving[p]) for p in parts]
 
-    def learn(self, found: Sequence[Judged], damping: float = 1.0) -> None:
+    def learn(self, found: Sequence[Judged], damping: float = 1.0, of_habits: float = 1.0) -> None:
         """Take in what runs say: sites, where to search for them, scatter, rates.
 
         Args:
             found: What they say.
             damping: Share of a new site that is taken.
+            of_habits: Share of what they newly say of scatter and losses that is taken.
         """
         for judged in found:
             rows, covariance = judged.rows, self._covariance(judged)
@@ -254,7 +266,8 @@ class RunsTogether:
             if self.habits is not None:
                 covariance = covariance * np.outer(self.unit, self.unit)
                 given = self.given.model.imperfections
-                self.told.put(rows, judged.habits(given, covariance, self._log_scatter))
+                told = judged.habits(given, covariance, self._log_scatter)
+                self.told.put(rows, self.told[rows].toward(told, of_habits))
         self.maximise()
         self.here = self.belief.moments[0][0] * self.unit
 

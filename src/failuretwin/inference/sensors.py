@@ -306,6 +306,14 @@ class SensorStack:
 
     # Where a motor stands.
 
+    def angles(self, point: FloatArray) -> FloatArray:
+        """Return the readings of the motors, where they are believed, (..., motor) [rad].
+
+        Args:
+            point: What was seen, (..., channel) [m].
+        """
+        return np.asarray(point[..., -len(self.twin.robot.motors) :] / self._scale[-1])
+
     def nearest(self, pose: FloatArray, own: BoolArray, point: FloatArray) -> FloatArray:
         """Return the angle of each motor that brings what is expected near to what was seen.
 
@@ -324,8 +332,7 @@ class SensorStack:
         here = np.sum(pose * own, axis=-1)
         told = [sensor.kind for sensor in self.at_rest]
         if Encoders.kind in told:
-            angles = point[..., -len(self.twin.robot.motors) :] / self._scale[-1]
-            return np.broadcast_to(np.sum(angles * own, axis=-1), here.shape)
+            return np.broadcast_to(np.sum(self.angles(point) * own, axis=-1), here.shape)
         turned = np.array([0.0, 0.5 * np.pi, np.pi])[:, None]
         at = np.where(own[..., None, :], turned, pose[..., None, :])
         circular = np.repeat([s.circular for s in self.at_rest], [s.channels for s in self.at_rest])

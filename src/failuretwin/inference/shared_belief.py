@@ -91,6 +91,13 @@ class Belief:
         each = np.einsum("rctu,rcu->rct", covariance, self.shift)
         return mixed(self.weight, each, covariance)
 
+    def log_density(self, theta: FloatArray) -> float:
+        """Return the log density of one theta in units, (theta,), but for a constant."""
+        away = theta - np.linalg.solve(self.precision[0], self.shift[0][..., None])[..., 0]
+        square = np.einsum("ct,ctu,cu->c", away, self.precision[0], away)
+        volume = np.linalg.slogdet(self.precision[0])[1]
+        return float(log_sum(self.log_weight[0] + 0.5 * (volume - square), axis=0))
+
     def blurred(self, variance: FloatArray) -> Belief:
         """Return what is believed after a random walk of that variance, (theta,)."""
         if not variance.any():

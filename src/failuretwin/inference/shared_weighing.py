@@ -194,6 +194,11 @@ class SharedWeighing:
         """Log prior of each hypothesis, (hypothesis,)."""
         return log_prior(self.hypotheses, self.priors)
 
+    @property
+    def _suspects(self) -> range:
+        """Motors that may be faulty: all, or none where every hypothesis is that all is well."""
+        return range(0 if all(h.is_healthy for h in self.hypotheses) else self.layout.motors)
+
     @cached_property
     def broad(self) -> FloatArray:
         """Largest deviations of all components, (theta,)."""
@@ -218,7 +223,7 @@ class SharedWeighing:
         seen = registered_evidence(likelihood.evidence[rows], place, model.sensors)
         way = likelihood.moving
         way = None if way is None else registered_samples(way[rows], place, model.sensors)
-        return Expansion(LinearResponse.of(seen, model, self.layout, way), place)
+        return Expansion(LinearResponse.of(seen, model, self.layout, self._suspects, way), place)
 
     def search(self, at: Expansion, prior: Normal, start: FloatArray) -> Weighed:
         """Return what runs say with theta normal.

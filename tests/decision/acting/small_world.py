@@ -47,6 +47,7 @@ class SmallWorld:
     seed: int = 0
     truth: BelievedFault | None = None
     lost: set = field(default_factory=set)
+    losers: object = ...
     orders: list = field(default_factory=list)
 
     def __post_init__(self):
@@ -60,7 +61,7 @@ class SmallWorld:
         self.orders.append((self.command, order))
         previous, target = self.command, order.target.copy()
         if len(self.orders) in self.lost:
-            target = previous.copy()
+            target[self.losers] = previous[self.losers]
         arm = BelievedArm(self.model, self.truth)
         pose = arm.settle(target, previous, self.time_s)
         scatter = np.asarray(self.model.settling.scatter) * self.rng.standard_normal(len(pose))
@@ -71,6 +72,9 @@ class SmallWorld:
                 sign = 1.0 if self.rng.random() < 0.5 else -1.0
                 self.error = sign * self.rng.uniform(0.05, 0.2)
             pose[truth.motor] += self.error
+        if truth is not None and truth.fault.mode == "intermittent" and self.rng.random() < 0.35:
+            k = truth.motor  # it is held on its way, and goes on with the next movement
+            pose[k] = previous[k] + self.rng.random() * (target[k] - previous[k])
         self.command, self.pose = target, pose
         self.time_s += PERIOD_S
         return self.model.twin.path(pose)

@@ -166,8 +166,8 @@ def test_a_way_is_looked_at_as_believed_too(armpi):
 def test_an_arm_that_is_too_near_may_only_get_away(armpi):
     gate = SafetyGate(armpi)
     low = np.array([0.0, 1.57, -0.9, 0.6])
-    assert gate.in_the_way(low, np.zeros(4)) == ""
-    assert gate.in_the_way(low, low + np.array([0.0, 0.0, -0.05, 0.1])) != ""
+    assert gate.in_the_way([(low, np.zeros(4))]) == ""
+    assert gate.in_the_way([(low, low + np.array([0.0, 0.0, -0.05, 0.1]))]) != ""
 
 
 def test_durations_keep_speed_and_acceleration(armpi):

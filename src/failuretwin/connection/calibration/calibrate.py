@@ -11,7 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from failuretwin.connection.calibration.cross_validation import cross_validate, judge
-from failuretwin.connection.calibration.observations import observe, session_names
+from failuretwin.connection.calibration.observations import (
+    observe,
+    session_names,
+    uncalibrated,
+)
 from failuretwin.connection.calibration.parameters import (
     LossRates,
     Rate,
@@ -36,8 +40,8 @@ from failuretwin.connection.calibration.sensor_fit import (
 from failuretwin.connection.calibration.settling_fit import (
     SettlingFit,
     best_payload,
+    fit_settling,
     sense_remarks,
-    sort_and_fit,
 )
 from failuretwin.connection.calibration.timing_fit import (
     fit_timing,
@@ -129,22 +133,23 @@ def fit_calibration(
     left_out = exclude_suspect_runs(names, session_names(runs), doubt)
     out = {entry.run for entry in left_out}
     kept = runs.isel(run=[i for i, run in enumerate(names) if run not in out])
-    part = sort_and_fit(observe(kept, use_readings=use_readings), robot)
+    part = fit_settling(observe(kept, robot, use_readings=use_readings))
     payload, remarks = 0.0, list[str]()
     if thorough:
         payload, told = best_payload(part, robot)
         remarks = [*sense_remarks(part, robot), told]
         if payload > 0.0:
-            part = sort_and_fit(part.observations, robot, payload)
+            model = uncalibrated(robot, part.observations.of_motors, payload=payload)
+            part = fit_settling(part.observations.of(model))
     movements = movements_of(kept)
     late = lateness(movements)
     losses = loss_rates(
-        part.observations, part.lost, late.punctual, late.delayed, robot.motor_names
+        part.observations, part.sorted.lost, late.punctual, late.delayed, robot.motor_names
     )
     rng = np.random.default_rng(BOOTSTRAP_SEED)
     timing = fit_timing(transients(kept, movements, late, part, part.settling, robot), robot, rng)
     gaps = gap_starts(kept, movements, late.late)
-    glitches = glitch_rates(kept) if part.observations.position is not None else None
+    glitches = glitch_rates(kept) if part.observations.of_motors else None
     imperfections = Imperfections(
         name=name,
         source=source,
@@ -169,7 +174,7 @@ def fit_calibration(
         sessions=part.observations.sessions,
         runs=len(names) - len(out),
         movements=int(np.sum(part.fitted)),
-        used_readings=part.observations.position is not None,
+        used_readings=part.observations.of_motors,
         left_out=(*left_out, *part.left_out(robot)),
         held_out=_held_out(part, robot, judged) if thorough else (),
         remarks=(*remarks, *part.remarks(), *spring_remarks(settling)),
@@ -179,10 +184,10 @@ def fit_calibration(
 def _held_out(part: SettlingFit, robot: Robot, judged: xr.Dataset | None) -> tuple[HeldOut, ...]:
     seen = part.observations
     if judged is None:
-        return cross_validate(seen, robot, part.payload)
-    unseen = observe(judged, use_readings=seen.position is not None)
+        return cross_validate(part, robot)
+    unseen = observe(judged, robot, use_readings=seen.of_motors)
     entries = [
-        judge(unseen[unseen.session == index], part, robot, name)
+        judge(unseen[np.flatnonzero(unseen.session == index)], part, robot, name)
         for index, name in enumerate(unseen.sessions)
     ]
     return tuple(entry for entry in entries if entry is not None)

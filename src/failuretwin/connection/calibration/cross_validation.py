@@ -7,12 +7,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.connection.calibration.observations import Observations, observe, rounding
+from failuretwin.connection.calibration.observations import (
+    Observations,
+    observe,
+    rounding,
+    uncalibrated,
+)
 from failuretwin.connection.calibration.result import Calibration, HeldOut
 from failuretwin.connection.calibration.settling_fit import (
     SettlingFit,
-    sort_and_fit,
-    sort_movements,
+    SortedMovements,
+    fit_settling,
 )
 from failuretwin.connection.calibration.timing_fit import (
     AFTER_RAMP_S,
@@ -39,20 +44,18 @@ TO_DEVIATION = 1.4826
 """Median absolute deviation to standard deviation of a normal distribution."""
 
 
-def cross_validate(
-    observations: Observations, robot: Robot, payload: float = 0.0
-) -> tuple[HeldOut, ...]:
+def cross_validate(part: SettlingFit, robot: Robot) -> tuple[HeldOut, ...]:
     """Return how well the other sessions predict each session; empty with one session alone."""
-    found = []
-    for index in range(len(observations.sessions)):
-        inside = observations.session == index
+    found, seen = [], part.observations
+    for index, name in enumerate(seen.sessions):
+        inside = seen.session == index
         if not inside.any() or inside.all():
             continue
         try:
-            others = sort_and_fit(observations[~inside], robot, payload)
+            others = part.without(inside)
         except InputError:
             continue  # what is left is too little to learn from
-        found.append(judge(observations[inside], others, robot, observations.sessions[index]))
+        found.append(judge(seen[np.flatnonzero(inside)], others, robot, name))
     return tuple(entry for entry in found if entry is not None)
 
 
@@ -75,7 +78,8 @@ def judge(
     generic = replace(kind.settling, scatter=tuple(kind.scatter.tolist()))
     plain = settled_errors(observations, robot, None)
     told = settled_errors(observations, robot, settling)
-    kept = _healthy(plain, observations)
+    became = SortedMovements.of(observations, others.together.learned)
+    kept = _healthy(plain, observations) & ~became.lost.any(axis=1)
     gain = _log_density(observations, robot, settling) - _log_density(observations, robot, generic)
     gain = gain[kept]
     if len(gain) < 2:
@@ -197,37 +201,48 @@ def predict(found: Calibration, runs: xr.Dataset, robot: Robot) -> Predictions:
         runs: The runs it was learned from or judged on.
         robot: The robot.
     """
-    seen = observe(trusted_runs(found, runs), use_readings=found.used_readings)
-    settling = settling_of(found, robot)
+    seen, settling = _observed(found, runs, robot), settling_of(found, robot)
     learned = np.array([name in found.sessions for name in seen.sessions])[seen.session]
-    if not learned.all():
-        seen = seen[~learned]
-        return _predictions(seen, robot, settling, expected_pose(seen, robot, settling), True)
-    pose = _expected_by_others(seen, robot, settling.payload)
-    unseen = pose is not None
+    pose = None
+    if learned.all():
+        pose = _expected_by_others(seen, robot)
+    else:
+        seen = seen[np.flatnonzero(~learned)]
+    unseen = pose is not None or not learned.all()
     if pose is None:
         pose = expected_pose(seen, robot, settling)
-    return _predictions(seen, robot, settling, pose, unseen)
+    return _predictions(seen, found, robot, pose, unseen)
 
 
-def _expected_by_others(seen: Observations, robot: Robot, payload: float) -> FloatArray | None:
+def _observed(found: Calibration, runs: xr.Dataset, robot: Robot) -> Observations:
+    """Return the movements of trusted runs, of a robot with the payload of the calibration."""
+    seen = observe(trusted_runs(found, runs), robot, use_readings=found.used_readings)
+    payload = settling_of(found, robot).payload
+    return seen.of(uncalibrated(robot, seen.of_motors, payload=payload))
+
+
+def _expected_by_others(seen: Observations, robot: Robot) -> FloatArray | None:
     """Return the angles expected by fits to other sessions; None where too little is left."""
-    groups = min(len(seen.sessions), MOST_FOLDS)
+    groups, run = min(len(seen.sessions), MOST_FOLDS), seen.at[0]
     pose = np.empty_like(seen.target)
-    for group in range(groups):
-        inside = seen.session % groups == group
-        try:
-            others = sort_and_fit(seen[~inside], robot, payload)
-        except InputError:
-            return None
-        pose[inside] = expected_pose(seen[inside], robot, others.settling)
+    try:
+        part = fit_settling(seen)
+        for group in range(groups):
+            inside = seen.session % groups == group
+            others, judged = part.without(inside), seen[np.flatnonzero(inside)]
+            pose[inside[run]] = expected_pose(judged, robot, others.settling)
+    except InputError:
+        return None
     return pose
 
 
 def _predictions(
-    seen: Observations, robot: Robot, settling: Settling, pose: FloatArray, unseen: bool
+    seen: Observations, found: Calibration, robot: Robot, pose: FloatArray, unseen: bool
 ) -> Predictions:
-    lost, odd = sort_movements(seen, robot, settling)
+    settling = settling_of(found, robot)
+    known = replace(found.imperfections, sensors=seen.model.imperfections.sensors)
+    sorting = SortedMovements.of(seen, replace(seen.model, imperfections=known))
+    lost, odd = sorting.lost, sorting.odd
     twin, scatter = DigitalTwin(robot), np.asarray(settling.scatter)
     error = settled_errors(seen, robot, None)
     if seen.position is not None:
@@ -298,8 +313,7 @@ def example_transient(
     """
     runs = trusted_runs(found, runs)
     settling = settling_of(found, robot)
-    seen = observe(runs, use_readings=found.used_readings)
-    part = sort_and_fit(seen, robot, settling.payload)
+    part = fit_settling(_observed(found, runs, robot))
     movements = movements_of(runs)
     # What is shown is the calibration, which may have seen fewer sessions than this fit.
     ramps = transients(runs, movements, lateness(movements), part, settling, robot)

@@ -10,28 +10,29 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import beta, binom
 
-from failuretwin.connection.calibration.observations import (
-    DOF_PRIOR,
-    DOF_PRIOR_SPREAD,
-    LEAST_DOF,
-    TRAVEL_RAD,
-    Observations,
-)
+from failuretwin.connection.calibration.observations import Observations
 from failuretwin.connection.calibration.result import Parameter
-from failuretwin.connection.calibration.settling_fit import SettlingPosterior
+from failuretwin.connection.calibration.settling_fit import (
+    DOF_PRIOR_SPREAD,
+    SettlingPosterior,
+)
 from failuretwin.connection.calibration.timing_fit import BOUNDS, Lateness, TimingFit
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.digital_model.arm_classes import class_of
 from failuretwin.digital_model.nonidealities import LostCommand, Range, Readings, Schedule, Timing
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import largest_load
+from failuretwin.inference.habits import HEAVIEST
 
 if TYPE_CHECKING:
     import xarray as xr
 
 # How often things go wrong by chance, from counts in healthy logs.
 
+TRAVEL_RAD = 0.105
+"""Travel below which a lost command cannot be told from a bad one [rad], 25 counts."""
 LEVEL = (0.025, 0.975)
 PRIOR_MOVEMENTS = 2.0
 """Late movements that the rate of the punctual ones is worth."""
@@ -120,7 +121,7 @@ def loss_rates(
         delayed: Movements that started late, (run, movement); what is neither does not count.
         names: Names of the motors.
     """
-    at = observations.run, observations.number
+    at = observations.at
     seen = {tuple(np.flatnonzero(row).tolist()) for row in lost if row.any()}
     single = {(motor,) for motor in range(len(names))}
     rates = []
@@ -177,9 +178,9 @@ LOAD_FLOOR_NM = 1e-6
 DELAY_BOUNDS = BOUNDS[0]
 """Where a delay that the logs do not tell may lie [s]."""
 INVERSE_DOF_SPREAD = float(
-    np.sqrt(np.expm1(DOF_PRIOR_SPREAD**2)) * np.exp(DOF_PRIOR_SPREAD**2 / 2.0) / DOF_PRIOR
+    np.sqrt(np.expm1(DOF_PRIOR_SPREAD**2)) * np.exp(DOF_PRIOR_SPREAD**2 / 2.0)
 )
-"""Standard deviation of the inverse degrees of freedom in the log-normal prior."""
+"""Prior deviation of the inverse degrees of freedom, times their median: log-normal."""
 UNLOADED = "gravity does not load this motor"
 
 ADVICE = {
@@ -208,7 +209,7 @@ def settling_parameters(fit: SettlingPosterior, robot: Robot, payload: float) ->
             if name == "scatter":
                 value, low, high = (float(np.exp(x)) for x in (value, low, high))
             found.append(Parameter(name, motor, unit, value, low, high, learned, note))
-    return [*found, _tails(fit)]
+    return [*found, _tails(fit, robot)]
 
 
 def spring_remarks(settling: Sequence[Parameter]) -> list[str]:
@@ -222,7 +223,7 @@ def spring_remarks(settling: Sequence[Parameter]) -> list[str]:
     ]
 
 
-def _tails(fit: SettlingPosterior) -> Parameter:
+def _tails(fit: SettlingPosterior, robot: Robot) -> Parameter:
     """Return the degrees of freedom, with an interval that is even about their inverse.
 
     How well logs tell the inverse hardly depends on what it is. They tell the figure itself the
@@ -231,7 +232,8 @@ def _tails(fit: SettlingPosterior) -> Parameter:
     dof = float(np.exp(fit.mode[-1]))
     inverse, deviation = 1.0 / dof, float(fit.deviation[-1]) / dof
     low, least = 1.0 / (inverse + Z_95 * deviation), inverse - Z_95 * deviation
-    learned = deviation < LEARNED * INVERSE_DOF_SPREAD and dof > 1.05 * LEAST_DOF
+    before = INVERSE_DOF_SPREAD / class_of(robot).tail_dof
+    learned = deviation < LEARNED * before and dof > 1.05 * HEAVIEST
     note = "" if learned else f"the logs hardly say; it takes {ADVICE['tail_dof']}"
     high = 1.0 / least if least > 0.0 else float("inf")
     return Parameter("tail_dof", "", "-", dof, low, high, learned, note)

@@ -1,33 +1,50 @@
-"""Settled movements sorted, and where motors settle fitted, also to other kinds of the robot."""
+"""Where the motors of a healthy robot settle, also if it were another kind of robot.
+
+The inference of a folder of runs, `RunsTogether`, with every run known to be healthy: what is
+asked is theta, the scatter, its tails and what became of each command. The prior is what arms of
+the class are like.
+
+Section: docs/calibration.md#settling-model-and-priors
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from failuretwin.connection.calibration.observations import (
-    TRAVEL_RAD,
-    Observations,
-    SettlingPrior,
-    SettlingRegression,
-    has_known_origin,
-    lost_command,
-    rounding,
-    without_lost,
-)
+from failuretwin.connection.calibration.observations import Observations, uncalibrated
 from failuretwin.connection.calibration.result import LeftOut
 from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, largest_load
-from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.habits import Habits
+from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.priors import Priors
+from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.runs_together import RunsTogether
+from failuretwin.inference.shared_belief import Belief
+from failuretwin.inference.shared_unknowns import REGISTRATION, SetupPrior, SharedLayout
+from failuretwin.inference.shared_weighing import SharedWeighing
 
-# Bias, compliance, friction and scatter of every motor from where healthy movements settled.
-
-POSE_ROUNDS = 3
-"""Rounds in which the pose that gravity acts in and the fit settle together (tool path alone)."""
+FEWEST_MOVEMENTS = 6
+"""Settled movements below which nothing can be fitted."""
+SCATTER_PRIOR_SPREAD, DOF_PRIOR_SPREAD = 1.0, 0.7
+"""Prior deviations of the logarithms of each scatter and of the degrees of freedom; assumed, wider
+than within a class: healthy logs tell them."""
+WARMING = 2
+"""Passes in which scatter and rates stay as believed: until the offsets are nearly found, what is
+left of a movement is no scatter."""
+DAMPING = 0.5
+"""Share of new sites and habits that is taken: what the tool tells apart badly would be handed to
+and fro between motors."""
+MOST_PASSES, CONVERGED = 30, 0.02
+"""Passes over the runs at most; they end when nothing moves by this share of its deviation, or a
+logarithm by this much."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +56,11 @@ class SettlingPosterior:
             motors (4 n + 1,), group by group.
         covariance: Of the same, (4 n + 1, 4 n + 1).
         prior_deviation: Standard deviation before the logs were seen, (4 n + 1,).
-        log_posterior: Log likelihood and log prior at the mode, for comparing fits.
     """
 
     mode: FloatArray
     covariance: FloatArray
     prior_deviation: FloatArray
-    log_posterior: float
 
     @property
     def motors(self) -> int:
@@ -57,92 +72,35 @@ class SettlingPosterior:
         """Standard deviation of each parameter, (4 n + 1,)."""
         return np.sqrt(np.diag(self.covariance))
 
-    def settling(self, source: str) -> Settling:
-        """Return the mode as a value of the digital model."""
-        bias, compliance, friction, log_scatter = self.mode[:-1].reshape(4, -1)
-        return Settling(
-            bias=tuple(bias.tolist()),
-            compliance=tuple(compliance.tolist()),
-            friction=tuple(friction.tolist()),
-            scatter=tuple(np.exp(log_scatter).tolist()),
-            tail_dof=float(np.exp(self.mode[-1])),
-            source=source,
-        )
 
+@dataclass(frozen=True)
+class SortedMovements:
+    """What probably became of healthy movements.
 
-def settling_posterior(
-    observations: Observations, robot: Robot, arrived: FloatArray, payload: float = 0.0
-) -> SettlingPosterior:
-    """Fit where the motors of a healthy robot settle.
-
-    Args:
-        observations: Settled movements.
-        robot: The robot.
-        arrived: How probable it is that each motor got its command, (movement, motor).
-        payload: Mass at the tool point [kg].
+    Attributes:
+        lost: Motors that did not get their command, (movement, motor).
+        odd: Movements that look like no healthy ones, (movement,).
+        log_likelihood: Of all movements together.
     """
-    of_motors = observations.position is not None
-    prior = SettlingPrior.of(robot, payload, of_motors)
-    settling, start = replace(Settling.ideal(len(robot.motors)), payload=payload), prior.mean
-    for _ in range(1 if of_motors else POSE_ROUNDS):
-        problem = SettlingRegression.of(observations, robot, arrived, settling)
-        fit, start = _mode(problem, prior, start)
-        settling = replace(fit.settling("fit"), payload=payload)
-    return fit
 
+    lost: BoolArray
+    odd: BoolArray
+    log_likelihood: float
 
-def _mode(
-    problem: SettlingRegression, prior: SettlingPrior, start: FloatArray
-) -> tuple[SettlingPosterior, FloatArray]:
-    """Return the posterior mode and its curvature, found in units of the prior deviations.
+    @classmethod
+    def of(cls, observations: Observations, model: HealthyModel) -> SortedMovements:
+        """Return what became of movements.
 
-    The noise of a tool sensor belongs to no motor: it is averaged out of the fit, and only the
-    second result, all parameters at the mode, still has it.
-    """
-    from scipy.optimize import minimize
-
-    unit = prior.deviation
-
-    def cost(scaled: FloatArray) -> float:
-        parameters = scaled * unit
-        return -problem.log_likelihood(parameters) - prior.log_density(parameters)
-
-    found = minimize(cost, start / unit, method="BFGS", options={"gtol": 1e-4, "maxiter": 500})
-    curvature = _hessian(cost, found.x)
-    values, vectors = np.linalg.eigh(curvature)
-    inverse = (vectors / np.maximum(values, 0.5)) @ vectors.T
-    covariance = inverse * np.outer(unit, unit)
-    own = slice(4 * problem.design.shape[2] + 1)
-    mode = found.x * unit
-    fit = SettlingPosterior(
-        mode[own], covariance[own, own], prior.deviation[own], -float(found.fun)
-    )
-    return fit, mode
-
-
-def _hessian(cost: Callable[[FloatArray], float], at: FloatArray, step: float = 1e-3) -> FloatArray:
-    """Return the second derivatives of `cost` by central differences."""
-    size = len(at)
-    steps = np.eye(size) * step
-    hessian = np.empty((size, size))
-    for i in range(size):
-        for j in range(i + 1):
-            corners = (
-                cost(at + steps[i] + steps[j])
-                - cost(at + steps[i] - steps[j])
-                - cost(at - steps[i] + steps[j])
-                + cost(at - steps[i] - steps[j])
-            )
-            hessian[i, j] = hessian[j, i] = corners / (4.0 * step**2)
-    return hessian
-
-
-FEWEST_MOVEMENTS = 6
-"""Settled movements below which nothing can be fitted."""
-STANDS_OUT_RAD, STANDS_OUT_M = 0.084, 0.03
-"""Error beyond which a movement is no healthy one [rad], twenty counts, and of the tool [m]."""
-ROUNDS = 2
-"""Rounds of sorting and fitting; the second knows where motors settle."""
+        Args:
+            observations: Settled movements.
+            model: The robot, with the sensors of the observations; it is not in doubt.
+        """
+        likelihood = RunLikelihood(observations.evidence, model.without_doubt)
+        share = likelihood.outcome_probability[observations.at]
+        sound = share.sum(axis=-1)
+        missed = (share @ likelihood.outcomes.lost) / np.maximum(sound, 1e-12)[:, None]
+        lost, odd = np.asarray(missed > 0.5), np.asarray(sound < 0.5)
+        return cls(lost & ~odd[:, None], odd, float(likelihood.log_healthy.sum()))
 
 
 @dataclass(frozen=True)
@@ -151,30 +109,58 @@ class SettlingFit:
 
     Attributes:
         observations: All settled movements.
-        lost: Motors that did not get their command, (movement, motor).
-        odd: Movements that look like no healthy ones, (movement,).
-        fitted: Movements that the fit is to: not odd, and after one that was seen, (movement,).
-        arrived: How probable it is that each motor got its command, (movement, motor).
-        fit: Where motors settle.
-        payload: Mass at the tool point that the fit knows of [kg].
+        together: The runs, learned from.
     """
 
     observations: Observations
-    lost: BoolArray
-    odd: BoolArray
-    fitted: BoolArray
-    arrived: FloatArray
-    fit: SettlingPosterior
-    payload: float = 0.0
+    together: RunsTogether
 
     @property
     def settling(self) -> Settling:
         """Where motors settle, payload included."""
-        return replace(self.fit.settling("fit"), payload=self.payload)
+        return replace(self.together.learned.settling, source="fit")
+
+    @property
+    def payload(self) -> float:
+        """Mass at the tool point that the fit knows of [kg]."""
+        return self.settling.payload
+
+    @cached_property
+    def fit(self) -> SettlingPosterior:
+        """Where motors settle, with covariance."""
+        habits, settling = _habits(self.together), self.settling
+        (_,), (covariance,) = self.together.belief.moments
+        unit, own = self.together.unit, slice(REGISTRATION, None)
+        offsets = (covariance * np.outer(unit, unit))[own, own]
+        scatter = np.linalg.inv(habits.precision)
+        whole = np.zeros((len(offsets) + len(scatter),) * 2)
+        whole[: len(offsets), : len(offsets)] = offsets
+        whole[len(offsets) :, len(offsets) :] = scatter
+        told = (settling.bias, settling.compliance, settling.friction, np.log(settling.scatter))
+        return SettlingPosterior(
+            np.concatenate([*told, [np.log(settling.tail_dof)]]),
+            whole,
+            np.concatenate([unit[own], _spreads(len(settling.scatter))]),
+        )
+
+    @cached_property
+    def sorted(self) -> SortedMovements:
+        """What became of the movements, of the robot that was found."""
+        return SortedMovements.of(self.observations, self.together.learned)
+
+    @property
+    def fitted(self) -> BoolArray:
+        """Movements that the fit is to, (movement,)."""
+        return np.asarray(self._counted & ~self.sorted.odd)
+
+    @property
+    def _counted(self) -> BoolArray:
+        """Movements that motors have set out for from a known place, (movement,)."""
+        return np.asarray(self.together.given.usable[self.observations.at])
 
     def remarks(self) -> list[str]:
         """Return what else did not count, a sentence each."""
-        unseen = int(np.sum(~self.odd & ~self.fitted))
+        unseen = int(np.sum(~self._counted))
         if unseen == 0:
             return []
         return [
@@ -182,111 +168,117 @@ class SettlingFit:
             "from is not known: they count for losses alone"
         ]
 
+    @property
+    def log_posterior(self) -> float:
+        """Log likelihood and log prior of the offsets found, for comparing robots."""
+        offsets = self.together.base.log_density(self.together.belief.moments[0][0])
+        return self.sorted.log_likelihood + offsets
+
+    def without(self, runs: BoolArray) -> SettlingFit:
+        """Return the fit to the other runs, found from here.
+
+        Args:
+            runs: The runs that it must not have seen, (run,).
+
+        Raises:
+            InputError: If too few movements are left.
+        """
+        kept = np.flatnonzero(~runs)
+        return fitted_to(self.observations[kept], self.together.of_runs(kept))
+
     def left_out(self, robot: Robot) -> tuple[LeftOut, ...]:
         """Return the movements that did not count, each with its reason."""
-        found = []
-        seen = self.observations
-        for i in np.flatnonzero(self.odd | self.lost.any(axis=1)):
-            motors = [robot.motor_names[k] for k in np.flatnonzero(self.lost[i])]
+        found, seen = [], self.observations
+        lost, odd = self.sorted.lost, self.sorted.odd
+        run, number = seen.at
+        for i in np.flatnonzero(odd | lost.any(axis=1)):
+            motors = [robot.motor_names[k] for k in np.flatnonzero(lost[i])]
             reason = "is far off its target"
             if motors:
                 reason = f"did not get {'its command' if len(motors) == 1 else 'their commands'}"
             name = " and ".join(motors)
-            found.append(LeftOut(seen.runs[seen.run[i]], int(seen.number[i]) + 1, name, reason))
+            found.append(LeftOut(seen.runs[run[i]], int(number[i]) + 1, name, reason))
         return tuple(found)
 
 
-def sort_and_fit(observations: Observations, robot: Robot, payload: float = 0.0) -> SettlingFit:
-    """Sort settled movements and fit where motors settle.
+def fit_settling(observations: Observations, passes: int = MOST_PASSES) -> SettlingFit:
+    """Fit where the motors of a healthy robot settle.
 
     Args:
-        observations: Settled movements of healthy runs.
-        robot: The robot.
-        payload: Mass at the tool point [kg].
+        observations: Settled movements of healthy runs, and what is believed of the robot.
+        passes: Over the runs at most.
 
     Raises:
         InputError: If too few movements are left.
     """
-    settling = Settling.ideal(len(robot.motors))
-    commanded = observations
-    for _ in range(ROUNDS):
-        lost, odd = sort_movements(observations, robot, settling)
-        kept = ~odd
-        known = has_known_origin(observations[kept])
-        if known.sum() >= FEWEST_MOVEMENTS:
-            kept[kept] = known
-        if kept.sum() < FEWEST_MOVEMENTS:
-            raise InputError(
-                f"only {int(kept.sum())} of {len(kept)} movements come to rest near their targets, "
-                f"expected {FEWEST_MOVEMENTS} at least. Give longer logs of a healthy robot."
-            )
-        observations = without_lost(commanded, lost)
-        arrived = probably_arrived(observations, robot, lost, settling)
-        fit = settling_posterior(observations[kept], robot, arrived[kept], payload)
-        part = SettlingFit(observations, lost, odd, kept, arrived, fit, payload)
-        settling = part.settling
-    return part
+    model, evidence, known = observations.model, observations.evidence, observations.follows_seen
+    if known.sum() >= FEWEST_MOVEMENTS:
+        evidence = replace(evidence, usable=known)
+    likelihood = RunLikelihood(evidence, model)
+    layout = SharedLayout(len(model.scatter), offsets=True)
+    weighing = SharedWeighing(likelihood, [HEALTHY], Priors(setup=SetupPrior.known()), layout)
+    told = weighing.parts
+    unit = told[0].deviation
+    together = RunsTogether.of(weighing, Belief.of(told, unit), unit)
+    return fitted_to(observations, together, passes)
 
 
-def sort_movements(
-    observations: Observations, robot: Robot, settling: Settling
-) -> tuple[BoolArray, BoolArray]:
-    """Return motors without their commands, (movement, motor), and odd movements, (movement,).
+def fitted_to(
+    observations: Observations, together: RunsTogether, passes: int = MOST_PASSES
+) -> SettlingFit:
+    """Return what is learned from runs, one pass after the other until nothing moves.
 
     Args:
-        observations: Settled movements.
-        robot: The robot.
-        settling: Where its motors settle, as far as is known.
+        observations: The movements.
+        together: The same runs; they are learned from.
+        passes: Over the runs at most.
+
+    Raises:
+        InputError: If too few movements are left.
     """
-    target, direction = observations.target, observations.direction
-    expected = target + settling.offset(robot, target, direction)
-    lost = lost_command(observations, robot, expected)
-    return lost, _odd(observations, robot, np.where(lost, observations.origin, expected))
+    _refuse_few(len(observations), len(observations))
+    rows, habits = np.arange(together.runs), _believed(together)
+    for count in range(passes):
+        before = together.here / together.unit, together.model.settling
+        together.habits = habits if count >= WARMING else None
+        sites, told = (1.0 if count <= first else DAMPING for first in (0, WARMING))
+        together.learn(together.judge(rows), sites, told)
+        if count > WARMING and _moved(together, *before) < CONVERGED:
+            break
+    found = SettlingFit(observations, together)
+    _refuse_few(int(found.fitted.sum()), len(observations))
+    return found
 
 
-def probably_arrived(
-    observations: Observations, robot: Robot, lost: BoolArray, settling: Settling
-) -> FloatArray:
-    """Return how probable it is that each motor got its command, (movement, motor).
-
-    A motor that had far to go is sorted already. One that had not, and is read, lost its command
-    as often as the others do; where it rests says which of the two it is. Otherwise those few
-    would make the tails of the scatter.
-
-    Args:
-        observations: Settled movements.
-        robot: The robot.
-        lost: Motors that surely did not get their command, (movement, motor).
-        settling: Where its motors settle, as far as is known.
-    """
-    arrived = (~lost).astype(np.float64)
-    travel = observations.target - observations.origin
-    if observations.position is None or not any(settling.scatter):
-        return arrived
-    told = np.abs(travel) > TRAVEL_RAD
-    rate = ((lost & told).sum(axis=0) + 0.5) / (told.sum(axis=0) + 1.0)
-    scale = np.hypot(settling.scatter, rounding(robot))
-    offset = settling.offset(robot, observations.position, observations.direction)
-    off = observations.position - observations.target - offset
-    # A motor that stays has come from either side before: friction holds it as now or as against.
-    held, turned = off + travel, 2.0 * np.asarray(settling.friction) * observations.direction
-    stays = 0.5 * sum(_density(error / scale, settling) for error in (held, held - turned))
-    odds = (1.0 - rate) / rate * _density(off / scale, settling) / stays
-    return np.where(told, arrived, odds / (1.0 + odds))
+def _believed(together: RunsTogether) -> Habits:
+    given = together.given.model.imperfections
+    return Habits.believed(given, SCATTER_PRIOR_SPREAD, DOF_PRIOR_SPREAD)
 
 
-def _density(unit: FloatArray, settling: Settling) -> FloatArray:
-    """Return the density of a Student t, but for a factor."""
-    dof = settling.tail_dof
-    return np.asarray((1.0 + unit**2 / dof) ** (-0.5 * (dof + 1.0)))
+def _spreads(motors: int) -> FloatArray:
+    return np.array([*[SCATTER_PRIOR_SPREAD] * motors, DOF_PRIOR_SPREAD])
 
 
-def _odd(observations: Observations, robot: Robot, expected: FloatArray) -> BoolArray:
-    if observations.position is not None:
-        off = np.abs(observations.position - expected) > STANDS_OUT_RAD
-        return np.asarray(off.any(axis=1))
-    away = DigitalTwin(robot).path(expected) - observations.point
-    return np.asarray(np.linalg.norm(away, axis=1) > STANDS_OUT_M)
+def _habits(together: RunsTogether) -> Habits:
+    return _believed(together).plus(together.told)
+
+
+def _moved(together: RunsTogether, place: FloatArray, settling: Settling) -> float:
+    """Return by how much a pass has moved the fit, in deviations or logarithms."""
+    (_,), (covariance,) = together.belief.moments
+    moved = (together.here / together.unit - place) / np.sqrt(np.diag(covariance))
+    now = together.model.settling
+    scatter = np.log(np.divide(now.scatter, settling.scatter))
+    tails = np.log(now.tail_dof / settling.tail_dof)
+    return float(max(np.abs(moved).max(), np.abs(scatter).max(), abs(tails)))
+
+
+def _refuse_few(kept: int, movements: int) -> None:
+    if kept < FEWEST_MOVEMENTS:
+        raise InputError(
+            f"only {kept} of {movements} movements come to rest near their targets, expected "
+            f"{FEWEST_MOVEMENTS} at least. Give longer logs of a healthy robot."
+        )
 
 
 # What the robot might be beside what its profile says: another sense of a motor, a payload.
@@ -330,9 +322,8 @@ def sense_remarks(part: SettlingFit, robot: Robot) -> list[str]:
 
 def _largest_sag(part: SettlingFit, robot: Robot) -> FloatArray:
     """Return how far each motor gives way under its largest load, as fitted, (motor,) [rad]."""
-    seen, arrived = part.observations[part.fitted], part.arrived[part.fitted]
-    fit, n = settling_posterior(seen, robot, arrived, part.payload), len(robot.motors)
-    return np.asarray(np.abs(fit.mode[n : 2 * n]) * largest_load(robot, part.payload))
+    compliance = np.asarray(_refit(part, robot, part.payload).settling.compliance)
+    return np.asarray(np.abs(compliance) * largest_load(robot, part.payload))
 
 
 def _best_senses(
@@ -343,9 +334,11 @@ def _best_senses(
     The sense that gains most is turned first: a wrong one bends the loads of the motors before it,
     and makes theirs look wrong too.
     """
-    best, posterior = robot, part.fit.log_posterior
+    best, posterior = robot, part.log_posterior
     while True:
-        turned = {k: _refit(part, _with_turned(best, k), part.payload) for k in loaded}
+        turned = {
+            k: _refit(part, _with_turned(best, k), part.payload).log_posterior for k in loaded
+        }
         k = max(turned, key=lambda motor: turned[motor], default=None)
         if k is None or turned[k] - posterior <= SURE_NATS:
             return best, {motor: posterior - other for motor, other in turned.items()}
@@ -368,7 +361,8 @@ def best_payload(part: SettlingFit, robot: Robot) -> tuple[float, str]:
     sag = np.abs(np.asarray(part.settling.compliance) * largest_load(robot, 0.0))
     if sag.max() < LEAST_SAG_RAD:
         return 0.0, "payload: the motors do not give way, so none can be told"
-    gain = np.array([_refit(part, robot, kg) for kg in PAYLOADS_KG]) - part.fit.log_posterior
+    gain = np.array([_refit(part, robot, kg).log_posterior for kg in PAYLOADS_KG])
+    gain -= part.log_posterior
     best = int(np.argmax(gain))
     if gain[best] > SURE_NATS:
         kg = PAYLOADS_KG[best]
@@ -380,7 +374,7 @@ def best_payload(part: SettlingFit, robot: Robot) -> tuple[float, str]:
     )
 
 
-def _refit(part: SettlingFit, robot: Robot, payload: float) -> float:
-    """Return the log posterior of another description on the very same movements."""
-    seen, arrived = part.observations[part.fitted], part.arrived[part.fitted]
-    return settling_posterior(seen, robot, arrived, payload).log_posterior
+def _refit(part: SettlingFit, robot: Robot, payload: float) -> SettlingFit:
+    """Return the fit of another description to the very same movements."""
+    seen = part.observations
+    return fit_settling(seen.of(uncalibrated(robot, seen.of_motors, payload=payload)))

@@ -321,7 +321,7 @@ def transients(
     """
     time = as_floats(runs["time"].values)
     used = _on_time(movements, late, part, time)
-    of_motors = part.observations.position is not None
+    of_motors = part.observations.of_motors
     reading = as_floats(runs["position"].values) if of_motors else measured_samples(runs).point
     free = unloaded_movements(movements, settling)
     if of_motors:
@@ -355,8 +355,9 @@ def _on_time(
 def _sound(movements: Movements, part: SettlingFit) -> BoolArray:
     """Return which movements began and ended where the fit says, (run, movement)."""
     good, seen = np.zeros(movements.start.shape, dtype=bool), part.observations
-    fine = ~part.odd & (part.arrived > 0.5).all(axis=1)
-    good[seen.run[fine], seen.number[fine]] = True
+    run, number = seen.at
+    fine = ~part.sorted.odd & ~part.sorted.lost.any(axis=1)
+    good[run[fine], number[fine]] = True
     before = np.ones_like(good)
     before[:, 1:] = good[:, :-1]
     return good & before

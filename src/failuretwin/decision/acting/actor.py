@@ -20,6 +20,7 @@ from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault, Seen
 from failuretwin.decision.acting.judging import Judgement
 from failuretwin.decision.acting.outcome import USUAL, ActingSettings, TargetResult
+from failuretwin.decision.acting.parking import parking_place
 from failuretwin.decision.acting.planner import Plan, Planner, Standing
 from failuretwin.decision.acting.reactions import lost_command, probing, told
 from failuretwin.decision.acting.sparing import Effort
@@ -224,6 +225,7 @@ class Actor:
                 self._previous, self._command = self._command, order.target
                 self._order = order
                 return order
+        self._judgement = None  # it holds what was seen of every arm that was judged with this one
         return None
 
     def _plans_anew(self) -> bool:
@@ -262,6 +264,7 @@ class Actor:
     def _begin(self) -> Order | None:
         """Return the order that a new plan begins with; None where the target is given up."""
         attempt, at = self._attempt, self.standing()
+        self._set_aside(at)
         attempt.planned_with, attempt.corrections = self.belief.believed, 0
         if attempt.planned_with is None:
             attempt.as_healthy = False
@@ -280,6 +283,20 @@ class Actor:
             poses = plan.pose, plan.unspared
             self.ways.append(tuple(Effort.of(self._planner, pose, at) for pose in poses))
         return self._probed(plan.order, at)
+
+    def _set_aside(self, at: Standing) -> None:
+        """Choose where to park a motor that sticks now and then, unless it is parked."""
+        believed = self.belief.believed
+        if believed is None or not believed.obeys or believed.set_aside:
+            return
+        if believed.reaction is not Reaction.PARK or self._attempt.as_healthy:
+            return
+        left = self._task.targets[len(self.results) :]
+        stands = float(at.pose[believed.motor])
+        place = parking_place(self._planner.gate, believed.motor, left, stands)
+        if place.reached:
+            self.belief.stands_at(place.angle, 0.0)
+            self._say(place.told(self._model.motor_names[believed.motor]))
 
     def _out_of_reach(self, plan: Plan, at: Standing) -> Plan:
         """Return what to do where the motor that rests keeps the tool from its target."""
@@ -346,6 +363,8 @@ class Actor:
         """Return the order that works round a motor that is at rest now; None: there is none."""
         believed = self.belief.believed
         if believed is None or believed.reaction is not Reaction.PARK or self._attempt.as_healthy:
+            return None
+        if believed.obeys:  # it was parked before, by its command
             return None
         arm = self.arm
         pose = arm.most_probable_pose(seen)

@@ -9,13 +9,13 @@ held, or that rests, stays where it is whatever it is told.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from failuretwin.core.hypothesis import Fault
-from failuretwin.core.numerics import Ellipsoid
+from failuretwin.core.numerics import Ellipsoid, log_of
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.inverse_kinematics import usable_limits
 from failuretwin.digital_model.robot import Robot
@@ -31,10 +31,14 @@ UNMOVED_RAD = 1e-9
 NEWTON_STEPS = 5
 PROBE_RAD = 0.01
 """Step by which it is asked how far the faulty motor follows its command [rad]."""
+CLOSE_RAD = 5e-4
+"""A command is near enough once it changes by no more; the next change is a tenth of it [rad]."""
 LEAST_GAIN = 0.1
 """A motor that follows less than this share of its command is not inverted any further."""
 OUTLIER_RATE = 1e-3
 """Share of movements after which the tool is anywhere, in what movements say of an arm [-]."""
+WAY = (0.1, 0.3, 0.5, 0.7, 0.9)
+"""Places on its way at which a motor that has stuck may stand, as shares of the way."""
 HALF_90 = 1.645
 """Half of a 90 % interval in standard deviations."""
 
@@ -93,10 +97,25 @@ class BelievedFault:
         return self.mode.reaction
 
     @property
-    def rests(self) -> bool:
-        """Whether the motor stays where it is: held, or at rest and told nothing new."""
+    def likely_size(self) -> float:
+        """Its size, or the middle of those that diagnosis considers where it is not known."""
+        return self.size if np.isfinite(self.size) else 0.5 * sum(self.mode.considered)
+
+    @property
+    def obeys(self) -> bool:
+        """Whether the motor goes where it is told, now and then too late: it is parked by that."""
+        return self.mode.signature is Signature.MISSED
+
+    @property
+    def set_aside(self) -> bool:
+        """Whether plans leave the motor where it is: it rests, or was parked."""
         at_rest = self.reaction in (Reaction.LOCK, Reaction.PARK)
         return at_rest and bool(np.isfinite(self.angle))
+
+    @property
+    def rests(self) -> bool:
+        """Whether the motor stays where it is: held, or at rest and told nothing new."""
+        return self.set_aside and not self.obeys
 
     @property
     def inverted(self) -> bool:
@@ -128,11 +147,19 @@ class BelievedArm:
         return usable_limits(self.robot)
 
     @cached_property
+    def held(self) -> BoolArray:
+        """Motors that stay where they are, whatever they are told, (motor,)."""
+        return self._marked(self.fault is not None and self.fault.rests)
+
+    @cached_property
     def locked(self) -> BoolArray:
-        """Motors that stay where they are, (motor,)."""
+        """Motors that plans leave where they are: held, or parked, (motor,)."""
+        return self._marked(self.fault is not None and self.fault.set_aside)
+
+    def _marked(self, faulty: bool) -> BoolArray:
         mask = np.zeros(len(self.robot.motors), dtype=bool)
-        if self.fault is not None and self.fault.rests:
-            mask[self.fault.motor] = True
+        if self.fault is not None:
+            mask[self.fault.motor] = faulty
         return mask
 
     def settle(self, command: FloatArray, previous: FloatArray, time_s: float) -> FloatArray:
@@ -147,8 +174,8 @@ class BelievedArm:
         direction = np.where(np.abs(travel) > UNMOVED_RAD, np.sign(travel), 0.0)
         fault, base = self.fault, command
         if fault is not None and fault.rests:
-            base = np.where(self.locked, fault.angle, command)
-        pose = self.model.settle(base, direction, self.locked)
+            base = np.where(self.held, fault.angle, command)
+        pose = self.model.settle(base, direction, self.held)
         if fault is None or not fault.inverted:
             return pose
         k, load = fault.motor, 0.0
@@ -174,15 +201,24 @@ class BelievedArm:
             previous: What they were told before, (motor,) [rad].
             time_s: When they will arrive [s].
         """
-        command = pose.copy()
+        command = self._nearly(pose, previous)
         for _ in range(NEWTON_STEPS):
             settled = self.settle(command, previous, time_s)
             gain = self._gain(command, previous, time_s, settled)
-            step = np.where(self.locked, 0.0, (pose - settled) / gain)
+            step = np.where(self.held, 0.0, (pose - settled) / gain)
             command = command + step
-            if np.abs(step).max() < 1e-3 * PROBE_RAD:
+            if np.abs(step).max() < CLOSE_RAD:
                 break
         return self.rounded(self.with_rest(command, previous))
+
+    def _nearly(self, pose: FloatArray, previous: FloatArray) -> FloatArray:
+        """Return the command that leads to a pose without a fault, (motor,) [rad].
+
+        What gravity does there is known, for that is where the arm shall stand.
+        """
+        direction = np.sign(pose - previous)
+        offset = self.model.settling.offset(self.robot, pose, direction)
+        return np.where(self.held, pose, pose - offset)
 
     def gain(self, seen: Seen) -> FloatArray:
         """Return how far each motor follows a change of its command, (motor,) [-]."""
@@ -209,7 +245,7 @@ class BelievedArm:
         if fault is None or not fault.rests:
             return command
         left = previous[fault.motor] if fault.reaction is Reaction.PARK else fault.angle
-        return np.where(self.locked, left, command)
+        return np.where(self.held, left, command)
 
     def rounded(self, command: FloatArray) -> FloatArray:
         """Return a command as it can be sent: within limits, and in whole counts of the servos."""
@@ -225,7 +261,34 @@ class BelievedArm:
     # What a movement says of the arm.
 
     def log_density(self, seen: Seen) -> float:
-        """Return the log density of a settled tool position [log 1/m3]; 0 if it was not seen."""
+        """Return the log density of a settled tool position [log 1/m3]; 0 if it was not seen.
+
+        Of a motor that misses movements it is a mixture over where it may stand,
+
+            p(e) = sum over places of p(place) p(e | place)
+        """
+        fault = self.fault
+        if fault is None or not fault.obeys:
+            return self.log_density_arrived(seen)
+        missed = fault.likely_size * sum(fault.mode.misses)
+        arrived = float(log_of(1.0 - missed)) + self.log_density_arrived(seen)
+        return float(np.logaddexp(arrived, self.log_density_missed(seen)))
+
+    def log_density_missed(self, seen: Seen) -> float:
+        """Return the log of p(the faulty motor has not arrived, e); it misses movements."""
+        fault = self.fault
+        assert fault is not None
+        k, (stays, midway) = fault.motor, fault.mode.misses
+        rates = np.array([stays, *np.full(len(WAY), midway / len(WAY))]) * fault.likely_size
+        says = log_of(rates)
+        for i, share in enumerate((0.0, *WAY)):
+            command = seen.command.copy()
+            command[k] = seen.previous[k] + share * (seen.command[k] - seen.previous[k])
+            says[i] += self.log_density_arrived(replace(seen, command=command))
+        return float(np.logaddexp.reduce(says))
+
+    def log_density_arrived(self, seen: Seen) -> float:
+        """Return the log density of a settled tool position if every motor has arrived."""
         if seen.point is None:
             return 0.0
         pose = self.settle(seen.command, seen.previous, seen.rest_s)
@@ -245,8 +308,7 @@ class BelievedArm:
         if fault.rests:
             scatter[k] = np.hypot(fault.spread / HALF_90, self.model.held_scatter[k])
         elif mode.signature is Signature.REDRAWN_OFFSET:
-            size = fault.size if np.isfinite(fault.size) else 0.5 * sum(mode.considered)
-            scatter[k] = np.hypot(scatter[k], size)
+            scatter[k] = np.hypot(scatter[k], fault.likely_size)
         elif fault.inverted:
             per_unit = {"rad": 1.0, "rad/s": max(time_s - fault.since_s, 0.0)}
             angle = fault.spread / HALF_90 * per_unit.get(mode.unit, abs(float(command[k])))

@@ -14,6 +14,7 @@ from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.believed_arm import BelievedFault, Seen
+from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.reaction import Reaction
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.evidence import SettledEvidence
@@ -25,7 +26,7 @@ from failuretwin.inference.shared_posterior import shared_posterior
 
 ACTED_ON = (
     *("stuck", "steady_state_error", "encoder_bias", "encoder_scale"),
-    *("drift", "torque_loss"),
+    *("drift", "torque_loss", "intermittent"),
 )
 """Modes that are told from settled positions and answered; of the others feedback, waiting and
 sending again are the whole answer, whatever they are called."""
@@ -67,9 +68,7 @@ class Judgement:
         twins = [
             each
             for each in self.posterior.hypotheses
-            if _reaction(each) in (Reaction.INVERT, Reaction.PARK)
-            and best.faults
-            and each.faults[0].motor == best.faults[0].motor
+            if _is_off(each) and best.faults and each.faults[0].motor == best.faults[0].motor
         ]
         return best, sum(self.probability(each) for each in twins)
 
@@ -100,6 +99,14 @@ def _reaction(hypothesis: Hypothesis) -> Reaction | None:
     if not hypothesis.known or len(hypothesis.faults) != 1:
         return None
     return MODES[hypothesis.faults[0].mode].reaction
+
+
+def _is_off(hypothesis: Hypothesis) -> bool:
+    """Return whether it is one fault that leaves its motor off its target."""
+    if _reaction(hypothesis) is Reaction.INVERT:
+        return True
+    known = hypothesis.known and len(hypothesis.faults) == 1
+    return known and MODES[hypothesis.faults[0].mode].signature is Signature.REDRAWN_OFFSET
 
 
 @dataclass(frozen=True)

@@ -158,7 +158,7 @@ class Planner:
         """Return poses that bring the tool near to a target."""
         count = STARTS if self.spared is None else SPARING_STARTS
         start = kinematics.starts(count, self._rng, at.pose)
-        if arm.fault is not None and arm.fault.rests:
+        if arm.fault is not None and arm.fault.set_aside:
             start[:, arm.fault.motor] = arm.fault.angle
         axis = None if target.axis is None else target.axis[None]
         return kinematics.solve(target.point[None], start, arm.locked, axis)

@@ -36,22 +36,28 @@ def lost_command(arm: BelievedArm, seen: Seen) -> list[int]:
 
         log p(e | lost) + log rate > log p(e | arrived) + 2
 
-    A motor that is held, or parked, does not count: it is not expected to move.
+    A motor that is held does not count: it is not expected to move. One that sticks now and then
+    may also stand on its way.
 
     Args:
         arm: The arm as it is believed to be.
         seen: The movement.
     """
-    arrived, best, lost = arm.log_density(seen), -np.inf, list[int]()
+    arrived, best, lost = arm.log_density_arrived(seen), -np.inf, list[int]()
+    moved = np.abs(seen.command - seen.previous) > MOVED_RAD
     for motors, rate in _loss_sets(arm):
-        moved = np.abs(seen.command - seen.previous) > MOVED_RAD
-        if not moved[motors].any() or (len(motors) == 1 and arm.locked[motors].any()):
+        if not moved[motors].any() or (len(motors) == 1 and arm.held[motors].any()):
             continue
         command = seen.command.copy()
         command[motors] = seen.previous[motors]
-        says = arm.log_density(replace(seen, command=command)) + np.log(rate)
+        says = arm.log_density_arrived(replace(seen, command=command)) + np.log(rate)
         if says > best:
             best, lost = says, motors
+    fault = arm.fault
+    if fault is not None and fault.obeys and moved[fault.motor]:
+        says = arm.log_density_missed(seen)
+        if says > best:
+            best, lost = says, [fault.motor]
     return lost if best > arrived + SURPRISE_NATS else []
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -125,23 +126,24 @@ class SafetyGate:
         fast = order.duration < needed * (1.0 - ROUNDING)
         if fast.any():
             return f"{self._names(fast)} would be faster than is allowed"
-        for start, end in ways:
-            said = self.in_the_way(start, end)
-            if said:
-                return said
-        return ""
+        return self.in_the_way(ways)
 
-    def in_the_way(self, start: FloatArray, end: FloatArray) -> str:
-        """Return what an arm would come too near to between two poses, empty if to nothing.
+    def in_the_way(self, ways: Sequence[Way]) -> str:
+        """Return what an arm would come too near to on some ways, empty if to nothing.
 
         An arm that stands too near already may go where it comes no nearer.
+
+        Args:
+            ways: Begin and end of each, (motor,) [rad].
         """
-        poses = way_between(start, end)
-        gap, height = self.clearance.gap(poses), self.clearance.height(poses)
-        for margin, what in ((gap, "its own links"), (height, "the floor")):
-            allowed = min(self.margin_m, float(margin[0]) - ROUNDING)
-            if margin.min() < allowed:
-                return f"the arm would come within {1e3 * self.margin_m:.0f} mm of {what}"
+        poses = [way_between(start, end) for start, end in ways]
+        first = np.cumsum([0, *(len(way) for way in poses)])
+        gap, height = self.clearance.gap_and_height(np.concatenate(poses))
+        for begin, end in pairwise(first.tolist()):
+            for margin, what in ((gap, "its own links"), (height, "the floor")):
+                allowed = min(self.margin_m, float(margin[begin]) - ROUNDING)
+                if margin[begin:end].min() < allowed:
+                    return f"the arm would come within {1e3 * self.margin_m:.0f} mm of {what}"
         return ""
 
     def _names(self, which: BoolArray) -> str:
