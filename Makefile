@@ -1,16 +1,44 @@
-# `make demo` and `make test` set up everything they need in .venv, then do their job.
+# Each target sets up what it needs in .venv, and no more, then does its job.
 PYTHON ?= python3
 BIN := .venv/bin
 # Small arrays gain nothing from threads, and threads of several processes get in each other's way.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test bench calibrations lint format clean
+.PHONY: demo test docs links notebooks pages wheel bench calibrations lint format clean
 
-demo: .venv/ready
+demo: .venv/demo
 	$(BIN)/python examples/demo.py
 
 test: .venv/ready lint
 	$(BIN)/pytest -m "not slow" --numprocesses 2 --dist loadfile
+
+# The site is build/site/index.html. Warnings are errors, links between pages among them.
+docs: .venv/docs
+	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet -b html docs build/site
+	@echo "the site: build/site/index.html"
+
+# Links to other sites, which need a network.
+links: .venv/docs
+	$(BIN)/sphinx-build --quiet -b linkcheck docs build/links
+
+# Runs the pages, writes into them what their code prints now, and draws what is drawn from code.
+pages: .venv/ready
+	$(BIN)/python docs/executed.py docs/tutorials/*.md docs/contributing/*.md docs/reference/*.md
+	$(BIN)/python docs/diagram.py
+	$(BIN)/python docs/notebooks.py
+
+# Every notebook, as Jupyter runs it.
+notebooks: .venv/ready
+	$(BIN)/pytest -n 0 tests/test_pages.py -k notebook
+
+# Source archive and wheel, looked at, then tried by a Python that has nothing else.
+wheel: .venv/release
+	rm -rf dist build/wheel
+	$(BIN)/python -m build
+	$(BIN)/twine check --strict dist/*
+	$(PYTHON) -m venv build/wheel
+	build/wheel/bin/pip install --constraint constraints.txt dist/*.whl
+	cd build && wheel/bin/failuretwin demo
 
 bench: .venv/ready
 	$(BIN)/python benchmarks/speed.py
@@ -27,14 +55,26 @@ format: .venv/ready
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-.venv/ready: pyproject.toml constraints.txt
+.venv/made:
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "failuretwin needs Python 3.11 or newer: make PYTHON=python3.11 ...")'
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+.venv/demo: EXTRA := plots
+.venv/demo: SIZE := 0.5 GB on disk, a minute or two
+.venv/docs: EXTRA := docs
+.venv/docs: SIZE := 0.7 GB on disk, a minute or two
+.venv/release: EXTRA := release
+.venv/release: SIZE := 0.5 GB on disk, a minute or two
+.venv/ready: EXTRA := dev
+.venv/ready: SIZE := 2 to 6 GB on disk, by what comes with PyTorch; some minutes
+.venv/demo .venv/docs .venv/release .venv/ready: pyproject.toml constraints.txt | .venv/made
+	@echo "installing failuretwin[$(EXTRA)] into .venv: $(SIZE)"
+	$(BIN)/pip install --constraint constraints.txt --editable '.[$(EXTRA)]'
 	touch $@
 
 clean:
-	rm -rf .venv .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
 
 # The calibrations that come with the package; DATA is the folder of the published logs.
 DATA ?= ../shared/data

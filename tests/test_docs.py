@@ -14,22 +14,24 @@ import pytest
 import failuretwin
 
 ROOT = Path(__file__).parents[1]
-DOCS = sorted((ROOT / "docs").glob("*.md"))
+DOCS = sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [*DOCS, ROOT / "README.md", ROOT / "CHANGELOG.md"]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 ENTRY_POINTS = {"failuretwin.modes"}
 """Groups of entry points: dotted, but no module."""
 READERS_OWN = {
-    *("arm_diagnoser.py", "bent_shaft.py", "my_methods.py", "FILE.py"),
-    *("cal.toml", "faults.toml", "map.toml", "MAP.toml", "mine.toml", "my_arm.toml"),
-    "my_robot.toml",
+    *("arm_diagnoser.py", "bent_shaft.py", "my_method.py", "my_methods.py", "my_robot.py"),
+    *("arm.toml", "arm.urdf", "cal.toml", "costs.toml", "faults.toml", "map.toml", "MAP.toml"),
+    *("mine.toml", "my_arm.toml", "my_robot.toml", "topics.toml", "CAL.toml", "FILE.py"),
 }
 """Files in examples that the reader writes or gets."""
 STRANGERS = {"Dataset", "Guess"}
 """Classes of xarray and of the reader."""
+SHOWN = {"changelog.md", "looks.md"}
+"""Pages of the site that only show a file from elsewhere."""
 FOLDERS = ("benchmarks", "docs", "examples", "src", "tests")
 
-FENCE = re.compile(r"```(\w*)\n(.*?)```", re.DOTALL)
+FENCE = re.compile(r"```([\w{}-]*)[^\n]*\n(.*?)```", re.DOTALL)
 NAME = re.compile(r"`(failuretwin(?:\.\w+)+)")
 PUBLIC = re.compile(r"\bft\.([A-Za-z]\w*)")
 FILE = re.compile(r"`([\w./-]+\.(?:md|py|toml|urdf))`")
@@ -129,7 +131,9 @@ def test_a_name_that_is_not_there_is_noticed(name):
         resolve(name)
 
 
-@pytest.mark.parametrize("page", [*PAGES, *EXAMPLES], ids=named)
+@pytest.mark.parametrize(
+    "page", [p for p in (*PAGES, *EXAMPLES) if p.parent.name != "contributing"], ids=named
+)
 def test_snippets_import_public_names_alone(page):
     assert [name for code in snippets(page) for name in deep_imports(code)] == []
 
@@ -152,7 +156,8 @@ def test_classes_on_the_page_exist(page, classes):
 
 @pytest.mark.parametrize("page", PAGES, ids=named)
 def test_files_on_the_page_exist(page):
-    files = [path.as_posix() for name in FOLDERS for path in (ROOT / name).rglob("*")]
+    below = [path for name in FOLDERS for path in (ROOT / name).rglob("*")]
+    files = [path.as_posix() for path in (*below, *ROOT.glob("*"))]
     for name in set(FILE.findall(page.read_text("utf-8"))) - READERS_OWN:
         assert any(path.endswith(f"/{name}") for path in files), name
 
@@ -168,15 +173,18 @@ def test_links_on_the_page_lead_somewhere(page):
         assert not anchor or anchor in anchors(target), link
 
 
-@pytest.mark.parametrize("page", DOCS, ids=named)
-def test_a_page_opens_with_code(page):
+@pytest.mark.parametrize("page", [p for p in DOCS if p.name not in SHOWN], ids=named)
+def test_a_page_opens_with_what_when_and_code(page):
     before_first_heading = page.read_text("utf-8").partition("\n## ")[0]
     assert FENCE.search(before_first_heading)
+    assert "**What:**" in before_first_heading
+    assert re.search(r"\*\*(When|When to use|Start here):\*\*", before_first_heading)
 
 
 def test_the_index_links_every_page():
-    index = (ROOT / "docs" / "index.md").read_text("utf-8")
-    others = {page.name for page in DOCS} - {"index.md"}
+    docs = ROOT / "docs"
+    index = (docs / "index.md").read_text("utf-8")
+    others = {page.relative_to(docs).as_posix() for page in DOCS} - {"index.md", *SHOWN}
     assert others <= {link.partition("#")[0] for link in LINK.findall(index)}
     assert "docs/index.md" in LINK.findall((ROOT / "README.md").read_text("utf-8"))
 
@@ -205,3 +213,44 @@ def test_the_first_snippet_of_the_readme_prints_what_stands_below_it(capsys):
     code, printed = re.search(r"```python\n(.*?)```\n\n```\n(.*?)```", text, re.DOTALL).groups()
     exec(compile(code, "README.md", "exec"), {})
     assert capsys.readouterr().out == printed
+
+
+def code_of(pages: list[Path]) -> str:
+    """Return all Python of some pages and scripts."""
+    return "\n".join(code for page in pages for code in snippets(page))
+
+
+@pytest.mark.parametrize("name", [n for n in failuretwin.__all__ if n != "__version__"])
+def test_every_public_name_has_an_example(name):
+    pages = [page for page in PAGES if page.name not in SHOWN]
+    assert re.search(rf"\bft\.{name}\b", code_of([*pages, *EXAMPLES]))
+
+
+def test_the_reference_has_every_public_name_once():
+    pages = sorted((ROOT / "docs" / "reference").glob("api_*.md"))
+    text = "\n".join(page.read_text("utf-8") for page in pages)
+    told = re.findall(r"auto(?:class|function|exception):: failuretwin\.(\w+)", text)
+    assert sorted(told) == sorted(set(failuretwin.__all__) - {"__version__"})
+    overview = (ROOT / "docs" / "reference" / "api.md").read_text("utf-8")
+    assert sorted(re.findall(r"^   ([A-Za-z_]\w*)$", overview, re.MULTILINE)) == sorted(told)
+
+
+def sentences(text: str) -> list[str]:
+    """Return the sentences of a page, without code, tables and addresses of links."""
+    text = re.sub(r"\]\([^)]*\)", "]", FENCE.sub("\n\n", text))
+    parts = re.split(r"\n\s*\n|\n(?=[-|#]|\d\. )", text)
+    prose = [" ".join(part.split()) for part in parts if not part.startswith("|")]
+    return [s for part in prose for s in re.split(r"(?<=[.!?:])\s+", part) if s]
+
+
+@pytest.mark.parametrize(
+    "page", [p for p in DOCS if p.parent != ROOT / "docs"] + [ROOT / "CONTRIBUTING.md"], ids=named
+)
+def test_sentences_are_short(page):
+    text = page.read_text("utf-8")
+    assert len(sentences(text)) > 3
+    assert [s for s in sentences(text) if len(s.split()) >= 30] == []
+
+
+def test_a_long_sentence_is_noticed():
+    assert max(len(s.split()) for s in sentences(f"Short. {'word ' * 40}end.\n")) == 41

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import inspect
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +21,7 @@ NAMES = [name for name in ft.__all__ if name != "__version__"]
 def test_the_namespace_is_what_it_lists():
     assert dir(ft) == ft.__all__
     assert len(set(ft.__all__)) == len(ft.__all__)
-    assert 30 <= len(NAMES) <= 55
+    assert 30 <= len(NAMES) <= 60
     with pytest.raises(AttributeError, match="no attribute 'nothing_like_it'"):
         _ = ft.nothing_like_it
 
@@ -86,3 +91,26 @@ def test_streams_calibrations_and_twins_take_names(tmp_path):
     assert ft.DigitalTwin("ur5e").robot.name == "ur5e"
     with pytest.raises(ft.InputError, match=r"nothing\.jsonl: cannot be read"):
         ft.read_results(str(tmp_path / "nothing.jsonl"))
+
+
+def test_names_that_need_an_extra_say_so():
+    code = (
+        "import sys; sys.modules['torch'] = None\n"
+        "import failuretwin as ft\n"
+        "try: ft.load_network\n"
+        "except ft.InputError as error: print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stderr == ""
+    assert done.stdout.endswith("Install them: pip install 'failuretwin[learn]'.\n")
+
+
+def test_extras_that_are_named_can_be_installed():
+    root = Path(__file__).parents[1]
+    project = tomllib.loads((root / "pyproject.toml").read_text("utf-8"))["project"]
+    pages = [*(root / "docs").rglob("*.md"), root / "README.md"]
+    files = [*(root / "src").rglob("*.py"), *pages]
+    text = "\n".join(path.read_text("utf-8") for path in files)
+    named = {n for found in re.findall(r"failuretwin\[([a-z,]+)\]", text) for n in found.split(",")}
+    named |= set(re.findall(r'needs_extra\("[^"]*", "(\w+)"\)', text))
+    assert {"files", "learn", "plots"} <= named <= project["optional-dependencies"].keys()

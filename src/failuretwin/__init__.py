@@ -14,8 +14,15 @@ if TYPE_CHECKING:
     from failuretwin.app.plots import run_figure
     from failuretwin.connection.calibration.calibrate import calibrate
     from failuretwin.connection.calibration.result import Calibration, save_calibration
-    from failuretwin.connection.links.base import Sink, Source
-    from failuretwin.connection.links.commander import Commander
+    from failuretwin.connection.links.base import (
+        Answer,
+        CommandSent,
+        LinkCounts,
+        Reading,
+        Sink,
+        Source,
+    )
+    from failuretwin.connection.links.commander import Commander, Order
     from failuretwin.connection.population import Population
     from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
     from failuretwin.core.errors import InputError
@@ -52,9 +59,11 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
+    "Answer": "connection.links.base",
     "BayesDiagnoser": "inference.diagnoser",
     "Calibration": "connection.calibration.result",
     "CheckResult": "decision.test_motions.health_check",
+    "CommandSent": "connection.links.base",
     "Commander": "connection.links.commander",
     "Diagnoser": "inference.diagnoser",
     "Diagnosis": "core.hypothesis",
@@ -65,11 +74,14 @@ _HOME = {
     "Hypothesis": "core.hypothesis",
     "InputError": "core.errors",
     "IsolabilityReport": "inference.isolability",
+    "LinkCounts": "connection.links.base",
     "OnsetPrior": "inference.priors",
+    "Order": "connection.links.commander",
     "Plan": "data_knowledge.generate",
     "Population": "connection.population",
     "Priors": "inference.priors",
     "ReadOptions": "data_knowledge.read",
+    "Reading": "connection.links.base",
     "Robot": "digital_model.robot",
     "SelfCalibratingDiagnoser": "connection.self_calibration",
     "SetupPrior": "inference.shared_unknowns",
@@ -108,9 +120,11 @@ _HOME = {
 }
 
 __all__ = [
+    "Answer",
     "BayesDiagnoser",
     "Calibration",
     "CheckResult",
+    "CommandSent",
     "Commander",
     "Diagnoser",
     "Diagnosis",
@@ -121,11 +135,14 @@ __all__ = [
     "Hypothesis",
     "InputError",
     "IsolabilityReport",
+    "LinkCounts",
     "OnsetPrior",
+    "Order",
     "Plan",
     "Population",
     "Priors",
     "ReadOptions",
+    "Reading",
     "Robot",
     "SelfCalibratingDiagnoser",
     "SetupPrior",
@@ -165,9 +182,22 @@ __all__ = [
 ]
 
 
+_LEARNING = ("load_network", "train")
+"""Names that need the extra `learn` as soon as they are used."""
+
+
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'failuretwin' has no attribute {name!r}")
+    if name not in _LEARNING:
+        return _loaded(name)
+    from failuretwin.core.errors import needs_extra
+
+    with needs_extra("networks need PyTorch and scikit-learn", "learn"):
+        return _loaded(name)
+
+
+def _loaded(name: str) -> Any:
     return getattr(import_module(f"failuretwin.{_HOME[name]}"), name)
 
 

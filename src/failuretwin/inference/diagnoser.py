@@ -8,7 +8,7 @@ Section: docs/diagnosis.md#posterior-estimates-and-abstention
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from importlib import import_module
@@ -312,7 +312,8 @@ class _Completed:
         Raises:
             InputError: If that is not what the class returns.
         """
-        found, faults = self.diagnoser.diagnose(runs), truth_of(runs)
+        told, faults = self.diagnoser.diagnose(runs), truth_of(runs)
+        found = list(told) if isinstance(told, Iterable) else []
         count = runs.sizes["run"]
         if len(found) != count or not all(isinstance(d, Diagnosis) for d in found):
             raise InputError(f"{self.name}: diagnose(runs) gave no Diagnosis for each of {count}.")

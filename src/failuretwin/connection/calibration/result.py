@@ -153,8 +153,8 @@ ORIGIN = ("robot", "failuretwin_version")
 """Keys of the file's table beside the fields of `Calibration`: what it is of and who wrote it."""
 
 
-def save_calibration(calibration: Calibration, robot: Robot, path: Path) -> None:
-    """Write a calibration; a file of that name is replaced at the end, all at once.
+def save_calibration(calibration: Calibration, robot: Robot, path: str | Path) -> None:
+    """Write a calibration as TOML; a file of that name is replaced at the end, all at once.
 
     Raises:
         OutputError: If it cannot be written; the old file is as before.
@@ -169,7 +169,7 @@ def save_calibration(calibration: Calibration, robot: Robot, path: Path) -> None
         "# says how. Angles in rad in the sense of the logs, times in s.\n"
         f"{tomli_w.dumps({**table, CALIBRATION_TABLE: {**origin, **record}})}"
     )
-    with replacing(path) as partial:
+    with replacing(Path(path)) as partial:
         partial.write_text(text, encoding="utf-8")
 
 

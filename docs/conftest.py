@@ -1,0 +1,14 @@
+"""Code of the pages, run as tests."""
+
+from __future__ import annotations
+
+from sybil import Sybil
+
+from executed import blocks, setup, teardown
+
+pytest_collect_file = Sybil(
+    parsers=[blocks],
+    patterns=["tutorials/*.md", "contributing/*.md", "reference/*.md"],
+    setup=setup,
+    teardown=teardown,
+).pytest()

@@ -1,0 +1,113 @@
+"""The site: pages that are run notice what is wrong, what is drawn from code is up to date."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+from sybil import Document
+
+import diagram
+import executed
+import notebooks
+
+ROOT = Path(__file__).parents[1]
+QUICK = "own_arm"
+EACH_TUTORIAL = [
+    pytest.param(name, marks=() if name == QUICK else pytest.mark.slow)
+    for name in notebooks.TUTORIALS
+]
+
+
+def run(page):
+    """Run a page as a test would."""
+    document = Document(page, "page.md")
+    for region in executed.blocks(document):
+        document.add(region)
+    with executed.in_a_folder_of_its_own():
+        for example in document.examples():
+            example.evaluate()
+    return document
+
+
+def test_a_page_prints_what_stands_below():
+    run("```python\nx = 2\nprint(x + 1)\n```\n\n```text\n3\n```\n")
+    run("```python\nprint('a 0.123 b')\n```\n\n```text\na ... b\n```\n")
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        "```python\nprint(1)\n```\n\n```text\n2\n```\n",
+        "```python\nprint(1)\n```\n\n```text\n1\n2\n```\n",
+        "```sh\nfailuretwin diagnose nowhere.csv\n```\n",
+        "```sh\nfailuretwin --version   # refused\n```\n",
+        "```sh\nls\n```\n",
+    ],
+)
+def test_a_page_that_is_not_true_is_noticed(page):
+    with pytest.raises(AssertionError):
+        run(page)
+
+
+def test_a_page_writes_files_and_is_told_what_is_refused():
+    run(
+        "Save this as `wrong.csv`:\n\n```csv\na,b\n1,2\n```\n\n"
+        "```sh\nfailuretwin diagnose wrong.csv   # refused\n```\n\n"
+        "```text\nerror: wrong.csv: ...\n```\n"
+    )
+    assert not Path("wrong.csv").exists()
+
+
+def test_lines_of_an_error_are_those_of_the_page():
+    with pytest.raises(ZeroDivisionError) as caught:
+        run("# title\n\n```python\nx = 1\n1 / 0\n```\n")
+    assert caught.traceback[-1].lineno + 1 == 5
+
+
+def test_pages_are_rewritten_where_they_are_not_true(tmp_path):
+    page = tmp_path / "page.md"
+    kept = "```python\nprint('a 1 b')\n```\n\n```text\na ...\n```\n"
+    page.write_text(f"{kept}\n```python\nprint(3)\n```\n\n```text\n2\n```\n")
+    executed.rewrite(page)
+    assert page.read_text() == f"{kept}\n```python\nprint(3)\n```\n\n```text\n3\n```\n"
+
+
+def test_the_picture_of_the_packages_is_of_today():
+    found = diagram.imports()
+    assert ("decision", "inference") in found
+    assert ("inference", "decision") not in found
+    assert diagram.PICTURE.read_text("utf-8") == diagram.picture(found), "python docs/diagram.py"
+
+
+@pytest.mark.parametrize("name", notebooks.TUTORIALS)
+def test_a_notebook_is_that_of_its_tutorial(name):
+    written = (notebooks.FOLDER / f"{name}.ipynb").read_text("utf-8")
+    assert written == notebooks.text_of(name), "python docs/notebooks.py"
+
+
+@pytest.mark.parametrize("name", EACH_TUTORIAL)
+def test_a_notebook_runs(name, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:/usr/bin:/bin")
+    monkeypatch.setenv("PYTHONWARNINGS", "default")
+    notebook = nbformat.read(notebooks.FOLDER / f"{name}.ipynb", 4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # those of Jupyter
+        client = NotebookClient(notebook, timeout=120, resources={"metadata": {"path": tmp_path}})
+        client.execute()
+    printed = [out for cell in notebook.cells for out in cell.get("outputs", [])]
+    assert any("sure" in out.get("text", "") for out in printed)
+
+
+def test_the_site_is_built_without_a_warning(tmp_path):
+    words = ["-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", "docs", str(tmp_path)]
+    done = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    diagnosis = (tmp_path / "reference" / "api_diagnose.html").read_text("utf-8")
+    assert "cannot be read, or does not fit together" in diagnosis
+    assert "--self-calibrate" in (tmp_path / "reference" / "cli.html").read_text("utf-8")
