@@ -367,14 +367,27 @@ class RunsTogether:
     def _site(self, judged: Judged, covariance: FloatArray) -> Normal:
         """Return what each run says beside its cavity, in units.
 
+        The moments are those over hypotheses, within each component of the belief; what is told in
+        the components counts by their shares. Moments over components would say with the run which
+        of them is true: a run that but prefers a known frame would be sure of it.
+
         A direction in which a run leaves more open than was believed before tells nothing.
         """
         theta = np.stack([each.found.theta for each in judged.candidates], axis=1)
-        mean, spread = mixed(judged.share, (theta + self.here) / self.unit, covariance)
-        cavity, precision = judged.cavity.matched(), np.linalg.inv(spread)
-        shift = (precision @ mean[..., None])[..., 0] - cavity.shift
-        values, vectors = np.linalg.eigh(precision - cavity.precision)
+        theta = (theta + self.here) / self.unit
+        share, cavity, (runs, count, _, size) = judged.share, judged.cavity, theta.shape
+        within, flat = share.sum(axis=-1), (runs * count, -1)
+        each = np.divide(share, within[..., None], out=np.full_like(share, 1.0 / share.shape[-1]), where=within[..., None] > 0.0)
+        mean, spread = mixed(
+            each.reshape(flat), theta.reshape(*flat, size), covariance.reshape(*flat, size, size)
+        )
+        precision = np.linalg.inv(spread)
+        shift = (precision @ mean[..., None])[..., 0] - cavity.shift.reshape(flat)
+        values, vectors = np.linalg.eigh(precision - cavity.precision.reshape(-1, size, size))
         told = np.swapaxes(vectors, -1, -2) * (values > 0.0)[..., None]
         site = np.swapaxes(told, -1, -2) @ (told * values[..., None])
-        along = np.swapaxes(told, -1, -2) @ (told @ shift[..., None])
-        return Normal(site, along[..., 0])
+        along = (np.swapaxes(told, -1, -2) @ (told @ shift[..., None]))[..., 0]
+        return Normal(
+            np.einsum("rc,rctu->rtu", within, site.reshape(runs, count, size, size)),
+            np.einsum("rc,rct->rt", within, along.reshape(runs, count, size)),
+        )
