@@ -377,7 +377,12 @@ class RunsTogether:
         theta = (theta + self.here) / self.unit
         share, cavity, (runs, count, _, size) = judged.share, judged.cavity, theta.shape
         within, flat = share.sum(axis=-1), (runs * count, -1)
-        each = np.divide(share, within[..., None], out=np.full_like(share, 1.0 / share.shape[-1]), where=within[..., None] > 0.0)
+        each = np.divide(
+            share,
+            within[..., None],
+            out=np.full_like(share, 1.0 / share.shape[-1]),
+            where=within[..., None] > 0.0,
+        )
         mean, spread = mixed(
             each.reshape(flat), theta.reshape(*flat, size), covariance.reshape(*flat, size, size)
         )
