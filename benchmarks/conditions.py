@@ -248,7 +248,7 @@ def _of_frames(base: Condition) -> Iterator[Condition]:
 def _of_other_arms() -> Iterator[Condition]:
     for name in OTHERS:
         robot = load_robot(name)
-        truth = generic_imperfections(robot)
+        truth = calibrated(robot).imperfections
         base = Condition(f"{name} as its class", robot, truth, None)
         yield base
         settling = truth.settling

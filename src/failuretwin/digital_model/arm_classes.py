@@ -127,7 +127,7 @@ def generic_imperfections(robot: Robot) -> Imperfections:
     )
 
 
-LEAST_LOAD = 1e-3
+LEAST_LOAD = 0.01
 """Motors whose load is a smaller share of the largest are not loaded [-]."""
 
 
