@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from html import escape
 
 import numpy as np
 
@@ -21,6 +22,8 @@ WIDTH, HEIGHT, MARGIN = 320.0, 260.0, 44.0
 """Size of the picture, and what is left free around the arm [px]."""
 APART_PX = 12.0
 """Joints that are nearer to each other than this share a label."""
+LABEL_ROOM = 60.0
+"""Labels are centred no nearer to an edge than this [px]."""
 BENT = 0.35
 """Share of the range from its middle by which joints are bent, so that no arm is one line."""
 
@@ -108,7 +111,7 @@ def arm_sketch(robot: Robot, marks: Mapping[str, Mark]) -> str:
     (x, y), (tool_x, tool_y) = points[0], points[-1]
     parts = [
         f'<svg class="arm" viewBox="0 0 {WIDTH:.0f} {HEIGHT:.0f}" role="img" '
-        f'aria-label="Sketch of the arm from the side: {_plain(named)}">',
+        f'aria-label="Sketch of the arm from the side: {escape(named)}">',
         f'<path d="M{x - 22:.1f},{y + 8:.1f}h44M{x:.1f},{y:.1f}v8" class="base"/>',
         f'<polyline points="{way}" class="links"/>',
         f'<path d="M{tool_x - 6:.1f},{tool_y:.1f}h12M{tool_x:.1f},{tool_y - 6:.1f}v12" '
@@ -132,17 +135,12 @@ def _dots(robot: Robot, points: FloatArray, marks: Mapping[str, Mark]) -> list[s
                 told = ", ".join(others)
                 plain.append(f'<text x="{x - 10:.1f}" y="{y + 4:.1f}" class="number">{told}</text>')
             continue
-        side, anchor = (-18.0, "end") if x > 0.6 * WIDTH else (18.0, "start")
+        at = float(np.clip(x, LABEL_ROOM, WIDTH - LABEL_ROOM))
         marked.append(
             f'<g class="marked" fill="{mark.colour}"><circle cx="{x:.1f}" cy="{y:.1f}" r="13" '
             f'fill="white" stroke="{mark.colour}" stroke-width="4"/>'
             f'<text x="{x:.1f}" y="{y + 5:.1f}" text-anchor="middle">{mark.sign}</text>'
-            f'<text x="{x + side:.1f}" y="{y + 5.0 + 16.0 * row:.1f}" text-anchor="{anchor}">'
-            f"{_plain(mark.label)}</text></g>"
+            f'<text x="{at:.1f}" y="{y - 21.0 - 16.0 * row:.1f}" text-anchor="middle" '
+            f'class="label">{escape(mark.label)}</text></g>'
         )
     return plain + marked
-
-
-def _plain(text: str) -> str:
-    """Return a text as it may stand in XML."""
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")

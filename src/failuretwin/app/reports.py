@@ -74,9 +74,14 @@ def _mark(diagnosis: Diagnosis) -> str:
     return "right" if truth == diagnosis.diagnosis else "WRONG"
 
 
-def state_lines(state: RobotState) -> list[str]:
-    """Return the state of the robot over all runs and what to do, as its page says them."""
-    return [f"over all runs: {state.line}", f"what to do: {state.step}"]
+def state_lines(state: RobotState, together: bool) -> list[str]:
+    """Return the state over several runs and what to do, as the page says them, a line each.
+
+    Of one run its diagnosis says both, and of runs that were weighed together `course_lines`.
+    """
+    if together or state.runs < 2:
+        return []
+    return ["", f"over all runs: {state.line}", f"what to do: {state.step}"]
 
 
 def course_lines(course: FaultCourse, state: RobotState, robot: Robot) -> list[str]:

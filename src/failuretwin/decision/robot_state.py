@@ -101,6 +101,7 @@ class RobotState:
         remark: What else is to be known of the runs together; empty: nothing.
         motors: A row for each motor, in chain order.
         arm_class: Kind of arm, by its actuators.
+        runs: Number of runs.
     """
 
     state: State
@@ -110,6 +111,7 @@ class RobotState:
     remark: str
     motors: tuple[MotorState, ...]
     arm_class: str
+    runs: int
 
     @property
     def line(self) -> str:
@@ -189,6 +191,7 @@ def robot_state(
         joint_names_in(found.remark, robot),
         _motor_states(diagnoses, states, found, robot),
         class_name(robot),
+        len(diagnoses),
     )
 
 

@@ -22,6 +22,7 @@ from failuretwin.core.hypothesis import Diagnosis, Hypothesis, paper_hypotheses,
 from failuretwin.core.runs import check_motors, check_runs, truth_of
 from failuretwin.core.types import BoolArray
 from failuretwin.data_knowledge.read import RunsLike, as_runs
+from failuretwin.digital_model.arm_classes import class_name as arm_class_of
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.sensors import Encoders

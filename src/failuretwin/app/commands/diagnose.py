@@ -198,8 +198,7 @@ def diagnose(
     reports.print_diagnoses(diagnoses)
     if method == "bayes" and sensing_of(runs, sensing) == TOOL_ALONE:
         show(*reports.isolability_summary(runs, bayes))
-    if course is None and len(diagnoses) > 1:
-        show("", *reports.state_lines(state))
+    show(*reports.state_lines(state, together=course is not None))
     reports.print_scores(Judged.of(diagnoses))
     lines = [] if course is None else reports.course_lines(course, state, model)
     lines += _learned_lines(learned, tracked)
