@@ -195,6 +195,19 @@ def test_900_runs_make_a_page_that_opens(tmp_path):
     assert "Different states in different runs" in page.text(page.card)
 
 
+def test_every_state_is_among_the_runs_that_are_shown():
+    robot = load_robot("armpi_fpv")
+    faulty = [f"{motor}:stuck" for motor in robot.motor_names]
+    wrong = [synthetic(robot, f"w{i}", faulty[i % 4], 0.6, truth="healthy") for i in range(40)]
+    wrong += [synthetic(robot, f"v{i}", faulty[i % 4], 0.99, truth="healthy") for i in range(40)]
+    right = [synthetic(robot, "h", "healthy", 0.99, truth="healthy")]
+    right += [synthetic(robot, name, name, 0.99, truth=name) for name in faulty]
+    right += [synthetic(robot, "o", "motor_1:stuck", 0.8, truth="motor_1:stuck")]
+    chosen = chosen_runs([*wrong, *right], robot, 6)
+    assert chosen == list(range(80, 86))
+    assert len(chosen_runs([*wrong, *right], robot, MOST_PICTURES)) == MOST_PICTURES
+
+
 def test_pictures_are_left_out_before_the_page_grows_too_large(tmp_path):
     robot = load_robot("armpi_fpv")
     runs = [synthetic(robot, f"run {i}", "motor_2:stuck", 0.99) for i in range(MOST_PICTURES)]

@@ -20,7 +20,7 @@ from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.data_knowledge.store import filling
 from failuretwin.decision.evaluation import Judged, as_unknown_line, score_line
 from failuretwin.decision.proportions import judged_truth
-from failuretwin.decision.robot_state import FAULTY, OPEN, WELL, RobotState, State, state_of_run
+from failuretwin.decision.robot_state import FAULTY, OPEN, WELL, RobotState, state_of_run
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -63,19 +63,21 @@ class _Row:
 def chosen_runs(diagnoses: Sequence[Diagnosis], robot: Robot, most: int) -> list[int]:
     """Return the runs that are shown in full, in their order.
 
-    Runs are grouped by state, motors and whether their verdict is known to be wrong, and taken in
-    turn from each group, the surest first.
+    Runs are grouped by state, faulty motors and whether their verdict is known to be wrong, and
+    taken in turn from each group, the surest first; a right one of every state comes before any
+    that is wrong.
 
     Args:
         diagnoses: Of all runs.
         robot: The robot.
         most: So many at most.
     """
-    groups: dict[tuple[State | bool | str, ...], list[int]] = {}
+    groups: dict[tuple[bool, str, tuple[str, ...]], list[int]] = {}
     for i, diagnosis in enumerate(diagnoses):
         state = state_of_run(diagnosis, robot.motor_names)
-        key = (_truth_cell(diagnosis)[1], state.kind, "+".join(state.motors))
-        groups.setdefault(key, []).append(i)
+        motors = state.motors if state.kind == FAULTY else ()
+        groups.setdefault((_truth_cell(diagnosis)[1], state.kind, motors), []).append(i)
+    groups = {key: groups[key] for key in sorted(groups, key=lambda key: key[0])}
     for members in groups.values():
         members.sort(key=lambda i: -(diagnoses[i].probability or 0.0))
     turns = max(map(len, groups.values()), default=0)
