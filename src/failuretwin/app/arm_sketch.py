@@ -125,6 +125,7 @@ def arm_sketch(robot: Robot, marks: Mapping[str, Mark]) -> str:
 def _dots(robot: Robot, points: FloatArray, marks: Mapping[str, Mark]) -> list[str]:
     """Return the joints, those that are marked last, so that they lie on top."""
     plain, marked = [], []
+    is_marked = np.array([motor.name in marks for motor in robot.motors])
     for k, (motor, (x, y)) in enumerate(zip(robot.motors, points, strict=True)):
         near = np.flatnonzero(np.linalg.norm(points - points[k], axis=1) < APART_PX)
         mark, row = marks.get(motor.name), int(np.flatnonzero(near == k)[0])
@@ -136,11 +137,15 @@ def _dots(robot: Robot, points: FloatArray, marks: Mapping[str, Mark]) -> list[s
                 plain.append(f'<text x="{x - 10:.1f}" y="{y + 4:.1f}" class="number">{told}</text>')
             continue
         at = float(np.clip(x, LABEL_ROOM, WIDTH - LABEL_ROOM))
+        over = (y - points[:, 1] > 0.0) & (y - points[:, 1] < LABEL_ROOM) & is_marked
+        if over.any() and not row:  # another mark is in the way: beside it, towards the middle
+            at = x + (LABEL_ROOM if x < 0.5 * WIDTH else -LABEL_ROOM)
+        up = y + 5.0 if over.any() and not row else y - 21.0 - 16.0 * row
         marked.append(
             f'<g class="marked" fill="{mark.colour}"><circle cx="{x:.1f}" cy="{y:.1f}" r="13" '
             f'fill="white" stroke="{mark.colour}" stroke-width="4"/>'
             f'<text x="{x:.1f}" y="{y + 5:.1f}" text-anchor="middle">{mark.sign}</text>'
-            f'<text x="{at:.1f}" y="{y - 21.0 - 16.0 * row:.1f}" text-anchor="middle" '
+            f'<text x="{at:.1f}" y="{up:.1f}" text-anchor="middle" '
             f'class="label">{escape(mark.label)}</text></g>'
         )
     return plain + marked
