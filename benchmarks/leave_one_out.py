@@ -195,7 +195,7 @@ def _plot_wrong(found: Sequence[Diagnosis], runs: xr.Dataset, robot: Robot, fold
     wrong = [i for i, diagnosis in enumerate(found) if diagnosis.diagnosis != diagnosis.truth]
     if wrong:
         folder.mkdir(parents=True, exist_ok=True)
-        plot_runs(runs.isel(run=wrong), [found[i] for i in wrong], ft.DigitalTwin(robot), folder)
+        plot_runs(runs, found, ft.DigitalTwin(robot), folder, wrong)
 
 
 if __name__ == "__main__":

@@ -16,11 +16,19 @@ def test_a_check_names_the_motor_and_what_to_do(failuretwin, tmp_path):
     healthy = failuretwin(*arguments)
     assert healthy.returncode == 0, healthy.stderr
     assert healthy.stdout.startswith("GREEN: healthy")
-    fault = ("--fault", "motor_2:encoder_bias=0.08", "--json", out)
+    *_, state, step = healthy.stdout.splitlines()
+    assert state.startswith("Healthy: ")
+    assert step == "what to do: Nothing to do now. Check again after a repair, or in a month."
+    fault = ("--fault", "motor_2:encoder_bias=0.08", "--json", out, "--plot", tmp_path / "page")
     answer = failuretwin(*arguments, *fault)
     assert answer.returncode == 0, answer.stderr
     assert answer.stdout.startswith("RED: motor 2")
-    assert "what to do: " in answer.stdout
+    *_, state, step = answer.stdout.splitlines()
+    assert state.startswith("Faulty: motor 2")
+    assert step.startswith("what to do: ")
+    page = (tmp_path / "page" / "index.html").read_text("utf-8")
+    assert step.removeprefix("what to do: ") in page.replace("&#39;", "'")
+    assert "What the check measured" in page
     assert "zero of motor_2 changed by +4." in answer.stdout
     record = json.loads(out.read_text())
     assert (record["light"], record["motor"]) == ("red", "motor_2")

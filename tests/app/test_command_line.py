@@ -291,6 +291,18 @@ def test_a_picture_for_every_run(failuretwin, simulated, tmp_path):
     assert list(tmp_path.rglob("*partial*")) == []
 
 
+def test_the_page_and_the_screen_say_the_same_of_all_runs(failuretwin, simulated, tmp_path):
+    runs = load_run_set(simulated).isel(run=[0, 2])
+    save_run_set(runs, tmp_path / "runs.nc")
+    answer = failuretwin("diagnose", "runs.nc", "--plot", "page", folder=tmp_path)
+    assert answer.returncode == 0, answer.stderr
+    page = (tmp_path / "page" / "index.html").read_text("utf-8")
+    (step,) = re.findall(r"^what to do: (.*)$", answer.stdout, re.M)
+    (line,) = re.findall(r"^over all runs: (.*)$", answer.stdout, re.M)
+    assert f"<b>Next step:</b> {step}</p>" in page
+    assert f"<h1>{re.split('[:;]', line)[0]}" in page
+
+
 def test_without_a_terminal_there_is_neither_colour_nor_progress(results):
     answer, _, _ = results
     assert ANSI not in answer.stdout

@@ -6,7 +6,8 @@ import pytest
 
 from failuretwin.core.hypothesis import HEALTHY, UNKNOWN, Hypothesis
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.explanation import advice_lines, plain_name
+from failuretwin.inference.advice import advice_lines, next_steps
+from failuretwin.inference.explanation import plain_name
 from failuretwin.inference.posterior import prior_odds
 
 
@@ -15,7 +16,8 @@ def test_every_built_in_mode_has_its_knowledge(mode):
     assert "{motor}" in mode.name
     assert 0.0 < mode.prior_odds <= 1.0
     assert 0.0 < mode.before_run <= 1.0
-    causes, advice = advice_lines(Hypothesis.parse(f"motor_1:{mode.mode}"))
+    fault = Hypothesis.parse(f"motor_1:{mode.mode}")
+    causes, advice = advice_lines(fault, next_steps({str(fault): 1.0}))
     assert causes.startswith("possible causes: ")
     assert advice.startswith("what to do: ")
     assert advice.endswith(".")

@@ -159,7 +159,7 @@ def test_possible_hypotheses_are_the_fewest_that_are_sure(chances):
 def test_explanation_says_which_movements_speak_for_it_and_what_to_do():
     evidence = (MovementEvidence(1, 3.21), MovementEvidence(2, 0.4), MovementEvidence(4, -1.5))
     stuck = single("stuck")
-    diagnosis = Diagnosis("run", {str(PAIR): 0.9, str(stuck): 0.1}, evidence=evidence)
+    diagnosis = Diagnosis("run", {str(PAIR): 0.94, str(stuck): 0.06}, evidence=evidence)
     lines = explanation(diagnosis, (PAIR, stuck), ["movement 2: motor 4 did not get the command"])
     pair = "motor 1 stuck and motor 3 drifts"
     assert lines[:4] == (
@@ -168,4 +168,9 @@ def test_explanation_says_which_movements_speak_for_it_and_what_to_do():
         "movement 2: motor 4 did not get the command",
         f"cannot be told apart in this run: {pair} or motor 3 stuck",
     )
-    assert [line.split(":")[0] for line in lines[4:]] == ["possible causes", "what to do"] * 2
+    told = [line.split(":")[0] for line in lines[4:]]
+    assert told == ["possible causes", "possible causes", "what to do"]
+    assert "record again" in lines[-1].lower()
+    sure = Diagnosis("run", {str(PAIR): 0.96, str(stuck): 0.04})
+    told = [line.split(":")[0] for line in explanation(sure, (PAIR, stuck), [])]
+    assert told == ["possible causes", "what to do"] * 2

@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 
 from failuretwin.app.tables import Table, figures_table
+from failuretwin.app.technician_page import write_page
 from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.data_knowledge.store import replacing
+from failuretwin.data_knowledge.store import filling, replacing
+from failuretwin.decision.robot_state import robot_state
 from failuretwin.decision.test_motions.health_check import OPEN, CheckResult
 from failuretwin.decision.test_motions.motions import Motions
 from failuretwin.digital_model.robot import Robot
@@ -29,7 +31,7 @@ LIKELY = 0.05
 
 
 def check_lines(result: CheckResult, robot: Robot, seconds: float) -> list[str | Table]:
-    """Return the page of a check: the light, why, and what every motor showed."""
+    """Return what a check found: the light, and what every motor showed."""
     diagnosis = result.diagnosis
     head = f"{result.light.upper()}: {diagnosis.verdict}"
     if result.light == OPEN and not diagnosis.undecided:
@@ -39,9 +41,29 @@ def check_lines(result: CheckResult, robot: Robot, seconds: float) -> list[str |
     made = counted(result.movements, "movement") + f" seen at rest, {seconds:.0f} s planned"
     if result.further:
         made += f", {counted(result.further, 'further movement')}"
-    advice = [line for line in diagnosis.explanation if line.startswith("what to do")]
     low = ["" if not diagnosis.quality else "the log: " + "; ".join(diagnosis.quality)]
-    return [head, *advice, made, *filter(None, low), _motor_table(result, robot)]
+    return [head, made, *filter(None, low), motor_table(result, robot)]
+
+
+def closing_lines(result: CheckResult, robot: Robot) -> list[str]:
+    """Return how a check ends: state of the robot, how surely, what to do; as on its page."""
+    state = robot_state([result.diagnosis], robot)
+    return [state.line, f"what to do: {state.step}"]
+
+
+def write_check_page(results: Sequence[CheckResult], robot: Robot, folder: Path) -> None:
+    """Write the technician's page of checks into a folder.
+
+    Args:
+        results: Of one check, or of the logs of several.
+        robot: The robot.
+        folder: Where `index.html` goes.
+    """
+    diagnoses = [result.diagnosis for result in results]
+    measured = motor_table(results[0], robot) if len(results) == 1 else None
+    with filling(folder) as partial:
+        state = robot_state(diagnoses, robot)
+        write_page(diagnoses, state, robot, partial / "index.html", measured=measured)
 
 
 def shown_line(found: IsolabilityReport, robot: Robot) -> str:
@@ -63,7 +85,7 @@ def told_size(name: str, size: float | None, largest: float, robot: Robot) -> st
     return f"not even {told}" if size is None else told
 
 
-def _motor_table(result: CheckResult, robot: Robot) -> Table:
+def motor_table(result: CheckResult, robot: Robot) -> Table:
     """Return what each motor showed, zeros and play in degrees, of slides in millimetres."""
     found, rows = result.offsets, []
     for k, name in enumerate(robot.motor_names):

@@ -22,7 +22,7 @@ from failuretwin.data_knowledge.raw_sessions import As
 from failuretwin.data_knowledge.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
-from failuretwin.digital_model.arm_classes import GENERIC_NAME
+from failuretwin.digital_model.arm_classes import GENERIC_NAME, class_name
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser, Diagnoser, diagnoser_from_text
@@ -208,7 +208,7 @@ def _pooled(network: LearnedDiagnoser, bayes: BayesDiagnoser, path: Path) -> Hyb
             f"{path}: how it weighs beside Bayes was never fitted. Train it "
             "with `failuretwin train`, or use it alone."
         )
-    return HybridDiagnoser(bayes, network, network.weights_)
+    return HybridDiagnoser(bayes, network, network.weights_, class_name(bayes.twin.robot))
 
 
 def expected_name(diagnoser: Diagnoser, bayes: BayesDiagnoser) -> str:

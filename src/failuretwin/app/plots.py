@@ -1,4 +1,4 @@
-"""Pictures and the page of diagnosed runs, and what all pages share. Needs the extra `plots`."""
+"""Pictures of diagnosed runs, and what all pages share. Needs the extra `plots`."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from failuretwin import __version__
 from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import AXES, unique_names
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.store import filling
-from failuretwin.decision.evaluation import Evaluation, Judged, as_unknown_line, score_line
-from failuretwin.decision.proportions import Share, judged_truth
+from failuretwin.decision.evaluation import Evaluation
+from failuretwin.decision.proportions import Share
 from failuretwin.decision.scoring_rules import Reliability
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.explanation import plain_name
@@ -62,18 +61,29 @@ def png(figure: Figure) -> str:
 
 
 def plot_runs(
-    runs: xr.Dataset, diagnoses: Sequence[Diagnosis], twin: DigitalTwin, folder: Path
-) -> list[Path]:
-    """Write a picture of each run into `folder`; diagnoses are in the order of the runs."""
+    runs: xr.Dataset,
+    diagnoses: Sequence[Diagnosis],
+    twin: DigitalTwin,
+    folder: Path,
+    chosen: Sequence[int],
+) -> dict[int, Path]:
+    """Write a picture of each chosen run into `folder`; return the files by index of the run.
+
+    Args:
+        runs: All runs.
+        diagnoses: Of each, in their order.
+        twin: The twin of their robot.
+        folder: Where pictures go.
+        chosen: Indices of the runs that are drawn.
+    """
     time = as_floats(runs["time"].values)
-    written = []
-    stems = unique_names([re.sub(r"[^\w.+-]+", "_", diagnosis.run) for diagnosis in diagnoses])
-    for i, (diagnosis, stem) in enumerate(zip(diagnoses, stems, strict=True)):
+    names = [re.sub(r"[^\w.+-]+", "_", diagnoses[i].run) for i in chosen]
+    written = {}
+    for i, stem in zip(chosen, unique_names(names), strict=True):
         desired = twin.path(as_floats(runs["command"].values[i]))
-        figure = run_figure(time, desired, as_floats(runs["measured"].values[i]), diagnosis)
-        path = folder / f"{stem}.png"
-        figure.savefig(path, dpi=110)
-        written.append(path)
+        figure = run_figure(time, desired, as_floats(runs["measured"].values[i]), diagnoses[i])
+        written[i] = folder / f"{stem}.png"
+        figure.savefig(written[i], dpi=110)
     return written
 
 
@@ -153,35 +163,6 @@ def render_page(template: str, values: Mapping[str, Any]) -> str:
     loader = PackageLoader("failuretwin.app", "")
     pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
     return pages.get_template(template).render(values)
-
-
-def write_page(
-    diagnoses: Sequence[Diagnosis], pictures: Sequence[Path], robot: str, path: Path
-) -> None:
-    """Write the page of some runs, which holds the PNG file of each (in the same order)."""
-    judged = Judged.of(diagnoses)
-    values = {
-        "runs": [
-            (d, *_truth_cell(d), base64.b64encode(p.read_bytes()).decode("ascii"))
-            for d, p in zip(diagnoses, pictures, strict=True)
-        ],
-        "robot": robot,
-        "method": diagnoses[0].method,
-        "protocol": diagnoses[0].protocol,
-        "version": __version__,
-        "known": any(d.truth is not None for d in diagnoses),
-        "score": score_line(judged),
-        "as_unknown": as_unknown_line(judged),
-    }
-    path.write_text(render_page("diagnoses.html.j2", values), encoding="utf-8")
-
-
-def _truth_cell(diagnosis: Diagnosis) -> tuple[str, bool]:
-    """Return the truth of a run in plain words, and whether the verdict is another."""
-    if diagnosis.truth is None:
-        return "", False
-    truth = judged_truth(diagnosis.truth, diagnosis.posterior)
-    return plain(diagnosis.truth), truth != diagnosis.diagnosis
 
 
 # Picture of the reliability diagram.

@@ -25,6 +25,7 @@ from failuretwin.decision.evaluation import (
     as_unknown_line,
     score_line,
 )
+from failuretwin.decision.robot_state import RobotState
 from failuretwin.digital_model.kinematics import has_range
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.urdf import UrdfJoint
@@ -32,6 +33,7 @@ from failuretwin.digital_model.urdf_report import JointReport, UrdfReport
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.explanation import joint_names_in, plain_name, size_words
+from failuretwin.inference.fault_course import FaultCourse
 from failuretwin.inference.isolability import IsolabilityReport, isolability
 from failuretwin.inference.wear_limits import wear_unit
 
@@ -70,6 +72,22 @@ def _mark(diagnosis: Diagnosis) -> str:
         return ""
     truth = proportions.judged_truth(diagnosis.truth, diagnosis.posterior)
     return "right" if truth == diagnosis.diagnosis else "WRONG"
+
+
+def state_lines(state: RobotState, together: bool) -> list[str]:
+    """Return the state over several runs and what to do, as the page says them, a line each.
+
+    Of one run its diagnosis says both, and of runs that were weighed together `course_lines`.
+    """
+    if together or state.runs < 2:
+        return []
+    return ["", f"over all runs: {state.line}", f"what to do: {state.step}"]
+
+
+def course_lines(course: FaultCourse, state: RobotState, robot: Robot) -> list[str]:
+    """Return what runs that were weighed together say of their robot, and what to do."""
+    told = [f"over all runs: {joint_names_in(line, robot)}" for line in course.verdict]
+    return [*told, f"what to do: {state.step}"]
 
 
 def print_scores(judged: Judged) -> None:

@@ -34,6 +34,7 @@ from failuretwin.decision.learned.feature_encoder import (
 from failuretwin.decision.learned.log_pool import HybridDiagnoser, fit_pool_weights
 from failuretwin.decision.learned.networks import Batch, Standard, epoch
 from failuretwin.decision.proportions import Scores
+from failuretwin.digital_model.arm_classes import class_name
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
 from failuretwin.digital_model.nonidealities import SETTLING_LISTS, Imperfections
 from failuretwin.digital_model.robot import Robot
@@ -306,7 +307,7 @@ def train(
     if not with_bayes:
         return network
     bayes = BayesDiagnoser(known)
-    return HybridDiagnoser(bayes, network, network.weights_)
+    return HybridDiagnoser(bayes, network, network.weights_, class_name(bayes.twin.robot))
 
 
 def train_network(
@@ -345,7 +346,7 @@ def train_network(
     bayes = BayesDiagnoser(DigitalTwin(robot), imperfections, hypotheses)
     _calibrate(network, bayes, other.run_set(0, half))
     judges = other.run_set(1, half)
-    both = HybridDiagnoser(bayes, network, network.weights_)
+    both = HybridDiagnoser(bayes, network, network.weights_, class_name(bayes.twin.robot))
     alone, pooled = (Judged.of(d.diagnose(judges)).scores for d in (network, both))
     return network, alone, pooled
 

@@ -22,6 +22,7 @@ from failuretwin.core.hypothesis import Diagnosis, Hypothesis, paper_hypotheses,
 from failuretwin.core.runs import check_motors, check_runs, truth_of
 from failuretwin.core.types import BoolArray
 from failuretwin.data_knowledge.read import RunsLike, as_runs
+from failuretwin.digital_model.arm_classes import class_name as arm_class_of
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.sensors import Encoders
@@ -296,7 +297,7 @@ def diagnoser_from_text(text: str, twin: DigitalTwin) -> Diagnoser:
             f"{text}: has no method `diagnose`. Expected a class with diagnose(runs) that returns "
             "a Diagnosis for each run."
         )
-    return _Completed(diagnoser, text)
+    return _Completed(diagnoser, text, arm_class_of(twin.robot))
 
 
 @dataclass(frozen=True)
@@ -305,6 +306,7 @@ class _Completed:
 
     diagnoser: Diagnoser
     name: str
+    arm_class: str
 
     def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
         """Return the diagnosis of each run.
@@ -324,7 +326,11 @@ class _Completed:
             replace(d, truth=true, posterior=self._posterior(d))
             for d, true in zip(found, truth, strict=True)
         ]
-        return [d if d.verdict else worded(d, list(map(Hypothesis.parse, d.ranked))) for d in made]
+        return [d if d.verdict else self._worded(d) for d in made]
+
+    def _worded(self, diagnosis: Diagnosis) -> Diagnosis:
+        ranked = [Hypothesis.parse(name) for name in diagnosis.ranked]
+        return worded(diagnosis, ranked, arm_class=self.arm_class)
 
     def _posterior(self, diagnosis: Diagnosis) -> dict[str, float]:
         """Return the posterior as plain numbers; refuse what is none."""

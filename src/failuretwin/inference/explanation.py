@@ -17,10 +17,15 @@ from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.advice import (
+    MOVEMENT,
+    SURE,
+    advice_lines,
+    next_steps,
+    rests_on_one_movement,
+)
 from failuretwin.inference.wrong_setup import NOWHERE
 
-SURE = 0.95
-"""Posterior mass that the hypotheses named as possible hold together."""
 TELLING_NATS = 1.0
 """Evidence of a movement worth telling [nats]: it changes the odds by a factor of 2.7."""
 
@@ -38,7 +43,10 @@ def percent(probability: float) -> str:
 
 
 def worded(
-    diagnosis: Diagnosis, ranked: Sequence[Hypothesis], losses: Sequence[str] = ()
+    diagnosis: Diagnosis,
+    ranked: Sequence[Hypothesis],
+    losses: Sequence[str] = (),
+    arm_class: str = "",
 ) -> Diagnosis:
     """Return a diagnosis with its verdict and explanation in words.
 
@@ -46,11 +54,12 @@ def worded(
         diagnosis: With evidence and estimates filled in, as far as there are any.
         ranked: Its hypotheses from the most to the least probable.
         losses: Commands that seem not to have arrived.
+        arm_class: Kind of arm, which advice depends on; empty: not known.
     """
     return replace(
         diagnosis,
         verdict=verdict(diagnosis, ranked),
-        explanation=explanation(diagnosis, ranked, losses),
+        explanation=explanation(diagnosis, ranked, losses, arm_class),
     )
 
 
@@ -156,7 +165,7 @@ def possible_hypotheses(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> S
 
 
 def explanation(
-    diagnosis: Diagnosis, ranked: Sequence[Hypothesis], losses: Sequence[str]
+    diagnosis: Diagnosis, ranked: Sequence[Hypothesis], losses: Sequence[str], arm_class: str = ""
 ) -> tuple[str, ...]:
     """Return what speaks for the verdict, what else it may be and what to do, a line each.
 
@@ -164,30 +173,25 @@ def explanation(
         diagnosis: With evidence filled in.
         ranked: Its hypotheses from the most to the least probable.
         losses: Commands that seem not to have arrived.
+        arm_class: Kind of arm; empty: not known.
     """
-    if NOWHERE in diagnosis.undecided:
-        return (WRONG_SETUP_ADVICE,)
     if diagnosis.undecided:
-        return ("Log again, for five movements or more, with the tool in view while it rests.",)
+        return (undecided_step(diagnosis.undecided),)
     lines = list(_evidence_lines(diagnosis.evidence, ranked))
     lines += losses
     possible = possible_hypotheses(diagnosis, ranked)
     if len(possible) > 1:
         names = " or ".join(plain_name(h) for h in possible)
         lines.append(f"cannot be told apart in this run: {names}")
-    return (*lines, *advice_lines(ranked[0]))
+    alone = MOVEMENT if rests_on_one_movement(diagnosis) else ""
+    return (*lines, *advice_lines(ranked[0], next_steps(diagnosis.posterior, arm_class, alone)))
 
 
-def advice_lines(hypothesis: Hypothesis) -> list[str]:
-    """Return what may have broken and what to do now, a line each."""
-    lines = []
-    for fault in hypothesis.faults:
-        mode = MODES.find(fault.mode)
-        if mode.mechanisms:
-            lines.append(f"possible causes: {', '.join(mode.mechanisms)}")
-        if mode.advice:
-            lines.append(f"what to do: {mode.advice}")
-    return lines
+def undecided_step(reason: str) -> str:
+    """Return what to do about a run that allows no verdict, for this reason."""
+    if NOWHERE in reason:
+        return WRONG_SETUP_ADVICE
+    return "Log again, for five movements or more, with the tool in view while it rests."
 
 
 def _evidence_lines(

@@ -24,6 +24,7 @@ from failuretwin.core.hypothesis import (
 )
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.digital_model.arm_classes import class_name
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import FaultMode, Signature
 from failuretwin.failure_behavior.registry import MODES
@@ -379,7 +380,7 @@ class Posterior:
             estimate = best.estimate(run)
             losses = self._losses(estimate, ranked[0])
             diagnosis = _with_estimate(diagnosis, ranked[0], estimate, place, robot)
-        return with_joint_names(worded(diagnosis, ranked, losses), robot)
+        return with_joint_names(worded(diagnosis, ranked, losses, class_name(robot)), robot)
 
     def _set_up(self, run: int) -> tuple[str, ...]:
         return (self.set_up[run],) if self.set_up and self.set_up[run] else ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +26,9 @@ from failuretwin.app.commands.options import (
 )
 
 if TYPE_CHECKING:
+    from failuretwin.decision.test_motions.health_check import CheckResult
     from failuretwin.decision.test_motions.session import Checking
+    from failuretwin.digital_model.robot import Robot
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,12 @@ seconds_option = click.option(
     help="So many further movements at most, if it is still open then what is wrong.",
 )
 @click.option("--json", "json_file", type=PATH, metavar="FILE", help="Write an object a line.")
+@click.option(
+    "--plot",
+    type=PATH,
+    metavar="DIR",
+    help="Write index.html: the state of the robot, which motor, how surely, what to do.",
+)
 @arm_options
 @motion_options
 @safety_options
@@ -123,6 +132,7 @@ def check(
     keep: Path | None,
     further: int,
     json_file: Path | None,
+    plot: Path | None,
     arm: ArmOptions,
     motion: MotionOptions,
     safety: SafetyOptions,
@@ -144,11 +154,7 @@ def check(
     asking = motion.checking(safety, calibration, robot, seed)
     model = asking.known.robot
     if logs:
-        results = asking.of_logs(logs)
-        for result in results:
-            show(result.diagnosis.run, *report.check_lines(result, model, 0.0), "")
-        if json_file is not None:
-            report.write_records([report.check_record(r, model, 0.0) for r in results], json_file)
+        _check_logs(asking.of_logs(logs), model, json_file, plot)
         return
     repeat = keep if keep is not None and keep.exists() else motions
     planned = asking.motions(seconds, repeat)
@@ -173,6 +179,25 @@ def check(
         report.keep_check(keep, planned, record)
     if json_file is not None:
         report.write_records([record], json_file)
+    if plot is not None:
+        report.write_check_page([result], model, plot)
+    show(*report.closing_lines(result, model))
+
+
+def _check_logs(
+    results: Sequence[CheckResult], model: Robot, json_file: Path | None, plot: Path | None
+) -> None:
+    """Say what logs of checks say that were recorded elsewhere."""
+    from failuretwin.app import check_report as report
+    from failuretwin.app.tables import show
+
+    for result in results:
+        lines = report.check_lines(result, model, 0.0)
+        show(result.diagnosis.run, *lines, *report.closing_lines(result, model), "")
+    if json_file is not None:
+        report.write_records([report.check_record(r, model, 0.0) for r in results], json_file)
+    if plot is not None:
+        report.write_check_page(results, model, plot)
 
 
 @click.command()

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from failuretwin.connection.self_calibration import SelfCalibration
     from failuretwin.connection.tracked_diagnosis import Tracked
     from failuretwin.core.hypothesis import Diagnosis
+    from failuretwin.decision.robot_state import RobotState
     from failuretwin.digital_model.twin import DigitalTwin
     from failuretwin.inference.diagnoser import BayesDiagnoser
     from failuretwin.inference.priors import Priors
@@ -99,7 +100,7 @@ if TYPE_CHECKING:
     "--plot",
     type=PATH,
     metavar="DIR",
-    help="Write a picture of each run, and index.html with all of them.",
+    help="Write index.html: the state of the robot, what to do, and pictures of some runs.",
 )
 @reading_options
 @plugin_option
@@ -143,6 +144,7 @@ def diagnose(
     from failuretwin.app.tables import progress_bar, show
     from failuretwin.connection import tracked_diagnosis as tracking
     from failuretwin.decision.evaluation import Judged
+    from failuretwin.decision.robot_state import course_of, robot_state
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.inference.diagnoser import BayesDiagnoser
@@ -188,32 +190,27 @@ def diagnose(
         diagnoses = diagnoser.diagnose(runs)
     if (sse_range or error_range) and diagnoser is bayes:
         _tell_ruled_out(runs, bayes, diagnoses, priors_of(model, None, onset))
-    _write(runs, diagnoses, known.twin, json_file, csv_file, plot)
+    course = None if independent or not together else course_of(diagnoses, bayes)
+    state = robot_state(diagnoses, model, course)
+    _write(runs, diagnoses, known.twin, state, json_file, csv_file, plot)
     if tracked is not None:
         _keep(tracked, runs, out)
     reports.print_diagnoses(diagnoses)
     if method == "bayes" and sensing_of(runs, sensing) == TOOL_ALONE:
         show(*reports.isolability_summary(runs, bayes))
+    show(*reports.state_lines(state, together=course is not None))
     reports.print_scores(Judged.of(diagnoses))
-    lines = [] if independent or not together else _course_lines(diagnoses, bayes)
-    if learned is not None:
-        lines += [f"self-calibrated: {line}" for line in learned.remarks]
-    if tracked is not None:
-        lines.append(reports.tracking_line(tracked))
+    lines = [] if course is None else reports.course_lines(course, state, model)
+    lines += _learned_lines(learned, tracked)
     show(*(["", *lines] if lines else []))
 
 
-def _course_lines(diagnoses: list[Diagnosis], bayes: BayesDiagnoser) -> list[str]:
-    """Return what runs that were weighed together say of the course of their robot."""
-    import numpy as np
+def _learned_lines(learned: SelfCalibration | None, tracked: Tracked | None) -> list[str]:
+    """Return what runs that were weighed together taught of the robot."""
+    from failuretwin.app.reports import tracking_line
 
-    from failuretwin.inference.explanation import joint_names_in
-    from failuretwin.inference.fault_course import FaultCourse
-    from failuretwin.inference.posterior import log_prior
-
-    prior = np.exp(log_prior(bayes.hypothesis_set, bayes.priors))
-    course = FaultCourse.of(diagnoses, prior).verdict
-    return [f"over all runs: {joint_names_in(line, bayes.twin.robot)}" for line in course]
+    lines = [] if learned is None else [f"self-calibrated: {line}" for line in learned.remarks]
+    return lines if tracked is None else [*lines, tracking_line(tracked)]
 
 
 def _check_tool(sensing: tuple[str, ...]) -> None:
@@ -337,6 +334,7 @@ def _write(
     runs: xr.Dataset,
     diagnoses: list[Diagnosis],
     twin: DigitalTwin,
+    state: RobotState,
     json_file: Path | None,
     csv_file: Path | None,
     plot: Path | None,
@@ -349,12 +347,9 @@ def _write(
     if csv_file is not None:
         write_csv(diagnoses, csv_file)
     if plot is not None:
-        from failuretwin.app.plots import plot_runs, write_page
-        from failuretwin.data_knowledge.store import filling
+        from failuretwin.app.technician_page import write_report
 
-        with filling(plot) as folder:
-            pictures = plot_runs(runs, diagnoses, twin, folder)
-            write_page(diagnoses, pictures, twin.robot.name, folder / "index.html")
+        write_report(runs, diagnoses, twin, state, plot)
 
 
 def _learn_together(

@@ -39,6 +39,7 @@ from failuretwin.decision.learned.networks import (
     shuffled_batches,
     training,
 )
+from failuretwin.digital_model.arm_classes import class_name
 from failuretwin.inference.explanation import worded
 from failuretwin.inference.log_quality import LogQuality, drop_invalid, log_quality
 
@@ -243,7 +244,9 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             protocol=protocol,
             method=method,
         )
-        return worded(diagnosis, [Hypothesis.parse(name) for name in diagnosis.ranked])
+        kind = class_name(self._encoder().robot)
+        ranked = [Hypothesis.parse(name) for name in diagnosis.ranked]
+        return worded(diagnosis, ranked, arm_class=kind)
 
     def _unfamiliar(self, movements: int) -> tuple[str, ...]:
         """Return a remark on a run of more or fewer movements than the network learned from."""

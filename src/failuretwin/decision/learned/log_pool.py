@@ -79,11 +79,13 @@ class HybridDiagnoser:
         bayes: The model-based one; where it gives no verdict, there is none.
         network: The learned one, of the same classes.
         weights: Of the pool; None: gated.
+        arm_class: Kind of arm, which advice depends on; empty: not known.
     """
 
     bayes: Diagnoser
     network: Diagnoser
     weights: PoolWeights | None = None
+    arm_class: str = ""
 
     def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
         """Return the diagnosis of each run of a run set.
@@ -120,4 +122,5 @@ class HybridDiagnoser:
         )
         if joined.diagnosis != bayes.diagnosis:
             joined = replace(joined, **UNSIZED)
-        return worded(joined, [Hypothesis.parse(name) for name in joined.ranked])
+        ranked = [Hypothesis.parse(name) for name in joined.ranked]
+        return worded(joined, ranked, arm_class=self.arm_class)

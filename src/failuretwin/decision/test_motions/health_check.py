@@ -25,6 +25,7 @@ from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.decision.test_motions.motions import Motions
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.advice import SURE, motor_probabilities
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.log_quality import LogQuality
@@ -40,8 +41,6 @@ LEAST_SHARE = 0.5
 """Where ranges of errors begin, in the least error that a profile states."""
 RANGES = 5
 """So many ranges from there to the paper's."""
-SURE = 0.95
-"""Probability from which a check names a motor, or says that all is well."""
 GREEN, RED, OPEN = "green", "red", "open"
 ROUNDS = 8
 """Steps in which movements that fit ill get less weight."""
@@ -155,15 +154,6 @@ class CheckResult:
         if self.diagnosis.posterior.get(str(HEALTHY), 0.0) >= SURE:
             return GREEN
         return RED if self.motor else OPEN
-
-
-def motor_probabilities(posterior: Mapping[str, float]) -> dict[str, float]:
-    """Return the probability that something is wrong with each motor, by its name."""
-    found: dict[str, float] = {}
-    for name, probability in posterior.items():
-        for fault in Hypothesis.parse(name).faults:
-            found[fault.motor] = found.get(fault.motor, 0.0) + probability
-    return found
 
 
 def faults_at_rest(model: HealthyModel) -> tuple[Hypothesis, ...]:

@@ -1,0 +1,314 @@
+"""The state of a robot over all its runs: healthy, faulty or open, how surely, what to do next.
+
+Runs that were weighed together have a course, and the state is that of the last run given all.
+Runs that were judged one by one are pooled linearly,
+
+    p(h) = mean over runs i of p(h | run i)
+
+which is never surer than the surest run: what they share, such as a calibration that is a little
+off, is in each of them and does not average out.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from failuretwin.core.errors import InputError, counted
+from failuretwin.core.hypothesis import HEALTHY, UNKNOWN, Diagnosis, Hypothesis
+from failuretwin.digital_model.arm_classes import class_name
+from failuretwin.digital_model.robot import Robot
+from failuretwin.inference.advice import (
+    MOVEMENT,
+    SURE,
+    motor_probabilities,
+    next_steps,
+    rests_on_one_movement,
+    sureness,
+)
+from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.explanation import (
+    joint_names_in,
+    percent,
+    plain_name,
+    undecided_step,
+)
+from failuretwin.inference.fault_course import FaultCourse
+from failuretwin.inference.posterior import log_prior
+
+WELL, FAULTY, OPEN = "healthy", "faulty", "cannot tell"
+"""What a robot, a motor or a run may be."""
+SUSPECT = 0.05
+"""Motors of an open state are named from this probability on."""
+RUN = "run"
+"""The single thing that a verdict over several runs may rest on."""
+DIFFERENT_STEP = (
+    "If these are runs of one robot in their order, weigh them together with --track or "
+    "--self-calibrate; else diagnose the runs of each state alone."
+)
+
+
+@dataclass(frozen=True)
+class State:
+    """What one run, or all of them together, say of the robot.
+
+    Attributes:
+        kind: `WELL`, `FAULTY` or `OPEN`.
+        motors: Those that are faulty, or may be, in chain order; none of a healthy robot.
+        probability: Of what `kind` and `motors` say; None where nothing can be told.
+    """
+
+    kind: str
+    motors: tuple[str, ...] = ()
+    probability: float | None = None
+
+
+@dataclass(frozen=True)
+class MotorState:
+    """What all runs say of one motor.
+
+    Attributes:
+        motor: Its name.
+        joint: Name of its joint in the URDF.
+        kind: What it is over all runs.
+        faulty: In how many runs it is named.
+        suspected: In how many it is suspected, and not named.
+        highest: Largest probability of a fault of it in one run.
+        probability: Of a fault of it over the runs that make up the state.
+    """
+
+    motor: str
+    joint: str
+    kind: str
+    faulty: int
+    suspected: int
+    highest: float
+    probability: float
+
+
+@dataclass(frozen=True)
+class RobotState:
+    """The state of a robot over all runs, as people are told it.
+
+    Attributes:
+        state: What is the case.
+        headline: That in a few words, with the motor and its joint.
+        sureness: How sure it is, in words; empty where nothing can be told.
+        step: The one thing to do next.
+        remark: What else is to be known of the runs together; empty: nothing.
+        motors: A row for each motor, in chain order.
+        arm_class: Kind of arm, by its actuators.
+        runs: Number of runs.
+    """
+
+    state: State
+    headline: str
+    sureness: str
+    step: str
+    remark: str
+    motors: tuple[MotorState, ...]
+    arm_class: str
+    runs: int
+
+    @property
+    def line(self) -> str:
+        """State, sureness and remark in one line."""
+        told = f"{self.headline}: {self.sureness}" if self.sureness else self.headline
+        return f"{told}; {self.remark}" if self.remark else told
+
+
+def state_of(posterior: Mapping[str, float], order: Sequence[str]) -> State:
+    """Return the state that a posterior tells.
+
+    Args:
+        posterior: Probability of every hypothesis.
+        order: Names of the motors in chain order.
+    """
+    well = posterior.get(str(HEALTHY), 0.0)
+    by_motor = motor_probabilities(posterior)
+    named = tuple(motor for motor in order if by_motor.get(motor, 0.0) >= SURE)
+    if well >= SURE:
+        return State(WELL, (), well)
+    if named:
+        return State(FAULTY, named, min(by_motor[motor] for motor in named))
+    best = max(posterior, key=lambda name: posterior[name])
+    motors = tuple(motor for motor in order if by_motor.get(motor, 0.0) >= SUSPECT)
+    if not Hypothesis.parse(best).faults:
+        return State(OPEN, motors, posterior[best])
+    top = tuple(fault.motor for fault in Hypothesis.parse(best).faults)
+    return State(OPEN, motors, min(by_motor[motor] for motor in top))
+
+
+def state_of_run(diagnosis: Diagnosis, order: Sequence[str]) -> State:
+    """Return the state that one run tells; without a verdict nothing can be told."""
+    return State(OPEN) if diagnosis.undecided else state_of(diagnosis.posterior, order)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What was found over all runs, motors by their own names."""
+
+    state: State
+    headline: str
+    step: str
+    remark: str = ""
+    posterior: Mapping[str, float] = field(default_factory=dict)
+
+
+def robot_state(
+    diagnoses: Sequence[Diagnosis], robot: Robot, course: FaultCourse | None = None
+) -> RobotState:
+    """Return the state of a robot over all its runs.
+
+    Args:
+        diagnoses: Of each run, the oldest first.
+        robot: The robot.
+        course: Of the robot over these runs, where they were weighed together; None: they were
+            judged one by one.
+
+    Raises:
+        InputError: If there is no run.
+    """
+    if not diagnoses:
+        raise InputError("a state needs the diagnosis of one run at least; there is none.")
+    states = [state_of_run(d, robot.motor_names) for d in diagnoses]
+    decided = [i for i, d in enumerate(diagnoses) if not d.undecided]
+    if not decided:
+        found = _nothing(diagnoses)
+    elif course is not None:
+        found = _of_course(course, robot)
+    else:
+        found = _one_by_one(diagnoses, states, decided, robot)
+    chance = found.state.probability
+    return RobotState(
+        found.state,
+        joint_names_in(found.headline, robot),
+        "" if chance is None else f"{sureness(chance)} ({percent(chance)})",
+        joint_names_in(found.step, robot),
+        joint_names_in(found.remark, robot),
+        _motor_states(diagnoses, states, found, robot),
+        class_name(robot),
+        len(diagnoses),
+    )
+
+
+def course_of(diagnoses: Sequence[Diagnosis], diagnoser: BayesDiagnoser) -> FaultCourse:
+    """Return the course of a robot over runs that were weighed together.
+
+    Args:
+        diagnoses: Of each run, the oldest first.
+        diagnoser: What they were judged with: its hypotheses and priors.
+    """
+    prior = np.exp(log_prior(diagnoser.hypothesis_set, diagnoser.priors))
+    return FaultCourse.of(diagnoses, prior)
+
+
+def _nothing(diagnoses: Sequence[Diagnosis]) -> _Found:
+    """Return what is said where no run allows a verdict."""
+    reason = diagnoses[0].undecided
+    return _Found(State(OPEN), f"Cannot tell, because {reason}", undecided_step(reason))
+
+
+def _of_course(course: FaultCourse, robot: Robot) -> _Found:
+    """Return the state after the last run, given all."""
+    last = course.posterior[-1]
+    posterior = {str(h): float(p) for h, p in zip(course.hypotheses, last, strict=True)}
+    steps = " ".join(next_steps(posterior, class_name(robot)))
+    state = state_of(posterior, robot.motor_names)
+    return _Found(state, _headline(state, posterior), steps, "; ".join(course.verdict), posterior)
+
+
+def _one_by_one(
+    diagnoses: Sequence[Diagnosis], states: Sequence[State], decided: Sequence[int], robot: Robot
+) -> _Found:
+    """Return the state that runs agree on, from the first on that names its motor."""
+    faulty = [i for i in decided if states[i].kind == FAULTY]
+    since = faulty[0] if faulty else 0
+    used = [i for i in decided if i >= since]
+    posterior = _pooled([diagnoses[i].posterior for i in used])
+    named = {states[i].motors for i in faulty}
+    if len(named) > 1 or (faulty and any(states[i].kind == WELL for i in used)):
+        return _different(states, decided, posterior)
+    state = state_of(posterior, robot.motor_names)
+    alone = _alone(diagnoses, faulty, len(decided))
+    remarks = [f"one {alone} alone shows it"] if alone else []
+    if any(states[i].kind == WELL for i in decided if i < since):
+        remarks.append(f"since run {since + 1} of {len(diagnoses)} ({diagnoses[since].run})")
+    step = " ".join(next_steps(posterior, class_name(robot), alone))
+    return _Found(state, _headline(state, posterior), step, "; ".join(remarks), posterior)
+
+
+def _alone(diagnoses: Sequence[Diagnosis], faulty: Sequence[int], decided: int) -> str:
+    """Return on what single thing a fault rests; empty: on several, or there is none."""
+    if len(faulty) > 1:
+        return ""
+    if faulty and decided > 1:
+        return RUN
+    return MOVEMENT if any(rests_on_one_movement(diagnoses[i]) for i in faulty) else ""
+
+
+def _pooled(posteriors: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return the mean of some posteriors; a hypothesis that one lacks has none of it there."""
+    names = dict.fromkeys(name for posterior in posteriors for name in posterior)
+    return {name: float(np.mean([p.get(name, 0.0) for p in posteriors])) for name in names}
+
+
+def _different(
+    states: Sequence[State], decided: Sequence[int], posterior: Mapping[str, float]
+) -> _Found:
+    """Return what is said of runs that show different states."""
+    counts = Counter(_short(states[i]) for i in decided)
+    told = ", ".join(f"{name} in {counted(count, 'run')}" for name, count in counts.most_common())
+    motors = dict.fromkeys(m for i in decided if states[i].kind == FAULTY for m in states[i].motors)
+    headline = "Different states in different runs"
+    return _Found(State(OPEN, tuple(motors)), headline, DIFFERENT_STEP, told, posterior)
+
+
+def _short(state: State) -> str:
+    if state.kind != FAULTY:
+        return state.kind
+    return f"{' and '.join(map(_spoken, state.motors))} faulty"
+
+
+def _headline(state: State, posterior: Mapping[str, float]) -> str:
+    """Return a state in a few words."""
+    best = max(posterior, key=lambda name: posterior[name])
+    name = plain_name(Hypothesis.parse(best))
+    if state.kind == WELL:
+        return "Healthy"
+    if state.kind == FAULTY:
+        told = name if posterior[best] >= SURE else " and ".join(map(_spoken, state.motors))
+        return f"Faulty: {told}"
+    return f"Cannot tell yet; most probable: {name}"
+
+
+def _motor_states(
+    diagnoses: Sequence[Diagnosis], states: Sequence[State], found: _Found, robot: Robot
+) -> tuple[MotorState, ...]:
+    """Return what all runs say of each motor; where a fault is unknown, no motor is healthy."""
+    by_run = [{} if d.undecided else motor_probabilities(d.posterior) for d in diagnoses]
+    over_all = motor_probabilities(found.posterior)
+    unknown = found.posterior.get(str(UNKNOWN), 0.0) if found.posterior else 1.0
+    rows = []
+    for name, motor in zip(robot.motor_names, robot.motors, strict=True):
+        chance = over_all.get(name, 0.0)
+        kind = WELL if chance + unknown < SUSPECT else OPEN
+        rows.append(
+            MotorState(
+                name,
+                motor.joint,
+                found.state.kind if name in found.state.motors else kind,
+                sum(s.kind == FAULTY and name in s.motors for s in states),
+                sum(s.kind == OPEN and name in s.motors for s in states),
+                max(each.get(name, 0.0) for each in by_run),
+                chance,
+            )
+        )
+    return tuple(rows)
+
+
+def _spoken(motor: str) -> str:
+    return motor.replace("_", " ")
