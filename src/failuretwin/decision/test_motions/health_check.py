@@ -29,7 +29,7 @@ from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.log_quality import LogQuality
 from failuretwin.inference.posterior import Posterior, log_prior
-from failuretwin.inference.priors import Priors
+from failuretwin.inference.priors import Priors, Range, visible_sizes
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.settings import ERROR_STEPS, WIDEST_ERROR
 from failuretwin.inference.shared_posterior import set_up_in_doubt, shared_posterior
@@ -40,6 +40,9 @@ LEAST_SHARE = 0.5
 """Where ranges of errors begin, in the least error that a profile states."""
 RANGES = 5
 """So many ranges from there to the paper's."""
+SMALLER = 2
+"""Ranges that a check adds below those from what one settled position shows: forty movements of a
+minute show a sixth of that, and "healthy" must not be surer than they can make it."""
 SURE = 0.95
 """Probability from which a check names a motor, or says that all is well."""
 GREEN, RED, OPEN = "green", "red", "open"
@@ -52,22 +55,33 @@ LOOSE_RAD = 0.1
 def checking(model: HealthyModel, hypotheses: Sequence[Hypothesis]) -> Priors:
     """Return priors of who checks an arm that nobody suspects: 2 to 1 that it is healthy.
 
-    Movements that are chosen for it show smaller errors than others do: where a profile states the
-    least, ranges of errors begin at half of that, in even steps of the logarithm.
+    Movements that are chosen for it, and are many, show smaller errors than others do: where a
+    profile states the least, ranges of errors begin at half of that, in even steps of the
+    logarithm; elsewhere at a sixth of what one settled position shows.
 
     Args:
         model: The healthy robot.
         hypotheses: What may be the case.
     """
-    least = model.settings.least_error_rad
-    begin = np.geomspace(LEAST_SHARE, max(ERROR_STEPS), RANGES) * least
-    ranges = tuple((low, WIDEST_ERROR * low) for low in begin.tolist())
-    plain = Priors(error_ranges=ranges if least else None)
+    plain = Priors(error_ranges=_error_ranges(model))
     prior = np.exp(log_prior(hypotheses, plain))
     own = sum(prior[i] for i, h in enumerate(hypotheses) if h.is_healthy)
     if not 0.0 < own < 1.0:
         return plain
     return replace(plain, healthy_odds=HEALTHY_TO_FAULTY * float((1.0 - own) / own))
+
+
+def _error_ranges(model: HealthyModel) -> Sequence[Range] | Mapping[str, Sequence[Range]]:
+    """Return ranges of errors, those of all motors or of each."""
+    least = model.settings.least_error_rad
+    if least:
+        begin = np.geomspace(LEAST_SHARE, max(ERROR_STEPS), RANGES) * least
+        return tuple((low, WIDEST_ERROR * low) for low in begin.tolist())
+    mode = MODES["steady_state_error"]
+    return {
+        name: visible_sizes(mode, model, motor, SMALLER).ranges
+        for motor, name in enumerate(model.motor_names)
+    }
 
 
 @dataclass(frozen=True)
