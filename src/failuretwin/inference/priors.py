@@ -267,9 +267,7 @@ WITHIN_A_DAY = 0.02
 little shows: not none, lest "healthy" be surer than it can be; assumed."""
 
 
-def visible_sizes(
-    mode: FaultMode, model: HealthyModel, motor: int, smaller: int = 0
-) -> SizePrior:
+def visible_sizes(mode: FaultMode, model: HealthyModel, motor: int, smaller: int = 0) -> SizePrior:
     """Return sizes of a fault of a motor, from what can be seen of it to the mode's largest.
 
     Each range is as wide as the paper's, five times its least size, and begins at 2.5 times that of

@@ -57,8 +57,6 @@ SAMPLED_RUNS = 24
 """Runs from which the registration of a run set is found, as a start for each of its runs."""
 
 
-FAR = 2.0
-"""Deviations of theta beyond which every hypothesis starts from the best theta of all too."""
 FEW_RUNS = 10
 """So few runs start from their own registration and from the profile's, more from a common one."""
 
@@ -287,35 +285,12 @@ class SharedWeighing:
             return [Candidate(0, rows, self.search(at, priors[0], self.nowhere))]
         untold = COARSE_TO_FINE[1] * self.likelihood.model.twin.robot.reach
         coarse = self.search(self.expand(rows, self.nowhere, untold), priors[-1], self.nowhere)
-        found = [
+        starts = (coarse.theta, self.nowhere)
+        return [
             Candidate(c, rows, self.search(at, prior, start))
             for c, prior in enumerate(priors)
-            for start in (coarse.theta, self.nowhere)
+            for start in starts
         ]
-        far = [
-            self._from_afar(at, c, found[2 * c].found.better(found[2 * c + 1].found))
-            for c in range(len(priors))
-        ]
-        return [*found, *(each for each in far if each is not None)]
-
-    def _from_afar(self, at: Expansion, component: int, found: Weighed) -> Candidate | None:
-        """Return what runs whose best theta is far off say from there; None: there are none.
-
-        From near by a few steps do not get there: a hypothesis that makes up for some of theta
-        must not win because the others have not arrived.
-
-        Args:
-            at: All runs.
-            component: What is believed of theta.
-            found: What was found there.
-        """
-        deviation = self.parts[component].deviation
-        best, _ = found.best(self.log_odds)
-        rows = np.flatnonzero(np.any(np.abs(best) > FAR * deviation, axis=1))
-        if len(rows) == 0:
-            return None
-        some = at[rows]
-        return Candidate(component, rows, self.search(some, some.prior(deviation), best[rows]))
 
     def _here(self, at: Expansion) -> list[LocalLikelihood]:
         """Return what runs say of the hypotheses that have a score, where they are expanded."""

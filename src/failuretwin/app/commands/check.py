@@ -78,7 +78,8 @@ seconds_option = click.option(
     "written",
     type=PATH,
     metavar="FILE",
-    help="Move nothing: write the motions (.json, .csv, .mcap) for an arm that we cannot command.",
+    help="Move nothing: write the motions (.json, .csv, .mcap, .bag) for an arm that we cannot "
+    "command.",
 )
 @click.option(
     "--log",
@@ -92,8 +93,8 @@ seconds_option = click.option(
 @click.option(
     "--motions",
     type=PATH,
-    metavar="FILE.json",
-    help="Make these motions. Default: they are designed anew.",
+    metavar="FILE",
+    help="Make these motions (.json, .csv). Default: they are designed anew.",
 )
 @click.option(
     "--keep",
@@ -178,7 +179,9 @@ def check(
 @click.command()
 @seconds_option
 @click.option("--movements", type=click.IntRange(min=1), default=1000, help="So many at most.")
-@click.option("--write", "written", type=PATH, metavar="FILE", help="Write .json, .csv or .mcap.")
+@click.option(
+    "--write", "written", type=PATH, metavar="FILE", help="Write .json, .csv, .mcap or .bag."
+)
 @motion_options
 @safety_options
 @calibration_option
@@ -214,7 +217,7 @@ def design(
     type=PATH,
     required=True,
     metavar="FILE",
-    help="Motions that `design` or `check` wrote (.json), or any log or run set.",
+    help="Motions that `design` or `check` wrote (.json, .csv), or any log or run set.",
 )
 @click.option(
     "--hypotheses",
