@@ -36,7 +36,8 @@ def check_lines(result: CheckResult, robot: Robot, seconds: float) -> list[str |
         names = [name for name, p in result.by_motor.items() if p >= LIKELY]
         head = f"OPEN: cannot tell, because {diagnosis.verdict}"
         head += f". Ask {' and '.join(names)} further: --further 6" if names else ""
-    made = counted(result.movements, "movement") + f" seen at rest, {seconds:.0f} s planned"
+    made = counted(result.movements, "movement") + " seen at rest"
+    made += f", {seconds:.0f} s planned" if seconds else ""
     if result.further:
         made += f", {counted(result.further, 'further movement')}"
     advice = [line for line in diagnosis.explanation if line.startswith("what to do")]

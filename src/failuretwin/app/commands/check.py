@@ -33,7 +33,8 @@ class MotionOptions:
     """Which movements are allowed, as the help texts of `motion_options` say it."""
 
     hypotheses: str | None
-    usual: bool
+    usual: bool = False
+    rest: float = 0.0
 
     def checking(
         self, safety: SafetyOptions, calibration: Path | None, robot: str, seed: int
@@ -45,7 +46,8 @@ class MotionOptions:
 
         known = load_calibration(calibration, robot)
         named = parse_cli_hypotheses(self.hypotheses, known.robot)
-        return Checking(known, safety.gate(known.robot), named, self.usual, seed)
+        gate = safety.gate(known.robot)
+        return Checking(known, gate, named, self.usual, seed, self.rest)
 
 
 motion_options = gathered(
@@ -61,6 +63,14 @@ motion_options = gathered(
         "--usual",
         is_flag=True,
         help="Keep to the ranges of usual movements, not to the limits of the joints alone.",
+    ),
+    click.option(
+        "--rest",
+        type=click.FloatRange(0.0, 10.0),
+        default=0.0,
+        metavar="SECONDS",
+        help="Leave so much time after each movement for the tool to come to rest. Default: what "
+        "arms of this kind need. An arm that is commanded is waited for anyway.",
     ),
 )
 seconds_option = click.option(
@@ -246,7 +256,7 @@ def isolability(
     from failuretwin.app.smallest import save_picture, size_table, smallest_of, smallest_record
     from failuretwin.app.tables import show
 
-    asking = MotionOptions(hypotheses, False).checking(SafetyOptions(), calibration, name, 0)
+    asking = MotionOptions(hypotheses).checking(SafetyOptions(), calibration, name, 0)
     found = smallest_of(asking, motions)
     show(size_table(found, asking.known.robot), *group_lines(found, asking.known.robot))
     if json_file is not None:

@@ -23,13 +23,13 @@ from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.work import Work, first_standing
 from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.decision.test_motions.motions import Motions
-from failuretwin.failure_behavior.mode import Signature
+from failuretwin.failure_behavior.mode import Range, Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.log_quality import LogQuality
 from failuretwin.inference.posterior import Posterior, log_prior
-from failuretwin.inference.priors import Priors, Range, visible_sizes
+from failuretwin.inference.priors import Priors, visible_sizes
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.settings import ERROR_STEPS, WIDEST_ERROR
 from failuretwin.inference.shared_posterior import set_up_in_doubt, shared_posterior
