@@ -11,7 +11,7 @@ from failuretwin.connection.emulated_arm import Emulation
 from failuretwin.connection.links.commander import Order
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
 from failuretwin.decision.acting.believed_arm import Seen
-from failuretwin.decision.acting.judging import settled_evidence_of
+from failuretwin.decision.acting.judging import Judge, settled_evidence_of
 from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.decision.test_motions.health_check import (
     CheckResult,
@@ -83,6 +83,9 @@ def test_a_motor_that_carries_nothing_is_not_asked_for_its_strength(model):
     assert model.settling.compliance[0] == 0.0
     assert "motor_1:torque_loss" not in asked
     assert "motor_2:torque_loss" in asked
+    acted_on = [str(hypothesis) for hypothesis in Judge(model).hypotheses]
+    assert "motor_1:torque_loss" not in acted_on
+    assert "motor_2:torque_loss" in acted_on
 
 
 def carried_out(known, model, gate, designed, schedule, modes=None, further=0):

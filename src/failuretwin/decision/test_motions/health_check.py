@@ -13,11 +13,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from failuretwin.connection.links.commander import Commander, Order
-from failuretwin.core.hypothesis import HEALTHY, Diagnosis, Hypothesis, single_faults
+from failuretwin.core.hypothesis import HEALTHY, Diagnosis, Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.belief import Belief, NoBelief
 from failuretwin.decision.acting.believed_arm import BelievedArm, Seen
-from failuretwin.decision.acting.judging import settled_evidence_of
+from failuretwin.decision.acting.judging import settled_evidence_of, shown_faults
 from failuretwin.decision.acting.planner import Standing
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.work import Work, first_standing
@@ -181,18 +181,9 @@ def motor_probabilities(posterior: Mapping[str, float]) -> dict[str, float]:
 
 
 def faults_at_rest(model: HealthyModel) -> tuple[Hypothesis, ...]:
-    """Return healthy and every single fault that can show in where a motor settles.
-
-    A motor that does not give way under load shows no loss of torque there.
-    """
+    """Return healthy and every single fault that can show in where a motor settles."""
     shown = (Signature.HELD, Signature.REDRAWN_OFFSET, Signature.OFFSET)
-    modes = [name for name, mode in MODES.items() if mode.signature in shown]
-    gives = dict(zip(model.motor_names, model.settling.compliance, strict=True))
-    return tuple(
-        hypothesis
-        for hypothesis in single_faults(model.motor_names, modes)
-        if all(gives[f.motor] or not MODES[f.mode].needs_compliance for f in hypothesis.faults)
-    )
+    return shown_faults(model, [name for name, mode in MODES.items() if mode.signature in shown])
 
 
 def judged(
