@@ -55,6 +55,16 @@ def test_motions_are_written_and_nothing_moves(failuretwin, tmp_path):
     )  # fmt: skip
     assert said.returncode == 0, said.stderr
     assert "told from all others" in said.stdout
+    again = failuretwin(
+        "check", "--seconds", 8, "--write", path.with_suffix(".csv"), "--motions", path
+    )
+    assert again.returncode == 0, again.stderr
+    only = ("--hypotheses", "motor_3:steady_state_error,healthy")
+    tables = [
+        failuretwin("isolability", "armpi_fpv", "--motions", each, *only).stdout
+        for each in (path, path.with_suffix(".csv"))
+    ]
+    assert tables[0] == tables[1]
     assert picture.read_bytes().startswith(b"\x89PNG")
     rows = [json.loads(line) for line in (tmp_path / "s").read_text().splitlines()]
     sizes = {row["hypothesis"]: row["isolated"] for row in rows}
@@ -91,7 +101,7 @@ def test_a_design_beside_random_movements(failuretwin):
         (("check", "--on", "ros2"), "expected emulated, ros1 or rosbridge"),
         (("check", "--seconds", 0.2), "no safe movement"),
         (("check", "--fault", "motor_9:stuck"), "motor_9"),
-        (("check", "--write", "motions.bag"), "expected .json, .csv, .mcap"),
+        (("check", "--write", "motions.txt"), "expected .json, .csv, .mcap, .bag"),
         (("check", "--motions", "nothing.json"), "cannot be read as motions"),
         (("check", "--floor", 2.0), "--floor"),
         (("isolability", "armpi_fpv", "--motions", "nothing.json"), "cannot be read as motions"),

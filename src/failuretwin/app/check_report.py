@@ -38,7 +38,8 @@ def check_lines(result: CheckResult, robot: Robot, seconds: float) -> list[str |
         names = [name for name, p in result.by_motor.items() if p >= LIKELY]
         head = f"OPEN: cannot tell, because {diagnosis.verdict}"
         head += f". Ask {' and '.join(names)} further: --further 6" if names else ""
-    made = counted(result.movements, "movement") + f" seen at rest, {seconds:.0f} s planned"
+    made = counted(result.movements, "movement") + " seen at rest"
+    made += f", {seconds:.0f} s planned" if seconds else ""
     if result.further:
         made += f", {counted(result.further, 'further movement')}"
     low = ["" if not diagnosis.quality else "the log: " + "; ".join(diagnosis.quality)]

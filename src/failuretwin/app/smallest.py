@@ -15,7 +15,7 @@ from failuretwin.app.tables import Table, figures_table
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.store import replacing
-from failuretwin.decision.test_motions.motions import Motions, read_motions
+from failuretwin.decision.test_motions.motions import Motions, holds_motions, read_motions
 from failuretwin.decision.test_motions.session import Checking
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.registry import MODES
@@ -25,6 +25,8 @@ from failuretwin.inference.isolability import isolability as isolability_of
 
 MOST_RUNS = 3
 """Runs of a log that are looked at, spread evenly."""
+NARROWEST_IN = 5.0
+"""The narrowest picture on which its title fits [in]."""
 
 
 def of_motions(asking: Checking, motions: Motions) -> IsolabilityReport:
@@ -41,7 +43,7 @@ def smallest_of(asking: Checking, path: Path) -> IsolabilityReport:
     Raises:
         InputError: If it cannot be read, or holds no movement.
     """
-    if path.suffix == ".json":
+    if holds_motions(path, asking.known.robot):
         return of_motions(asking, read_motions(path, asking.known.robot))
     from failuretwin.data_knowledge.read import read_runs
 
@@ -115,7 +117,7 @@ def save_picture(found: IsolabilityReport, robot: Robot, path: Path) -> None:
         OutputError: If it cannot be written.
     """
     modes = list(dict.fromkeys(Hypothesis.parse(name).faults[0].mode for name in found.isolated))
-    figure = new_figure(3.2 * max(len(modes), 1), 2.6)
+    figure = new_figure(max(3.2 * len(modes), NARROWEST_IN), 2.6)
     for panel, mode in zip(np.ravel(figure.subplots(1, max(len(modes), 1))), modes, strict=False):
         turns = MODES[mode].unit.startswith("rad")
         factor = 180.0 / np.pi if turns else 1.0
@@ -135,7 +137,8 @@ def save_picture(found: IsolabilityReport, robot: Robot, path: Path) -> None:
         panel.invert_yaxis()
         clean(panel)
     figure.suptitle(
-        "smallest shown: blue, told from healthy; red, from all others; pale: not even", fontsize=8
+        "smallest fault shown: blue, told from healthy; red, from all others; pale: not even",
+        fontsize=8,
     )
     with replacing(path) as partial:
         figure.savefig(partial, format="png", dpi=130)

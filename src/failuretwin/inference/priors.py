@@ -267,7 +267,7 @@ WITHIN_A_DAY = 0.02
 little shows: not none, lest "healthy" be surer than it can be; assumed."""
 
 
-def visible_sizes(mode: FaultMode, model: HealthyModel, motor: int) -> SizePrior:
+def visible_sizes(mode: FaultMode, model: HealthyModel, motor: int, smaller: int = 0) -> SizePrior:
     """Return sizes of a fault of a motor, from what can be seen of it to the mode's largest.
 
     Each range is as wide as the paper's, five times its least size, and begins at 2.5 times that of
@@ -278,13 +278,15 @@ def visible_sizes(mode: FaultMode, model: HealthyModel, motor: int) -> SizePrior
         mode: The mode; its sizes are offsets [rad], or grow with the time [rad/s].
         model: The healthy robot.
         motor: Index of the motor.
+        smaller: Ranges that are added below what one settled position shows, as many movements
+            together show less.
     """
     low, high = model.twin.robot.travel[motor]
     largest = LARGEST_ERROR_RAD if mode.sizes is None else mode.considered[1]
     if model.twin.robot.slides[motor]:
         largest *= (high - low) / np.pi
     within = 1.0 / GROWN_S if mode.signature is Signature.GROWING_OFFSET else 1.0
-    shown = within * LEAST_ERROR * model.least_visible[motor]
+    shown = within * LEAST_ERROR * model.least_visible[motor] / LARGER**smaller
     least = max(shown, within * _of_a_day(model, motor))
     count = 1 + max(0, int(np.ceil(np.log(largest / WIDEST_ERROR / least) / np.log(LARGER))))
     lows = np.geomspace(least, max(least, largest / WIDEST_ERROR), count).tolist()

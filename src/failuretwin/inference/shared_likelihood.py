@@ -22,7 +22,7 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
-from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.counted_outcomes import CountedOutcomes
@@ -67,6 +67,20 @@ class LocalLikelihood:
     scatter_information: FloatArray
     scatter_slack: FloatArray
     outcomes: FloatArray
+
+    def __getitem__(self, rows: IntArray) -> LocalLikelihood:
+        """Return that of some of the runs alone."""
+        return LocalLikelihood(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def with_rows(self, rows: IntArray, some: LocalLikelihood) -> LocalLikelihood:
+        """Return the same with that of some of the runs replaced."""
+
+        def replaced(name: str) -> FloatArray:
+            values = np.array(getattr(self, name))
+            values[rows] = getattr(some, name)
+            return values
+
+        return LocalLikelihood(*(replaced(field.name) for field in fields(self)))
 
 
 def local_likelihood(
@@ -363,6 +377,9 @@ def integrated(prior: Normal, says: LocalLikelihood) -> FloatArray:
 
 NEWTON_STEPS = 2
 """Steps towards the best theta; more change nothing in the mean."""
+RISING_NATS, TIMES_MORE = 2.0, 3
+"""Runs whose last step has gained more are followed on, so many times as far at most: what is far
+off, such as a zero that nobody has measured, is not reached in two steps."""
 
 
 def search(
@@ -384,18 +401,36 @@ def search(
         known: What they say there, where that is known.
     """
     best = known or local_likelihood(response, hypothesis, priors, start)
-    start = best.theta
-    height = best.log_likelihood + prior.log_density(start)
-    theta = prior.times(best).mean
+    best, rising = _stepped(response, hypothesis, priors, prior, best)
+    for _ in range(TIMES_MORE):
+        rows = np.flatnonzero(rising)
+        if len(rows) == 0:
+            break
+        part = Normal(prior.precision[rows], prior.shift[rows])
+        some, rising[rows] = _stepped(response[rows], hypothesis, priors, part, best[rows])
+        best = best.with_rows(rows, some)
+    return best
+
+
+def _stepped(
+    response: LinearResponse,
+    hypothesis: Hypothesis,
+    priors: Priors,
+    prior: Normal,
+    best: LocalLikelihood,
+) -> tuple[LocalLikelihood, BoolArray]:
+    """Return what runs say some steps on, and which gained much by the last of them, (run,)."""
+    height = best.log_likelihood + prior.log_density(best.theta)
+    theta, gain = prior.times(best).mean, np.zeros(len(height))
     for step in range(NEWTON_STEPS):
         here = local_likelihood(response, hypothesis, priors, theta)
         high = here.log_likelihood + prior.log_density(theta)
-        better = high > height
+        better, gain = high > height, high - height
         best, height = _where(better, here, best), np.where(better, high, height)
         if step < NEWTON_STEPS - 1:
             newton = prior.times(best).mean
             theta = np.where(better[:, None], newton, 0.5 * (theta + best.theta))
-    return best
+    return best, gain > RISING_NATS
 
 
 def _where(better: BoolArray, one: LocalLikelihood, other: LocalLikelihood) -> LocalLikelihood:

@@ -178,3 +178,12 @@ def test_motions_hold_what_was_designed(armpi, designed):
         end = begin + movement.order.duration[0]
         reached = command[np.searchsorted(time, end + 0.005)]
         np.testing.assert_allclose(reached, movement.order.target, atol=1e-9)
+
+
+def test_as_much_time_is_left_for_coming_to_rest_as_is_asked_for(gate, outlook):
+    usual = Designer(gate, outlook, seed=0)
+    longer = Designer(gate, outlook, seed=0, least_rest_s=2.0)
+    shorter = Designer(gate, outlook, seed=0, least_rest_s=0.1)
+    assert (longer.rest_s, shorter.rest_s) == (2.0, usual.rest_s)
+    for movement in longer.sequence(np.zeros(4), 8.0):
+        assert movement.seconds == pytest.approx(2.0 + movement.order.duration.max())

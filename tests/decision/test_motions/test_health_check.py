@@ -11,7 +11,7 @@ from failuretwin.connection.emulated_arm import Emulation
 from failuretwin.connection.links.commander import Order
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
 from failuretwin.decision.acting.believed_arm import Seen
-from failuretwin.decision.acting.judging import settled_evidence_of
+from failuretwin.decision.acting.judging import Judge, settled_evidence_of
 from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.decision.test_motions.health_check import (
     CheckResult,
@@ -22,10 +22,13 @@ from failuretwin.decision.test_motions.health_check import (
     motor_offsets,
 )
 from failuretwin.decision.test_motions.motions import Motions, read_motions, write_motions
+from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.failure_behavior.injection import ScheduledFault
 from failuretwin.failure_behavior.modes import SteadyStateError
 from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.posterior import log_prior
+from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 COUNT_RAD = np.deg2rad(0.24)
@@ -80,6 +83,9 @@ def test_a_motor_that_carries_nothing_is_not_asked_for_its_strength(model):
     assert model.settling.compliance[0] == 0.0
     assert "motor_1:torque_loss" not in asked
     assert "motor_2:torque_loss" in asked
+    acted_on = [str(hypothesis) for hypothesis in Judge(model).hypotheses]
+    assert "motor_1:torque_loss" not in acted_on
+    assert "motor_2:torque_loss" in acted_on
 
 
 def carried_out(known, model, gate, designed, schedule, modes=None, further=0):
@@ -170,6 +176,11 @@ def test_motions_are_written(armpi, designed, tmp_path, suffix):
         np.testing.assert_array_equal(again.target, motions.target)
         np.testing.assert_array_equal(again.seconds, motions.seconds)
     elif suffix == ".csv":
+        again = read_motions(path, armpi)
+        np.testing.assert_allclose(again.target, motions.target, atol=1e-6)
+        np.testing.assert_allclose(again.start, motions.start, atol=1e-6)
+        np.testing.assert_allclose(again.ramp_s, motions.ramp_s, atol=2e-3)
+        np.testing.assert_allclose(again.seconds, motions.seconds, atol=2e-3)
         table = np.genfromtxt(path, delimiter=",", names=True)
         time, command = motions.reference()
         drawn = np.interp(time, table["time_s"], table["motor_3_rad"])
@@ -201,7 +212,48 @@ def test_ramps_that_make_no_sense(armpi, designed, tmp_path):
     with pytest.raises(ft.InputError, match="each time as long as its ramp"):
         read_motions(path, armpi)
     with pytest.raises(ft.InputError, match=r"expected \.json, "):
-        write_motions(Motions.of(armpi, designed), armpi, tmp_path / "motions.bag")
+        write_motions(Motions.of(armpi, designed), armpi, tmp_path / "motions.txt")
+
+
+def test_a_bag_of_ros_1_holds_what_motors_are_told(armpi, designed, tmp_path):
+    rosbags = pytest.importorskip("rosbags.rosbag1")
+    typesys = pytest.importorskip("rosbags.typesys")
+    motions, path = Motions.of(armpi, designed), tmp_path / "motions.bag"
+    write_motions(motions, armpi, path)
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+    with rosbags.Reader(path) as bag:
+        said = [(t, store.deserialize_ros1(data, c.msgtype)) for c, t, data in bag.messages()]
+    np.testing.assert_allclose([1e-9 * t for t, _ in said], motions.start_s, atol=1e-6)
+    np.testing.assert_allclose([m.points[-1].positions for _, m in said], motions.target)
+    due = [m.points[-1].time_from_start for _, m in said]
+    np.testing.assert_allclose([d.sec + 1e-9 * d.nanosec for d in due], motions.ramp_s, atol=1e-6)
+    assert said[0][1].joint_names == [motor.joint for motor in armpi.motors]
+    with pytest.raises(ft.InputError, match="exists already"):
+        write_motions(motions, armpi, path)
+
+
+def test_a_table_that_is_cut_off_or_leaps_holds_no_motions(armpi, designed, tmp_path):
+    path = tmp_path / "motions.csv"
+    write_motions(Motions.of(armpi, designed), armpi, path)
+    rows = path.read_text().splitlines()
+    for wrong in (rows[:-1], [*rows[:3], rows[4], rows[3], *rows[5:]], rows[:1]):
+        path.write_text("\n".join(wrong) + "\n")
+        with pytest.raises(ft.InputError, match="holds no motions"):
+            read_motions(path, armpi)
+
+
+def test_errors_below_what_one_position_shows_are_weighed(model):
+    """Where a profile states no least, a check of many movements begins a sixth of it."""
+    known = load_calibration(None, "ur5e")
+    arm = HealthyModel.of(known.twin, known.imperfections)
+    told = checking(arm, faults_at_rest(arm)).error_ranges
+    for motor, name in enumerate(arm.motor_names):
+        low = min(begin for begin, _ in told[name])
+        usual = Priors().sizes_of(MODES["steady_state_error"], arm, motor).ends[0]
+        assert low == pytest.approx(usual / 6.25, rel=1e-6)
+    assert min(low for low, _ in checking(model, faults_at_rest(model)).error_ranges) == (
+        pytest.approx(2.0 * COUNT_RAD)
+    )
 
 
 def test_in_one_call(known):

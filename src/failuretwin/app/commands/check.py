@@ -36,7 +36,8 @@ class MotionOptions:
     """Which movements are allowed, as the help texts of `motion_options` say it."""
 
     hypotheses: str | None
-    usual: bool
+    usual: bool = False
+    rest: float = 0.0
 
     def checking(
         self, safety: SafetyOptions, calibration: Path | None, robot: str, seed: int
@@ -48,7 +49,8 @@ class MotionOptions:
 
         known = load_calibration(calibration, robot)
         named = parse_cli_hypotheses(self.hypotheses, known.robot)
-        return Checking(known, safety.gate(known.robot), named, self.usual, seed)
+        gate = safety.gate(known.robot)
+        return Checking(known, gate, named, self.usual, seed, self.rest)
 
 
 motion_options = gathered(
@@ -64,6 +66,14 @@ motion_options = gathered(
         "--usual",
         is_flag=True,
         help="Keep to the ranges of usual movements, not to the limits of the joints alone.",
+    ),
+    click.option(
+        "--rest",
+        type=click.FloatRange(0.0, 10.0),
+        default=0.0,
+        metavar="SECONDS",
+        help="Leave so much time after each movement for the tool to come to rest. Default: what "
+        "arms of this kind need. An arm that is commanded is waited for anyway.",
     ),
 )
 seconds_option = click.option(
@@ -81,7 +91,8 @@ seconds_option = click.option(
     "written",
     type=PATH,
     metavar="FILE",
-    help="Move nothing: write the motions (.json, .csv, .mcap) for an arm that we cannot command.",
+    help="Move nothing: write the motions (.json, .csv, .mcap, .bag) for an arm that we cannot "
+    "command.",
 )
 @click.option(
     "--log",
@@ -95,8 +106,8 @@ seconds_option = click.option(
 @click.option(
     "--motions",
     type=PATH,
-    metavar="FILE.json",
-    help="Make these motions. Default: they are designed anew.",
+    metavar="FILE",
+    help="Make these motions (.json, .csv). Default: they are designed anew.",
 )
 @click.option(
     "--keep",
@@ -203,7 +214,9 @@ def _check_logs(
 @click.command()
 @seconds_option
 @click.option("--movements", type=click.IntRange(min=1), default=1000, help="So many at most.")
-@click.option("--write", "written", type=PATH, metavar="FILE", help="Write .json, .csv or .mcap.")
+@click.option(
+    "--write", "written", type=PATH, metavar="FILE", help="Write .json, .csv, .mcap or .bag."
+)
 @motion_options
 @safety_options
 @calibration_option
@@ -239,7 +252,7 @@ def design(
     type=PATH,
     required=True,
     metavar="FILE",
-    help="Motions that `design` or `check` wrote (.json), or any log or run set.",
+    help="Motions that `design` or `check` wrote (.json, .csv), or any log or run set.",
 )
 @click.option(
     "--hypotheses",
@@ -268,7 +281,7 @@ def isolability(
     from failuretwin.app.smallest import save_picture, size_table, smallest_of, smallest_record
     from failuretwin.app.tables import show
 
-    asking = MotionOptions(hypotheses, False).checking(SafetyOptions(), calibration, name, 0)
+    asking = MotionOptions(hypotheses).checking(SafetyOptions(), calibration, name, 0)
     found = smallest_of(asking, motions)
     show(size_table(found, asking.known.robot), *group_lines(found, asking.known.robot))
     if json_file is not None:

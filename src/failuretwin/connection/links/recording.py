@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from io import FileIO
 from itertools import count
 from pathlib import Path
@@ -31,7 +31,7 @@ from failuretwin.connection.links.ros_messages import (
     RosTopics,
     RosWriter,
 )
-from failuretwin.core.errors import InputError, OutputError
+from failuretwin.core.errors import InputError, OutputError, needs_extra
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.bag_messages import NS_PER_S
 from failuretwin.data_knowledge.bags import BagTopics, is_bag, read_bag
@@ -173,6 +173,37 @@ RETRY_S = 5.0
 """Time between two attempts to go on when the disk is full [s]."""
 KEPT = 10_000
 """Diagnoses that are kept for a disk that is full; at one a second nearly three hours."""
+
+
+def write_bag(path: Path, robot: Robot, commands: Sequence[CommandSent]) -> None:
+    """Write commands as a ROS 1 bag, with the topic and type of recordings.
+
+    Args:
+        path: The file; it must not exist.
+        robot: The robot.
+        commands: In order of time.
+
+    Raises:
+        InputError: If it exists, or rosbags is missing.
+        OutputError: If it cannot be written.
+    """
+    with needs_extra("bags need rosbags", "files"):
+        from rosbags.rosbag1 import Writer
+        from rosbags.typesys import Stores, get_typestore
+    if path.exists():
+        raise InputError(f"{path}: exists already. Choose another name, or remove it.")
+    store, writer = get_typestore(Stores.ROS1_NOETIC), RosWriter(robot, RECORDED)
+    type_ = RECORDED.command_type.replace("/", "/msg/")
+    try:
+        with Writer(path) as bag:
+            connection = bag.add_connection(RECORDED.command, type_, typestore=store)
+            for command in commands:
+                for message in writer.command(command):
+                    content = _build(store, type_, message.content)
+                    data = store.serialize_ros1(content, type_)
+                    bag.write(connection, round(command.time * NS_PER_S), data)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror}).") from error
 
 
 class Recorder:

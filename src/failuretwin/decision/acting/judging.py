@@ -5,7 +5,7 @@ Section: docs/acting.md#belief
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +30,23 @@ ACTED_ON = (
 )
 """Modes that are told from settled positions and answered; of the others feedback, waiting and
 sending again are the whole answer, whatever they are called."""
+
+
+def shown_faults(model: HealthyModel, modes: Iterable[str]) -> tuple[Hypothesis, ...]:
+    """Return healthy and single faults of some modes, without those that cannot show at rest.
+
+    A motor that does not give way under load shows no loss of torque there.
+
+    Args:
+        model: The healthy robot.
+        modes: Names of modes.
+    """
+    gives = dict(zip(model.motor_names, model.settling.compliance, strict=True))
+    return tuple(
+        hypothesis
+        for hypothesis in single_faults(model.motor_names, modes)
+        if all(gives[f.motor] or not MODES[f.mode].needs_compliance for f in hypothesis.faults)
+    )
 
 
 @dataclass(frozen=True)
@@ -125,8 +142,7 @@ class Judge:
 
     def __post_init__(self) -> None:
         if not self.hypotheses:
-            names = self.model.twin.robot.motor_names
-            object.__setattr__(self, "hypotheses", single_faults(names, ACTED_ON))
+            object.__setattr__(self, "hypotheses", shown_faults(self.model, ACTED_ON))
 
     def __call__(
         self, windows: Sequence[Sequence[Seen]], believed: Sequence[BelievedFault | None]

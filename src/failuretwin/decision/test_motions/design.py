@@ -67,12 +67,14 @@ class Designer:
         outlook: What may be the case, and what it would look like.
         seed: Seed of the poses that are tried.
         usual: Whether poses keep to the ranges of usual movements.
+        least_rest_s: Time that is left for coming to rest after each movement at least [s].
     """
 
     gate: SafetyGate
     outlook: Outlook
     seed: int = 0
     usual: bool = False
+    least_rest_s: float = 0.0
     _pool: FloatArray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -104,7 +106,8 @@ class Designer:
         figures = self.model.imperfections
         late = figures.timing.late_rate * float(np.mean(figures.timing.late_s))
         beat = 0.0 if figures.readings is None else READINGS / figures.readings.rate_hz
-        return SETTLING_S + self.model.lag_s + QUIET_S + late + beat
+        usual = SETTLING_S + self.model.lag_s + QUIET_S + late + beat
+        return max(usual, self.least_rest_s)
 
     def sequence(self, start: FloatArray, seconds: float, most: int = 1000) -> list[Movement]:
         """Return movements that fit into a time.

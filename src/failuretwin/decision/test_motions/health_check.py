@@ -13,24 +13,24 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from failuretwin.connection.links.commander import Commander, Order
-from failuretwin.core.hypothesis import HEALTHY, Diagnosis, Hypothesis, single_faults
+from failuretwin.core.hypothesis import HEALTHY, Diagnosis, Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.belief import Belief, NoBelief
 from failuretwin.decision.acting.believed_arm import BelievedArm, Seen
-from failuretwin.decision.acting.judging import settled_evidence_of
+from failuretwin.decision.acting.judging import settled_evidence_of, shown_faults
 from failuretwin.decision.acting.planner import Standing
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.work import Work, first_standing
 from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.decision.test_motions.motions import Motions
-from failuretwin.failure_behavior.mode import Signature
+from failuretwin.failure_behavior.mode import Range, Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.advice import SURE, motor_probabilities
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.log_quality import LogQuality
 from failuretwin.inference.posterior import Posterior, log_prior
-from failuretwin.inference.priors import Priors
+from failuretwin.inference.priors import Priors, visible_sizes
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.settings import ERROR_STEPS, WIDEST_ERROR
 from failuretwin.inference.shared_posterior import set_up_in_doubt, shared_posterior
@@ -41,6 +41,9 @@ LEAST_SHARE = 0.5
 """Where ranges of errors begin, in the least error that a profile states."""
 RANGES = 5
 """So many ranges from there to the paper's."""
+SMALLER = 2
+"""Ranges that a check adds below those from what one settled position shows: forty movements of a
+minute show a sixth of that, and "healthy" must not be surer than they can make it."""
 GREEN, RED, OPEN = "green", "red", "open"
 ROUNDS = 8
 """Steps in which movements that fit ill get less weight."""
@@ -51,22 +54,33 @@ LOOSE_RAD = 0.1
 def checking(model: HealthyModel, hypotheses: Sequence[Hypothesis]) -> Priors:
     """Return priors of who checks an arm that nobody suspects: 2 to 1 that it is healthy.
 
-    Movements that are chosen for it show smaller errors than others do: where a profile states the
-    least, ranges of errors begin at half of that, in even steps of the logarithm.
+    Movements that are chosen for it, and are many, show smaller errors than others do: where a
+    profile states the least, ranges of errors begin at half of that, in even steps of the
+    logarithm; elsewhere at a sixth of what one settled position shows.
 
     Args:
         model: The healthy robot.
         hypotheses: What may be the case.
     """
-    least = model.settings.least_error_rad
-    begin = np.geomspace(LEAST_SHARE, max(ERROR_STEPS), RANGES) * least
-    ranges = tuple((low, WIDEST_ERROR * low) for low in begin.tolist())
-    plain = Priors(error_ranges=ranges if least else None)
+    plain = Priors(error_ranges=_error_ranges(model))
     prior = np.exp(log_prior(hypotheses, plain))
     own = sum(prior[i] for i, h in enumerate(hypotheses) if h.is_healthy)
     if not 0.0 < own < 1.0:
         return plain
     return replace(plain, healthy_odds=HEALTHY_TO_FAULTY * float((1.0 - own) / own))
+
+
+def _error_ranges(model: HealthyModel) -> Sequence[Range] | Mapping[str, Sequence[Range]]:
+    """Return ranges of errors, those of all motors or of each."""
+    least = model.settings.least_error_rad
+    if least:
+        begin = np.geomspace(LEAST_SHARE, max(ERROR_STEPS), RANGES) * least
+        return tuple((low, WIDEST_ERROR * low) for low in begin.tolist())
+    mode = MODES["steady_state_error"]
+    return {
+        name: visible_sizes(mode, model, motor, SMALLER).ranges
+        for motor, name in enumerate(model.motor_names)
+    }
 
 
 @dataclass(frozen=True)
@@ -157,18 +171,9 @@ class CheckResult:
 
 
 def faults_at_rest(model: HealthyModel) -> tuple[Hypothesis, ...]:
-    """Return healthy and every single fault that can show in where a motor settles.
-
-    A motor that does not give way under load shows no loss of torque there.
-    """
+    """Return healthy and every single fault that can show in where a motor settles."""
     shown = (Signature.HELD, Signature.REDRAWN_OFFSET, Signature.OFFSET)
-    modes = [name for name, mode in MODES.items() if mode.signature in shown]
-    gives = dict(zip(model.motor_names, model.settling.compliance, strict=True))
-    return tuple(
-        hypothesis
-        for hypothesis in single_faults(model.motor_names, modes)
-        if all(gives[f.motor] or not MODES[f.mode].needs_compliance for f in hypothesis.faults)
-    )
+    return shown_faults(model, [name for name, mode in MODES.items() if mode.signature in shown])
 
 
 def judged(

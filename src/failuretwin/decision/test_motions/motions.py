@@ -1,6 +1,6 @@
-"""A sequence of test movements as a value and as a file: JSON, CSV, or a recording of commands.
+"""A sequence of test movements as a value and as a file: JSON, CSV, or a bag of commands.
 
-The JSON file is what a check is repeated from; the others are for robots that we cannot command.
+A check is repeated from JSON or CSV; bags are for robots that we cannot command.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ from failuretwin.digital_model.robot import Robot
 
 STEP_S = 0.01
 """Step of a reference [s]."""
-SUFFIXES = (".json", ".csv", ".mcap")
+SUFFIXES = (".json", ".csv", ".mcap", ".bag")
+TABLE_RAD = 1e-5
+"""Angles of a table that are nearer to each other are the same [rad]; it has six digits."""
 NEEDED = ("robot", "motors", "start_rad", "target_rad", "ramp_s", "seconds")
 """What a JSON file must hold."""
 
@@ -157,13 +159,14 @@ class Motions:
 
 
 def read_motions(path: Path, robot: Robot) -> Motions:
-    """Read motions from a JSON file, as `write_motions` or a kept check has them.
+    """Read motions from a JSON file, as `write_motions` or a kept check has them, or from its CSV.
 
     Raises:
         InputError: If it cannot be read, or is of another robot.
     """
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        record = _table_record(text, str(path)) if path.suffix == ".csv" else json.loads(text)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as motions ({error}).") from error
     if isinstance(record, dict) and "motions" in record:
@@ -171,8 +174,52 @@ def read_motions(path: Path, robot: Robot) -> Motions:
     return Motions.from_record(record, robot, str(path))
 
 
+def holds_motions(path: Path, robot: Robot) -> bool:
+    """Return whether a file is one that `write_motions` wrote and `read_motions` reads."""
+    if path.suffix != ".csv":
+        return path.suffix == ".json"
+    try:
+        with path.open(encoding="utf-8") as file:
+            return file.readline().strip().split(",") == _columns(robot.motor_names)
+    except (OSError, ValueError):
+        return False
+
+
+def _columns(motors: Sequence[str]) -> list[str]:
+    """Return the heads of a table of motions."""
+    return ["time_s", *(f"{motor}_rad" for motor in motors)]
+
+
+def _table_record(text: str, where: str) -> dict[str, Any]:
+    """Return the JSON object of a table: two rows a movement, and where all ends.
+
+    Raises:
+        InputError: If rows are missing, or motors do not wait where they arrived.
+        ValueError: If something is no number.
+    """
+    head, *rows = csv.reader(io.StringIO(text))
+    table = np.array(rows, dtype=np.float64)
+    whole = table.ndim == 2 and len(table) >= 3 and len(table) % 2 == 1
+    if not whole or np.abs(table[2::2, 1:] - table[1::2, 1:]).max() > TABLE_RAD:
+        raise InputError(
+            f"{where}: holds no motions. Expected two rows for each movement, where it begins and "
+            "where it has arrived, and one where all ends, as `failuretwin design --write` writes."
+        )
+    begin, arrived = table[0::2, 0], table[1::2, 0]
+    return {
+        "robot": "",
+        "motors": [name.removesuffix("_rad") for name in head[1:]],
+        "start_rad": table[0, 1:],
+        "target_rad": table[1::2, 1:],
+        "ramp_s": arrived - begin[:-1],
+        "seconds": np.diff(begin),
+    }
+
+
 def write_motions(motions: Motions, robot: Robot, path: Path) -> None:
-    """Write motions as JSON, CSV (straight lines between its rows) or commands in an MCAP file.
+    """Write motions as JSON, CSV (straight lines between its rows) or a bag of commands.
+
+    Bags are MCAP, as ROS 2 has them, or those of ROS 1 (.bag).
 
     Raises:
         InputError: If the name of the file ends otherwise, or exists already as a recording.
@@ -180,23 +227,34 @@ def write_motions(motions: Motions, robot: Robot, path: Path) -> None:
     """
     if path.suffix not in SUFFIXES:
         raise InputError(f"{path}: ends in {path.suffix!r}, expected {', '.join(SUFFIXES)}.")
-    if path.suffix == ".mcap":
-        from failuretwin.connection.links.recording import Recorder
-
-        with Recorder(path, robot) as recorder:
-            for begin, order in zip(motions.start_s.tolist(), motions.orders, strict=True):
-                recorder.put(CommandSent(begin, order.target, order.duration))
+    if path.suffix in (".mcap", ".bag"):
+        _write_commands(motions, robot, path)
         return
     text = json.dumps(motions.record()) + "\n" if path.suffix == ".json" else _csv(motions)
     with replacing(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
 
+def _write_commands(motions: Motions, robot: Robot, path: Path) -> None:
+    from failuretwin.connection.links.recording import Recorder, write_bag
+
+    commands = [
+        CommandSent(begin, order.target, order.duration)
+        for begin, order in zip(motions.start_s.tolist(), motions.orders, strict=True)
+    ]
+    if path.suffix == ".bag":
+        write_bag(path, robot, commands)
+        return
+    with Recorder(path, robot) as recorder:
+        for command in commands:
+            recorder.put(command)
+
+
 def _csv(motions: Motions) -> str:
     """Return corners of the reference, a row each: time [s], then angles [rad]."""
     out = io.StringIO()
     table = csv.writer(out, lineterminator="\n")
-    table.writerow(["time_s", *(f"{motor}_rad" for motor in motions.motors)])
+    table.writerow(_columns(motions.motors))
     for time, angles in zip(*motions.corners, strict=True):
         table.writerow([f"{time:.3f}", *(f"{angle:.6f}" for angle in angles)])
     return out.getvalue()

@@ -45,6 +45,7 @@ class Checking:
         named: Hypotheses that the user names; None: all faults that show at rest.
         usual: Whether poses keep to the ranges of usual movements.
         seed: Seed of the poses that are tried.
+        rest_s: Time that is left for coming to rest after each movement at least [s].
     """
 
     known: CalibratedRobot
@@ -52,6 +53,7 @@ class Checking:
     named: Sequence[Hypothesis] | None = None
     usual: bool = False
     seed: int = 0
+    rest_s: float = 0.0
 
     @cached_property
     def model(self) -> HealthyModel:
@@ -78,7 +80,8 @@ class Checking:
     def designer(self) -> Designer:
         """What chooses movements."""
         members = of_priors(self.model, self.asked, checking(self.model, self.asked))
-        return Designer(self.gate, Outlook(self.model, members), self.seed, self.usual)
+        outlook = Outlook(self.model, members)
+        return Designer(self.gate, outlook, self.seed, self.usual, self.rest_s)
 
     def motions(self, seconds: float, repeat: Path | None = None, most: int = 1000) -> Motions:
         """Return the motions of a check: those of a file, or designed anew.
