@@ -199,7 +199,7 @@ def write_bag(path: Path, robot: Robot, commands: Sequence[CommandSent]) -> None
             connection = bag.add_connection(RECORDED.command, type_, typestore=store)
             for command in commands:
                 for message in writer.command(command):
-                    content = _build(store, type_, message.content)
+                    content = ros2_object(store, type_, message.content)
                     data = store.serialize_ros1(content, type_)
                     bag.write(connection, round(command.time * NS_PER_S), data)
     except OSError as error:
