@@ -158,7 +158,7 @@ class LinearResponse:
             evidence: Settled positions, registered.
             model: The healthy robot; what theta holds of its doubt is no scatter.
             layout: What stands in theta.
-            motors: Those that may be faulty: none, or all in their order.
+            motors: Those to look at: none, or all in their order.
             moving: Readings on the way, registered; None: they are left aside.
         """
         usual, sharp = model.outcomes_as_seen(evidence), model

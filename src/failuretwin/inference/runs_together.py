@@ -47,6 +47,8 @@ from failuretwin.inference.shared_weighing import (
 
 LEAST_SHARE = 1e-3
 """Components of the belief that are less probable are not weighed."""
+KNOWN_FRAME = 1e-3
+"""Share of the largest precision of a frame below which it is in doubt; they lie millions apart."""
 CHUNK_RUNS = 64
 """Runs that are weighed at a time."""
 
@@ -61,6 +63,7 @@ class Judged:
         cavity: What was believed without them, in units.
         candidates: What was found with each component of that.
         log_evidence: Log of weight times evidence, (run, candidate, hypothesis).
+        loose: Whether the frame of the sensor is in doubt with each, (candidate,).
     """
 
     rows: IntArray
@@ -68,6 +71,7 @@ class Judged:
     cavity: Belief
     candidates: Sequence[Candidate]
     log_evidence: FloatArray
+    loose: BoolArray
 
     @property
     def share(self) -> FloatArray:
@@ -336,7 +340,16 @@ class RunsTogether:
         used = Belief(
             cavity.log_weight[:, asked], cavity.precision[:, asked], cavity.shift[:, asked]
         )
-        return Judged(rows, weighing, used, candidates, height)
+        return Judged(rows, weighing, used, candidates, height, self._loose[asked])
+
+    @property
+    def _loose(self) -> BoolArray:
+        """With which components the frame may be elsewhere, if with some it may not, (component,).
+
+        By how precisely its origin is believed to be known.
+        """
+        known = self.base.precision[0, :, 0, 0]
+        return np.asarray(known < KNOWN_FRAME * known.max())
 
     @staticmethod
     def _search(
@@ -367,32 +380,33 @@ class RunsTogether:
     def _site(self, judged: Judged, covariance: FloatArray) -> Normal:
         """Return what each run says beside its cavity, in units.
 
-        The moments are those over hypotheses, within each component of the belief; what is told in
-        the components counts by their shares. Moments over components would say with the run which
-        of them is true: a run that but prefers a known frame would be sure of it.
+        The moments are those over hypotheses and components, with the frame known and with it in
+        doubt apart; the two count by their shares. Moments over both would say with the run which
+        is true: a run that but prefers a known frame would be sure of it.
+        """
+        runs, size = len(judged.share), len(self.unit)
+        told = Normal(np.zeros((runs, size, size)), np.zeros((runs, size)))
+        for loose in np.unique(judged.loose):
+            some = np.flatnonzero(judged.loose == loose)
+            weight = judged.share[:, some].sum(axis=(1, 2))
+            site = self._moments(judged, covariance, some)
+            told.precision[...] += weight[:, None, None] * site.precision
+            told.shift[...] += weight[:, None] * site.shift
+        return told
+
+    def _moments(self, judged: Judged, covariance: FloatArray, some: IntArray) -> Normal:
+        """Return what each run says by the moments over some components, in units.
 
         A direction in which a run leaves more open than was believed before tells nothing.
         """
-        theta = np.stack([each.found.theta for each in judged.candidates], axis=1)
-        theta = (theta + self.here) / self.unit
-        share, cavity, (runs, count, _, size) = judged.share, judged.cavity, theta.shape
-        within, flat = share.sum(axis=-1), (runs * count, -1)
-        each = np.divide(
-            share,
-            within[..., None],
-            out=np.full_like(share, 1.0 / share.shape[-1]),
-            where=within[..., None] > 0.0,
-        )
-        mean, spread = mixed(
-            each.reshape(flat), theta.reshape(*flat, size), covariance.reshape(*flat, size, size)
-        )
-        precision = np.linalg.inv(spread)
-        shift = (precision @ mean[..., None])[..., 0] - cavity.shift.reshape(flat)
-        values, vectors = np.linalg.eigh(precision - cavity.precision.reshape(-1, size, size))
+        theta = np.stack([judged.candidates[c].found.theta for c in some], axis=1)
+        share = np.maximum(judged.share[:, some], np.finfo(float).tiny)
+        share = share / share.sum(axis=(1, 2), keepdims=True)
+        mean, spread = mixed(share, (theta + self.here) / self.unit, covariance[:, some])
+        cavity, precision = judged.cavity.only(some).matched(), np.linalg.inv(spread)
+        shift = (precision @ mean[..., None])[..., 0] - cavity.shift
+        values, vectors = np.linalg.eigh(precision - cavity.precision)
         told = np.swapaxes(vectors, -1, -2) * (values > 0.0)[..., None]
         site = np.swapaxes(told, -1, -2) @ (told * values[..., None])
-        along = (np.swapaxes(told, -1, -2) @ (told @ shift[..., None]))[..., 0]
-        return Normal(
-            np.einsum("rc,rctu->rtu", within, site.reshape(runs, count, size, size)),
-            np.einsum("rc,rct->rt", within, along.reshape(runs, count, size)),
-        )
+        along = np.swapaxes(told, -1, -2) @ (told @ shift[..., None])
+        return Normal(site, along[..., 0])

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from failuretwin.core.numerics import log_sum
-from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.shared_likelihood import Normal
 from failuretwin.inference.shared_unknowns import SharedComponent
 
@@ -60,6 +60,12 @@ class Belief:
     def __getitem__(self, component: int) -> Normal:
         """Return one component alone."""
         return Normal(self.precision[:, component], self.shift[:, component])
+
+    def only(self, components: IntArray) -> Belief:
+        """Return what is believed if one of some components is true."""
+        log_weight = self.log_weight[:, components]
+        log_weight = log_weight - log_sum(log_weight, axis=1)[:, None]
+        return Belief(log_weight, self.precision[:, components], self.shift[:, components])
 
     @property
     def weight(self) -> FloatArray:

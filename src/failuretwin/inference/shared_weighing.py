@@ -196,8 +196,9 @@ class SharedWeighing:
 
     @property
     def _suspects(self) -> range:
-        """Motors that may be faulty: all, or none where every hypothesis is that all is well."""
-        return range(0 if all(h.is_healthy for h in self.hypotheses) else self.layout.motors)
+        """Motors to look at: all, or none where all is well and the way is left aside."""
+        healthy = all(hypothesis.is_healthy for hypothesis in self.hypotheses)
+        return range(0 if healthy and self.likelihood.moving is None else self.layout.motors)
 
     @cached_property
     def broad(self) -> FloatArray:
