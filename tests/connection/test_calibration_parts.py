@@ -330,7 +330,7 @@ def test_settling_intervals_hold_the_truth(settle, armpi, readings, draws):
 def test_what_the_logs_do_not_say_keeps_its_prior(settle):
     fit = fit_settling(settle(TYPICAL, seed=3, movements=40)).fit
     share = fit.deviation / fit.prior_deviation
-    assert share[4] == pytest.approx(1.0, rel=1e-3)  # compliance of motor 1
+    assert share[4] == pytest.approx(1.0, rel=0.05)  # compliance of motor 1
     assert share[[5, 6, 7]].max() < 0.3
 
 

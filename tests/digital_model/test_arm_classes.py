@@ -106,9 +106,9 @@ def test_twice_the_mass_gives_way_the_same(tmp_path):
     np.testing.assert_allclose(heavy.compliance, np.divide(light.compliance, 2.0), rtol=1e-9)
 
 
-@pytest.mark.parametrize(("lower", "loaded"), [(0.006, True), (0.00003, False)])
+@pytest.mark.parametrize(("lower", "loaded"), [(0.06, True), (0.003, False)])
 def test_a_motor_that_bears_next_to_nothing_does_not_give_way(tmp_path, lower, loaded):
-    """Below a thousandth of the largest load; of 0.8 kg at 0.1 m, 0.8 g at 0.05 m is a half."""
+    """Below a hundredth of the largest load; of 0.8 kg at 0.1 m, 8 g at 0.05 m is a half."""
     settling = generic_imperfections(two_links(tmp_path, lower=lower)).settling
     assert (settling.compliance[1] > 0.0) is loaded
     if loaded:
