@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import needs_extra
 from failuretwin.core.foreign import reading
 from failuretwin.data_knowledge.bag_claims import check_chunks
 
@@ -113,14 +113,9 @@ def read_messages(path: Path, names: Sequence[str]) -> dict[str, list[BagMessage
 
 
 def _check_installed(path: Path) -> None:
-    try:
+    with needs_extra(f"{path}: ROS bags need rosbags", "files"):
         import rosbags.rosbag1
         import rosbags.rosbag2  # noqa: F401
-    except ImportError as error:
-        raise InputError(
-            f"{path}: ROS bags need rosbags ({error}). Install it: "
-            "pip install 'failuretwin[files]'."
-        ) from error
 
 
 def _guarded(path: Path) -> AbstractContextManager[None]:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.errors import InputError, needs_extra, unknown_name
 from failuretwin.core.foreign import as_cell, files_below, reading
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Movements, find_movements
@@ -113,15 +113,10 @@ def read_matlab_file(path: Path, robot: Robot, *, approximate: bool = False) -> 
 
 
 def _load(path: Path) -> dict[str, Any]:
-    try:
-        with warnings.catch_warnings():  # it sets a deprecated option of pandas when imported
-            warnings.simplefilter("ignore")
-            from matio import load_from_mat
-    except ImportError as error:
-        raise InputError(
-            f"{path}: MATLAB files need mat-io ({error}). Install it: "
-            "pip install 'failuretwin[files]'."
-        ) from error
+    # It sets a deprecated option of pandas when imported.
+    with needs_extra(f"{path}: MATLAB files need mat-io", "files"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from matio import load_from_mat
     with reading(path, "a MATLAB file"), path.open("rb") as file:
         newest = file.read(10) == b"MATLAB 7.3"
     if newest:

@@ -14,7 +14,7 @@ from itertools import islice
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, TypeVar
 
-from failuretwin.core.errors import FailureTwinError, InputError
+from failuretwin.core.errors import FailureTwinError, InputError, needs_extra
 from failuretwin.failure_behavior.registry import plugin_files
 
 if TYPE_CHECKING:
@@ -42,12 +42,8 @@ def dask_client(workers: int, scheduler: str | None) -> Iterator[Client]:
     Raises:
         InputError: If Dask is not installed, or the scheduler does not answer or has no workers.
     """
-    try:
+    with needs_extra("several workers need Dask", "cluster"):
         import distributed  # noqa: F401
-    except ImportError as error:
-        raise InputError(
-            f"several workers need Dask ({error}). Install it: pip install 'failuretwin[cluster]'."
-        ) from error
     cluster = _own_cluster(workers) if scheduler is None else _connected(scheduler)
     with _silence(), cluster as client:
         for path in plugin_files():

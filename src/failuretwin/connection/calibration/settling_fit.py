@@ -202,12 +202,11 @@ class SettlingFit:
         return tuple(found)
 
 
-def fit_settling(observations: Observations, passes: int = MOST_PASSES) -> SettlingFit:
+def fit_settling(observations: Observations) -> SettlingFit:
     """Fit where the motors of a healthy robot settle.
 
     Args:
         observations: Settled movements of healthy runs, and what is believed of the robot.
-        passes: Over the runs at most.
 
     Raises:
         InputError: If too few movements are left.
@@ -221,25 +220,22 @@ def fit_settling(observations: Observations, passes: int = MOST_PASSES) -> Settl
     told = weighing.parts
     unit = told[0].deviation
     together = RunsTogether.of(weighing, Belief.of(told, unit), unit)
-    return fitted_to(observations, together, passes)
+    return fitted_to(observations, together)
 
 
-def fitted_to(
-    observations: Observations, together: RunsTogether, passes: int = MOST_PASSES
-) -> SettlingFit:
+def fitted_to(observations: Observations, together: RunsTogether) -> SettlingFit:
     """Return what is learned from runs, one pass after the other until nothing moves.
 
     Args:
         observations: The movements.
         together: The same runs; they are learned from.
-        passes: Over the runs at most.
 
     Raises:
         InputError: If too few movements are left.
     """
     _refuse_few(len(observations), len(observations))
     rows, habits = np.arange(together.runs), _believed(together)
-    for count in range(passes):
+    for count in range(MOST_PASSES):
         before = together.here / together.unit, together.model.settling
         together.habits = habits if count >= WARMING else None
         sites, told = (1.0 if count <= first else DAMPING for first in (0, WARMING))

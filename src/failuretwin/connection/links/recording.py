@@ -84,14 +84,9 @@ class McapFile:
     """
 
     def __init__(self, path: Path) -> None:
-        try:
+        with needs_extra("recording needs mcap and rosbags", "live"):
             from mcap.writer import Writer
             from rosbags.typesys import Stores, get_typestore
-        except ImportError as error:
-            raise InputError(
-                f"recording needs mcap and rosbags ({error}). Install them: "
-                "pip install 'failuretwin[live]'."
-            ) from error
         self.path = path
         self._store = get_typestore(Stores.ROS2_HUMBLE)
         try:

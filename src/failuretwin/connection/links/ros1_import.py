@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.data_knowledge.bag_file import MONITORING_DEFINITION, message_fields
 from failuretwin.data_knowledge.bag_messages import STANDARD_TYPES, Kind, kind_of
 
@@ -119,13 +119,8 @@ class Decoder:
     """
 
     def __init__(self) -> None:
-        try:
+        with needs_extra("messages are decoded by rosbags", "live"):
             import rosbags.typesys  # noqa: F401
-        except ImportError as error:
-            raise InputError(
-                f"messages are decoded by rosbags ({error}). Install it: "
-                "pip install 'failuretwin[live]'."
-            ) from error
         self._types: dict[str, tuple[Any, str, Kind]] = {}
 
     def decode(self, message: Any) -> Decoded:

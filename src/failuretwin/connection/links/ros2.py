@@ -31,7 +31,7 @@ from failuretwin.connection.links.ros_messages import (
     RosTopics,
     RosWriter,
 )
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.data_knowledge.bag_messages import NS_PER_S, Role
 from failuretwin.digital_model.robot import Robot
 
@@ -64,12 +64,8 @@ def connect(host: str = "localhost", port: int = ROUTER_PORT) -> Any:
     Raises:
         InputError: If zenoh is missing or no router answers.
     """
-    try:
+    with needs_extra("ROS 2 needs eclipse-zenoh", "ros2"):
         import zenoh
-    except ImportError as error:
-        raise InputError(
-            f"ROS 2 needs eclipse-zenoh ({error}). Install it: pip install 'failuretwin[ros2]'."
-        ) from error
     config, endpoint = zenoh.Config(), f"tcp/{host}:{port}"
     settings = {
         "mode": "client",

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.data_knowledge.bag_file import MONITORING_DEFINITION, message_fields
 from failuretwin.data_knowledge.bag_messages import Kind, kind_of
 
@@ -46,13 +46,8 @@ class Ros2Types:
     """
 
     def __init__(self) -> None:
-        try:
+        with needs_extra("messages of ROS 2 need rosbags", "ros2"):
             from rosbags.typesys import Stores, get_typestore
-        except ImportError as error:
-            raise InputError(
-                f"messages of ROS 2 need rosbags ({error}). Install it: "
-                "pip install 'failuretwin[ros2]'."
-            ) from error
         self._store = get_typestore(Stores.ROS2_JAZZY)
 
     def known(self, type_: str) -> str:

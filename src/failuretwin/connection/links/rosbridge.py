@@ -17,7 +17,7 @@ from failuretwin.connection.links.ros_messages import (
     Outgoing,
     RosTopics,
 )
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.data_knowledge.bag_messages import Kind, Role, kind_of_type
 from failuretwin.digital_model.robot import Robot
 
@@ -41,12 +41,8 @@ def connect(host: str, port: int) -> Any:
     Raises:
         InputError: If roslibpy is missing or no server answers.
     """
-    try:
+    with needs_extra("rosbridge needs roslibpy", "live"):
         import roslibpy
-    except ImportError as error:
-        raise InputError(
-            f"rosbridge needs roslibpy ({error}). Install it: pip install 'failuretwin[live]'."
-        ) from error
     ros = roslibpy.Ros(host, port, transport="asyncio")
     ros.factory.set_max_delay(RECONNECT_S)
     ros.factory.on("ready", partial(_hear_status, ros.factory))
