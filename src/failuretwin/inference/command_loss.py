@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import Annotated, TypeVar
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.movements import Movements
@@ -74,10 +75,10 @@ class ConsecutiveLossHmm:
         chances = np.empty((runs, count, len(self.missed)))
         state = np.zeros((runs, len(self.missed)))
         state[:, 0] = 1.0
-        follows = self.transition.reshape(-1, self.transition.shape[-1])
+        follows = csr_array(self.transition.reshape(-1, len(self.missed)))  # one of each row
         for m in range(count):
             pairs = rates[:, m, :, None] * state[:, None]
-            chances[:, m] = state = pairs.reshape(runs, len(follows)) @ follows
+            chances[:, m] = state = pairs.reshape(runs, -1) @ follows
             if log_likelihood is not None:
                 says = np.where(state > 0.0, log_likelihood[:, m], -np.inf)
                 state = state * np.exp(says - says.max(axis=-1, keepdims=True))

@@ -246,15 +246,12 @@ class LifeFilter:
             return told
         window = self.window
         seen = window.given.evidence
-        names = np.array([str(hypothesis) for hypothesis in self.hypotheses])
         return {
             **told,
             **_fields("sites", window.sites),
             **_fields("told", window.told),
             **seen.to_arrays("seen"),
             "window": np.array(seen.usable.shape),
-            "names": names,
-            "start": window.start,
             "counted": window.counted,
             "here": window.here,
         }
@@ -289,8 +286,6 @@ class LifeFilter:
         window = found._together(seen)
         window.sites = Normal(arrays["sites/precision"], arrays["sites/shift"])
         window.told = _read(Habits, "told", arrays)
-        if arrays["names"].tolist() == [str(hypothesis) for hypothesis in self.hypotheses]:
-            window.start = arrays["start"]
         window.counted[:], window.here = arrays["counted"], arrays["here"]
         window.maximise()
         found.window = window
@@ -367,7 +362,7 @@ class LifeFilter:
         variance[REGISTRATION:] = 0.0
         odds = self.priors.setup.doubt / (1.0 - self.priors.setup.doubt)
         self.moved, self.base = True, self.base.or_moved(variance, odds)
-        window.base, window.start[:] = self.base, np.nan
+        window.base = self.base
         window.sites.precision[:], window.sites.shift[:] = 0.0, 0.0
         window.here = weighing.register_together()[0]
 
@@ -442,7 +437,7 @@ def _take(after: RunsTogether, rows: slice, before: RunsTogether, kept: slice) -
     """Take over what is known of some runs."""
     after.sites.precision[rows] = before.sites.precision[kept]
     after.sites.shift[rows] = before.sites.shift[kept]
-    after.start[rows], after.counted[rows] = before.start[kept], before.counted[kept]
+    after.counted[rows] = before.counted[kept]
     after.told.put(rows, before.told[kept])
     after.here = before.here
     after.maximise()

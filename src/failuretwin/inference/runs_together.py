@@ -22,27 +22,20 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.digital_model.nonidealities import Imperfections, LostCommand
-from failuretwin.failure_behavior.mode import Signature
-from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.evidence import TransientSamples
 from failuretwin.inference.habits import Habits
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.posterior import Posterior
+from failuretwin.inference.judged_runs import Judged
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.shared_belief import Belief, mixed, summed
 from failuretwin.inference.shared_likelihood import Normal
-from failuretwin.inference.shared_posterior import Mixture
 from failuretwin.inference.shared_unknowns import REGISTRATION, SharedLayout, offsets_of
 from failuretwin.inference.shared_weighing import (
     COARSE_TO_FINE,
     Candidate,
-    Expansion,
     SharedWeighing,
-    Weighed,
 )
 
 LEAST_SHARE = 1e-3
@@ -51,94 +44,6 @@ KNOWN_FRAME = 1e-3
 """Share of the largest precision of a frame below which it is in doubt; they lie millions apart."""
 CHUNK_RUNS = 64
 """Runs that are weighed at a time."""
-
-
-@dataclass(frozen=True)
-class Judged:
-    """What some of the runs say, each with its cavity.
-
-    Attributes:
-        rows: Which they are.
-        weighing: The runs.
-        cavity: What was believed without them, in units.
-        candidates: What was found with each component of that.
-        log_evidence: Log of weight times evidence, (run, candidate, hypothesis).
-        loose: Whether the frame of the sensor is in doubt with each, (candidate,).
-    """
-
-    rows: IntArray
-    weighing: SharedWeighing
-    cavity: Belief
-    candidates: Sequence[Candidate]
-    log_evidence: FloatArray
-    loose: BoolArray
-
-    @property
-    def share(self) -> FloatArray:
-        """Probability of each hypothesis with each candidate, (run, candidate, hypothesis)."""
-        height = self.log_evidence + self.weighing.log_odds
-        return np.exp(height - log_sum(height, axis=(1, 2))[:, None, None])
-
-    @property
-    def best(self) -> FloatArray:
-        """Best theta of each hypothesis beside where the runs are expanded, (run, h, theta)."""
-        theta = np.stack([each.found.theta for each in self.candidates], axis=1)
-        winner = np.argmax(self.log_evidence, axis=1)[:, None, :, None]
-        return np.take_along_axis(theta, winner, axis=1)[:, 0]
-
-    def posterior(self) -> Posterior:
-        """Return the posterior over hypotheses of each run."""
-        top = np.argmax(self.log_evidence, axis=1)[:, None]
-        first = np.arange(len(self.candidates))[None, :, None] == top
-        whole = log_sum(self.log_evidence, axis=1)[:, None]
-        table = np.where(first, whole, -np.inf)
-        return Mixture(self.weighing, self.candidates, table).posterior()
-
-    def habits(self, given: Imperfections, covariance: FloatArray, at: FloatArray) -> Habits:
-        """Return what the runs say of scatter and losses, (run, ...); faulty motors left out.
-
-        A motor that is held takes the others where healthy runs do not go, under loads that their
-        compliance is stretched to: what is left of those movements is not taken for scatter.
-
-        Args:
-            given: What was given of the robot.
-            covariance: Of theta under each hypothesis, (run, candidate, hypothesis, theta, theta).
-            at: Logarithms of scatter and tail that the runs were weighed with, (motor + 1,).
-        """
-        share, found = self.share, [each.found for each in self.candidates]
-        score = np.stack([each.scatter_score for each in found], axis=1)
-        slack = np.stack([each.scatter_slack for each in found], axis=1)
-        score[..., :-1] += np.einsum("rchntu,rchtu->rchn", slack, covariance, optimize=True)
-        told = np.stack([each.scatter_information for each in found], axis=1)
-        free = share * [not _holds(hypothesis) for hypothesis in self.weighing.hypotheses]
-        precision = np.einsum("rch,rchnk->rnk", free, told)
-        shift = np.einsum("rch,rchn->rn", free, score) + precision @ at
-        outcomes = sum(share[:, c, :, None, None] * each.outcomes for c, each in enumerate(found))
-        losses = [self._losses(entry, np.asarray(outcomes)) for entry in given.lost_commands]
-        shape = (len(share), len(losses), 2, 2)
-        stacked = np.stack(losses, axis=1) if losses else np.zeros(0)
-        return Habits(precision, shift, np.reshape(stacked, shape))
-
-    def _losses(self, entry: LostCommand, outcomes: FloatArray) -> FloatArray:
-        """Return how often some motors lose a command, punctual and late, (run, 2, 2)."""
-        likelihood = self.weighing.likelihood
-        names, late = likelihood.model.motor_names, likelihood.late
-        lost = np.isin(names, entry.motors)
-        patterns = self.candidates[0].found.expansion.response.usual.lost
-        told = np.zeros((len(outcomes), 2, 2))
-        for h, hypothesis in enumerate(self.weighing.hypotheses):
-            faulty = np.isin(names, [fault.motor for fault in hypothesis.faults])
-            if (lost & faulty).any():
-                continue
-            hit = (patterns[:, ~faulty] == lost[~faulty]).all(axis=1)
-            for k, kind in enumerate((1.0 - late, late)):
-                told[:, k, 0] += (outcomes[:, h][..., hit].sum(axis=-1) * kind).sum(axis=1)
-                told[:, k, 1] += (outcomes[:, h].sum(axis=-1) * kind).sum(axis=1)
-        return told
-
-
-def _holds(hypothesis: Hypothesis) -> bool:
-    return any(MODES[fault.mode].signature is Signature.HELD for fault in hypothesis.faults)
 
 
 @dataclass
@@ -156,7 +61,6 @@ class RunsTogether:
         here: Where runs are expanded, (theta,).
         habits: What is believed of scatter and losses without these runs; None: they are known.
         told: What each run says of them.
-        start: Where to search for the best theta of each, (run, hypothesis, theta); NaN: not known.
         counted: Whether others are judged with what each says, (run,).
         model: The healthy robot with scatter and rates that were learned.
     """
@@ -171,7 +75,6 @@ class RunsTogether:
     here: FloatArray
     habits: Habits | None
     told: Habits
-    start: FloatArray
     counted: BoolArray
     model: HealthyModel = field(init=False)
 
@@ -202,7 +105,6 @@ class RunsTogether:
             np.zeros(size),
             Habits.believed(given) if learns else None,
             Habits.none(runs, given),
-            np.full((runs, len(weighing.hypotheses), size), np.nan),
             np.ones(runs, dtype=bool),
         )
 
@@ -238,7 +140,6 @@ class RunsTogether:
             given=self.given[rows],
             sites=Normal(self.sites.precision[rows], self.sites.shift[rows]),
             told=self.told[rows],
-            start=self.start[rows],
             counted=self.counted[rows],
         )
 
@@ -253,7 +154,7 @@ class RunsTogether:
         return [self._judge(rows[p], None if moving is None else moving[p]) for p in parts]
 
     def learn(self, found: Sequence[Judged], damping: float = 1.0, of_habits: float = 1.0) -> None:
-        """Take in what runs say: sites, where to search for them, scatter, rates.
+        """Take in what runs say: sites, scatter, rates.
 
         Args:
             found: What they say.
@@ -266,7 +167,6 @@ class RunsTogether:
             old = Normal(self.sites.precision[rows], self.sites.shift[rows])
             self.sites.precision[rows] += damping * (site.precision - old.precision)
             self.sites.shift[rows] += damping * (site.shift - old.shift)
-            self.start[rows] = judged.best + self.here
             if self.habits is not None:
                 covariance = covariance * np.outer(self.unit, self.unit)
                 given = self.given.model.imperfections
@@ -331,9 +231,9 @@ class RunsTogether:
         place = np.tile(self.here, (len(rows), 1))
         place[:, REGISTRATION:] = 0.0
         at = weighing.expand(np.arange(len(rows)), place)
-        starts = self._starts(weighing, rows, place, cavity)
+        start = self._start(weighing, rows, place)
         asked = np.flatnonzero((cavity.weight > LEAST_SHARE).any(axis=0))
-        found = [self._search(weighing, at, self._local(cavity[int(c)]), starts) for c in asked]
+        found = [weighing.search(at, self._local(cavity[int(c)]), start) for c in asked]
         candidates = [Candidate(0, np.arange(len(rows)), each) for each in found]
         height = np.stack([each.log_evidence for each in found], axis=1)
         height += cavity.log_weight[:, asked, None]
@@ -351,24 +251,18 @@ class RunsTogether:
         known = self.base.precision[0, :, 0, 0]
         return np.asarray(known < KNOWN_FRAME * known.max())
 
-    @staticmethod
-    def _search(
-        weighing: SharedWeighing, at: Expansion, prior: Normal, starts: Sequence[FloatArray]
-    ) -> Weighed:
-        found = [weighing.search(at, prior, start) for start in starts]
-        return found[0] if len(found) == 1 else found[0].better(found[1])
+    def _start(self, weighing: SharedWeighing, rows: IntArray, place: FloatArray) -> FloatArray:
+        """Return where to search, (run, theta) or (run, hypothesis, theta).
 
-    def _starts(
-        self, weighing: SharedWeighing, rows: IntArray, place: FloatArray, cavity: Belief
-    ) -> list[FloatArray]:
-        """Return where to search: where it was found before, else where it is found coarsely."""
-        before = self.start[rows] - self.here
-        if np.isfinite(before).all():
-            return [before]
+        At the mean of what is believed; of runs that say something for the first time, where each
+        hypothesis is found coarsely.
+        """
+        prior = self._local(self._cavity(rows).matched())
+        if self.sites.precision[rows].any(axis=(1, 2)).all():
+            return prior.mean
         untold = COARSE_TO_FINE[1] * weighing.likelihood.model.twin.robot.reach
         coarse = weighing.expand(np.arange(len(rows)), place, untold)
-        prior = self._local(cavity.matched())
-        return [weighing.search(coarse, prior, np.zeros_like(place)).theta]
+        return weighing.search(coarse, prior, np.zeros_like(place)).theta
 
     def _covariance(self, judged: Judged) -> FloatArray:
         """Return that of theta in units, (run, candidate, hypothesis, theta, theta)."""

@@ -1,33 +1,78 @@
-"""What movements say of how far motors scatter: score and information of logarithms.
+"""What movements say of how far motors scatter and of which commands were lost.
 
-Of the scale of each motor's scatter, and of the degrees of freedom that they have in common.
+Score and information of the logarithms of each motor's scatter, and of the degrees of freedom that
+they have in common.
 
 Section: docs/shared_unknowns.md
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import digamma, polygamma
 
+from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.inference.counted_outcomes import CountedOutcomes
-from failuretwin.inference.linear_response import Whitened
+from failuretwin.inference.explained_movements import (
+    ExplainedMovements,
+    OwnAngle,
+    explained,
+    mean_pull,
+    pull_of,
+)
+from failuretwin.inference.linear_response import LinearResponse, Whitened
+from failuretwin.inference.priors import Priors
 
 
-def scatter_sums(
-    counted: CountedOutcomes,
-    seen: Whitened,
-    off: FloatArray,
-    unknown: FloatArray,
-    square: FloatArray,
-    weight: FloatArray,
-    scatter: FloatArray,
-    nu: float,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return score, information and slack of the logarithms of each motor's scatter, and of nu.
+@dataclass(frozen=True)
+class ScatterTold:
+    """What some runs say of scatter and lost commands under one hypothesis, at one theta.
+
+    Attributes:
+        score: Derivative of the log likelihood by the logarithms of the scatter of each motor and
+            of its degrees of freedom, (run, motor + 1); a faulty motor says nothing of its own.
+        information: Expected information about these, (run, motor + 1, motor + 1).
+        slack: What a covariance C of theta adds to the score of scatters, tr(slack C),
+            (run, motor, theta, theta): theta was fitted to the same movements.
+        outcomes: Expected share of each outcome of each movement, (run, movement, outcome).
+    """
+
+    score: FloatArray
+    information: FloatArray
+    slack: FloatArray
+    outcomes: FloatArray
+
+    def __add__(self, other: ScatterTold) -> ScatterTold:
+        return ScatterTold(
+            self.score + other.score,
+            self.information + other.information,
+            self.slack + other.slack,
+            self.outcomes + other.outcomes,
+        )
+
+
+def told_of_scatter(
+    response: LinearResponse, hypothesis: Hypothesis, priors: Priors, theta: FloatArray
+) -> ScatterTold:
+    """Return what settled positions say of scatter and lost commands under a hypothesis.
+
+    Args:
+        response: The runs.
+        hypothesis: What may be the case; one that `has_score`.
+        priors: Beliefs about onset and size.
+        theta: Beside the theta of the response, (run, theta).
+    """
+    runs = explained(response, hypothesis, priors, theta)
+    scatter, nu = response.model.scatter, response.model.settling.tail_dof
+    first, *rest = (_told(some, scatter, nu) for some in runs.movements)
+    return sum(rest, first)
+
+
+def _told(movements: ExplainedMovements, scatter: FloatArray, nu: float) -> ScatterTold:
+    """Return what movements say of the logarithms of each motor's scatter, and of nu.
 
     With a = s^2 lambda^T lambda, p = 3 axes, u as of `pull_of`, residuals of mean rho and
     covariance d d^T, D^2 their mean square, and G = S (Lambda^T Lambda - Lambda^T d d^T Lambda) S,
@@ -44,17 +89,19 @@ def scatter_sums(
     and column are those of nu; with nu infinite they are 0. Slack is that of the scatter alone.
 
     Args:
-        counted: The outcomes that count.
-        seen: Their columns and levers.
-        off: rho, (counted, 3).
-        unknown: d, same shape: what is not known of them.
-        square: |rho|^2, (counted,).
-        weight: How much each counts, (counted,).
-        scatter: Scale of each motor's scatter, (motor,) [rad]; 0: it tells nothing.
+        movements: The movements.
+        scatter: Scale of each motor's scatter, (motor,) [rad].
         nu: Degrees of freedom of the scatter.
     """
+    counted, weight, seen = movements.counted, movements.share, movements.seen
+    off, unknown, own_angle = movements.off, np.zeros_like(movements.off), movements.own
+    if own_angle is not None:
+        scatter = np.where(np.arange(len(scatter)) == own_angle.motor, 0.0, scatter)
+        off = off - own_angle.lever * own_angle.beyond[:, None]
+        unknown = own_angle.lever * np.sqrt(own_angle.doubt)[:, None]
+        seen = _with_own(seen, own_angle)
     motors, dims = len(scatter), seen.dims
-    square = square + np.einsum("ck,ck->c", unknown, unknown)
+    square = movements.square + np.einsum("ck,ck->c", unknown, unknown)
     u = pull_of(square, nu, dims)
     levers = seen.levers * scatter
     transposed = np.swapaxes(levers, -1, -2)
@@ -71,7 +118,6 @@ def scatter_sums(
     information = np.zeros((counted.runs, motors + 1, motors + 1))
     information[:, :motors, :motors] = counted.total(told * weight[:, None, None])
     along = np.matmul(transposed, seen.gamma) * np.sqrt(u * weight)[:, None, None]
-    slack = counted.total(along[..., :, None] * along[..., None, :])
     tail = np.zeros_like(square)
     if np.isfinite(nu):
         tail, each = _tail_score(square, nu, dims)
@@ -79,8 +125,13 @@ def scatter_sums(
         information[:, motors, motors] = counted.total(each * weight)
         information[:, :motors, motors] = counted.total(crossed * weight[:, None])
         information[:, motors, :motors] = information[:, :motors, motors]
-    whole = np.concatenate([score, (tail * weight)[:, None]], axis=1)
-    return counted.total(whole), information, slack
+    whole = counted.total(np.concatenate([score, (tail * weight)[:, None]], axis=1))
+    return ScatterTold(whole, information, _slack(counted, along), movements.weight)
+
+
+def _slack(counted: CountedOutcomes, along: FloatArray) -> FloatArray:
+    """Return the sum of outer products of (counted, motor, theta), (run, motor, theta, theta)."""
+    return counted.total(along[..., :, None] * along[..., None, :])
 
 
 def _tail_score(square: FloatArray, nu: float, dims: int) -> tuple[FloatArray, float]:
@@ -92,29 +143,10 @@ def _tail_score(square: FloatArray, nu: float, dims: int) -> tuple[FloatArray, f
     return half * slope, float(each - dims * (whole + 4.0) * nu / (2.0 * whole * (whole + 2.0)))
 
 
-def with_own(
-    seen: Whitened, motor: int, own: FloatArray, precision: FloatArray, left: FloatArray
-) -> Whitened:
-    """Return columns and levers with what a motor itself makes up for, its own scatter counted.
-
-    Args:
-        seen: The same without.
-        motor: The motor.
-        own: Its lever in units of all scatter, (..., channel).
-        precision: P, (...) [1/rad2].
-        left: By how much its angle is off for each theta, (..., theta).
-    """
-    lever = seen.levers[..., motor]
-    along = np.matmul(lever[..., None, :], seen.levers) / precision[..., None, None]
-    levers = seen.levers - (lever - own)[..., None] * along
-    return replace(seen, levers=levers, gamma=seen.gamma + own[..., None] * left[..., None, :])
-
-
-def pull_of(square: FloatArray, nu: float, dims: int) -> FloatArray:
-    """Return u, the weight that a Student t gives a deviation of squared distance D^2."""
-    return np.ones_like(square) if np.isinf(nu) else (nu + dims) / (nu + square)
-
-
-def mean_pull(nu: float, dims: int) -> float:
-    """Return what the information of a Student t is of that of a normal with its scale."""
-    return 1.0 if np.isinf(nu) else (nu + dims) / (nu + dims + 2.0)
+def _with_own(seen: Whitened, own: OwnAngle) -> Whitened:
+    """Return columns and levers with what a motor itself makes up for, its own scatter counted."""
+    lever = seen.levers[..., own.motor]
+    along = np.matmul(lever[..., None, :], seen.levers) / own.precision[..., None, None]
+    levers = seen.levers - (lever - own.lever)[..., None] * along
+    gamma = seen.gamma + own.lever[..., None] * own.left[..., None, :]
+    return replace(seen, levers=levers, gamma=gamma)

@@ -8,36 +8,30 @@ faulty motor takes away. With weights w of outcomes and states, u = (nu + d)/(nu
 
     b = sum w u Gamma^T rho,    A = sum w (nu + d)/(nu + d + 2) Gamma^T Gamma - missing
 
-A motor with an active fault says nothing of its own offsets. An angle that holds for the run is
-common to its movements; an offset that is drawn anew takes away all along its lever.
+A motor with an active fault says nothing of its own offsets.
 
 Section: docs/shared_unknowns.md
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.counted_outcomes import CountedOutcomes
-from failuretwin.inference.joint_likelihood import LEAST_PRECISION
-from failuretwin.inference.linear_response import LinearResponse, Whitened
-from failuretwin.inference.marginal import (
-    ChangePointPosterior,
-    FaultModel,
-    change_points,
-    movement_log_likelihoods,
+from failuretwin.inference.explained_movements import (
+    ExplainedMovements,
+    explained,
+    mean_pull,
+    pull_of,
 )
-from failuretwin.inference.posterior import fault_model_of
+from failuretwin.inference.linear_response import LinearResponse
 from failuretwin.inference.priors import Priors
-from failuretwin.inference.run_likelihood import RunLikelihood, share_of
-from failuretwin.inference.scatter_score import mean_pull, pull_of, scatter_sums, with_own
 
 
 @dataclass(frozen=True)
@@ -50,12 +44,6 @@ class LocalLikelihood:
         score: b, (run, theta).
         information: A, (run, theta, theta).
         misfit: Mean D^2 of what is explained, (run,); 3 if all is well.
-        scatter_score: Derivative of L by the logarithms of the scatter of each motor and of its
-            degrees of freedom, (run, motor + 1); a faulty motor says nothing of its own.
-        scatter_information: Expected information about these, (run, motor + 1, motor + 1).
-        scatter_slack: What a covariance C of theta adds to the score of scatters, tr(slack C),
-            (run, motor, theta, theta): theta was fitted to the same movements.
-        outcomes: Expected share of each outcome of each movement, (run, movement, outcome).
     """
 
     theta: FloatArray
@@ -63,10 +51,6 @@ class LocalLikelihood:
     score: FloatArray
     information: FloatArray
     misfit: FloatArray
-    scatter_score: FloatArray
-    scatter_information: FloatArray
-    scatter_slack: FloatArray
-    outcomes: FloatArray
 
     def __getitem__(self, rows: IntArray) -> LocalLikelihood:
         """Return that of some of the runs alone."""
@@ -74,74 +58,12 @@ class LocalLikelihood:
 
     def with_rows(self, rows: IntArray, some: LocalLikelihood) -> LocalLikelihood:
         """Return the same with that of some of the runs replaced."""
-
-        def replaced(name: str) -> FloatArray:
-            values = np.array(getattr(self, name))
-            values[rows] = getattr(some, name)
-            return values
-
-        return LocalLikelihood(*(replaced(field.name) for field in fields(self)))
-
-
-def local_likelihood(
-    response: LinearResponse, hypothesis: Hypothesis, priors: Priors, theta: FloatArray
-) -> LocalLikelihood:
-    """Return what settled positions say of a hypothesis near theta.
-
-    Args:
-        response: The runs.
-        hypothesis: What may be the case; one that `has_score`.
-        priors: Beliefs about onset and size.
-        theta: Beside the theta of the response, (run, theta).
-    """
-    if hypothesis.is_healthy:
-        likelihood = response.at(theta, ())
-        sums = _healthy_sums(response, likelihood, theta, np.ones(likelihood.usable.shape))
-        return sums.local(theta, likelihood.log_healthy.sum(axis=1), likelihood.usable)
-    motor = response.model.motor_names.index(hypothesis.faults[0].motor)
-    likelihood = response.at(theta, (motor,))
-    fault_model = fault_model_of(likelihood, hypothesis.faults[0], priors)
-    says = movement_log_likelihoods(likelihood, fault_model)
-    joint = change_points(likelihood.log_healthy, says.by_cell, fault_model.log_prior)
-    found = ChangePointPosterior.of(joint)
-    active = np.cumsum(np.exp(found.log_responsibility), axis=1)  # (run, movement, cell)
-    faulty = np.clip(active.sum(axis=-1), 0.0, 1.0)
-    sums = _healthy_sums(response, likelihood, theta, 1.0 - faulty)
-    sums += _faulty_sums(response, likelihood, fault_model, theta, active, says.by_node)
-    return sums.local(theta, found.log_evidence, likelihood.usable)
+        names = [field.name for field in fields(self)]
+        return LocalLikelihood(*(_put(getattr(self, n), rows, getattr(some, n)) for n in names))
 
 
 OUTLYING = 100.0
 """Squared distance that stands for "nowhere near" when the fit of a run is judged."""
-
-
-@dataclass(frozen=True)
-class _Sums:
-    """Sums over the movements of each run: b, A, D^2 and scatter; and the weights of outcomes."""
-
-    score: FloatArray
-    information: FloatArray
-    square: FloatArray
-    scatter_score: FloatArray
-    scatter_information: FloatArray
-    scatter_slack: FloatArray
-    weight: FloatArray
-
-    def __add__(self, other: _Sums) -> _Sums:
-        both = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
-        return _Sums(*(one + two for one, two in both))
-
-    def local(
-        self, theta: FloatArray, log_likelihood: FloatArray, usable: BoolArray
-    ) -> LocalLikelihood:
-        """Return the local likelihood that has these sums."""
-        count = np.maximum(usable.sum(axis=1), 1)
-        explained = self.weight.sum(axis=(1, 2))
-        misfit = (self.square + OUTLYING * (count - explained)) / count
-        spread = (self.scatter_score, self.scatter_information, self.scatter_slack)
-        return LocalLikelihood(
-            theta, log_likelihood, self.score, self.information, misfit, *spread, self.weight
-        )
 
 
 def has_score(hypothesis: Hypothesis) -> bool:
@@ -156,182 +78,44 @@ def has_score(hypothesis: Hypothesis) -> bool:
     return not set(signatures) & {Signature.TRANSIENT, Signature.MISSED}
 
 
-def _healthy_sums(
-    response: LinearResponse, likelihood: RunLikelihood, theta: FloatArray, share: FloatArray
-) -> _Sums:
-    """Return the sums of movements that are healthy with some probability, (run, movement)."""
-    model = response.model
-    weight = likelihood.outcome_probability * share[..., None]
-    counted = CountedOutcomes.of(weight)
-    seen = counted.seen(response.healthy)
-    off = seen.off(theta[counted.run])
-    square, nu = np.einsum("ck,ck->c", off, off), model.settling.tail_dof
-    known, shares = np.zeros_like(off), counted(weight)
-    spread = scatter_sums(counted, seen, off, known, square, shares, model.scatter, nu)
-    told = _theta_sums(counted, seen, off, square, shares, nu)
-    return _Sums(*told, counted.total(square * shares), *spread, weight)
-
-
-def _theta_sums(
-    counted: CountedOutcomes,
-    seen: Whitened,
-    off: FloatArray,
-    square: FloatArray,
-    weight: FloatArray,
-    nu: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Return score (run, theta) and information (run, theta, theta) of some movements.
-
-    Args:
-        counted: The outcomes that count.
-        seen: Their residuals and columns.
-        off: Residuals at theta, (counted, 3).
-        square: D^2, (counted,).
-        weight: How much each counts, (counted,).
-        nu: Degrees of freedom of the scatter.
-    """
-    pulled = (pull_of(square, nu, seen.dims) * weight)[:, None] * off
-    score = np.matmul(pulled[:, None], seen.gamma)[:, 0]
-    scaled = seen.gamma * np.sqrt(mean_pull(nu, seen.dims) * weight)[:, None, None]
-    information = np.matmul(np.swapaxes(scaled, -1, -2), scaled)
-    return counted.total(score), counted.total(information)
-
-
-def _faulty_sums(
-    response: LinearResponse,
-    likelihood: RunLikelihood,
-    fault_model: FaultModel,
-    theta: FloatArray,
-    active: FloatArray,
-    by_node: FloatArray,
-) -> _Sums:
-    """Return the sums of movements that are faulty with some probability.
+def local_likelihood(
+    response: LinearResponse, hypothesis: Hypothesis, priors: Priors, theta: FloatArray
+) -> LocalLikelihood:
+    """Return what settled positions say of a hypothesis near theta.
 
     Args:
         response: The runs.
-        likelihood: The same at theta.
-        fault_model: The fault.
+        hypothesis: What may be the case; one that `has_score`.
+        priors: Beliefs about onset and size.
         theta: Beside the theta of the response, (run, theta).
-        active: Probability that each movement is faulty, by cell of what is unknown,
-            (run, movement, cell).
-        by_node: Log density of each settled position at each node, (run, movement, node).
     """
-    motor, nu = response.motors[fault_model.motor], response.model.settling.tail_dof
-    profile = likelihood.profile(fault_model.motor)
-    if fault_model.redrawn is not None:
-        log_share = by_node[:, :, None] + fault_model.redrawn
-        angle, variance = _redrawn_angle(fault_model, log_share, active, profile.mode.shape)
-    else:
-        angle, variance, slope = _common_angle(fault_model, active, profile.mode.shape)
-    precision = np.maximum(profile.precision, LEAST_PRECISION)
-    loose = 1.0 / profile.inflation(fault_model.held)
-    terms = profile.log_terms(angle, fault_model.held)
-    weight = share_of(terms, profile.outlier, profile.usable)
-    weight = weight * np.clip(active.sum(axis=-1), 0.0, 1.0)[..., None]
-    counted = CountedOutcomes.of(weight)
-    seen, shares = counted.seen(motor.seen), counted(weight)
-    precision, loose, lever = counted(precision), counted(loose), counted(motor.lever)
-    beyond = counted(profile.turned(angle - profile.mode))
-    off, doubt = seen.off(theta[counted.run]), counted(variance)
-    square = np.einsum("ck,ck->c", off, off) + loose * precision * beyond**2
-    others = np.where(
-        np.arange(response.layout.motors) == fault_model.motor, 0.0, response.model.scatter
-    )
-    pull = pull_of(square, nu, seen.dims) * shares * loose
-    mean = mean_pull(nu, seen.dims) * shares * loose
-    if fault_model.redrawn is None:
-        left = _left_along(counted, lever, mean, precision, counted(slope))
-        scaled = left * np.sqrt(mean * precision)[:, None]
-    else:
-        known = np.clip(1.0 - loose * precision * doubt, 0.0, 1.0)
-        left = lever * (known / precision)[:, None]
-        scaled = lever * np.sqrt(mean * known / precision)[:, None]
-    own = seen.levers[..., fault_model.motor] * np.sqrt(loose)[:, None]
-    turned = off - own * beyond[:, None]
-    unknown = own * np.sqrt(doubt)[:, None]
-    whole = with_own(seen, fault_model.motor, own, precision, left)
-    spread = scatter_sums(counted, whole, turned, unknown, square, shares, others, nu)
-    score, information = _theta_sums(counted, seen, off, square, shares, nu)
-    score = score - counted.total((pull * beyond)[:, None] * lever)
-    information = information + counted.total(scaled[:, :, None] * scaled[:, None])
-    return _Sums(score, information, counted.total(square * shares), *spread, weight)
+    runs = explained(response, hypothesis, priors, theta)
+    nu, size = response.model.settling.tail_dof, theta.shape[1]
+    score, information = np.zeros_like(theta), np.zeros((len(theta), size, size))
+    square, sound = np.zeros(len(theta)), np.zeros(len(theta))
+    for some in runs.movements:
+        told = _theta_sums(some, nu)
+        score, information = score + told[0], information + told[1]
+        square = square + some.counted.total(some.square * some.share)
+        sound = sound + some.weight.sum(axis=(1, 2))
+    count = np.maximum(runs.usable.sum(axis=1), 1)
+    misfit = (square + OUTLYING * (count - sound)) / count
+    return LocalLikelihood(theta, runs.log_likelihood, score, information, misfit)
 
 
-def _left_along(
-    counted: CountedOutcomes,
-    lever: FloatArray,
-    weight: FloatArray,
-    precision: FloatArray,
-    gain: FloatArray,
-) -> FloatArray:
-    """Return by how much a motor's angles are off for each theta, where one amount is common.
-
-    With c = lambda^T Gamma and slopes s of the angle by the amount,
-
-        left = c / P - s (sum w s c) / sum w P s^2
-
-    Args:
-        counted: The outcomes that count.
-        lever: c, (counted, theta).
-        weight: w, (counted,).
-        precision: P, (counted,) [1/rad2].
-        gain: s, (counted,).
-
-    Returns:
-        (counted, theta).
-    """
-    common = counted.total((weight * gain)[:, None] * lever)
-    total = counted.total(weight * precision * gain**2)
-    shift = common / np.maximum(total, 1e-12)[:, None]
-    return np.asarray(lever / precision[:, None] - gain[:, None] * shift[counted.run])
-
-
-def _common_angle(
-    fault_model: FaultModel, active: FloatArray, shape: tuple[int, ...]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return mean and variance of each angle and its slope by what is common, (..., outcome).
-
-    The slope is that of the regression of the angle on the size over the nodes.
-
-    Args:
-        fault_model: The fault.
-        active: Probability that each movement is faulty with each node, (run, movement, node).
-        shape: Runs, movements and outcomes.
-    """
-    total = active.sum(axis=-1, keepdims=True)
-    even = np.full_like(active, 1.0 / active.shape[-1])
-    share = np.where(total > 1e-9, active / np.maximum(total, 1e-9), even)
-    size = np.broadcast_to(fault_model.size, (len(active), active.shape[-1]))
-    angle = np.broadcast_to(fault_model.angle, (*shape[:2], active.shape[-1], shape[2]))
-    mean = np.einsum("rmn,rmna->rma", share, angle)
-    spread = np.einsum("rmn,rmna->rma", share, (angle - mean[:, :, None]) ** 2)
-    if fault_model.held:
-        return mean, spread, np.ones_like(mean)
-    centre = np.einsum("rmn,rn->rm", share, size)
-    away = size[:, None] - centre[..., None]
-    covariance = np.einsum("rmn,rmna->rma", share * away, angle)
-    variance = np.maximum(np.einsum("rmn,rmn->rm", share, away**2), 1e-18)
-    return mean, spread, covariance / variance[..., None]
-
-
-def _redrawn_angle(
-    fault_model: FaultModel, joint: FloatArray, active: FloatArray, shape: tuple[int, ...]
-) -> tuple[FloatArray, FloatArray]:
-    """Return mean and variance of an angle that each movement draws anew, (..., outcome).
-
-    Args:
-        fault_model: The fault.
-        joint: Log weight times density of each settled position at each node of each group,
-            (run, movement, group, node).
-        active: Probability that each movement is faulty with each group, (run, movement, group).
-        shape: Runs, movements and outcomes.
-    """
-    share = np.exp(joint - log_sum(joint, axis=-1)[..., None])
-    share = np.einsum("rmg,rmgn->rmn", active + 1e-12, share)
-    share /= share.sum(axis=-1, keepdims=True)
-    angle = np.broadcast_to(fault_model.angle, (*shape[:2], share.shape[-1], shape[2]))
-    mean = np.einsum("rmn,rmna->rma", share, angle)
-    return mean, np.einsum("rmn,rmna->rma", share, (angle - mean[:, :, None]) ** 2)
+def _theta_sums(some: ExplainedMovements, nu: float) -> tuple[FloatArray, FloatArray]:
+    """Return score (run, theta) and information (run, theta, theta) of some movements."""
+    counted, seen = some.counted, some.seen
+    pull = pull_of(some.square, nu, seen.dims) * some.share
+    root = np.sqrt(mean_pull(nu, seen.dims) * some.share)
+    score = np.matmul((pull[:, None] * some.off)[:, None], seen.gamma)[:, 0]
+    scaled = seen.gamma * root[:, None, None]
+    information = np.matmul(np.swapaxes(scaled, -1, -2), scaled)
+    if some.own is not None:
+        told = some.own.told * root[:, None]
+        score = score - pull[:, None] * some.own.pull
+        information = information + told[:, :, None] * told[:, None]
+    return counted.total(score), counted.total(information)
 
 
 # A normal distribution of theta times a local likelihood: its integral and what is left of it.
@@ -348,6 +132,10 @@ class Normal:
 
     precision: FloatArray
     shift: FloatArray
+
+    def __getitem__(self, rows: IntArray) -> Normal:
+        """Return those of some of the runs."""
+        return Normal(self.precision[rows], self.shift[rows])
 
     @property
     def mean(self) -> FloatArray:
@@ -366,78 +154,142 @@ class Normal:
         return 0.5 * (np.linalg.slogdet(self.precision)[1] - square)
 
 
-def integrated(prior: Normal, says: LocalLikelihood) -> FloatArray:
-    """Return log of the integral of prior times likelihood over theta, by Laplace's method, (run,).
+# Searching for the most probable theta of each hypothesis.
 
-    L + log N(theta; prior) - 1/2 log |P^-1 + A| + 1/2 log |P^-1|, with `says` at the best theta
+FOUND_NATS = 0.1
+"""What a step promises or brings, below which it is not made: the promise itself is counted."""
+STEPS, MOST_STEPS = 2, 8
+"""Newton steps, and those at most of what is far off, such as a zero that nobody has measured."""
+RISING_NATS = 2.0
+"""What promises more is far off: where all is an outlier, a promise says little of what comes."""
+HOPELESS_NATS = 20.0
+"""Hypotheses that are not far off and would be so much less probable than another are left."""
+SHORTEST = 0.2
+"""A step that does not rise is halved, until it is shorter than this share of it."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What some runs say of one hypothesis with theta normal, by Laplace's method.
+
+    Attributes:
+        says: The likelihood where it was evaluated last.
+        top: Where prior times likelihood is highest, to second order, (run, theta).
+        promised: By how much it is higher there, (run,) [nats].
+        height: Log of prior times likelihood where it was evaluated, (run,).
+        width: 1/2 log |P^-1 + A|, (run,).
     """
-    posterior = np.linalg.slogdet(prior.precision + says.information)[1]
-    return says.log_likelihood + prior.log_density(says.theta) - 0.5 * posterior
 
+    says: LocalLikelihood
+    top: FloatArray
+    promised: FloatArray
+    height: FloatArray
+    width: FloatArray
 
-NEWTON_STEPS = 2
-"""Steps towards the best theta; more change nothing in the mean."""
-RISING_NATS, TIMES_MORE = 2.0, 3
-"""Runs whose last step has gained more are followed on, so many times as far at most: what is far
-off, such as a zero that nobody has measured, is not reached in two steps."""
+    @classmethod
+    def of(cls, prior: Normal, says: LocalLikelihood) -> Fit:
+        """Return what a likelihood says with theta normal."""
+        height = says.log_likelihood + prior.log_density(says.theta)
+        pulled = prior.shift - np.einsum("rtu,ru->rt", prior.precision, says.theta)
+        slope, precision = says.score + pulled, prior.precision + says.information
+        step = np.linalg.solve(precision, slope[..., None])[..., 0]
+        promised = 0.5 * np.einsum("rt,rt->r", slope, step)
+        curved = 0.5 * np.linalg.slogdet(precision)[1]
+        return cls(says, says.theta + step, promised, height, curved)
+
+    def __getitem__(self, rows: IntArray) -> Fit:
+        """Return that of some of the runs."""
+        rest = (getattr(self, field.name)[rows] for field in fields(self)[1:])
+        return Fit(self.says[rows], *rest)
+
+    def with_rows(self, rows: IntArray, some: Fit) -> Fit:
+        """Return the same with that of some of the runs replaced."""
+        names = [field.name for field in fields(self)[1:]]
+        rest = (_put(getattr(self, name), rows, getattr(some, name)) for name in names)
+        return Fit(self.says.with_rows(rows, some.says), *rest)
+
+    @property
+    def found(self) -> BoolArray:
+        """Whether the top is so near that it is known to second order, (run,)."""
+        return np.asarray(self.promised < FOUND_NATS)
+
+    @property
+    def theta(self) -> FloatArray:
+        """The best theta that is known, (run, theta)."""
+        return np.where(self.found[:, None], self.top, self.says.theta)
+
+    @property
+    def log_evidence(self) -> FloatArray:
+        """Log of the integral of prior times likelihood over theta there, (run,).
+
+        L + log N(theta; prior) - 1/2 log |P^-1 + A| + 1/2 log |P^-1|
+        """
+        return self.height + np.where(self.found, self.promised, 0.0) - self.width
 
 
 def search(
     response: LinearResponse,
-    hypothesis: Hypothesis,
+    hypotheses: Sequence[Hypothesis],
+    log_odds: FloatArray,
     priors: Priors,
     prior: Normal,
     start: FloatArray,
-    known: LocalLikelihood | None = None,
-) -> LocalLikelihood:
-    """Return what runs say of a hypothesis near its most probable theta: Newton, halved if worse.
+) -> list[Fit]:
+    """Return what runs say of hypotheses near the most probable theta of each: Newton's steps.
+
+    A step that does not rise is halved. A hypothesis is followed on while that may matter.
 
     Args:
         response: The runs.
-        hypothesis: What may be the case.
+        hypotheses: What may be the case; all of them have a score.
+        log_odds: Log prior of each, (hypothesis,).
         priors: Beliefs about onset and size.
         prior: Of theta, beside that of the response.
-        start: Where to start, (run, theta).
-        known: What they say there, where that is known.
+        start: Where to start, (run, hypothesis, theta).
     """
-    best = known or local_likelihood(response, hypothesis, priors, start)
-    best, rising = _stepped(response, hypothesis, priors, prior, best)
-    for _ in range(TIMES_MORE):
-        rows = np.flatnonzero(rising)
-        if len(rows) == 0:
+    fits = [
+        Fit.of(prior, local_likelihood(response, h, priors, start[:, i]))
+        for i, h in enumerate(hypotheses)
+    ]
+    share, gained = np.ones(start.shape[:2]), np.full(start.shape[:2], np.inf)
+    for step in range(MOST_STEPS):
+        enough = FOUND_NATS if step < STEPS else RISING_NATS
+        asked = _worth_following(fits, log_odds, gained, enough) & (share > SHORTEST)
+        if not asked.any():
             break
-        part = Normal(prior.precision[rows], prior.shift[rows])
-        some, rising[rows] = _stepped(response[rows], hypothesis, priors, part, best[rows])
-        best = best.with_rows(rows, some)
-    return best
+        for i in map(int, np.flatnonzero(asked.any(axis=0))):
+            rows = np.flatnonzero(asked[:, i])
+            old, some = fits[i][rows], response if len(rows) == len(start) else response[rows]
+            theta = old.says.theta + share[rows, i, None] * (old.top - old.says.theta)
+            new = Fit.of(prior[rows], local_likelihood(some, hypotheses[i], priors, theta))
+            gain = new.height - old.height
+            rose = gain > 0.0
+            fits[i] = fits[i].with_rows(rows[rose], new[np.flatnonzero(rose)])
+            share[rows, i] = np.where(rose, 1.0, 0.5 * share[rows, i])
+            gained[rows, i] = np.where(rose, gain, gained[rows, i])
+    return fits
 
 
-def _stepped(
-    response: LinearResponse,
-    hypothesis: Hypothesis,
-    priors: Priors,
-    prior: Normal,
-    best: LocalLikelihood,
-) -> tuple[LocalLikelihood, BoolArray]:
-    """Return what runs say some steps on, and which gained much by the last of them, (run,)."""
-    height = best.log_likelihood + prior.log_density(best.theta)
-    theta, gain = prior.times(best).mean, np.zeros(len(height))
-    for step in range(NEWTON_STEPS):
-        here = local_likelihood(response, hypothesis, priors, theta)
-        high = here.log_likelihood + prior.log_density(theta)
-        better, gain = high > height, high - height
-        best, height = _where(better, here, best), np.where(better, high, height)
-        if step < NEWTON_STEPS - 1:
-            newton = prior.times(best).mean
-            theta = np.where(better[:, None], newton, 0.5 * (theta + best.theta))
-    return best, gain > RISING_NATS
+def _worth_following(
+    fits: Sequence[Fit], log_odds: FloatArray, gained: FloatArray, enough: float
+) -> BoolArray:
+    """Return which hypotheses still matter, (run, hypothesis): those that rise by enough.
+
+    Args:
+        fits: What is known of each.
+        log_odds: Log prior of each, (hypothesis,).
+        gained: By how much each rose last, (run, hypothesis) [nats].
+        enough: What a step promises or brings at least [nats].
+    """
+    promised = np.stack([fit.promised for fit in fits], axis=1)
+    reach = np.stack([fit.height - fit.width for fit in fits], axis=1) + promised + log_odds
+    hopeless = reach < reach.max(axis=1, keepdims=True) - HOPELESS_NATS
+    rising = np.minimum(promised, gained) > FOUND_NATS
+    rising &= np.maximum(promised, np.where(np.isinf(gained), 0.0, gained)) > enough
+    return np.asarray(rising & ~(hopeless & (promised < RISING_NATS)))
 
 
-def _where(better: BoolArray, one: LocalLikelihood, other: LocalLikelihood) -> LocalLikelihood:
-    """Return one local likelihood for some runs and the other for the rest."""
-
-    def either(name: str) -> FloatArray:
-        first, second = getattr(one, name), getattr(other, name)
-        return np.where(better.reshape(-1, *(1,) * (first.ndim - 1)), first, second)
-
-    return LocalLikelihood(*(either(field.name) for field in fields(one)))
+def _put(values: FloatArray, rows: IntArray, some: FloatArray) -> FloatArray:
+    changed = np.array(values)
+    changed[rows] = some
+    return changed

@@ -26,10 +26,10 @@ from failuretwin.inference.posterior import (
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.shared_likelihood import (
+    Fit,
     LocalLikelihood,
     Normal,
     has_score,
-    integrated,
     local_likelihood,
     search,
 )
@@ -98,33 +98,24 @@ class Weighed:
         log_evidence: (run, hypothesis).
         misfit: Mean D^2 there, (run, hypothesis).
         information: A there, (run, hypothesis, theta, theta).
-        scatter_score: As of `LocalLikelihood`, (run, hypothesis, motor + 1).
-        scatter_information: As there, (run, hypothesis, motor + 1, motor + 1).
-        scatter_slack: As there, (run, hypothesis, motor, theta, theta).
-        outcomes: As of `LocalLikelihood`, (run, hypothesis, movement, outcome).
     """
 
     expansion: Expansion
     theta: FloatArray
     log_evidence: FloatArray
     misfit: FloatArray
-
     information: FloatArray
-    scatter_score: FloatArray
-    scatter_information: FloatArray
-    scatter_slack: FloatArray
-    outcomes: FloatArray
 
     @classmethod
-    def of(cls, at: Expansion, prior: Normal, says: Sequence[LocalLikelihood]) -> Weighed:
+    def of(cls, at: Expansion, fits: Sequence[Fit]) -> Weighed:
         """Return what was found near the best theta of each hypothesis."""
-
-        def stacked(name: str) -> FloatArray:
-            return np.stack([getattr(each, name) for each in says], axis=1)
-
-        log_evidence = np.stack([integrated(prior, each) for each in says], axis=1)
-        rest = [field.name for field in fields(cls)[3:]]
-        return cls(at, stacked("theta"), log_evidence, *map(stacked, rest))
+        return cls(
+            at,
+            np.stack([fit.theta for fit in fits], axis=1),
+            np.stack([fit.log_evidence for fit in fits], axis=1),
+            np.stack([fit.says.misfit for fit in fits], axis=1),
+            np.stack([fit.says.information for fit in fits], axis=1),
+        )
 
     def __getitem__(self, rows: slice | IntArray) -> Weighed:
         """Return some of the runs alone."""
@@ -135,6 +126,16 @@ class Weighed:
         best = np.argmax(self.log_evidence + log_odds, axis=1)
         rows = np.arange(len(best))
         return self.theta[rows, best], self.misfit[rows, best]
+
+    def with_hypotheses(self, places: Sequence[int], some: Weighed) -> Weighed:
+        """Return the same with what is said of some hypotheses replaced."""
+
+        def replaced(name: str) -> FloatArray:
+            values = np.array(getattr(self, name))
+            values[:, places] = getattr(some, name)
+            return values
+
+        return Weighed(self.expansion, *(replaced(field.name) for field in fields(self)[1:]))
 
     def better(self, other: Weighed) -> Weighed:
         """Return the better of two searches for each run and hypothesis."""
@@ -229,44 +230,33 @@ class SharedWeighing:
     def search(self, at: Expansion, prior: Normal, start: FloatArray) -> Weighed:
         """Return what runs say with theta normal.
 
-        Hypotheses without a score of their own are weighed at the best theta of the others.
+        Hypotheses without a score of their own are weighed at the best theta of the others, and
+        count as wide as the most probable of them.
 
         Args:
             at: The runs.
             prior: Of theta, as seen from there.
             start: Where to start, (run, theta) or (run, hypothesis, theta).
         """
-        start = np.broadcast_to(
-            start if start.ndim == 3 else start[:, None],
-            (len(start), len(self.hypotheses), self.layout.size),
-        )
-        scored = {
-            i: search(at.response, h, self.priors, prior, start[:, i])
-            for i, h in enumerate(self.hypotheses)
-            if has_score(h)
-        }
-        if len(scored) == len(self.hypotheses):
-            return Weighed.of(at, prior, list(scored.values()))
-        known = Weighed.of(at, prior, list(scored.values()))
-        log_odds = self.log_odds[list(scored)]
-        theta, _ = known.best(log_odds)
-        best = np.argmax(known.log_evidence + log_odds, axis=1)
-        information = np.stack([each.information for each in scored.values()], axis=1)
+        shape = (len(start), len(self.hypotheses), self.layout.size)
+        start = np.broadcast_to(start if start.ndim == 3 else start[:, None], shape)
+        scored = [i for i, h in enumerate(self.hypotheses) if has_score(h)]
+        asked, odds = [self.hypotheses[i] for i in scored], self.log_odds[scored]
+        fits = search(at.response, asked, odds, self.priors, prior, start[:, scored])
+        known = Weighed.of(at, fits)
+        if len(asked) == len(self.hypotheses):
+            return known
+        theta, misfit = known.best(odds)
+        rows, best = np.arange(len(theta)), np.argmax(known.log_evidence + odds, axis=1)
+        information = known.information[rows, best]
         there = at.response.at(theta, range(self.layout.motors))
         others = marginal_likelihoods(there, self.hypotheses, self.priors)
-        rows = np.arange(len(best))
-        likest = list(scored.values())[int(np.bincount(best).argmax())]
-        rest = replace(
-            likest,
-            theta=theta,
-            information=information[rows, best],
-            misfit=known.misfit[rows, best],
-        )
-        says = [
-            scored.get(i) or replace(rest, log_likelihood=other.log_evidence)
-            for i, other in enumerate(others)
-        ]
-        return Weighed.of(at, prior, says)
+        width = 0.5 * np.linalg.slogdet(prior.precision + information)[1]
+        says = np.stack([other.log_evidence for other in others], axis=1)
+        says = says + (prior.log_density(theta) - width)[:, None]
+        all_alike = (np.repeat(one[:, None], len(others), axis=1) for one in (misfit, information))
+        rest = Weighed(at, np.repeat(theta[:, None], len(others), axis=1), says, *all_alike)
+        return rest.with_hypotheses(scored, known)
 
     def search_twice(self, at: Expansion, prior: Normal, start: FloatArray) -> Weighed:
         """Return the same, every hypothesis started from the best theta of all too."""
