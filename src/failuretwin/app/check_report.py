@@ -46,8 +46,8 @@ def check_lines(result: CheckResult, robot: Robot, seconds: float) -> list[str |
     if result.further:
         made += f", {counted(result.further, 'further movement')}"
     low = ["" if not diagnosis.quality else "the log: " + "; ".join(diagnosis.quality)]
-    lines = [head, made, *filter(None, low), motor_table(result, robot)]
-    return [*lines, LIMIT] if result.shown is not None else lines
+    said = [] if result.shown is None else [LIMIT]
+    return [head, made, *filter(None, low), motor_table(result, robot), *said]
 
 
 def closing_lines(result: CheckResult, robot: Robot) -> list[str]:

@@ -44,8 +44,9 @@ EXPLAINED = 25.0
 """Squared distance by which the nearest angle may explain more than where a motor should be."""
 DENIED = 4.0
 """Squared distance from the nearest angle to where a motor should be from which it is looked at."""
-OVERSTATED = 1.0
-"""By so much the parabola of the nearest angle must overstate that distance to be given up."""
+OVERSTATED = 1.2
+"""So many times that distance, and 1 more, must the parabola of the nearest angle claim to be given
+up: on larger circles it always claims a little too much."""
 LEAST_PRECISION = 1e-3
 """Precision [1/rad2] below which a movement says nothing of the motor: the tool is on its axis."""
 
@@ -301,7 +302,7 @@ def _take_where_they_should_be(
     square = spread.product(error, error) - step * (2.0 * slope - precision * step)
     exact = square + precision / (1.0 + own * precision) * step**2
     told = found.square[of, at] + beyond[of, at]
-    some = (exact < found.square[of, at] + EXPLAINED) & (told > exact + OVERSTATED)
+    some = (exact < found.square[of, at] + EXPLAINED) & (told > OVERSTATED * (exact + 1.0))
     left = error - lever * step[:, None]
     settled = expected[at] + scattered(spread, jacobian, scale[of], left)
     where = of[some], at[some]
