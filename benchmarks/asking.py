@@ -13,7 +13,7 @@ is drawn from what its class file says, with play. `few`: five random movements 
 counts, as `diagnose` weighs them. `further`:
 errors of 4 to 12 counts; posteriors that three random movements leave open, how many more settle
 them (P >= 0.99), designed or random. `promised`:
-faults as large as `ft.isolability` says that the motions show.
+faults as large as `ft.isolability` says that the motions show, by the priors of a check.
 
 A fault is named right if the motor is (P of its modes together above all else), healthy if P of
 healthy is above that of every motor. The set-up of the sensor is taken as known.
@@ -284,7 +284,9 @@ def promised(arms: int, seed: int) -> None:
         made = robots.designer(seed, usual=False).sequence(home, length)
         motions = Motions.of(robots.known.robot, made)
         time, command = motions.reference()
-        said = isolability(robots.known.twin, command, time, robots.known.imperfections)
+        priors = checking(robots.model, robots.hypotheses)
+        figures = robots.known.imperfections
+        said = isolability(robots.known.twin, command, time, figures, priors=priors)
         for factor in (0.75, 1.0, 1.25):
             cells = []
             for k, name in enumerate(robots.names):

@@ -33,7 +33,7 @@ from failuretwin.digital_model.calibrated_robot import (
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.isolability import isolability
+from failuretwin.inference.isolability import IsolabilityReport, isolability
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 
@@ -113,6 +113,16 @@ class Checking:
             self.seed,
         )
 
+    def isolability(self, command: FloatArray, time: FloatArray) -> IsolabilityReport:
+        """Return what motions can tell apart, by the priors of a check.
+
+        Args:
+            command: References, (sample, motor) or (run, sample, motor) [rad].
+            time: Their times, (sample,) [s].
+        """
+        known, priors = self.known, checking(self.model, self.asked)
+        return isolability(known.twin, command, time, known.imperfections, self.asked, priors)
+
     def shown(self, result: CheckResult, command: FloatArray, time: FloatArray) -> CheckResult:
         """Return a result with what its movements can show, where it says that all is well.
 
@@ -123,8 +133,7 @@ class Checking:
         """
         if result.light != GREEN:
             return result
-        found = isolability(self.known.twin, command, time, self.known.imperfections, self.asked)
-        return replace(result, shown=found)
+        return replace(result, shown=self.isolability(command, time))
 
     def of_logs(self, paths: Sequence[Path]) -> list[CheckResult]:
         """Return what logs of a check say that was made elsewhere, a result a run.
