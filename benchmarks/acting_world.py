@@ -134,7 +134,9 @@ class World:
         if self.count <= self.onset:
             self.struck_s = self.time_s
         scatter *= self.scatter
-        friction = 0.0 if self.engine == "physics" else self.friction
+        # The engine knows the play of gears only of robots whose figures it was fitted to.
+        fitted = bool(self.robot.profile.physics)
+        friction = 0.0 if self.engine == "physics" and fitted else self.friction
         new = aim + self.bias - friction * np.sign(target - self.commanded) + scatter
         keeps = still if not self.redrawn_at_rest else np.zeros_like(still)
         new = np.where(keeps | self.lost, self.base, new)

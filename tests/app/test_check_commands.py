@@ -13,9 +13,13 @@ pytest.importorskip("mujoco")
 def test_a_check_names_the_motor_and_what_to_do(failuretwin, tmp_path):
     out, kept = tmp_path / "out.json", tmp_path / "kept.json"
     arguments = ("check", "--seconds", 14, "--seed", 2, "--keep", kept)
-    healthy = failuretwin(*arguments)
+    healthy = failuretwin(*arguments, "--json", out, "--plot", tmp_path / "green")
     assert healthy.returncode == 0, healthy.stderr
     assert healthy.stdout.startswith("GREEN: healthy")
+    assert "green rules out what the last column says" in healthy.stdout
+    shown = [row["shown_from"] for row in json.loads(out.read_text())["motors"]]
+    assert all(0.01 < size < 0.04 for size in shown)
+    assert "shows errors from" in (tmp_path / "green" / "index.html").read_text("utf-8")
     *_, state, step = healthy.stdout.splitlines()
     assert state.startswith("Healthy: ")
     assert step == "what to do: Nothing to do now. Check again after a repair, or in a month."
@@ -29,6 +33,7 @@ def test_a_check_names_the_motor_and_what_to_do(failuretwin, tmp_path):
     page = (tmp_path / "page" / "index.html").read_text("utf-8")
     assert step.removeprefix("what to do: ") in page.replace("&#39;", "'")
     assert "What the check measured" in page
+    assert "shows errors from" not in page
     assert "zero of motor_2 changed by +4." in answer.stdout
     record = json.loads(out.read_text())
     assert (record["light"], record["motor"]) == ("red", "motor_2")
@@ -83,6 +88,8 @@ def test_a_log_of_a_check_made_elsewhere(failuretwin, tmp_path):
     rows = [json.loads(line) for line in out.read_text().splitlines()]
     assert [row["truth"] for row in rows] == ["healthy", "motor_3:stuck"]
     assert rows[1]["motor"] == "motor_3"
+    known = [row["shown_from"] is not None for row in rows[0]["motors"]]
+    assert known == [rows[0]["light"] == "green"] * 4
 
 
 def test_a_design_beside_random_movements(failuretwin):

@@ -9,7 +9,8 @@ import pytest
 from rich.console import Console
 
 from failuretwin.app import shadow as shadow_module
-from failuretwin.app.live import View, watch_until_end
+from failuretwin.app.live import watch_until_end
+from failuretwin.app.live_view import View
 from failuretwin.app.shadow import Changes, Shadow
 from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, LinkCounts, Reading
 from failuretwin.connection.links.live_events import SampledCommands

@@ -151,6 +151,23 @@ def test_likelihoods_are_those_of_the_batch(faults, stuck):
         np.testing.assert_allclose(integral, expected, atol=0.05)
 
 
+def test_sizes_are_what_is_left_of_their_grid_and_their_ranges(faults):
+    """Held angles around one node; errors of one range, evenly over it."""
+    begin = faults.begin(1)
+    nodes = np.flatnonzero(faults.held_of == 1)
+    held, off = np.zeros_like(begin.held), np.zeros_like(begin.off)
+    held[0, nodes[9:12]] = 0.1, 0.3, 0.1
+    off[0, 1] = 0.5
+    belief = replace(begin, held=held, off=off)
+    middle = faults.size(belief, 1).quantiles((0.5,))
+    np.testing.assert_allclose(middle, faults.held_angles[nodes[10]], atol=1e-9)
+    low, high = faults._sizes(faults.hypotheses[2].faults[0]).ranges[1]
+    quarters = faults.size(belief, 2).quantiles((0.25, 0.5, 0.75))
+    expected = low + np.array([0.25, 0.5, 0.75]) * (high - low)
+    np.testing.assert_allclose(quarters, expected, atol=0.05 * (high - low))
+    assert faults.size(belief, 0) is None
+
+
 def test_an_unseen_movement_says_nothing(faults, stuck):
     hidden = replace(stuck.evidence, usable=np.zeros_like(stuck.evidence.usable))
     seen = faults.evidence(RunLikelihood(hidden, stuck.model))

@@ -22,7 +22,13 @@ from failuretwin.inference.expected_bayes_factors import (
     expected_distance_factor,
 )
 from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.isolability import MonteCarloFaults, _groups, _motions
+from failuretwin.inference.isolability import (
+    FOUND_NATS,
+    MonteCarloFaults,
+    _groups,
+    _motions,
+    needed_nats,
+)
 from failuretwin.inference.priors import Priors
 
 TIME = 0.01 * np.arange(1000)
@@ -292,3 +298,15 @@ def test_the_page_prints_what_it_says(capsys):
             assert float(word) == pytest.approx(float(other), rel=0.02)
         else:
             assert word == other
+
+
+def test_a_fault_that_is_improbable_must_be_further_ahead():
+    """As often ahead of the odds against it as one of even odds is ahead: normal leads, drawn."""
+    lead = np.random.default_rng(0).standard_normal(400_000)
+    even = needed_nats(1.0)
+    assert even == pytest.approx(FOUND_NATS)
+    for odds in (4.0, 16.0, 100.0):
+        needed = needed_nats(odds)
+        found = np.mean(needed + np.sqrt(2.0 * needed) * lead > np.log(odds))
+        assert found == pytest.approx(np.mean(even + np.sqrt(2.0 * even) * lead > 0.0), abs=2e-3)
+    assert needed_nats(0.1) == pytest.approx(FOUND_NATS)

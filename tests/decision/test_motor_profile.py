@@ -147,6 +147,33 @@ def test_a_healthy_motor_is_the_healthy_robot(scene_of, motor):
     np.testing.assert_allclose(found, likelihood.log_healthy, rtol=0, atol=0.05)
 
 
+def test_near_its_axis_a_motor_is_where_it_should_be_if_that_explains_the_tool(twin, run_of):
+    """The tool is 2 to 6 mm beside the axis of motor 1, so the nearest angle may be anywhere.
+
+    Small errors of the motor have the densities of brute force, none that of a healthy robot.
+    """
+    rng = np.random.default_rng(3)
+    poses = rng.uniform(-1.5, 1.5, (20_000, 4))
+    model = HealthyModel(twin, IMPERFECT)
+    beside = np.linalg.norm(model.sensors.expected(poses)[1][..., 0], axis=1)
+    targets = poses[(beside > 0.002) & (beside < 0.006)][:100]
+    points = twin.path(targets + SCATTER * rng.standard_normal(targets.shape))
+    likelihood = RunLikelihood(settled_evidence(run_of(targets, points, MOTORS)), model)
+    profile = likelihood.profile(0)
+    at_expected = profile.log_density(profile.expected[:, :, None], False)[0, :, 0]
+    assert np.mean(np.abs(at_expected - likelihood.log_healthy[0]) < 1.0) > 0.96
+    anew = np.flatnonzero(profile.place[0, :, 0] != profile.mode[0, :, 0])
+    assert len(anew) >= 5
+    off = np.array([-0.01, 0.0, 0.01])
+    for movement in anew[:6]:
+        force = BruteForce(likelihood, movement, 0)
+        angles = profile.expected[0, movement, 0] + off
+        shape = (1, len(targets), len(off), 1)
+        got = profile.log_density(np.broadcast_to(angles[:, None], shape), False)[0, movement]
+        expected = np.log([force.density(angle, False) for angle in angles])
+        np.testing.assert_allclose(got, expected, rtol=0, atol=0.4)
+
+
 @pytest.mark.parametrize("turned", [3.5, 4.5, 2.0 * np.pi, 7.0])
 def test_a_full_turn_makes_no_difference_where_a_motor_may_turn_around(tmp_path, run_of, turned):
     twin = small_twin(tmp_path, "scara", SCARA, tool="0.2 0 0")

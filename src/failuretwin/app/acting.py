@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,13 +19,22 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.outcome import TargetResult
 from failuretwin.decision.acting.sparing import stopped_learning, wear_weights
-from failuretwin.digital_model.calibrated_robot import CalibratedRobot, RobotLike, calibrated
+from failuretwin.digital_model.calibrated_robot import (
+    CalibratedRobot,
+    RobotLike,
+    calibrated,
+    load_calibration,
+)
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.injection import ScheduledFault
 from failuretwin.failure_behavior.mode import FaultMode, SizedMode
 from failuretwin.failure_behavior.modes import SteadyStateError, Stuck
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.healthy_model import HealthyModel
+
+if TYPE_CHECKING:
+    from failuretwin.app.commands.options import LiveOptions
+    from failuretwin.connection.emulated_arm import Emulation
 
 PLACES = f"{EMULATED}, {ROS1} or {ROSBRIDGE}://HOST[:PORT]"
 
@@ -116,6 +125,27 @@ def emulated_arm(
     own = emulated_faults(faults, known.robot)
     return CommandedArm(
         Emulation(known.robot, known.imperfections, own.schedule, seed, own.modes, own.start)
+    )
+
+
+def emulation_of(robot: Robot, live: LiveOptions, seed: int) -> Emulation:
+    """Return what an emulated arm is that others command, with faults of sizes that are asked for.
+
+    Args:
+        robot: The robot, as it is without faults.
+        live: Its imperfections and faults.
+        seed: Seed of all chance.
+
+    Raises:
+        InputError: If a fault or the imperfections cannot be read.
+    """
+    from failuretwin.connection.emulated_arm import Emulation
+
+    own = "none" if robot.imperfections_file is None else robot.name
+    known = load_calibration(live.imperfections or own, robot)
+    asked = emulated_faults(live.faults, robot)
+    return Emulation(
+        known.robot, known.imperfections, asked.schedule, seed, asked.modes, asked.start
     )
 
 

@@ -23,9 +23,12 @@ from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.explanation import size_words
 from failuretwin.inference.isolability import IsolabilityReport
 
+ERROR = "steady_state_error"
 CHANGED = 3.0
 """A zero or a play that differs from that of the check before by so many standard deviations has
 changed."""
+LIMIT = "green rules out what the last column says; smaller errors may be there"
+"""Said of a green light."""
 LIKELY = 0.05
 """Motors are named where it is open from this probability on."""
 
@@ -43,7 +46,8 @@ def check_lines(result: CheckResult, robot: Robot, seconds: float) -> list[str |
     if result.further:
         made += f", {counted(result.further, 'further movement')}"
     low = ["" if not diagnosis.quality else "the log: " + "; ".join(diagnosis.quality)]
-    return [head, made, *filter(None, low), motor_table(result, robot)]
+    said = [] if result.shown is None else [LIMIT]
+    return [head, made, *filter(None, low), motor_table(result, robot), *said]
 
 
 def closing_lines(result: CheckResult, robot: Robot) -> list[str]:
@@ -67,14 +71,19 @@ def write_check_page(results: Sequence[CheckResult], robot: Robot, folder: Path)
         write_page(diagnoses, state, robot, partial / "index.html", measured=measured)
 
 
-def shown_line(found: IsolabilityReport, robot: Robot) -> str:
-    """Return what a green light rules out, and what it does not."""
+def shown_cell(found: IsolabilityReport, motor: str, robot: Robot) -> str:
+    """Return from which size on motions show errors of a motor."""
     sizes = [
-        f"{name.split(':')[0]} {told_size(name, size, found.largest[name], robot)}"
+        told_size(name, size, found.largest[name], robot)
         for name, size in found.isolated.items()
+        if Hypothesis.parse(name).faults[0].motor == motor
     ]
-    said = "random errors that these motions show: " + ", ".join(sizes)
-    return f"{said}; smaller ones may be there"
+    return ", ".join(sizes)
+
+
+def shown_from(found: IsolabilityReport, motor: str) -> float | None:
+    """Return the smallest random error of a motor that motions show [rad or m]; None: none."""
+    return found.isolated.get(f"{motor}:{ERROR}")
 
 
 def told_size(name: str, size: float | None, largest: float, robot: Robot) -> str:
@@ -88,7 +97,7 @@ def told_size(name: str, size: float | None, largest: float, robot: Robot) -> st
 
 def motor_table(result: CheckResult, robot: Robot) -> Table:
     """Return what each motor showed, zeros and play in degrees, of slides in millimetres."""
-    found, rows = result.offsets, []
+    found, shown, rows = result.offsets, result.shown, []
     for k, name in enumerate(robot.motor_names):
         factor, unit = (1e3, "mm") if robot.slides[k] else (180.0 / np.pi, "deg")
         rows.append([
@@ -96,13 +105,15 @@ def motor_table(result: CheckResult, robot: Robot) -> Table:
             f"{result.by_motor.get(name, 0.0):.1%}",
             *(f"{factor * value[k]:+.2f} +- {factor * deviation[k]:.2f} {unit}"
               for value, deviation in ((found.zero, found.zero_sd), (found.play, found.play_sd))),
+            *([] if shown is None else [shown_cell(shown, name, robot)]),
         ])  # fmt: skip
-    return figures_table(["motor", "faulty", "zero off by", "play"], rows)
+    heads = ["motor", "faulty", "zero off by", "play"]
+    return figures_table([*heads, *([] if shown is None else ["shows errors from"])], rows)
 
 
 def check_record(result: CheckResult, robot: Robot, seconds: float) -> dict[str, Any]:
     """Return a check as a JSON object: its diagnosis, as of `diagnose --json`, and more."""
-    found = result.offsets
+    found, shown = result.offsets, result.shown
     return {
         **result.diagnosis.to_record(),
         "robot": robot.name,
@@ -121,6 +132,7 @@ def check_record(result: CheckResult, robot: Robot, seconds: float) -> dict[str,
                 "play": float(found.play[k]),
                 "play_deviation": float(found.play_sd[k]),
                 "unit": "m" if robot.slides[k] else "rad",
+                "shown_from": None if shown is None else shown_from(shown, name),
             }
             for k, name in enumerate(robot.motor_names)
         ],

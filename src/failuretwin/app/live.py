@@ -6,37 +6,26 @@ import math
 import re
 import sys
 import time
-from collections import Counter, deque
 from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-import numpy as np
-from rich.console import Console, Group, RenderableType
+from rich.console import Console
 from rich.live import Live
-from rich.panel import Panel
-from rich.table import Table
-from rich.text import Text
 
 from failuretwin.app.commands.options import LiveOptions
-from failuretwin.app.shadow import SILENCE_S, Change, Changes, Shadow, Snapshot
+from failuretwin.app.live_view import View
+from failuretwin.app.shadow import SILENCE_S, Changes, Shadow
 from failuretwin.app.terminal import tell
-from failuretwin.connection.links.base import LinkCounts, Pace, Sink, Source, source_from_text
+from failuretwin.connection.links.base import Event, Pace, Sink, Source, source_from_text
 from failuretwin.connection.links.ros_messages import RosTopics, load_topics
-from failuretwin.connection.links.statuses import (
-    LEVEL_ERROR,
-    LEVEL_NAMES,
-    LEVEL_OK,
-    LEVEL_STALE,
-    LEVEL_WARN,
-    statuses,
-)
 from failuretwin.core.errors import InputError, counted
-from failuretwin.core.foreign import printable
 from failuretwin.data_knowledge.bag_messages import BagTopics
 from failuretwin.decision.streaming.monitor import FaultMonitor, Fit
+from failuretwin.decision.test_motions.probing import Prober
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.injection import ScheduledFault
@@ -84,11 +73,12 @@ def topics_of(path: Path | None) -> RosTopics:
 
 
 def connect(
-    text: str, robot: Robot, live: LiveOptions, seed: int, stack: ExitStack
+    text: str, robot: Robot, live: LiveOptions, seed: int, stack: ExitStack, commands: bool = False
 ) -> tuple[Source, list[Sink]]:
     """Return what a SOURCE on the command line stands for, and where its network publishes.
 
-    The text is one of `SOURCES`; the stack closes everything in the end.
+    The text is one of `SOURCES`; the stack closes everything in the end. With `commands` a source
+    on ROS 1 or rosbridge takes orders too: it is a `Commander`.
 
     Raises:
         InputError: If it does not exist, cannot be reached, is none of these, or is told what only
@@ -104,11 +94,11 @@ def connect(
             f"Leave them out, or watch {EMULATED!r}."
         )
     if text == ROS1:
-        return _ros1(robot, topics, stack)
+        return _ros1(robot, topics, stack, commands)
     if text == ROS2 or text.startswith(f"{ROS2}://"):
         return _ros2(text, robot, topics, stack)
     if text.startswith(f"{ROSBRIDGE}://"):
-        return _rosbridge(text, robot, topics, stack)
+        return _rosbridge(text, robot, topics, stack, commands)
     from failuretwin.connection.links.recording import replay
 
     path = Path(text)
@@ -122,10 +112,12 @@ def connect(
     return stack.enter_context(replay(path, robot, pace, named)), []
 
 
-def _ros1(robot: Robot, topics: RosTopics, stack: ExitStack) -> tuple[Source, list[Sink]]:
-    from failuretwin.connection.links.ros1 import Ros1Diagnostics, Ros1Source
+def _ros1(
+    robot: Robot, topics: RosTopics, stack: ExitStack, commands: bool
+) -> tuple[Source, list[Sink]]:
+    from failuretwin.connection.links.ros1 import Ros1Commander, Ros1Diagnostics, Ros1Source
 
-    source = stack.enter_context(Ros1Source(robot, topics))
+    source = stack.enter_context((Ros1Commander if commands else Ros1Source)(robot, topics))
     return source, [stack.enter_context(Ros1Diagnostics(robot, topics))]
 
 
@@ -192,124 +184,16 @@ def address_of(text: str, usual_port: int = ROSBRIDGE_PORT) -> tuple[str, int]:
 
 
 def _rosbridge(
-    text: str, robot: Robot, topics: RosTopics, stack: ExitStack
+    text: str, robot: Robot, topics: RosTopics, stack: ExitStack, commands: bool
 ) -> tuple[Source, list[Sink]]:
     from failuretwin.connection.links import rosbridge
 
     ros = rosbridge.connect(*address_of(text))
     stack.callback(rosbridge.disconnect, ros)
-    source = stack.enter_context(rosbridge.RosbridgeSource(robot, topics, ros))
+    link = rosbridge.RosbridgeCommander if commands else rosbridge.RosbridgeSource
+    source = stack.enter_context(link(robot, topics, ros))
     sink = stack.enter_context(rosbridge.RosbridgeDiagnostics(robot, topics, ros))
     return source, [sink]
-
-
-# The live view on a terminal: motors, residual, posterior over time, what changed.
-
-STYLES = {
-    LEVEL_OK: "green",
-    LEVEL_WARN: "yellow",
-    LEVEL_ERROR: "bold red",
-    LEVEL_STALE: "magenta",
-}
-BLOCKS = " ▁▂▃▄▅▆▇█"
-COLUMNS = 60
-"""Width of the posterior over time."""
-COLUMN_S = 1.0
-"""Time of the stream that one column stands for [s]."""
-RESIDUAL_MM = 50.0
-"""Residual that fills its bar [mm]."""
-BAR = 20
-SHOWN_HYPOTHESES = 6
-SHOWN_CHANGES = 8
-
-
-class View:
-    """Draws what the shadow knows."""
-
-    def __init__(self, motors: Sequence[str], source: str) -> None:
-        self._motors = motors
-        self._source = source
-        self._history: deque[dict[str, float]] = deque(maxlen=COLUMNS)
-        self._next_s = -np.inf
-
-    def remember(self, snapshot: Snapshot) -> None:
-        """Take a snapshot into the posterior over time; time without any is a gap."""
-        now_s = snapshot.stream_time
-        if now_s < self._next_s:
-            return
-        if np.isfinite(self._next_s):
-            missing = int((now_s - self._next_s) / COLUMN_S)
-            self._history.extend([{}] * min(missing, COLUMNS))
-        self._next_s = now_s + COLUMN_S
-        diagnosis, stale = snapshot.answer.diagnosis, snapshot.answer.state != "OK"
-        known = diagnosis is not None and not stale
-        self._history.append(dict(diagnosis.posterior) if known and diagnosis else {})
-
-    def draw(
-        self, snapshot: Snapshot, counts: LinkCounts, changes: Sequence[Change]
-    ) -> RenderableType:
-        """Return the view of what is known now; of the changes the newest is the last."""
-        lines = [Text(printable(str(change))) for change in list(changes)[-SHOWN_CHANGES:]]
-        return Group(
-            self._head(snapshot, counts),
-            self._motor_table(snapshot),
-            Panel(self._posterior(), title=f"posterior, last {COLUMNS} s", title_align="left"),
-            Panel(Group(*lines), title="what changed", title_align="left"),
-        )
-
-    def _head(self, snapshot: Snapshot, counts: LinkCounts) -> Text:
-        arm = statuses(snapshot.answer, self._motors)[0]
-        head = Text(f"{LEVEL_NAMES[arm.level]:6s}", STYLES[arm.level])
-        head.append(f" {printable(arm.message)}\n", "default")
-        off = float(np.linalg.norm(snapshot.residual)) * 1000.0
-        share = 0.0 if np.isnan(off) else min(1.0, off / RESIDUAL_MM)
-        said = "no reading" if np.isnan(off) else f"{off:5.1f} mm off the reference"
-        head.append(
-            f"{printable(self._source)}  {snapshot.stream_time:.1f} s  {counts.received} events, "
-            f"{counts.garbage} garbage, {counts.dropped} dropped, {counts.reconnects} reconnects, "
-            f"{1000 * snapshot.seconds:.1f} ms a sample\n",
-            "dim",
-        )
-        head.append(f"tool   {_bar(share)} {said}", "default")
-        return head
-
-    def _motor_table(self, snapshot: Snapshot) -> Table:
-        table = Table(box=None, pad_edge=False)
-        for name in ("motor", "state", "faulty", "", "how"):
-            table.add_column(name)
-        for status in statuses(snapshot.answer, self._motors)[1:]:
-            probability = float(status.values.get("probability", 0.0))
-            table.add_row(
-                printable(status.name),
-                Text(LEVEL_NAMES[status.level], STYLES[status.level]),
-                f"{100 * probability:5.1f} %" if status.values else "",
-                _bar(probability),
-                printable(status.message),
-            )
-        return table
-
-    def _posterior(self) -> Table:
-        """Return the posterior over time, a row for each hypothesis that ever mattered."""
-        weight = Counter[str]()
-        for column in self._history:
-            weight.update(column)
-        table = Table(box=None, show_header=False, pad_edge=False)
-        for name, _ in weight.most_common(SHOWN_HYPOTHESES):
-            blocks = "".join(_block(column.get(name)) for column in self._history)
-            last = self._history[-1].get(name)
-            table.add_row(printable(name), blocks, "" if last is None else f"{100 * last:5.1f} %")
-        return table
-
-
-def _bar(share: float) -> str:
-    full = round(BAR * share)
-    return "█" * full + "·" * (BAR - full)
-
-
-def _block(probability: float | None) -> str:
-    if probability is None:
-        return "?"
-    return BLOCKS[round(probability * (len(BLOCKS) - 1))]
 
 
 # Watching until the source ends or the user has seen enough.
@@ -322,6 +206,52 @@ LATE_S = 0.3
 """A command that comes later than this spoils the diagnosis, and the user is told [s]."""
 
 
+@dataclass
+class _Screen:
+    """Tells what changes: a view on a terminal, else a line for each change."""
+
+    shadow: Shadow
+    source: Source
+    sinks: Sequence[Sink]
+    monitor: FaultMonitor | None
+    changes: Changes
+    view: View
+    live: Live | None
+
+    def __post_init__(self) -> None:
+        self._begun_s, self._drawn_s, self._looked = time.monotonic(), 0.0, False
+
+    def look(self, last: bool = False) -> None:
+        """Tell what has changed since the last call."""
+        shadow, changes, monitor = self.shadow, self.changes, self.monitor
+        troubles = _troubles(shadow, self.source, self.sinks, time.monotonic() - self._begun_s)
+        troubles += () if monitor is None else _misfit(monitor.fit)
+        found = changes.notice(shadow.snapshot, self.source.counts, shadow.clock_jumps, troubles)
+        if monitor is not None and monitor.set_up is not None and not self._looked:
+            self._looked = True
+            found.append(changes.add(shadow.snapshot.stream_time, fit_of(monitor)))
+        if self.live is None:
+            for change in found:
+                tell(str(change))
+            return
+        self.view.remember(shadow.snapshot)
+        if last or time.monotonic() >= self._drawn_s + REFRESH_S:
+            self._drawn_s = time.monotonic()
+            picture = self.view.draw(shadow.snapshot, self.source.counts, changes.lines)
+            self.live.update(picture, refresh=True)
+
+    def hear(self, event: Event | None) -> None:
+        """Take an event that was polled elsewhere."""
+        self.shadow.hear(event)
+        self.look()
+
+    def say(self, text: str) -> None:
+        """Tell something else."""
+        change = self.changes.add(self.shadow.snapshot.stream_time, text)
+        if self.live is None:
+            tell(str(change))
+
+
 def watch_until_end(
     shadow: Shadow,
     source: Source,
@@ -330,35 +260,24 @@ def watch_until_end(
     console: Console,
     until_s: float,
     monitor: FaultMonitor | None = None,
+    prober: Prober | None = None,
 ) -> Changes:
     """Watch a robot until `until_s` of our monotonic clock [s], and return all that has changed.
 
     With a monitor it is told how well its calibration and the profile fit, once it has seen enough.
+    With a prober, one of the sinks, the robot is asked by movements when it is time to.
     On a terminal there is a live view, else a line for each change.
     """
-    changes, view = Changes(motors), View(motors, source.name)
     live = Live(console=console, auto_refresh=False) if console.is_terminal else nullcontext()
-    begun_s, drawn_s, looked = time.monotonic(), 0.0, False
     with live as shown:
-        going = True
+        told = Changes(motors), View(motors, source.name), shown
+        screen, going = _Screen(shadow, source, sinks, monitor, *told), True
         while going:
             going = shadow.step(POLL_S) and time.monotonic() < until_s
-            troubles = _troubles(shadow, source, sinks, time.monotonic() - begun_s)
-            troubles += () if monitor is None else _misfit(monitor.fit)
-            found = changes.notice(shadow.snapshot, source.counts, shadow.clock_jumps, troubles)
-            if monitor is not None and monitor.set_up is not None and not looked:
-                looked = True
-                found.append(changes.add(shadow.snapshot.stream_time, fit_of(monitor)))
-            if shown is None:
-                for change in found:
-                    tell(str(change))
-                continue
-            view.remember(shadow.snapshot)
-            if not going or time.monotonic() >= drawn_s + REFRESH_S:
-                drawn_s = time.monotonic()
-                picture = view.draw(shadow.snapshot, source.counts, changes.lines)
-                shown.update(picture, refresh=True)
-    return changes
+            screen.look(last=not going)
+            if going and prober is not None and prober.due:
+                prober.ask(screen.hear, screen.say)
+    return screen.changes
 
 
 def _misfit(fit: Fit) -> tuple[str, ...]:

@@ -7,15 +7,13 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from failuretwin.app.acting import emulated_faults
+from failuretwin.app.acting import emulation_of
 from failuretwin.app.commands.options import LiveOptions
 from failuretwin.app.live import topics_of
 from failuretwin.connection.commanded_arm import CommandedArm
-from failuretwin.connection.emulated_arm import Emulation
 from failuretwin.connection.links.base import CommandSent, Pace, Reading
 from failuretwin.connection.links.commander import Order
 from failuretwin.connection.links.ros1 import Ros1Robot, Ros1Source
-from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
 
 
@@ -28,12 +26,7 @@ def obey_commands(robot: Robot, live: LiveOptions, seed: int, tell: Callable[[st
         seed: Seed of all chance.
         tell: Called with what happens.
     """
-    own = "none" if robot.imperfections_file is None else robot.name
-    known = load_calibration(live.imperfections or own, robot)
-    faults = emulated_faults(live.faults, robot)
-    emulation = Emulation(
-        known.robot, known.imperfections, faults.schedule, seed, faults.modes, faults.start
-    )
+    emulation = emulation_of(robot, live, seed)
     topics, zero = topics_of(live.topics), time.time()
     arm = CommandedArm(emulation, Pace(live.speed))
     length = live.duration or math.inf

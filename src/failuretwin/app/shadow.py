@@ -99,7 +99,14 @@ class Shadow:
 
     def step(self, timeout_s: float) -> bool:
         """Take one event, or see after a wait [s] that time goes on; return if more may come."""
-        event = self._source.poll(min(timeout_s, TICK_S))
+        return self.hear(self._source.poll(min(timeout_s, TICK_S)))
+
+    def hear(self, event: Event | None) -> bool:
+        """Take an event of the source that was polled elsewhere; return if more may come.
+
+        Args:
+            event: None: nothing came just now.
+        """
         if event is not None:
             self._take(event)
         elif self._source.ended:

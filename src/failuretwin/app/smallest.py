@@ -21,7 +21,6 @@ from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.explanation import plain_name
 from failuretwin.inference.isolability import IsolabilityReport
-from failuretwin.inference.isolability import isolability as isolability_of
 
 MOST_RUNS = 3
 """Runs of a log that are looked at, spread evenly."""
@@ -32,9 +31,7 @@ NARROWEST_IN = 5.0
 def of_motions(asking: Checking, motions: Motions) -> IsolabilityReport:
     """Return what designed motions can tell apart."""
     time, command = motions.reference()
-    return isolability_of(
-        asking.known.twin, command, time, asking.known.imperfections, asking.asked
-    )
+    return asking.isolability(command, time)
 
 
 def smallest_of(asking: Checking, path: Path) -> IsolabilityReport:
@@ -51,9 +48,7 @@ def smallest_of(asking: Checking, path: Path) -> IsolabilityReport:
     some = np.unique(np.linspace(0, runs.sizes["run"] - 1, MOST_RUNS).astype(np.int64))
     command = as_floats(runs["command"].values)[some]
     time = as_floats(runs["time"].values)
-    return isolability_of(
-        asking.known.twin, command, time, asking.known.imperfections, asking.asked
-    )
+    return asking.isolability(command, time)
 
 
 def smallest_beside_random(asking: Checking, motions: Motions) -> list[str | Table]:

@@ -27,7 +27,7 @@ import numpy as np
 from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Fault, Hypothesis
-from failuretwin.core.numerics import log_of
+from failuretwin.core.numerics import Weighted, log_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
@@ -49,6 +49,8 @@ LEAST = 1e-300
 """Probability below which none is kept."""
 MOST_NATS = 300.0
 """Most that one movement can say for a fault or against."""
+PLACES = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
+"""Where sizes are told of a range in which all are as likely, in its width."""
 
 
 @dataclass(frozen=True)
@@ -225,6 +227,27 @@ class FaultFilter:
             for k in np.unique(of):
                 found[:, k] = values[:, of == k].sum(axis=1)
         return found
+
+    def size(self, belief: FaultBelief, at: int, robot: int = 0) -> Weighted | None:
+        """Return what is believed of the size of a fault; None of a healthy robot.
+
+        Args:
+            belief: What is believed.
+            at: Index of its hypothesis.
+            robot: Which robot.
+
+        Returns:
+            Held angles of a stuck motor [rad]; sizes of an error [rad], each range at `PLACES`.
+        """
+        nodes, cells = self.held_of == at, self._cell_of == at
+        if nodes.any():
+            return Weighted(self.held_angles[nodes], belief.held[robot, nodes])
+        if not cells.any():
+            return None
+        ranges = np.array(self._sizes(self.hypotheses[at].faults[0]).ranges)
+        inside = ranges[:, :1] + np.ptp(ranges, axis=1)[:, None] * PLACES
+        share = np.repeat(belief.off[robot, cells] / len(PLACES), len(PLACES))
+        return Weighted(inside.ravel(), share)
 
     @property
     def faults_per_h(self) -> float:

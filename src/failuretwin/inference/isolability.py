@@ -135,10 +135,12 @@ def minimum_detectable_sizes(
         Two sizes; None where the largest is not told either.
     """
     own = trials.judge.hypotheses.index(hypothesis)
+    further = needed_nats(trials.judge.priors.healthy_odds) - FOUND_NATS
 
     def ahead(sizes: FloatArray) -> FloatArray:
         nats = trials.log_bayes_factor([(hypothesis, float(size)) for size in sizes])
         nats[:, own] = np.inf
+        nats[:, 0] -= further
         return np.stack([nats[:, 0], nats.min(axis=1)])
 
     low, high = considered
@@ -150,6 +152,21 @@ def minimum_detectable_sizes(
     order = np.argsort(sizes)
     found = [_crossing(sizes[order], row[order]) for row in nats]
     return found[0], found[1]
+
+
+def needed_nats(healthy_odds: float) -> float:
+    """Return by how much a fault must be ahead of healthy on average, to be found as often [nats].
+
+    The lead of what is true scatters by its mean T, with variance 2 T. So that it exceeds log odds
+    as often as a lead of F = `FOUND_NATS` exceeds 0,
+
+        T - sqrt(F T) = log odds
+
+    Args:
+        healthy_odds: Odds of healthy that a fault has to make up for.
+    """
+    against = max(0.0, float(np.log(healthy_odds)))
+    return 0.25 * float(np.sqrt(FOUND_NATS) + np.sqrt(FOUND_NATS + 4.0 * against)) ** 2
 
 
 def _bracket(sizes: FloatArray, nats: FloatArray) -> FloatArray:

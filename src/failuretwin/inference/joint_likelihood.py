@@ -7,6 +7,10 @@ numbers say all that a movement can say of this motor, and any fault of it is we
     D^2(phi) = D0^2 + P (phi - phi*)^2
     exp L_m(phi) = sum over a of w_a (1 - eps) t_nu(D_a^2(phi)) + eps / V
 
+Where the tool is close to the axis the circle is small, and the nearest angle may be anywhere on
+it. If the motor explains the position where it should be too, and the parabola denies that, the
+parabola of where it should be counts.
+
 Section: docs/diagnosis.md#joint-likelihood-what-a-movement-says-of-one-motor
 """
 
@@ -36,6 +40,13 @@ NEGLIGIBLE_NATS = 9.0
 LARGEST_OFFSET_RAD = 0.9
 """Furthest from its target that a motor is taken to have settled without being stuck [rad]; the
 largest encoder faults that are considered."""
+EXPLAINED = 25.0
+"""Squared distance by which the nearest angle may explain more than where a motor should be."""
+DENIED = 4.0
+"""Squared distance from the nearest angle to where a motor should be from which it is looked at."""
+OVERSTATED = 1.2
+"""So many times that distance, and 1 more, must the parabola of the nearest angle claim to be given
+up: on larger circles it always claims a little too much."""
 LEAST_PRECISION = 1e-3
 """Precision [1/rad2] below which a movement says nothing of the motor: the tool is on its axis."""
 
@@ -54,6 +65,7 @@ class JointLikelihood(ArrayStruct):
         mode: Angle that brings the tool nearest to where it was seen [rad].
         precision: Curvature of the squared distance there [1/rad2].
         min_distance2: Squared distance at `mode`, in scales of the others' scatter.
+        place: Angle at which the parabola was taken: `mode`, or `expected` [rad].
         log_weight: Log of the outcome's weight times the density's norm.
         expected: Angle at which the motor settles if it is healthy [rad].
         scatter: Scale of its own settled scatter [rad].
@@ -73,6 +85,7 @@ class JointLikelihood(ArrayStruct):
     mode: PerOutcome
     precision: PerOutcome
     min_distance2: PerOutcome
+    place: PerOutcome
     log_weight: PerOutcome
     expected: PerOutcome
     scatter: float
@@ -200,22 +213,25 @@ def joint_likelihoods(
         angle = angle + taken
     square = spread.product(error, error) - taken * (2.0 * slope - precision * taken)
     settled = settled + scattered(spread, jacobian, scale, error - lever * taken[..., None])
-    settled = np.where(own, angle[..., None], settled)
-    commanded = base - np.broadcast_to(kept, (*lead, kept.shape[-1]))[possible]
-    beside = _beside(model, expected, direction, commanded, own, angle)
     dof = model.settling.tail_dof
-    weighed = log_weight + spread.log_norm(dof)
+    found = _Parabola(angle, angle.copy(), precision, square, spread.log_norm(dof), settled)
+    _take_where_they_should_be(found, model, point, expected, scale[:, 0], list(motors))
+    settled = np.where(own, found.mode[..., None], found.settled)
+    commanded = base - np.broadcast_to(kept, (*lead, kept.shape[-1]))[possible]
+    beside = _beside(model, expected, direction, commanded, own, found.mode)
+    weighed = log_weight + found.log_norm
 
     def everywhere(values: FloatArray, elsewhere: float = 0.0) -> FloatArray:
-        found = np.full((*lead, *values.shape[1:]), elsewhere)
-        found[possible] = values
-        return found
+        filled = np.full((*lead, *values.shape[1:]), elsewhere)
+        filled[possible] = values
+        return filled
 
     return [
         JointLikelihood(
-            mode=everywhere(angle[i]),
-            precision=everywhere(precision[i]),
-            min_distance2=everywhere(np.maximum(square[i], 0.0)),
+            mode=everywhere(found.mode[i]),
+            precision=everywhere(found.precision[i]),
+            min_distance2=everywhere(np.maximum(found.square[i], 0.0)),
+            place=everywhere(found.place[i]),
             log_weight=everywhere(weighed[i], -np.inf),
             expected=everywhere(expected[..., motor]),
             scatter=float(model.scatter[motor]),
@@ -230,6 +246,71 @@ def joint_likelihoods(
         )
         for i, motor in enumerate(motors)
     ]
+
+
+@dataclass(frozen=True)
+class _Parabola:
+    """The squared distance by the angle of each motor, (own, ...) each.
+
+    Attributes:
+        mode: Angle at which it is least [rad].
+        place: Angle at which it was taken [rad].
+        precision: Its curvature [1/rad2].
+        square: The least.
+        log_norm: Log density there.
+        settled: Angles of all motors there, scatter included, (own, ..., motor) [rad].
+    """
+
+    mode: FloatArray
+    place: FloatArray
+    precision: FloatArray
+    square: FloatArray
+    log_norm: FloatArray
+    settled: FloatArray
+
+
+def _take_where_they_should_be(
+    found: _Parabola,
+    model: HealthyModel,
+    point: FloatArray,
+    expected: FloatArray,
+    scale: FloatArray,
+    motors: list[int],
+) -> None:
+    """Take parabolas anew, in place, where motors explain positions that these deny them.
+
+    Args:
+        found: Parabolas at the nearest angles.
+        model: The healthy robot.
+        point: Settled positions, (..., channel) [m].
+        expected: Angles at which motors settle if healthy, (..., motor) [rad].
+        scale: Scatter of all motors but each of these, (own, motor) [rad].
+        motors: Indices of these motors.
+    """
+    off = found.mode - expected[..., motors].T
+    off -= 2.0 * np.pi * np.rint(off / (2.0 * np.pi))
+    own = model.scatter[motors, None] ** 2
+    beyond = found.precision / (1.0 + own * found.precision) * off**2
+    of, at = np.nonzero(beyond > DENIED)
+    if not len(of):
+        return
+    motor, own = np.array(motors)[of], own[of, 0]
+    error, jacobian, spread = model.residual(point[at], expected[at], scale[of])
+    lever = np.take_along_axis(jacobian, motor[:, None, None], axis=-1)[..., 0]
+    precision, slope = spread.product(lever, lever), spread.product(lever, error)
+    step = slope / np.maximum(precision, LEAST_PRECISION)
+    square = spread.product(error, error) - step * (2.0 * slope - precision * step)
+    exact = square + precision / (1.0 + own * precision) * step**2
+    told = found.square[of, at] + beyond[of, at]
+    some = (exact < found.square[of, at] + EXPLAINED) & (told > OVERSTATED * (exact + 1.0))
+    left = error - lever * step[:, None]
+    settled = expected[at] + scattered(spread, jacobian, scale[of], left)
+    where = of[some], at[some]
+    found.place[where] = expected[at, motor][some]
+    found.mode[where] = found.place[where] + step[some]
+    found.precision[where], found.square[where] = precision[some], square[some]
+    found.log_norm[where] = spread.log_norm(model.settling.tail_dof)[some]
+    found.settled[where] = settled[some]
 
 
 def _beside(

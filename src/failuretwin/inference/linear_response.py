@@ -233,7 +233,7 @@ class _Place:
     ) -> MotorResponse:
         """Return residuals with one motor where it is best."""
         own = np.arange(self.layout.motors) == motor
-        base = np.where(own, profile.mode[..., None], outcomes.base)
+        base = np.where(own, profile.place[..., None], outcomes.base)
         pose = self.model.settle(base, outcomes.direction, own)
         scale = np.where(own, 0.0, self.model.scatter)
         seen = self.whitened(pose, outcomes.direction, scale)
@@ -247,7 +247,8 @@ class _Place:
             load = loads(self.model, base)[..., motor]
             parts = [np.ones_like(load), load, -outcomes.direction[..., motor]]
             derivative = np.stack(parts, axis=-1)
-        return MotorResponse(profile, replace(seen, gamma=gamma), along, derivative)
+        rho = seen.rho - lever * (profile.mode - profile.place)[..., None]
+        return MotorResponse(profile, replace(seen, rho=rho, gamma=gamma), along, derivative)
 
     def whitened(self, pose: FloatArray, direction: FloatArray, scale: FloatArray) -> Whitened:
         """Return whitened residuals, columns and levers."""

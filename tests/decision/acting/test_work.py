@@ -80,6 +80,17 @@ def test_a_task_is_carried_out(exact, armpi):
     assert len(arm.sent) == 4
 
 
+def test_the_first_movement_is_seen_of_an_arm_whose_clock_began_long_ago(exact, armpi):
+    arm, heard = Fake(exact), []
+    arm.now = 1.7e9
+    work, _ = work_of(exact, arm, task_of(armpi, 4))
+    work.hear = heard.append
+    work.carry_out()
+    assert [result.movements for result in work.actor.results] == [1] * 4
+    assert all(isinstance(event, Reading) for event in heard)
+    assert len(heard) > 20
+
+
 def test_somebody_elses_command_ends_the_work(exact, armpi):
     foreign = CommandSent(2.0, np.full(4, 0.3), np.ones(4))
     arm = Fake(exact, [foreign])

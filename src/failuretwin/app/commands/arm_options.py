@@ -14,6 +14,7 @@ from failuretwin.app.commands.options import PATH, gathered
 if TYPE_CHECKING:
     from failuretwin.connection.links.commander import Commander
     from failuretwin.decision.acting.safety import SafetyGate
+    from failuretwin.decision.test_motions.probing import ProbeRules
     from failuretwin.digital_model.calibrated_robot import CalibratedRobot
     from failuretwin.digital_model.robot import Robot
 
@@ -91,6 +92,51 @@ class SafetyOptions:
             speed_share=self.speed_share, floor_m=self.floor, radius_m=self.radius
         )
         return SafetyGate(robot, limits)
+
+
+@dataclass(frozen=True)
+class ProbeOptions:
+    """Whether a watched arm is asked by movements, as the help texts of `probe_options` say it."""
+
+    probes: int
+    idle: float
+    move: bool
+
+    def rules(self, place: str, wait_s: float) -> ProbeRules:
+        """Return when the arm at a place is asked; commands may come so late [s]."""
+        from failuretwin.app.live import EMULATED
+        from failuretwin.decision.test_motions.probing import ProbeRules
+
+        return ProbeRules(self.probes, self.idle + wait_s, self.move or place == EMULATED)
+
+
+probe_options = gathered(
+    ProbeOptions,
+    "probe",
+    click.option(
+        "--probe",
+        "probes",
+        type=click.IntRange(min=0),
+        default=0,
+        metavar="N",
+        help="While a fault is suspected and the arm stands still, make N movements at most that "
+        "settle which, each with the way back. Default: 0, nothing moves.",
+    ),
+    click.option(
+        "--idle",
+        type=click.FloatRange(min=1.0),
+        default=10.0,
+        show_default=True,
+        metavar="SECONDS",
+        help="With --probe: only so long after the last command of others was carried out.",
+    ),
+    click.option(
+        "--move",
+        is_flag=True,
+        help="With --probe: really send orders. Without it a real arm gets none, and what would be "
+        "ordered is told. An emulated arm needs no --move.",
+    ),
+)
 
 
 safety_options = gathered(

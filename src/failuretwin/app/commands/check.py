@@ -156,10 +156,8 @@ def check(
     Movements are chosen to tell most; each passes the gate of `act`. See docs/asking.md.
     """
     from failuretwin.app import check_report as report
-    from failuretwin.app.smallest import of_motions
     from failuretwin.app.tables import show
     from failuretwin.app.terminal import tell
-    from failuretwin.decision.test_motions.health_check import GREEN
     from failuretwin.decision.test_motions.motions import write_motions
 
     asking = motion.checking(safety, calibration, robot, seed)
@@ -180,10 +178,10 @@ def check(
     with ExitStack() as stack:
         commander = arm.commander(asking.known, seed, stack)
         result = asking.health_check(planned, further).work(commander, tell)
+    time, command = planned.reference()
+    result = asking.shown(result, command, time)
     record = report.check_record(result, model, planned.duration_s)
     show(*report.check_lines(result, model, planned.duration_s))
-    if result.light == GREEN:
-        show(report.shown_line(of_motions(asking, planned), model))
     if keep is not None:
         before = report.kept_checks(keep) if keep.exists() else []
         show(*(report.changes(before[-1], record) if before else [f"kept in {keep}"]))

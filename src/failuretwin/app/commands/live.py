@@ -11,6 +11,12 @@ from typing import TYPE_CHECKING
 
 import click
 
+from failuretwin.app.commands.arm_options import (
+    ProbeOptions,
+    SafetyOptions,
+    probe_options,
+    safety_options,
+)
 from failuretwin.app.commands.options import (
     PATH,
     LiveOptions,
@@ -54,6 +60,8 @@ if TYPE_CHECKING:
     help="Whether what the motors report of themselves, such as /joint_states, is believed beside "
     "the tool's position: errors show sooner, but a wrong reading is taken for the motor.",
 )
+@probe_options
+@safety_options
 @live_options
 @plugin_option
 @common_options
@@ -63,11 +71,17 @@ def watch(
     record: Path | None,
     budget: float,
     sensing: str,
+    probe: ProbeOptions,
+    safety: SafetyOptions,
     live: LiveOptions,
     robot: str,
     seed: int,
 ) -> None:
     """Watch a robot as a digital shadow: it listens, says what is wrong, and moves nothing.
+
+    With --probe N it may ask: while a fault is suspected and nobody commands the arm, it is moved
+    to settle which, and back. Each order passes the gate of `act` (--speed-share, --floor,
+    --radius); any command of others ends it.
 
     SOURCE is `ros1`, `ros2[://HOST[:PORT]]` (over Zenoh), `rosbridge://HOST[:PORT]`, `emulated` (a
     robot that exists only as physics), a log to replay (a raw session, a bag, a recording), or a
@@ -78,11 +92,13 @@ def watch(
     from contextlib import ExitStack
 
     from failuretwin.app.live import connect, fit_of, topics_of, watch_until_end
+    from failuretwin.app.probing import commanded
     from failuretwin.app.shadow import Shadow
     from failuretwin.app.tables import console
     from failuretwin.connection.links.recording import Recorder
     from failuretwin.connection.links.statuses import statuses
     from failuretwin.decision.streaming.monitor import monitor
+    from failuretwin.decision.test_motions.probing import Prober
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
 
@@ -95,13 +111,21 @@ def watch(
     # An emulated robot ends by itself, a log when it is over.
     length = live.duration if live.duration and source != "emulated" else math.inf
     with ExitStack() as stack:
-        link, sinks = connect(source, model, live, seed, stack)
+        link: Source
+        prober = None
+        if probe.probes:
+            commander, sinks = commanded(source, model, live, seed, stack)
+            link, rules = commander, probe.rules(source, wait_s)
+            prober = Prober(diagnoser, safety.gate(known.robot), commander, rules, seed)
+            sinks.append(prober)
+        else:
+            link, sinks = connect(source, model, live, seed, stack)
         if record is not None:
             sinks.append(stack.enter_context(Recorder(record, model)))
         shadow = Shadow(link, diagnoser, known.twin, sinks, wait_s)
         try:
             until = time.monotonic() + length
-            watch_until_end(shadow, link, sinks, motors, console(), until, diagnoser)
+            watch_until_end(shadow, link, sinks, motors, console(), until, diagnoser, prober)
         except KeyboardInterrupt:
             tell("stopped")
     arm = statuses(shadow.snapshot.answer, motors)[0]

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from failuretwin.connection.links.base import CommandSent, Reading
+from failuretwin.connection.links.base import CommandSent, Event, Reading
 from failuretwin.connection.links.commander import Commander, Order
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
@@ -36,7 +36,7 @@ class Halted(InputError):  # noqa: N818 - it is no error of the user
 
 
 class Worker(Protocol):
-    """Says what to order next, by what was seen: an `Actor`, or a `HealthCheck`."""
+    """Says what to order next, by what was seen: an `Actor`, a `HealthCheck`, a `Question`."""
 
     @property
     def arm(self) -> BelievedArm:
@@ -86,6 +86,7 @@ class Work:
         commander: The arm.
         standing: What its motors were told last, (motor,) [rad].
         tell: Called with what is said, as it happens.
+        hear: Called with each event before it counts; None: nothing came just now.
     """
 
     actor: Worker
@@ -94,6 +95,7 @@ class Work:
     commander: Commander
     standing: FloatArray
     tell: Callable[[str], None]
+    hear: Callable[[Event | None], object] = lambda event: None
 
     def __post_init__(self) -> None:
         self._now = 0.0
@@ -111,8 +113,8 @@ class Work:
         """
         while (order := self.actor.next()) is not None:
             self._report()
-            start = self._now
             self._send(order)
+            start = self._now
             point = self._rest(order, start)
             self.actor.see(point, start, self._now)
             self.actor.learn(self._judgement())
@@ -169,13 +171,14 @@ class Work:
                 return point
         return None
 
-    def _next_event(self) -> Reading | CommandSent | None:
+    def _next_event(self) -> Event | None:
         """Return what the arm says next; None: nothing just now.
 
         Raises:
             Halted: If it has ended or fallen silent, or somebody else commands it.
         """
         event = self.commander.poll(POLL_S)
+        self.hear(event)
         if event is None:
             if self.commander.ended:
                 raise Halted("the arm has ended; nothing more is sent.")
@@ -219,7 +222,7 @@ def first_standing(commander: Commander) -> FloatArray:
     )
 
 
-def _angles(event: Reading | CommandSent | None) -> FloatArray | None:
+def _angles(event: Event | None) -> FloatArray | None:
     """Return the angles that a reading tells of all motors, (motor,) [rad]; None: it does not."""
     if not isinstance(event, Reading) or event.position is None:
         return None

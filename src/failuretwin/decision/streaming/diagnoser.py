@@ -26,7 +26,7 @@ from failuretwin.inference.diagnoser import BayesDiagnoser
 
 # The state of a stream in a file: plain arrays, read without running anything.
 
-FORMAT = 4
+FORMAT = 5
 SUFFIX = ".npz"
 HEADER = "header"
 

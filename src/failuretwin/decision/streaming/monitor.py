@@ -7,15 +7,15 @@ the robot itself teaches (`HealthyMixture`, `LifeLearner`); the alarm comes from
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from failuretwin.connection.links.base import OK, STALE, Answer
-from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.core.numerics import log_of
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis
+from failuretwin.core.numerics import Weighted, log_of
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.decision.streaming.alarm_rule import AlarmRule
 from failuretwin.decision.streaming.diagnoser import reference_of
@@ -51,6 +51,23 @@ class Fit:
     fits: float
     learned: int
     seen: int = 0
+
+
+@dataclass(frozen=True)
+class Believed:
+    """What a watch makes of its robot by all movements so far.
+
+    Attributes:
+        model: The healthy robot that explains it best.
+        hypotheses: What may be the case; the first is healthy.
+        probability: Of each hypothesis, (hypothesis,).
+        sizes: What is believed of the size of each fault; None of healthy.
+    """
+
+    model: HealthyModel
+    hypotheses: Sequence[Hypothesis]
+    probability: FloatArray
+    sizes: Sequence[Weighted | None]
 
 
 class FaultMonitor:
@@ -90,7 +107,7 @@ class FaultMonitor:
         self._rule = AlarmRule(
             self._fleet.hypotheses, filters[0].faults_per_h, false_alarms_per_100h
         )
-        self._concluded = self._mixture.begin(1)
+        self._concluded = self._present = self._mixture.begin(1)
         self._movements = 0
         self._explained: dict[int, float] = {}
         self._diagnosis: Diagnosis | None = None
@@ -107,6 +124,15 @@ class FaultMonitor:
         fits = float(np.exp(self._concluded.log_weight[0, 0])) if self._given else 0.0
         learned = 0 if self._learner is None else self._learner.movements
         return Fit(self._given, fits, learned, self._set_up.movements)
+
+    @property
+    def believed(self) -> Believed:
+        """What is believed, the present movement as it looks now included."""
+        best = int(np.argmax(self._present.log_weight[0]))
+        own, belief = self._mixture.filters[best], self._present.beliefs[best]
+        sizes = [own.size(belief, at) for at in range(len(own.hypotheses))]
+        probability = self._mixture.posterior(self._present)[0]
+        return Believed(self._models[best], own.hypotheses, probability, sizes)
 
     def update(
         self,
@@ -188,6 +214,7 @@ class FaultMonitor:
             if movement < count - 1:
                 hours += float(says[0].hours[0, movement - part.start])
                 self._concluded, self._movements = belief, before + movement + 1
+        self._present = belief
         posterior = self._mixture.posterior(belief)[0]
         self._rule.see(self._fleet.time, posterior, hours)
         for movement in range(new, count - 1):

@@ -160,7 +160,7 @@ class Designer:
         near = self._allowed(np.clip(drawn[np.argmax(score)] + around, *self.limits))
         drawn, score = np.concatenate([drawn, near]), np.append(score, score_of(near))
         for pose in drawn[np.argsort(-score)[:TRIED]]:
-            found = self._movement(pose, told[-1], start)
+            found = self.movement(pose, told[-1], start)
             if found is not None and since[-1] + found.seconds <= seconds:
                 return found
         return None
@@ -171,7 +171,7 @@ class Designer:
         at, left = start, seconds
         for _ in range(TRIED * most):
             pose = self._pool[self._rng.integers(len(self._pool))]
-            found = self._movement(pose, at, start)
+            found = self.movement(pose, at, start)
             if found is None or found.seconds > left:
                 continue
             made.append(found)
@@ -179,6 +179,20 @@ class Designer:
             if len(made) == most or left < self.rest_s + self.gate.limits.least_ramp_s:
                 break
         return made
+
+    def movement(self, pose: FloatArray, at: FloatArray, start: FloatArray) -> Movement | None:
+        """Return the movement to a pose; None if it is not safe.
+
+        Args:
+            pose: Where to, (motor,) [rad].
+            at: What the motors were told last, (motor,) [rad].
+            start: Where a motor is left that does not follow, (motor,) [rad].
+        """
+        ramp = self.gate.least_duration(pose - at)
+        order = Order(pose, np.full(len(pose), ramp))
+        if self.gate.wrong(order, self._ways(at, pose, start)):
+            return None
+        return Movement(order, at, ramp + self.rest_s)
 
     def _allowed(self, poses: FloatArray) -> FloatArray:
         """Return poses as they can be told, without those that are not allowed."""
@@ -188,14 +202,6 @@ class Designer:
         low, high = self.limits
         poses = poses[np.all((poses >= low) & (poses <= high), axis=1)]
         return np.asarray(poses[self.gate.clearance.margin(poses) > self.gate.margin_m])
-
-    def _movement(self, pose: FloatArray, at: FloatArray, start: FloatArray) -> Movement | None:
-        """Return the movement to a pose; None if it is not safe."""
-        ramp = self.gate.least_duration(pose - at)
-        order = Order(pose, np.full(len(pose), ramp))
-        if self.gate.wrong(order, self._ways(at, pose, start)):
-            return None
-        return Movement(order, at, ramp + self.rest_s)
 
     def _ways(self, at: FloatArray, pose: FloatArray, start: FloatArray) -> Sequence[Way]:
         """Return the way as it is told, as it settles, and with each motor left at the start."""

@@ -28,6 +28,7 @@ from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.advice import SURE, motor_probabilities
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.isolability import IsolabilityReport
 from failuretwin.inference.log_quality import LogQuality
 from failuretwin.inference.posterior import Posterior, log_prior
 from failuretwin.inference.priors import Priors, visible_sizes
@@ -141,12 +142,14 @@ class CheckResult:
         offsets: Zeros and play of the motors.
         movements: Movements that were seen at rest.
         further: How many of the movements made were not planned before.
+        shown: What its movements can show at all; None: not looked at.
     """
 
     diagnosis: Diagnosis
     offsets: MotorOffsets
     movements: int
     further: int = 0
+    shown: IsolabilityReport | None = None
 
     @property
     def by_motor(self) -> Mapping[str, float]:

@@ -11,13 +11,15 @@ Section: docs/asking.md#what-a-movement-is-expected-to-tell
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.numerics import Weighted
 from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.decision.streaming.monitor import Believed
 from failuretwin.decision.test_motions.information import (
     expected_information,
     pairwise_distance,
@@ -102,12 +104,42 @@ def of_posterior(posterior: Posterior, row: int) -> list[Member]:
         posterior: Of all hypotheses, for several arms.
         row: Which of them.
     """
+    shares = np.exp(posterior.log_posterior[row])
+
+    def size_of(at: int) -> Weighted | None:
+        healthy = posterior.hypotheses[at].is_healthy
+        return None if healthy else posterior.weights[at].estimate(row).size
+
+    return _at_quantiles(posterior.hypotheses, shares, size_of)
+
+
+def of_belief(believed: Believed) -> list[Member]:
+    """Return members of what a watch believes, healthy and faulty as probable as each other.
+
+    An alarm is raised at odds that have to do with neither: whether there is a fault is asked as
+    much as which.
+
+    Args:
+        believed: What it believes.
+    """
+    shares = believed.probability.copy()
+    healthy = np.array([hypothesis.is_healthy for hypothesis in believed.hypotheses])
+    for part in (healthy, ~healthy):
+        shares[part] *= 0.5 / max(float(shares[part].sum()), np.finfo(float).tiny)
+    return _at_quantiles(believed.hypotheses, shares, believed.sizes.__getitem__)
+
+
+def _at_quantiles(
+    hypotheses: Sequence[Hypothesis],
+    shares: FloatArray,
+    size_of: Callable[[int], Weighted | None],
+) -> list[Member]:
+    """Return members of hypotheses that are not negligible, sizes at quantiles."""
     members = []
-    for at, hypothesis in enumerate(posterior.hypotheses):
-        share = float(np.exp(posterior.log_posterior[row, at]))
+    for at, (hypothesis, share) in enumerate(zip(hypotheses, shares.tolist(), strict=True)):
         if share < NEGLIGIBLE or not hypothesis.known or len(hypothesis.faults) > 1:
             continue
-        size = None if hypothesis.is_healthy else posterior.weights[at].estimate(row).size
+        size = size_of(at)
         sizes = [np.nan] if size is None else size.quantiles(tuple(_levels(SIZES).tolist()))
         members += [Member(hypothesis, float(each), share / len(sizes)) for each in sizes]
     return members

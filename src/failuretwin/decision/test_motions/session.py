@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -11,10 +11,11 @@ import numpy as np
 
 from failuretwin.connection.links.commander import Commander
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
 from failuretwin.decision.test_motions.design import Designer
 from failuretwin.decision.test_motions.health_check import (
+    GREEN,
     CheckResult,
     HealthCheck,
     checking,
@@ -32,6 +33,7 @@ from failuretwin.digital_model.calibrated_robot import (
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.isolability import IsolabilityReport, isolability
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 
@@ -111,6 +113,28 @@ class Checking:
             self.seed,
         )
 
+    def isolability(self, command: FloatArray, time: FloatArray) -> IsolabilityReport:
+        """Return what motions can tell apart, by the priors of a check.
+
+        Args:
+            command: References, (sample, motor) or (run, sample, motor) [rad].
+            time: Their times, (sample,) [s].
+        """
+        known, priors = self.known, checking(self.model, self.asked)
+        return isolability(known.twin, command, time, known.imperfections, self.asked, priors)
+
+    def shown(self, result: CheckResult, command: FloatArray, time: FloatArray) -> CheckResult:
+        """Return a result with what its movements can show, where it says that all is well.
+
+        Args:
+            result: The result.
+            command: References of its movements, (run, sample, motor) [rad].
+            time: Their times, (sample,) [s].
+        """
+        if result.light != GREEN:
+            return result
+        return replace(result, shown=self.isolability(command, time))
+
     def of_logs(self, paths: Sequence[Path]) -> list[CheckResult]:
         """Return what logs of a check say that was made elsewhere, a result a run.
 
@@ -125,10 +149,12 @@ class Checking:
             self.known.twin, self.known.imperfections, self.hypotheses, priors
         )
         settled = Evidence(runs, self.model.settings).sound.settled
-        return [
+        command, time = as_floats(runs["command"].values), as_floats(runs["time"].values)
+        found = [
             result_of(RunLikelihood(settled[row : row + 1], self.model), diagnosis)
             for row, diagnosis in enumerate(diagnoser.diagnose(runs))
         ]
+        return [self.shown(each, command[row : row + 1], time) for row, each in enumerate(found)]
 
 
 def check(
