@@ -34,6 +34,7 @@ from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfec
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections, vary
 from failuretwin.inference.fault_filter import FaultFilter
+from failuretwin.inference.healthy_density import healthy_log_density
 from failuretwin.inference.healthy_mixture import FOREIGN, HealthyMixture
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.joint_likelihood import movement_likelihoods
@@ -95,14 +96,19 @@ def look(lives: Lives, mixture: HealthyMixture) -> Seen:
     """Return lives as they are seen."""
     models = [one.model for one in mixture.filters]
     found = [movement_likelihoods(lives.evidence, model) for model in models]
+    healthy = [healthy_log_density(lives.evidence, known) for known in found]
     belief, posterior, hours = mixture.begin(len(lives.hours)), [], []
     movements = lives.evidence.usable.shape[1]
     for first in range(0, movements, BLOCK):
         before = max(first - 1, 0)
         part = (slice(None), slice(before, min(first + BLOCK, movements)))
         says = [
-            one.evidence(RunLikelihood(lives.evidence[part], one.model, remembered=known[part]))
-            for one, known in zip(mixture.filters, found, strict=True)
+            one.evidence(
+                RunLikelihood(
+                    lives.evidence[part], one.model, remembered=known[part], healthy=usual[part]
+                )
+            )
+            for one, known, usual in zip(mixture.filters, found, healthy, strict=True)
         ]
         for at in range(first - before, says[0].hours.shape[1]):
             belief = mixture.advance(belief, says, at)

@@ -132,7 +132,7 @@ class CommandOutcomes(ArrayStruct):
     """What may become of each movement: which motors lost how many commands in a row.
 
     Attributes:
-        lost: Motors that lose their command, (outcome, motor).
+        missed: Commands that each motor has missed in a row, (outcome, motor).
         base: Angles that the motors then go for, (run, movement, outcome, motor) [rad].
         kept: What of them is scatter of the movement before a loss, which a motor that does not
             move keeps, (run, movement, outcome, motor) [rad].
@@ -141,11 +141,16 @@ class CommandOutcomes(ArrayStruct):
             (run, movement, outcome).
     """
 
-    lost: BoolArray
+    missed: IntArray
     base: Annotated[FloatArray, Axes("run", "movement", "outcome", "motor")]
     kept: Annotated[FloatArray, Axes("run", "movement", "outcome", "motor")]
     direction: Annotated[FloatArray, Axes("run", "movement", "outcome", "motor")]
     log_weight: Annotated[FloatArray, Axes("run", "movement", "outcome")]
+
+    @property
+    def lost(self) -> BoolArray:
+        """Motors that lose their command, (outcome, motor)."""
+        return np.asarray(self.missed > 0)
 
 
 @dataclass(frozen=True)
@@ -194,7 +199,7 @@ class LostCommands:
         travel = np.sign(target - stood)
         kept = _of_last_made(np.zeros_like(off), off, rows.missed)
         return CommandOutcomes(
-            lost=rows.missed > 0,
+            missed=rows.missed,
             base=_of_last_made(target, origin, rows.missed) + kept,
             kept=kept,
             direction=_of_last_made(travel, _before(travel), rows.missed),

@@ -27,6 +27,7 @@ from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.fault_filter import RATES, FaultFilter, FaultRates
+from failuretwin.inference.healthy_density import healthy_log_density
 from failuretwin.inference.healthy_mixture import FOREIGN, HealthyMixture
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.posterior import StreamPosition
@@ -200,8 +201,9 @@ class FaultMonitor:
         if model is not likelihood.model:
             likelihood = RunLikelihood(likelihood.evidence, model)
         rows = slice(None), part
-        evidence, findings = likelihood.evidence[rows], likelihood.findings[rows]
-        return RunLikelihood(evidence, model, remembered=findings)
+        evidence, findings = likelihood.evidence, likelihood.findings
+        healthy = healthy_log_density(evidence, findings)[rows]
+        return RunLikelihood(evidence[rows], model, remembered=findings[rows], healthy=healthy)
 
     def _learn(self, evidence: SettledEvidence, movement: int, begin_s: float) -> None:
         """Learn from a movement that is over; what is known better counts from the next on.
