@@ -123,6 +123,9 @@ RARE = 1e-6
 than one movement in twenty days of work. One left out looks like a fault."""
 NEGLIGIBLE = 1e-7
 """What is less probable than this given the movements before is left to the outliers [-]."""
+STALE_GOAL, CHANCE_GOAL = 1e-3, 1e-5
+"""Share of reported goals that are old or spoilt, and of those that by chance are that of a command
+which did not arrive [-]; assumed."""
 LATE_MARGIN_S = 0.15
 """A movement that lasts this much longer than the schedule allows started late [s]."""
 
@@ -207,7 +210,11 @@ class LostCommands:
         )
 
     def filtered_outcomes(
-        self, outcomes: CommandOutcomes, late: FloatArray, log_likelihood: FloatArray
+        self,
+        outcomes: CommandOutcomes,
+        late: FloatArray,
+        log_likelihood: FloatArray,
+        arrived: FloatArray | None = None,
     ) -> CommandOutcomes:
         """Return outcomes with their probability given what was seen of the movements before.
 
@@ -218,8 +225,13 @@ class LostCommands:
             late: Probability that each started late, (run, movement).
             log_likelihood: What was seen of each movement says of each outcome, up to a
                 constant, (run, movement, outcome); 0 where nothing was seen.
+            arrived: Whether each motor reports to have received its command, (run, movement,
+                motor), NaN where it does not tell; None: nowhere.
         """
-        chances = self._in_a_row.forward(self._rates(late), log_likelihood)
+        rates = self._rates(late)
+        if arrived is not None and np.isfinite(arrived).any():
+            rates = self._given_goals(rates, arrived)
+        chances = self._in_a_row.forward(rates, log_likelihood)
         chances[chances < NEGLIGIBLE] = 0.0
         return replace(outcomes, log_weight=self._log_weight(chances))
 
@@ -236,12 +248,30 @@ class LostCommands:
         shares = np.stack([none, *rates], axis=-1)
         return shares / np.maximum(total, 1.0)[..., None]  # rounding may exceed one
 
+    def _given_goals(self, rates: FloatArray, arrived: FloatArray) -> FloatArray:
+        """Return the probability of each loss given what motors report to have received.
+
+        Args:
+            rates: What it is without that, (run, movement, loss).
+            arrived: (run, movement, motor), NaN where a motor does not tell.
+        """
+        told = np.isfinite(arrived)[:, :, None]
+        came = arrived[:, :, None] > 0.5
+        arrives = np.where(self._losses, CHANCE_GOAL, 1.0 - STALE_GOAL)
+        says = np.where(told, np.where(came, arrives, 1.0 - arrives), 1.0)
+        joint = rates * says.prod(axis=-1)
+        return joint / joint.sum(axis=-1, keepdims=True)
+
+    @cached_property
+    def _losses(self) -> BoolArray:
+        """Motors that each loss hits, (loss, motor); the first hits none."""
+        names, entries = self.robot.motor_names, self.imperfections.lost_commands
+        return np.array([np.isin(names, m) for m in ((), *(e.motors for e in entries))])
+
     @cached_property
     def _in_a_row(self) -> ConsecutiveLossHmm:
-        names, entries = self.robot.motor_names, self.imperfections.lost_commands
-        losses = [np.isin(names, motors) for motors in ((), *(e.motors for e in entries))]
         most = self._rates(np.array([0.0, 1.0])).max(axis=0)
-        return ConsecutiveLossHmm.of(np.array(losses), most, RARE)
+        return ConsecutiveLossHmm.of(self._losses, most, RARE)
 
     @staticmethod
     def _log_weight(chances: FloatArray) -> FloatArray:

@@ -48,11 +48,12 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--sensing",
-    type=click.Choice(["tool", "tool+encoders"]),
+    type=click.Choice(["tool", "tool+encoders", "tool+goals", "tool+encoders+goals"]),
     default="tool",
     show_default=True,
-    help="Whether what the motors report of themselves, such as /joint_states, is believed beside "
-    "the tool's position: errors show sooner, but a wrong reading is taken for the motor.",
+    help="What is believed beside the tool's position. encoders: what motors report of themselves, "
+    "such as /joint_states; errors show sooner, but a wrong reading is taken for the motor. goals: "
+    "which goal they report to have received; a stuck motor shows sooner.",
 )
 @live_options
 @plugin_option

@@ -115,6 +115,7 @@ class FaultMonitor:
         command: Mapping[str, float] | ArrayLike | None,
         measured: ArrayLike | None,
         position: ArrayLike | None = None,
+        goal: ArrayLike | None = None,
     ) -> Answer:
         """Take what is known at a time and return what is believed then.
 
@@ -123,6 +124,7 @@ class FaultMonitor:
             command: Reference of every motor, by name or (motor,) [rad]; None: not known.
             measured: Tool position, (axis,) [m]; None or NaN: no reading.
             position: What the motors report of themselves, (motor,) [rad], where that is believed.
+            goal: Goals that they report to have received, (motor,) [rad], where these are believed.
 
         Raises:
             InputError: If a motor is missing, shapes do not fit or the time is not finite.
@@ -131,7 +133,8 @@ class FaultMonitor:
         reference = None if command is None else reference_of(motors, command)[None]
         point = None if measured is None else as_floats(measured)[None]
         motors_say = None if position is None else as_floats(position)[None]
-        if len(self._fleet.update(time, reference, point, motors_say)):
+        goals = None if goal is None else as_floats(goal)[None]
+        if len(self._fleet.update(time, reference, point, motors_say, goals)):
             self._judge()
         self._set_up.see(time, _row(reference), _row(point))
         return self._answer()
@@ -249,7 +252,7 @@ def monitor(
         imperfections: How the healthy robot differs from it, or a calibration by name or path;
             None: as its profile says.
         false_alarms_per_100h: False alarms that are allowed in 100 hours of work.
-        sensing: ``tool`` or ``tool+encoders``; None: the tool's position alone.
+        sensing: ``tool``, with ``+encoders``, ``+goals`` or both; None: the tool's position alone.
     """
     diagnoser = BayesDiagnoser(twin, imperfections, whole_run=False, sensing=sensing)
     return FaultMonitor(diagnoser, false_alarms_per_100h)
