@@ -36,6 +36,9 @@ from failuretwin.inference.run_likelihood import RunLikelihood
 WORTH_LEARNING = 0.01
 """Probability that the calibration that was given is not this robot's from which it learns."""
 
+UNHEARD = 3
+"""Commands in a row of which a motor reports that they did not arrive, from which it is told."""
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -96,6 +99,7 @@ class FaultMonitor:
         self._explained: dict[int, float] = {}
         self._diagnosis: Diagnosis | None = None
         self._set_up = SetUpWatch(diagnoser)
+        self._arrived = np.full((0, len(known.scatter)), np.nan)
 
     @property
     def set_up(self) -> str | None:
@@ -148,11 +152,23 @@ class FaultMonitor:
     def _answer(self) -> Answer:
         """Return what is believed; where the set-up is in doubt, no motor is blamed."""
         state = STALE if self._fleet.stale[0] else OK
-        reason = self._set_up.against(self._rule.alarm)
+        reason = self._set_up.against(self._rule.alarm) or self._unheard(self._rule.alarm.cause)
         if not reason:
             return Answer(self._fleet.time, state, self._diagnosis, self._rule.alarm)
         undecided = replace(self._fleet.undecided(0, reason, self._diagnosis), run="stream")
         return Answer(self._fleet.time, state, undecided)
+
+    def _unheard(self, cause: str) -> str:
+        """Return that commands do not reach the motor that a fault is blamed on; else nothing."""
+        names, motor = self._fleet.diagnoser.twin.robot.motor_names, cause.partition(":")[0]
+        if motor not in names:
+            return ""
+        arrived = self._arrived[:, names.index(motor)]
+        last = arrived[np.isfinite(arrived)][-UNHEARD:]
+        if len(last) < UNHEARD or last.any():
+            return ""
+        name = motor.replace("_", " ")
+        return f"{name} reports that its commands do not arrive: what it does is not known"
 
     def _judge(self) -> None:
         """Renew what is believed by what the last movements say."""
@@ -178,6 +194,7 @@ class FaultMonitor:
             position: Where they lie in the stream.
         """
         count, before = likelihood.usable.shape[1], position.movements
+        self._arrived = likelihood.evidence.arrived[0]
         new = max(self._movements - before, 0)
         part = slice(max(new - 1, 0), count)
         says = [
