@@ -45,17 +45,20 @@ class ConsecutiveLossHmm:
     transition: FloatArray
 
     @staticmethod
-    def of(losses: BoolArray, chance: FloatArray, rare: float) -> ConsecutiveLossHmm:
+    def of(
+        losses: BoolArray, chance: FloatArray, rare: float, most: FloatArray | None = None
+    ) -> ConsecutiveLossHmm:
         """Return the chain of the states that are not too rare, single losses first.
 
         What is left out counts as fewer losses in a row.
 
         Args:
             losses: Motors that each loss hits, (loss, motor); the first hits none.
-            chance: Highest probability of each, (loss,).
-            rare: Losses in a row that are less probable are left out.
+            chance: Probability of each, (loss,).
+            rare: Losses in a row that are less probable, at their highest, are left out.
+            most: Highest probability of each, (loss,); None: it is always the same.
         """
-        states = _states(losses, chance, rare)
+        states = _states(losses, chance, chance if most is None else most, rare)
         leads = np.zeros((len(losses), len(states), len(states)))
         for i, loss in enumerate(losses):
             for j, state in enumerate(states):
@@ -85,22 +88,31 @@ class ConsecutiveLossHmm:
         return chances
 
 
-def _states(losses: BoolArray, chance: FloatArray, rare: float) -> list[tuple[int, ...]]:
-    """Return the states that are not too rare, from few losses in a row to many."""
+def _states(
+    losses: BoolArray, chance: FloatArray, most: FloatArray, rare: float
+) -> list[tuple[int, ...]]:
+    """Return the states that are not too rare, from few losses in a row to many.
+
+    Where there are more than `MOST_STATES`, those stay that come up most often.
+    """
     none = (0,) * losses.shape[1]
-    newest = {_one_more(none, loss): float(p) for loss, p in zip(losses, chance, strict=True)}
-    found = list(newest)
-    while newest:
-        longer: dict[tuple[int, ...], float] = {}
-        for state, before in newest.items():
-            for loss, now in zip(losses, chance, strict=True):
+    singles = [_one_more(none, loss) for loss in losses]
+    newest = dict(zip(singles, zip(chance.tolist(), most.tolist(), strict=True), strict=True))
+    found = dict(newest)
+    for _ in range(MOST_STATES):
+        longer: dict[tuple[int, ...], tuple[float, float]] = {}
+        for state, (usual, high) in newest.items():
+            for loss, now, at_most in zip(losses, chance.tolist(), most.tolist(), strict=True):
                 missed = _one_more(state, loss)
                 if missed not in found:
-                    longer[missed] = longer.get(missed, 0.0) + before * float(now)
-        ranked = sorted((p, missed) for missed, p in longer.items() if p > rare)[::-1]
-        newest = {missed: p for p, missed in ranked[: max(MOST_STATES - len(found), 0)]}
-        found += newest
-    return found
+                    known, top = longer.get(missed, (0.0, 0.0))
+                    longer[missed] = known + usual * now, top + high * at_most
+        ranked = sorted((p, q, missed) for missed, (p, q) in longer.items() if q > rare)[::-1]
+        newest = {missed: (p, q) for p, q, missed in ranked[:MOST_STATES]}
+        found |= newest
+    others = sorted(list(found)[len(losses) :], key=lambda state: -found[state][0])
+    kept = {*singles, *others[: max(MOST_STATES - len(losses), 0)]}
+    return [state for state in found if state in kept]
 
 
 def _one_more(missed: tuple[int, ...], loss: BoolArray) -> tuple[int, ...]:
@@ -270,8 +282,10 @@ class LostCommands:
 
     @cached_property
     def _in_a_row(self) -> ConsecutiveLossHmm:
-        most = self._rates(np.array([0.0, 1.0])).max(axis=0)
-        return ConsecutiveLossHmm.of(self._losses, most, RARE)
+        late_rate = self.imperfections.timing.late_rate
+        usual = self._rates(np.array(late_rate))
+        most = self._rates(np.array([0.0, float(late_rate > 0.0)])).max(axis=0)
+        return ConsecutiveLossHmm.of(self._losses, usual, RARE, most)
 
     @staticmethod
     def _log_weight(chances: FloatArray) -> FloatArray:

@@ -27,7 +27,7 @@ def reported(work, twin, rng):
         found, stood, goal = [], None, np.zeros(4)
         for t, reference, _ in work(movements):
             angle = reference.copy()
-            if t > 0.5 + 2.04 * stays_from:
+            if t > 0.3 + 2.04 * stays_from:
                 stood = angle[MOTOR] if stood is None else stood
                 angle[MOTOR] = stood
             goal = reference.copy()
@@ -65,7 +65,7 @@ def test_a_motor_whose_goals_do_not_come_is_not_stuck(twin, reported):
         told = [watch.update(*sample) for sample in samples]
         states[sensing] = {answer.alarm.state for answer in told}
     assert RAISED in states["tool"]
-    assert states["tool+goals"] == {CLEAR}
+    assert RAISED not in states["tool+goals"]
     assert "motor 1 reports that its commands do not arrive" in told[-1].diagnosis.undecided
 
 
