@@ -92,7 +92,8 @@ def watch(
     diagnoser = monitor(known.twin, known.imperfections, budget, sensing)
     wait_s = topics_of(live.topics).wait_s
     when = "" if calibration is None else _written(calibration)
-    tell(_rests_on(known.imperfections, when) + _limit(known.imperfections, motors, budget))
+    limit = "" if "goals" in sensing else _limit(known.imperfections, motors, budget)
+    tell(_rests_on(known.imperfections, when) + limit)
     # An emulated robot ends by itself, a log when it is over.
     length = live.duration if live.duration and source != "emulated" else math.inf
     with ExitStack() as stack:
