@@ -1,7 +1,7 @@
 """False alarms and delays of the watch: healthy hours and faults, robots drawn at random.
 
     python benchmarks/alarms.py [--hours 30] [--faults 200] [--seed 0] [--robot armpi_fpv]
-        [--of CALIBRATION] [--by CALIBRATION] [--robots N | --alone] [--encoders]
+        [--of CALIBRATION] [--by CALIBRATION] [--robots N | --alone] [--sensing SENSING ...]
         [--picture FILE]
 
 Movements are seen at rest alone (`alarms_world.py`). Each healthy life is an hour of a robot of its
@@ -34,6 +34,7 @@ from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfec
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections, vary
 from failuretwin.inference.fault_filter import FaultFilter
+from failuretwin.inference.healthy_density import healthy_log_density
 from failuretwin.inference.healthy_mixture import FOREIGN, HealthyMixture
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.joint_likelihood import movement_likelihoods
@@ -95,14 +96,19 @@ def look(lives: Lives, mixture: HealthyMixture) -> Seen:
     """Return lives as they are seen."""
     models = [one.model for one in mixture.filters]
     found = [movement_likelihoods(lives.evidence, model) for model in models]
+    healthy = [healthy_log_density(lives.evidence, known) for known in found]
     belief, posterior, hours = mixture.begin(len(lives.hours)), [], []
     movements = lives.evidence.usable.shape[1]
     for first in range(0, movements, BLOCK):
         before = max(first - 1, 0)
         part = (slice(None), slice(before, min(first + BLOCK, movements)))
         says = [
-            one.evidence(RunLikelihood(lives.evidence[part], one.model, remembered=known[part]))
-            for one, known in zip(mixture.filters, found, strict=True)
+            one.evidence(
+                RunLikelihood(
+                    lives.evidence[part], one.model, remembered=known[part], healthy=usual[part]
+                )
+            )
+            for one, known, usual in zip(mixture.filters, found, healthy, strict=True)
         ]
         for at in range(first - before, says[0].hours.shape[1]):
             belief = mixture.advance(belief, says, at)
@@ -141,6 +147,8 @@ def joined(parts: Sequence[Seen]) -> Seen:
         hours=np.concatenate([part.lives.hours for part in parts]),
         truth=[fault for part in parts for fault in part.lives.truth],
         onset=np.concatenate([part.lives.onset for part in parts]),
+        onset_s=np.concatenate([part.lives.onset_s for part in parts]),
+        told_s=np.concatenate([part.lives.told_s for part in parts]),
     )
     names = ("posterior", "hours", "residual", "shown")
     values = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
@@ -215,18 +223,19 @@ def false_alarms(told: Told, hours: float) -> str:
 
 @dataclass(frozen=True)
 class Delays:
-    """How faults were found: delay and delay after shown, of those that were, and who was named."""
+    """How faults were found: delays, after shown and in seconds too, and who was named."""
 
     found: int
     of: int
     movements: FloatArray
     after_shown: FloatArray
+    seconds: FloatArray
     right: int
 
     @classmethod
     def of_alarms(cls, told: Told, seen: Seen, some: Sequence[int]) -> Delays:
         """Return the delays of some lives; alarms before the onset do not count."""
-        movements, after, right = [], [], 0
+        movements, after, seconds, right = [], [], [], 0
         for i in some:
             onset, shown = int(seen.lives.onset[i]), int(seen.shown[i])
             rows = zip(told.raised[i], told.cause[i], strict=True)
@@ -235,18 +244,22 @@ class Delays:
                 continue
             movements.append(first[0] - onset + 1)
             after.append(first[0] - shown if shown >= 0 else np.nan)
+            seconds.append(seen.lives.told_s[i, first[0]] - seen.lives.onset_s[i])
             right += first[1] == seen.lives.truth[i]
-        return cls(len(movements), len(some), np.array(movements), np.array(after), right)
+        delays = np.array(movements), np.array(after), np.array(seconds)
+        return cls(len(movements), len(some), *delays, right)
 
     def __str__(self) -> str:
         if not self.found:
             return f"found 0 of {self.of}"
         quantiles = np.quantile(self.movements, (0.5, 0.9, 0.99), method="inverted_cdf")
         after = np.nanquantile(self.after_shown, (0.5, 0.9), method="inverted_cdf")
+        seconds = np.quantile(self.seconds, (0.5, 0.9))
         right = f"right {100 * self.right / self.found:.1f} %" if self.right else "names nothing"
         return (
             f"found {self.found} of {self.of}; movements {'/'.join(f'{q:.0f}' for q in quantiles)};"
-            f" after shown {'/'.join(f'{q:.0f}' for q in after)}; {right}"
+            f" after shown {'/'.join(f'{q:.0f}' for q in after)};"
+            f" {'/'.join(f'{q:.1f}' for q in seconds)} s; {right}"
         )
 
 
@@ -316,11 +329,11 @@ def main() -> None:
     parser.add_argument("--by", default=None, help="calibration that the watch uses")
     parser.add_argument("--robots", type=int, default=0, help="so many, which have taught")
     parser.add_argument("--alone", action="store_true", help="believe the calibration for sure")
-    parser.add_argument("--encoders", action="store_true", help="believe the motors' readings too")
+    parser.add_argument("--sensing", nargs="+", default=["tool"], help="what is believed")
     parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
     curves: dict[str, list[tuple[float, float]]] = {}
-    for sensing in ("tool", "tool+encoders")[: 1 + options.encoders]:
+    for sensing in options.sensing:
         study(options, sensing, curves)
     if options.picture:
         draw(curves, options.picture)

@@ -13,6 +13,7 @@ import numpy as np
 
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.decision.streaming.tracking import REST_S
 from failuretwin.digital_model.disturbances import (
     Disturbances,
     actual_movements,
@@ -47,6 +48,9 @@ class Lives:
         held: Angle of a stuck motor, (life,) [rad]; NaN of others.
         off: Steady-state error of each movement, (life, movement) [rad]; 0 without.
         late: Movements that start late, (life, movement).
+        onset_s: When the fault begins, (life,) [s]: at any time of the cycle that spoils that
+            movement; 0 of healthy ones.
+        told_s: When each movement can be judged, (life, movement) [s].
     """
 
     evidence: SettledEvidence
@@ -57,6 +61,8 @@ class Lives:
     held: FloatArray
     off: FloatArray
     late: BoolArray
+    onset_s: FloatArray
+    told_s: FloatArray
 
 
 def live(
@@ -97,7 +103,7 @@ def live(
     target = told.target.copy()
     target[np.arange(len(faults)), :, motor] += off
     base = actual_movements(replace(told, target=target), chance).target
-    angle, at_rest, held = _settled(twin, told, chance, faults, motor, spoilt, rng, base)
+    angle, place, held = _settled(twin, told, chance, faults, motor, spoilt, rng, base)
     readings = imperfections.readings
     if readings is not None and readings.whole_counts:
         units = robot.servo_units
@@ -106,10 +112,14 @@ def live(
     point = twin.path(angle) + rng.normal(0.0, noise_m, (*angle.shape[:2], 3))
     if sensors is not None:
         point = sensors.reading(point, angle)
+    arrived = np.full(base.shape, np.nan)
+    if sensors is not None and sensors.goals:
+        arrived = sensors.has_arrived(_received(told, chance), told.target)
     usable = np.ones(point.shape[:2], dtype=bool)
     late = chance.late > 0.0
     if gaps:
         usable[:, :-1] = ~late[:, 1:]
+        arrived[~usable] = np.nan  # a bus that stalls says nothing of goals either
     begin = told.start + chance.late + told.ramp_duration.max(axis=-1) + SETTLING_S
     evidence = SettledEvidence(
         movements=told,
@@ -119,9 +129,23 @@ def live(
         begin=begin,
         end=begin + JUST_AFTER_S,
         first_reading_delay=chance.late + READ_S,
+        arrived=arrived,
     )
     hours = (told.start[:, -1] - told.start[:, 0]) / 3600.0
-    return Lives(evidence, hours, faults, first, at_rest, held, off, late)
+    period = np.median(np.diff(told.start, axis=1), axis=1)
+    waits = np.random.default_rng([seed, 1]).random(len(faults)) * period
+    begins = np.take_along_axis(told.start + chance.late, spoilt.argmax(axis=1)[:, None], axis=1)
+    onset_s = np.where(spoilt.any(axis=1), begins[:, 0] + np.where(errs, -waits, place), 0.0)
+    told_s = begin + REST_S
+    return Lives(evidence, hours, faults, first, place < 0.0, held, off, late, onset_s, told_s)
+
+
+def _received(told: Movements, chance: Disturbances) -> FloatArray:
+    """Return the goal that each motor has received by each movement's end, (..., motor) [rad]."""
+    goal, before = np.empty_like(told.target), told.initial
+    for m in range(goal.shape[1]):
+        goal[:, m] = before = np.where(chance.lost[:, m], before, told.target[:, m])
+    return goal
 
 
 def _motor(fault: str, names: Sequence[str]) -> int:
@@ -137,8 +161,11 @@ def _settled(
     spoilt: BoolArray,
     rng: np.random.Generator,
     base: FloatArray,
-) -> tuple[FloatArray, BoolArray, FloatArray]:
-    """Return where motors settle (life, movement, motor) [rad], and how stuck ones are held."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return where motors settle (life, movement, motor) [rad], and how stuck ones are held.
+
+    That is: when, from the beginning of a ramp on (life,) [s], and where (life,) [rad].
+    """
     compliance = chance.compliance[:, None]
 
     def sagged(base: FloatArray, stays: BoolArray) -> FloatArray:
@@ -149,16 +176,16 @@ def _settled(
 
     angle = sagged(base, np.zeros_like(base, dtype=bool))
     stuck = np.array([fault.endswith("stuck") for fault in faults])
-    at_rest, held = np.zeros(len(faults), dtype=bool), np.full(len(faults), np.nan)
+    places, held = np.zeros(len(faults)), np.full(len(faults), np.nan)
     stays = np.zeros_like(base, dtype=bool)
     for i in np.flatnonzero(stuck):
         m, k = int(np.argmax(spoilt[i])), motor[i]
         ramp = told.ramp_duration[i, m, k]
         period = float(np.median(np.diff(told.start[i])))
         place = rng.random() * period - (period - ramp)
-        at_rest[i] = place < 0.0
+        places[i] = place
         before, after = angle[i, m - 1, k], angle[i, m, k]
         held[i] = before + (after - before) * max(place, 0.0) / ramp
         stays[i, m:, k] = True
         base[i, m:, k] = held[i]
-    return sagged(base, stays), at_rest, held
+    return sagged(base, stays), places, held

@@ -139,8 +139,8 @@ class MotorNotebook(Notebook, FaultMonitor):
     def __init__(self):
         Notebook.__init__(self)
 
-    def update(self, time, command, measured, position=None):
-        self.told.append((time, measured is not None, position))
+    def update(self, time, command, measured, position=None, goal=None):
+        self.told.append((time, measured is not None, position if goal is None else goal))
         return Answer(time, OK, self.diagnosis)
 
     conclude = Notebook.conclude
@@ -164,6 +164,13 @@ def test_motor_readings_count_with_the_tools_reading_of_then(twin):
     assert seen[0][1] is angles[0]
     assert seen[1][1] is None
     assert seen[2][1] is angles[2]
+
+
+def test_goals_are_passed_on_when_they_come(twin):
+    goal, notebook = np.full(4, 0.3), MotorNotebook()
+    events = [reading(0.0), Reading(0.2, np.full(3, np.nan), goal=goal), reading(0.4)]
+    run(Shadow(Script(events), notebook, twin))
+    assert [told[2] is goal for told in notebook.told] == [False, True, False]
 
 
 def test_commands_that_come_late_take_their_place(twin):

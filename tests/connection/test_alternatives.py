@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from failuretwin.core.movements import Movements
 from failuretwin.digital_model.nonidealities import Imperfections, LostCommand, Timing
+from failuretwin.inference.command_loss import CHANCE_GOAL, STALE_GOAL
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
 
@@ -61,6 +62,37 @@ def test_probabilities_of_all_alternatives_add_up(twin, entries, late, late_rate
         chance = np.array([*late[:-1], late_rate], dtype=float)
         expected = rate + chance * (when_late - rate)
         np.testing.assert_allclose(weights[:, same].sum(axis=-1), expected, rtol=1e-12)
+
+
+def test_what_motors_report_to_have_received_counts_as_bayes_says(twin):
+    """Every loss by itself: its rate times how probable such reports are if it happened."""
+    entries = [(("motor_1",), 0.1, 0.1), (("motor_1", "motor_2"), 0.05, 0.05)]
+    known, told = model(twin, entries, 0.0), movements([False])
+    outcomes = known.outcomes(told)
+    report = np.array([0.0, 1.0, np.nan, 1.0])
+    arrived = np.broadcast_to(report, (1, 1, 4))
+    silent = np.zeros(outcomes.log_weight.shape)
+    late = known.late(told)
+    found = known.lost_commands.filtered_outcomes(outcomes, late, silent, arrived)
+    weight = np.exp(found.log_weight[0, 0]) / (1.0 - OUTLIER_RATE)
+
+    def probability(lost):
+        of_motor = [
+            1.0 if np.isnan(came) else (CHANCE_GOAL if gone else 1.0 - STALE_GOAL) if came
+            else (1.0 - CHANCE_GOAL if gone else STALE_GOAL)
+            for came, gone in zip(report, lost, strict=True)
+        ]  # fmt: skip
+        return np.prod(of_motor)
+
+    share = {(False,) * 4: 0.85, (True, False, False, False): 0.1, (True, True, False, False): 0.05}
+    joint = {lost: rate * probability(lost) for lost, rate in share.items()}
+    for lost, expected in joint.items():
+        same = (found.lost == lost).all(axis=1)
+        total = sum(joint.values())
+        np.testing.assert_allclose(weight[same].sum(), expected / total, rtol=1e-6)
+    silence = np.full((1, 1, 4), np.nan)
+    again = known.lost_commands.filtered_outcomes(outcomes, late, silent, silence)
+    np.testing.assert_allclose(again.log_weight, outcomes.log_weight)
 
 
 @given(motors=st.sampled_from(SETS), lost=st.lists(st.booleans(), min_size=1, max_size=5))

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from itertools import takewhile
+from itertools import pairwise, takewhile
 
 import numpy as np
 import pytest
@@ -102,6 +102,25 @@ def test_a_motor_that_misses_its_targets_does_so_while_it_is_faulty(armpi):
     assert np.median(np.abs(np.rad2deg(errors[faulty, 1]))) > 4.0
     healthy_again = starts > 60.0
     assert np.abs(np.rad2deg(errors[healthy_again, 1])).max() < 3.0
+
+
+def test_motors_report_the_last_goal_that_arrived(armpi, measured_armpi):
+    """Whatever they do with it: a stuck motor receives its goals, a lost command never comes."""
+    events = life(armpi, measured_armpi, ["motor_2:stuck@0-400"], seconds=400.0)
+    told, arrived = None, []
+    for event, after in pairwise(events):
+        if isinstance(event, CommandSent):
+            told = event.target
+        elif told is not None and isinstance(after, CommandSent):
+            arrived.append(event.goal == told)
+    lost = 1.0 - np.mean(arrived, axis=0)
+    rates = dict.fromkeys(armpi.motor_names, 0.0)
+    for entry in measured_armpi.lost_commands:
+        for motor in entry.motors:
+            rates[motor] += entry.rate
+    expected = np.array(list(rates.values()))
+    assert len(arrived) > 100
+    assert np.all(np.abs(lost - expected) < 4.0 * np.sqrt((expected + 0.01) / len(arrived)))
 
 
 def test_readings_are_the_tool_path_of_the_motors(armpi, twin, measured_armpi):

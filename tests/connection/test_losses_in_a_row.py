@@ -98,6 +98,21 @@ def test_one_motor_misses_as_many_in_a_row_as_are_not_too_rare():
     np.testing.assert_allclose(missed, [0.9, 0.09, 0.009, 0.001], rtol=1e-12)
 
 
+def test_pairs_that_hardly_happen_do_not_take_the_place_of_long_rows():
+    """Three motors that lose one command in six, pairs of them only if all is late, as if never."""
+    losses = losses_of(SETS)
+    usual = np.array([0.5, *[1.0 / 6.0] * 3, *[1e-5] * 3])
+    most = np.array([0.5, *[1.0 / 6.0] * 3, *[0.05] * 3])
+    chain = ConsecutiveLossHmm.of(losses, usual, 1e-6, most)
+    assert len(chain.missed) == 48
+    assert (chain.missed.max(axis=0) >= 6).all()
+    by_their_highest = ConsecutiveLossHmm.of(losses, most, 1e-6)
+    assert by_their_highest.missed.max() < chain.missed.max()
+    rates = np.broadcast_to(usual, (1, 12, len(usual)))
+    chances, six = chain.forward(rates)[0, -1], chain.missed[:, 0] >= 6
+    assert chances[six].sum() == pytest.approx((1.0 / 6.0) ** 6, rel=0.01)
+
+
 def test_chains_end_although_losses_are_certain():
     chain = ConsecutiveLossHmm.of(losses_of([(0,), (1,)]), np.array([0.0, 1.0, 1.0]), 1e-4)
     assert len(chain.missed) == 48

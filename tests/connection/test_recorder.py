@@ -41,7 +41,10 @@ def test_a_recording_is_a_log_like_any_other(armpi, measured_armpi, tmp_path):
         event = source.poll(0.0)
         again += [] if event is None else [event]
     sound = [e for e in told if isinstance(e, Reading) and np.isfinite(e.tool).all()]
-    tools = [e for e in again if isinstance(e, Reading)]
+    read = [e for e in again if isinstance(e, Reading)]
+    tools = [e for e in read if np.isfinite(e.tool).all()]
+    goals = [e.goal for e in read if e.goal is not None]
+    assert_allclose(goals, [e.goal for e in told if isinstance(e, Reading)], atol=1e-12)
     shift = sound[0].time - tools[0].time
     assert_allclose([e.time + shift for e in tools], [e.time for e in sound], atol=1e-6)
     assert_allclose([e.tool for e in tools], [e.tool for e in sound], atol=1e-12)

@@ -54,6 +54,19 @@ def test_a_log_with_an_accelerometer_alone_is_a_run_set(tmp_path):
     assert runs.attrs["measured_rate_hz"] == pytest.approx(10.0)
 
 
+def test_goals_that_motors_report_are_read_like_their_angles(tmp_path):
+    log = table().assign(**{f"g{k}": np.rad2deg(0.1 * k) for k in range(1, 5)})
+    log.to_csv(tmp_path / "log.csv", index=False)
+    goals = '[goal]\ncolumns = ["g1", "g2", "g3", "g4"]\nunit = "deg"\n'
+    (tmp_path / "map.toml").write_text(MAP + goals)
+    found = read(tmp_path)["goal"].values[0]
+    seen = np.isfinite(found[:, 0])
+    np.testing.assert_allclose(found[seen], np.tile([0.1, 0.2, 0.3, 0.4], (seen.sum(), 1)))
+    (tmp_path / "map.toml").write_text(MAP + goals.replace('"g1", ', ""))
+    with pytest.raises(InputError, match="goal"):
+        read(tmp_path)
+
+
 def test_a_sensor_lacks_no_channel(tmp_path):
     table().to_csv(tmp_path / "log.csv", index=False)
     (tmp_path / "map.toml").write_text(MAP.replace('"ax", ', ""))

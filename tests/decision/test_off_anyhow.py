@@ -133,6 +133,7 @@ def of_points(likelihood, points):
         one * likelihood.evidence.begin,
         one * likelihood.evidence.end,
         one * likelihood.evidence.first_reading_delay,
+        np.repeat(likelihood.evidence.arrived, count, axis=0),
     )
     return RunLikelihood(evidence, likelihood.model)
 

@@ -159,20 +159,23 @@ class Shadow:
         if seen is not None:
             expected = np.full(3, np.nan) if command is None else self._twin.path(command)
             residual = seen - expected
-        answer = self._update(reading.time, command, seen)
+        answer = self._update(reading, command, seen)
         self._fed_s = time.monotonic()  # what we take to think is no silence of the robot
         if seen is not None:
             self._read_s = self._fed_s
         self._publish(answer, residual)
 
-    def _update(self, time: float, command: FloatArray | None, seen: FloatArray | None) -> Answer:
+    def _update(
+        self, reading: Reading, command: FloatArray | None, seen: FloatArray | None
+    ) -> Answer:
         """Tell the diagnoser of a reading, with what the motors said about then."""
+        time = reading.time
         if not isinstance(self._diagnoser, FaultMonitor):
             return self._diagnoser.update(time, command, seen)
         said = self._motors
         there = said is not None and abs(time - said[0]) <= TOGETHER_S
         position = said[1] if said is not None and there else None
-        return self._diagnoser.update(time, command, seen, position)
+        return self._diagnoser.update(time, command, seen, position, reading.goal)
 
     def _publish(self, answer: Answer, residual: FloatArray) -> None:
         silent = time.monotonic() - self._read_s > SILENCE_S

@@ -111,6 +111,7 @@ class EmulatedArm:
         self._next_reading = 0.0
         motors = len(emulation.robot.motors)
         self._commanded = np.zeros(motors) + np.asarray(emulation.start or 0.0)
+        self._goal = self._commanded
         self._told = (self._commanded + self._self.bias + self._self.scatter[0])[None]
         engine = PhysicsEngine(emulation.robot)
         self._arm = LiveArm(engine, self._told[0], STEP_S, float(self._self.payload))
@@ -214,6 +215,7 @@ class EmulatedArm:
         return FaultValue(scheduled.fault, endless.share, course)
 
     def _live_through(self, leg: _Leg) -> list[Event]:
+        before = self._goal
         position = self._move(leg)
         local = leg.time - leg.time[0]
         # A bus that stalls twice in a row comes back between; else it would be silent for minutes.
@@ -222,10 +224,13 @@ class EmulatedArm:
         measured, angle = sense(self._twin, readings, position[None], local, start, leg.chance)
         stalled = float(start[0, 0]) if leg.late > 0.0 else 0.0
         seen = np.isfinite(angle[0]).any(axis=1) & (local > 0.0) & (local >= stalled)
-        events: list[Event] = [
-            Reading(float(leg.time[k]), measured[0, k], angle[0, k]) for k in np.flatnonzero(seen)
-        ]
         movement = leg.movement
+        came = leg.time >= movement.start[0, 0] + leg.late
+        goal = np.where(came[:, None], self._goal, before)
+        events: list[Event] = [
+            Reading(float(leg.time[k]), measured[0, k], angle[0, k], goal[k])
+            for k in np.flatnonzero(seen)
+        ]
         command = CommandSent(
             float(movement.start[0, 0]), movement.target[0, 0], movement.ramp_duration[0, 0]
         )
@@ -236,6 +241,7 @@ class EmulatedArm:
         faulty, lost = leg.faults.on_movements(leg.movement, leg.chance.lost)
         told = actual_movements(faulty, replace(leg.chance, lost=lost)).reference(leg.time)[0]
         self._commanded = np.where(lost[0, 0], self._commanded, faulty.target[0, 0])
+        self._goal = np.where(lost[0, 0], self._goal, leg.movement.target[0, 0])
         return self._follow(told, leg.time, leg.chance.lag, leg.faults)
 
     def _follow(

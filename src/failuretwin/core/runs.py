@@ -4,7 +4,8 @@ Shorter runs are padded: `measured` NaN, `command` held. Variables, dimensions a
 of `VARIABLES`; only `command` and `measured` are required. `measured` is NaN throughout where
 nobody watched the tool's position, but another sensor: `tool_orientation`, a rotation vector in the
 frame of `measured`; `accelerometer` and `gyroscope` on the tool, in their own frames; `wire`, a
-length; `position`, the readings of the motors.
+length; `position`, the readings of the motors. `goal` is the goal that each motor reports to have
+received.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str]] = {
     "onset": (("run",), "s"),
     "magnitude": (("run",), "unit of the fault mode"),
     "position": (("run", "time", "motor"), "rad"),
+    "goal": (("run", "time", "motor"), "rad"),
     "temperature": (("run", "time", "motor"), "degC"),
     "voltage": (("run", "time", "motor"), "V"),
     "tool_orientation": (("run", "time", "axis"), "rad"),
@@ -48,6 +50,8 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str]] = {
 }
 """Dimensions and unit of every variable that a run set may hold."""
 
+GOAL_VARIABLE = "goal"
+"""Variable of the goals that motors report to have received."""
 UNIFORM = 1e-3
 """Steps of a time grid may differ by this share; single precision rounds by a tenth of it."""
 LARGEST = {

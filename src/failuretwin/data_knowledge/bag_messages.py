@@ -37,13 +37,14 @@ class Kind(Enum):
     POSE = "geometry_msgs/msg/PoseStamped"
 
 
-Role = Literal["command", "tool", "position"]
+Role = Literal["command", "tool", "position", "goal"]
 ROLES: tuple[Role, ...] = get_args(Role)
 
 KINDS: dict[Role, tuple[Kind, ...]] = {
     "command": (Kind.TRAJECTORY, Kind.MONITORING, Kind.JOINT_STATE),
     "tool": (Kind.POINT, Kind.POSE),
     "position": (Kind.MONITORING, Kind.JOINT_STATE),
+    "goal": (Kind.MONITORING, Kind.JOINT_STATE),
 }
 """Kinds of messages that can play each role."""
 FIELDS: dict[Kind, dict[str, str]] = {
@@ -308,12 +309,15 @@ EXPECTED: dict[Role, str] = {
     "tool": "neither tool positions nor motor readings. Expected a PointStamped, PoseStamped or "
     "JointState, or a topic `condition_monitoring`",
     "position": "no motor readings. Expected a JointState or a topic `condition_monitoring`",
+    "goal": "no goals that motors report. Expected a JointState",
 }
 """What a recording lacks where no topic fits a role."""
 COMMAND_WORDS = ("command", "cmd", "position_monitoring")
 """A topic of joint values with one of these in its name holds commands."""
 WISH_WORDS = (*COMMAND_WORDS, "desired", "goal", "reference", "setpoint", "target")
 """A topic with one of these in its name holds no readings."""
+GOAL_TOPIC = "/joint_goals"
+"""Topic of the goals that motors report, in our recordings."""
 LISTED_TOPICS = 20
 """Topics that an error text lists at most."""
 
@@ -326,11 +330,14 @@ class BagTopics:
         command: Topic of the commands; None: the one that fits.
         tool: Topic of the tool's position; None: the one that fits, if any.
         position: Topic of the motor readings; None: the one that fits, if any.
+        goal: Topic of the goals that the motors report to have received; None: `GOAL_TOPIC`, if
+            there is one.
     """
 
     command: str | None = None
     tool: str | None = None
     position: str | None = None
+    goal: str | None = None
 
 
 def fitting_topics(
@@ -357,6 +364,8 @@ def _suits(role: Role, topic: BagTopic) -> bool:
     kind, name = kind_of(topic.fields), topic.name.lower()
     if kind is None or kind not in KINDS[role]:
         return False
+    if role == "goal":
+        return topic.name == GOAL_TOPIC
     if role == "command":
         return kind is Kind.TRAJECTORY or any(word in name for word in COMMAND_WORDS)
     return not any(word in name for word in WISH_WORDS)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from failuretwin.core.errors import InputError
+from failuretwin.core.runs import GOAL_VARIABLE
 from failuretwin.core.types import FloatArray, IntArray, as_floats
 from failuretwin.data_knowledge.bag_file import (
     BagMessage,
@@ -71,6 +72,7 @@ def read_bag(path: Path, robot: Robot, topics: BagTopics | None = None) -> list[
     command = recording.motors("command", fitting["command"], needed=True)
     if command is None:
         raise nothing_for("command", found, path)
+    goal = recording.motors("goal", fitting["goal"], needed=False)
     _check_commanded(command, robot)
     if tool is None:
         if position is None:
@@ -83,6 +85,7 @@ def read_bag(path: Path, robot: Robot, topics: BagTopics | None = None) -> list[
             command=_command(command, position, zero_ns),
             tool=None if tool is None else Samples(_seconds(tool.stamp_ns, zero_ns), tool.value),
             position=None if position is None else _samples(position, zero_ns),
+            sensors={} if goal is None else {GOAL_VARIABLE: _samples(goal, zero_ns)},
         )
     ]
 

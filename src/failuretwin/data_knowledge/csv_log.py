@@ -13,6 +13,7 @@ import numpy as np
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.foreign import check_memory, reading, stored_bytes
+from failuretwin.core.runs import GOAL_VARIABLE
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.data_knowledge.timed_log import SHAPES, Samples, Targets, TimedLog
 from failuretwin.digital_model.robot import Robot
@@ -140,6 +141,7 @@ class ColumnMap:
         separator: Between columns.
         decimal: Decimal point, or comma where the log writes 0,5.
         sensors: Other sensors.
+        goal: Goals that the motors report to have received.
     """
 
     time: TimeColumn
@@ -150,6 +152,7 @@ class ColumnMap:
     separator: str = ","
     decimal: str = "."
     sensors: tuple[SensorColumns, ...] = ()
+    goal: AngleColumns | None = None
 
 
 def read_column_map(path: Path, robot: Robot) -> ColumnMap:
@@ -176,7 +179,8 @@ def read_column_map(path: Path, robot: Robot) -> ColumnMap:
     if mapping.tool is not None:
         _check_unit(mapping.tool.unit, LENGTH_UNITS, f"{where}: tool")
     _check_anchor(mapping.sensors, where, robot)
-    for name, angles in (("command", command), ("position", mapping.position)):
+    named = ("command", command), ("position", mapping.position), ("goal", mapping.goal)
+    for name, angles in named:
         if angles is not None:
             _check_angles(angles, f"{where}: {name}", robot)
             _check_distinct(angles.columns, f"{where}: {name}")
@@ -306,12 +310,17 @@ def _log(table: pd.DataFrame, name: str, path: Path, mapping: ColumnMap, robot: 
     if mapping.tool is not None:
         scale = LENGTH_UNITS[mapping.tool.unit]
         tool = _present(time, numbers(table, mapping.tool.columns, path) * scale)
+
+    def angles(columns: AngleColumns) -> Samples:
+        return _present(time, _angles(numbers(table, columns.columns, path), columns, robot))
+
     if mapping.position is not None:
-        counts = numbers(table, mapping.position.columns, path)
-        position = _present(time, _angles(counts, mapping.position, robot))
+        position = angles(mapping.position)
     sensors = {
         one.variable: _present(time, numbers(table, one.columns, path)) for one in mapping.sensors
     }
+    if mapping.goal is not None:
+        sensors[GOAL_VARIABLE] = angles(mapping.goal)
     commands = _commands(table, time, mapping.command, path, robot)
     return TimedLog(name, commands, tool, position, sensors)
 

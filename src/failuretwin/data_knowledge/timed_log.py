@@ -68,7 +68,7 @@ SHAPES: Mapping[str, tuple[int, ...]] = {
     "gyroscope": (3,),
     "wire": (),
 }
-"""Channels of the sensors that a log may hold beside tool and motors."""
+"""Channels of the sensors that a log may hold beside tool and motors; goals have one a motor."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,9 @@ def timed_run(log: TimedLog, robot: Robot) -> RunTable:
         movements=movements,
         position=None if log.position is None else _on_grid(log.position, time, begin)[None],
         sensors={
-            name: _on_grid(samples, time, begin).reshape(1, len(time), *SHAPES[name])
+            name: _on_grid(samples, time, begin).reshape(
+                1, len(time), *SHAPES.get(name, samples.value.shape[1:])
+            )
             for name, samples in log.sensors.items()
         },
     )

@@ -46,17 +46,20 @@ class ConsecutiveLossHmm:
     transition: FloatArray
 
     @staticmethod
-    def of(losses: BoolArray, chance: FloatArray, rare: float) -> ConsecutiveLossHmm:
+    def of(
+        losses: BoolArray, chance: FloatArray, rare: float, most: FloatArray | None = None
+    ) -> ConsecutiveLossHmm:
         """Return the chain of the states that are not too rare, single losses first.
 
         What is left out counts as fewer losses in a row.
 
         Args:
             losses: Motors that each loss hits, (loss, motor); the first hits none.
-            chance: Highest probability of each, (loss,).
-            rare: Losses in a row that are less probable are left out.
+            chance: Probability of each, (loss,).
+            rare: Losses in a row that are less probable, at their highest, are left out.
+            most: Highest probability of each, (loss,); None: it is always the same.
         """
-        states = _states(losses, chance, rare)
+        states = _states(losses, chance, chance if most is None else most, rare)
         leads = np.zeros((len(losses), len(states), len(states)))
         for i, loss in enumerate(losses):
             for j, state in enumerate(states):
@@ -86,22 +89,31 @@ class ConsecutiveLossHmm:
         return chances
 
 
-def _states(losses: BoolArray, chance: FloatArray, rare: float) -> list[tuple[int, ...]]:
-    """Return the states that are not too rare, from few losses in a row to many."""
+def _states(
+    losses: BoolArray, chance: FloatArray, most: FloatArray, rare: float
+) -> list[tuple[int, ...]]:
+    """Return the states that are not too rare, from few losses in a row to many.
+
+    Where there are more than `MOST_STATES`, those stay that come up most often.
+    """
     none = (0,) * losses.shape[1]
-    newest = {_one_more(none, loss): float(p) for loss, p in zip(losses, chance, strict=True)}
-    found = list(newest)
-    while newest:
-        longer: dict[tuple[int, ...], float] = {}
-        for state, before in newest.items():
-            for loss, now in zip(losses, chance, strict=True):
+    singles = [_one_more(none, loss) for loss in losses]
+    newest = dict(zip(singles, zip(chance.tolist(), most.tolist(), strict=True), strict=True))
+    found = dict(newest)
+    for _ in range(MOST_STATES):
+        longer: dict[tuple[int, ...], tuple[float, float]] = {}
+        for state, (usual, high) in newest.items():
+            for loss, now, at_most in zip(losses, chance.tolist(), most.tolist(), strict=True):
                 missed = _one_more(state, loss)
                 if missed not in found:
-                    longer[missed] = longer.get(missed, 0.0) + before * float(now)
-        ranked = sorted((p, missed) for missed, p in longer.items() if p > rare)[::-1]
-        newest = {missed: p for p, missed in ranked[: max(MOST_STATES - len(found), 0)]}
-        found += newest
-    return found
+                    known, top = longer.get(missed, (0.0, 0.0))
+                    longer[missed] = known + usual * now, top + high * at_most
+        ranked = sorted((p, q, missed) for missed, (p, q) in longer.items() if q > rare)[::-1]
+        newest = {missed: (p, q) for p, q, missed in ranked[:MOST_STATES]}
+        found |= newest
+    others = sorted(list(found)[len(losses) :], key=lambda state: -found[state][0])
+    kept = {*singles, *others[: max(MOST_STATES - len(losses), 0)]}
+    return [state for state in found if state in kept]
 
 
 def _one_more(missed: tuple[int, ...], loss: BoolArray) -> tuple[int, ...]:
@@ -124,6 +136,9 @@ RARE = 1e-6
 than one movement in twenty days of work. One left out looks like a fault."""
 NEGLIGIBLE = 1e-7
 """What is less probable than this given the movements before is left to the outliers [-]."""
+STALE_GOAL, CHANCE_GOAL = 1e-3, 1e-5
+"""Share of reported goals that are old or spoilt, and of those that by chance are that of a command
+which did not arrive [-]; assumed."""
 LATE_MARGIN_S = 0.15
 """A movement that lasts this much longer than the schedule allows started late [s]."""
 
@@ -133,7 +148,7 @@ class CommandOutcomes(ArrayStruct):
     """What may become of each movement: which motors lost how many commands in a row.
 
     Attributes:
-        lost: Motors that lose their command, (outcome, motor).
+        missed: Commands that each motor has missed in a row, (outcome, motor).
         base: Angles that the motors then go for, (run, movement, outcome, motor) [rad].
         kept: What of them is scatter of the movement before a loss, which a motor that does not
             move keeps, (run, movement, outcome, motor) [rad].
@@ -142,11 +157,16 @@ class CommandOutcomes(ArrayStruct):
             (run, movement, outcome).
     """
 
-    lost: BoolArray
+    missed: IntArray
     base: Annotated[FloatArray, Axes("run", "movement", "outcome", "motor")]
     kept: Annotated[FloatArray, Axes("run", "movement", "outcome", "motor")]
     direction: Annotated[FloatArray, Axes("run", "movement", "outcome", "motor")]
     log_weight: Annotated[FloatArray, Axes("run", "movement", "outcome")]
+
+    @property
+    def lost(self) -> BoolArray:
+        """Motors that lose their command, (outcome, motor)."""
+        return np.asarray(self.missed > 0)
 
 
 @dataclass(frozen=True)
@@ -195,7 +215,7 @@ class LostCommands:
         travel = np.sign(target - stood)
         kept = _of_last_made(np.zeros_like(off), off, rows.missed)
         return CommandOutcomes(
-            lost=rows.missed > 0,
+            missed=rows.missed,
             base=_of_last_made(target, origin, rows.missed) + kept,
             kept=kept,
             direction=_of_last_made(travel, _before(travel), rows.missed),
@@ -203,7 +223,11 @@ class LostCommands:
         )
 
     def filtered_outcomes(
-        self, outcomes: CommandOutcomes, late: FloatArray, log_likelihood: FloatArray
+        self,
+        outcomes: CommandOutcomes,
+        late: FloatArray,
+        log_likelihood: FloatArray,
+        arrived: FloatArray | None = None,
     ) -> CommandOutcomes:
         """Return outcomes with their probability given what was seen of the movements before.
 
@@ -214,8 +238,13 @@ class LostCommands:
             late: Probability that each started late, (run, movement).
             log_likelihood: What was seen of each movement says of each outcome, up to a
                 constant, (run, movement, outcome); 0 where nothing was seen.
+            arrived: Whether each motor reports to have received its command, (run, movement,
+                motor), NaN where it does not tell; None: nowhere.
         """
-        chances = self._in_a_row.forward(self._rates(late), log_likelihood)
+        rates = self._rates(late)
+        if arrived is not None and np.isfinite(arrived).any():
+            rates = self._given_goals(rates, arrived)
+        chances = self._in_a_row.forward(rates, log_likelihood)
         chances[chances < NEGLIGIBLE] = 0.0
         return replace(outcomes, log_weight=self._log_weight(chances))
 
@@ -232,12 +261,32 @@ class LostCommands:
         shares = np.stack([none, *rates], axis=-1)
         return shares / np.maximum(total, 1.0)[..., None]  # rounding may exceed one
 
+    def _given_goals(self, rates: FloatArray, arrived: FloatArray) -> FloatArray:
+        """Return the probability of each loss given what motors report to have received.
+
+        Args:
+            rates: What it is without that, (run, movement, loss).
+            arrived: (run, movement, motor), NaN where a motor does not tell.
+        """
+        told = np.isfinite(arrived)[:, :, None]
+        came = arrived[:, :, None] > 0.5
+        arrives = np.where(self._losses, CHANCE_GOAL, 1.0 - STALE_GOAL)
+        says = np.where(told, np.where(came, arrives, 1.0 - arrives), 1.0)
+        joint = rates * says.prod(axis=-1)
+        return joint / joint.sum(axis=-1, keepdims=True)
+
+    @cached_property
+    def _losses(self) -> BoolArray:
+        """Motors that each loss hits, (loss, motor); the first hits none."""
+        names, entries = self.robot.motor_names, self.imperfections.lost_commands
+        return np.array([np.isin(names, m) for m in ((), *(e.motors for e in entries))])
+
     @cached_property
     def _in_a_row(self) -> ConsecutiveLossHmm:
-        names, entries = self.robot.motor_names, self.imperfections.lost_commands
-        losses = [np.isin(names, motors) for motors in ((), *(e.motors for e in entries))]
-        most = self._rates(np.array([0.0, 1.0])).max(axis=0)
-        return ConsecutiveLossHmm.of(np.array(losses), most, RARE)
+        late_rate = self.imperfections.timing.late_rate
+        usual = self._rates(np.array(late_rate))
+        most = self._rates(np.array([0.0, float(late_rate > 0.0)])).max(axis=0)
+        return ConsecutiveLossHmm.of(self._losses, usual, RARE, most)
 
     @staticmethod
     def _log_weight(chances: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ import numpy as np
 from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.numerics import masked_median
-from failuretwin.core.runs import measured_rate
+from failuretwin.core.runs import GOAL_VARIABLE, measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.inference.log_quality import LogQuality, drop_invalid, log_quality, sensor_quality
 from failuretwin.inference.readings import MeasuredSamples, grid_steps, measured_samples
@@ -101,6 +101,11 @@ class Evidence:
         item = np.nonzero(movements.exists & (begin < end))
         samples, inside = _between(readings.point, time, item[0], begin[item], end[item])
         found.settle(item, estimate_rest(samples, inside, self._moving_spread_m))
+        if self.sensors and self.sensors.goals:
+            goal = _last_known(as_floats(self.runs[GOAL_VARIABLE].values))
+            last = np.searchsorted(time, np.nan_to_num(end) - 1e-9)
+            there = np.take_along_axis(goal, np.maximum(last - 1, 0)[..., None], axis=1)
+            found.arrived[:] = self.sensors.has_arrived(there, movements.target)
         return found
 
     @cached_property
@@ -159,6 +164,8 @@ class SettledEvidence(ArrayStruct):
         end: End of each plateau, (run, movement) [s].
         first_reading_delay: Time from each command to the first reading after it, (run, movement)
             [s]; NaN where there is none or where straight lines fill the gaps between readings.
+        arrived: Whether each motor reports to have received the command, (run, movement, motor);
+            NaN where it does not tell.
     """
 
     movements: Movements
@@ -168,6 +175,7 @@ class SettledEvidence(ArrayStruct):
     begin: PerMovement
     end: PerMovement
     first_reading_delay: PerMovement
+    arrived: Annotated[FloatArray, Axes("run", "movement", "motor", empty=np.nan)]
 
     @property
     def transient_until(self) -> FloatArray:
@@ -245,6 +253,13 @@ class Rest:
     point: FloatArray
     usable: BoolArray
     moving: BoolArray
+
+
+def _last_known(values: FloatArray) -> FloatArray:
+    """Return values (run, time, motor) with the last one before where there is none."""
+    known = np.isfinite(values)
+    index = np.where(known, np.arange(values.shape[1])[None, :, None], 0)
+    return np.take_along_axis(values, np.maximum.accumulate(index, axis=1), axis=1)
 
 
 def rest_begin(start: FloatArray, ramp_duration: FloatArray, end: FloatArray) -> FloatArray:

@@ -267,7 +267,7 @@ class HealthyModel:
         says = np.logaddexp(np.log1p(-OUTLIER_RATE) + density, self.outlier_log_density)
         says = np.where(evidence.usable[..., None], says, 0.0)
         late = self.late(evidence.movements, evidence.first_reading_delay)
-        return self.lost_commands.filtered_outcomes(outcomes, late, says)
+        return self.lost_commands.filtered_outcomes(outcomes, late, says, evidence.arrived)
 
     def late(
         self, movements: Movements, first_reading_delay: FloatArray | None = None

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.runs import GOAL_VARIABLE
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.sensors import SENSORS, Encoders, Sensor, Tool, sensor_of
@@ -31,24 +32,29 @@ if TYPE_CHECKING:
 
 TOOL_ALONE = (Tool.kind,)
 """What is believed where nothing else is said: the position of the tool."""
+GOALS = "goals"
+"""Believed beside sensors: which goal each motor reports to have received. It tells of commands
+that do not arrive, and nothing of the pose."""
+SAME_GOAL = 1e-3
+"""Goals that differ by less than this share of a motor's travel are the same [-]."""
 SHOWS_NOTHING = 0.1
 """A motor that moves what is seen by less than this share of its noise, all the way round, does not
 show [-]."""
 
 
 def parse_sensing(text: str) -> tuple[str, ...]:
-    """Return the names in a text such as ``tool+encoders``, in the order of `SENSORS`.
+    """Return the names in a text such as ``tool+encoders``, in the order of `SENSORS`, goals last.
 
     Raises:
         InputError: If a sensor is unknown, or none tells of the pose at rest.
     """
-    names = [name.strip() for name in text.split("+")]
+    names, known = [name.strip() for name in text.split("+")], (*SENSORS, GOALS)
     for name in names:
-        if name not in SENSORS:
-            raise unknown_name("sensor", name, SENSORS)
-    if not any(SENSORS[name].at_rest for name in names):
-        raise InputError(f"{text}: tells nothing of where the arm rests. Add accelerometer.")
-    return tuple(kind for kind in SENSORS if kind in names)
+        if name not in known:
+            raise unknown_name("sensor", name, known)
+    if not any(name in SENSORS and SENSORS[name].at_rest for name in names):
+        raise InputError(f"{text}: tells nothing of where the arm rests. Add tool.")
+    return tuple(kind for kind in known if kind in names)
 
 
 def sensing_of(runs: xr.Dataset, sensing: str | None) -> tuple[str, ...]:
@@ -67,12 +73,14 @@ def sensing_of(runs: xr.Dataset, sensing: str | None) -> tuple[str, ...]:
         others = [kind for kind in there if kind != Encoders.kind]
         alone = Tool.kind in there or not any(SENSORS[kind].at_rest for kind in others)
         return TOOL_ALONE if alone else tuple(others)
+    there += [GOALS] if _has_readings(runs, GOAL_VARIABLE) else []
     asked = parse_sensing(sensing)
     for kind in asked:
         if kind not in there:
+            variable = GOAL_VARIABLE if kind == GOALS else SENSORS[kind].variable
             raise InputError(
-                f"the runs hold no readings of {kind} (variable `{SENSORS[kind].variable}`); they "
-                f"hold {', '.join(there) or 'none of any sensor'}."
+                f"the runs hold no readings of {kind} (variable `{variable}`); they hold "
+                f"{', '.join(there) or 'none of any sensor'}."
             )
     return asked
 
@@ -90,12 +98,14 @@ class SensorStack:
         sensors: The sensors; one at least tells of the pose at rest.
         unit_m: sn, the noise of every channel [m].
         rough_m: What is added to it on the way [m].
+        goals: Whether motors are believed about the goals that they have received.
     """
 
     twin: DigitalTwin
     sensors: tuple[Sensor, ...]
     unit_m: float
     rough_m: float
+    goals: bool = False
 
     @classmethod
     def of(
@@ -107,8 +117,9 @@ class SensorStack:
         rough_m: float,
     ) -> SensorStack:
         """Return the sensors of these names, as the calibration, then the profile, has them."""
-        told = (imperfections.sensors, twin.robot.profile.sensors)
-        return cls(twin, tuple(sensor_of(kind, twin, *told) for kind in sensing), unit_m, rough_m)
+        told, kinds = (imperfections.sensors, twin.robot.profile.sensors), set(sensing) - {GOALS}
+        sensors = tuple(sensor_of(kind, twin, *told) for kind in sensing if kind in kinds)
+        return cls(twin, sensors, unit_m, rough_m, GOALS in sensing)
 
     @cached_property
     def tool_alone(self) -> bool:
@@ -293,6 +304,23 @@ class SensorStack:
         parts = [sensor.to_channels(told[sensor.kind]) for sensor in self.at_rest]
         point = np.concatenate(parts, axis=-1) * self._scale
         return np.where(np.isfinite(point).all(axis=-1, keepdims=True), point, np.nan)
+
+    def has_arrived(self, goal: FloatArray, target: FloatArray) -> FloatArray:
+        """Return whether motors report to have received a target; NaN where they do not tell.
+
+        Goals count as the same within a count of the servo, or a thousandth of the travel: a
+        command that moves a motor by less says nothing if it is lost.
+
+        Args:
+            goal: Goals that they report, (..., motor) [rad].
+            target: Targets, same axes [rad].
+        """
+        robot = self.twin.robot
+        near = SAME_GOAL * np.ptp(robot.travel, axis=1)
+        if robot.profile.servo_units is not None:
+            near = np.maximum(near, abs(robot.servo_units.rad_per_count))
+        same = (np.abs(goal - target) < near).astype(np.float64)
+        return np.where(np.isfinite(goal) & np.isfinite(target), same, np.nan)
 
     def read_on_way(self, runs: xr.Dataset, readings: MeasuredSamples) -> FloatArray:
         """Return what is seen on the way, (run, time, channel) [m].

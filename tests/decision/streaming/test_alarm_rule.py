@@ -41,8 +41,8 @@ def test_states_from_clear_over_suspected_to_an_alarm_and_back():
 
 def test_an_alarm_waits_for_a_name_but_not_for_ever():
     rule = AlarmRule(NAMES, PER_H)
-    states = [rule.see(float(k), odds(100.0, 0.6), 0.001).state for k in range(4)]
-    assert states == [SUSPECTED, SUSPECTED, RAISED, RAISED]
+    states = [rule.see(float(k), odds(100.0, 0.6), 0.001).state for k in range(5)]
+    assert states == [SUSPECTED, SUSPECTED, SUSPECTED, RAISED, RAISED]
     quick = AlarmRule(NAMES, PER_H)
     assert quick.see(0.0, odds(100.0, 0.96), 0.001).state == RAISED
 

@@ -54,11 +54,12 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--sensing",
-    type=click.Choice(["tool", "tool+encoders"]),
+    type=click.Choice(["tool", "tool+encoders", "tool+goals", "tool+encoders+goals"]),
     default="tool",
     show_default=True,
-    help="Whether what the motors report of themselves, such as /joint_states, is believed beside "
-    "the tool's position: errors show sooner, but a wrong reading is taken for the motor.",
+    help="What is believed beside the tool's position. encoders: what motors report of themselves, "
+    "such as /joint_states; errors show sooner, but a wrong reading is taken for the motor. goals: "
+    "which goal they report to have received; a stuck motor shows sooner.",
 )
 @probe_options
 @safety_options
@@ -107,7 +108,8 @@ def watch(
     diagnoser = monitor(known.twin, known.imperfections, budget, sensing)
     wait_s = topics_of(live.topics).wait_s
     when = "" if calibration is None else _written(calibration)
-    tell(_rests_on(known.imperfections, when) + _limit(known.imperfections, motors, budget))
+    limit = "" if "goals" in sensing else _limit(known.imperfections, motors, budget)
+    tell(_rests_on(known.imperfections, when) + limit)
     # An emulated robot ends by itself, a log when it is over.
     length = live.duration if live.duration and source != "emulated" else math.inf
     with ExitStack() as stack:

@@ -31,12 +31,15 @@ class Reading:
         time: By the robot's clock [s].
         tool: Tool position in the base frame, (axis,) [m]; NaN where there is none.
         position: Angles of the motors in the log's sense, (motor,) [rad], NaN where one is
-            missing; None where the robot does not tell. No diagnosis looks at them.
+            missing; None where the robot does not tell.
+        goal: Goals that the motors report to have received, (motor,) [rad], NaN where one is
+            missing; None where the robot does not tell.
     """
 
     time: float
     tool: FloatArray
     position: FloatArray | None = None
+    goal: FloatArray | None = None
 
 
 @dataclass(frozen=True)

@@ -199,6 +199,11 @@ def motor_reading(time: float, angle: FloatArray, twin: DigitalTwin) -> Reading:
     return Reading(time, twin.path(angle) if sound else np.full(3, np.nan), angle)
 
 
+def goal_reading(time: float, goal: FloatArray) -> Reading:
+    """Return what motors report to have received, (motor,) [rad], as a reading of nothing else."""
+    return Reading(time, np.full(3, np.nan), goal=goal)
+
+
 LARGEST_RAD = 100.0
 """Angles beyond this make no sense [rad]."""
 LARGEST_M = 100.0
@@ -249,7 +254,13 @@ class RosReader:
         command = self._role == "command"
         values = joint_rows(messages, kind, self._where, command=command)
         track = motor_track(values, self._robot, self._where)
+        if self._role == "goal":
+            return self._goal_events(track)
         return self._command_events(track) if command else self._position_events(track)
+
+    def _goal_events(self, track: Track) -> list[Event]:
+        rows = zip(track.stamp_ns.tolist(), track.value, strict=True)
+        return [goal_reading(s / NS_PER_S, self._checked(v, LARGEST_RAD)) for s, v in rows]
 
     def _position_events(self, track: Track) -> list[Event]:
         events: list[Event] = []

@@ -23,7 +23,11 @@ from failuretwin.connection.links.base import (
     PacedSource,
     Reading,
 )
-from failuretwin.connection.links.live_events import SampledCommands, motor_reading
+from failuretwin.connection.links.live_events import (
+    SampledCommands,
+    goal_reading,
+    motor_reading,
+)
 from failuretwin.connection.links.ros2_messages import ros2_object
 from failuretwin.connection.links.ros_messages import (
     DiagnosticsPublisher,
@@ -32,8 +36,9 @@ from failuretwin.connection.links.ros_messages import (
     RosWriter,
 )
 from failuretwin.core.errors import InputError, OutputError, needs_extra
+from failuretwin.core.runs import GOAL_VARIABLE
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.bag_messages import NS_PER_S
+from failuretwin.data_knowledge.bag_messages import GOAL_TOPIC, NS_PER_S
 from failuretwin.data_knowledge.bags import BagTopics, is_bag, read_bag
 from failuretwin.data_knowledge.raw_sessions import RawSession, find_sessions, read_session
 from failuretwin.data_knowledge.timed_log import Samples, Targets, TimedLog
@@ -160,6 +165,7 @@ RECORDED = RosTopics(
     position="/joint_states",
     position_type="sensor_msgs/JointState",
     tool="/tool_point",
+    goal=GOAL_TOPIC,
 )
 """Topics in a recording: standard types, whatever the robot itself speaks."""
 PROBABILITY_TOPIC = "/failuretwin/probability"
@@ -367,17 +373,20 @@ def session_events(session: RawSession, robot: Robot) -> Iterator[Event]:
 
 def log_events(log: TimedLog, robot: Robot) -> Iterator[Event]:
     """Give the commands and readings of a log in the order of their times."""
-    commands = _commands(log.command)
+    commands, told = _commands(log.command), log.sensors.get(GOAL_VARIABLE)
+    rows = [] if told is None else zip(told.time.tolist(), told.value, strict=True)
+    goals = [goal_reading(time, goal) for time, goal in rows]
     if log.tool is not None:
         readings = [
             Reading(float(time), point)
             for time, point in zip(log.tool.time, log.tool.value, strict=True)
         ]
-        return _in_order(commands, readings)
+        return _in_order(commands, [*readings, *goals])
     if log.position is None:
         raise InputError(f"{log.name}: holds neither a tool path nor motor readings.")
     twin = DigitalTwin(robot)
-    return _in_order(commands, _motor_readings(log.position.time, log.position.value, twin))
+    readings = _motor_readings(log.position.time, log.position.value, twin)
+    return _in_order(commands, [*readings, *goals])
 
 
 def _motor_readings(time: FloatArray, angle: FloatArray, twin: DigitalTwin) -> list[Reading]:

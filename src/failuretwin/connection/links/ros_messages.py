@@ -52,6 +52,8 @@ class RosTopics:
         position_type: Its type: a JointState or a message with the authors' fields.
         tool: Topic of the tool's position in the base frame; empty: none.
         tool_type: Its type: a PointStamped or a PoseStamped.
+        goal: Topic of the goals that the motors report to have received; empty: none.
+        goal_type: Its type: as of motor readings.
         diagnostics: Topic of the diagnosis.
         commands_late_s: How much later than their stamps commands may arrive [s]; readings wait
             that long for them. The authors' programs publish a command two seconds after it was
@@ -64,6 +66,8 @@ class RosTopics:
     position_type: str = AUTHORS_TYPE
     tool: str = ""
     tool_type: str = "geometry_msgs/PointStamped"
+    goal: str = ""
+    goal_type: str = "sensor_msgs/JointState"
     diagnostics: str = "/diagnostics"
     commands_late_s: float | None = None
 
@@ -115,6 +119,7 @@ class RosTopics:
             ("command", self.command, self.command_type),
             ("tool", self.tool, self.tool_type),
             ("position", self.position, self.position_type),
+            ("goal", self.goal, self.goal_type),
         ]
         return [entry for entry in found if entry[1]]
 
@@ -212,6 +217,9 @@ class RosWriter:
         if topics.position and reading.position is not None:
             content = self._joints(reading.time, reading.position, topics.position_type)
             found.append(Outgoing(topics.position, topics.position_type, content))
+        if topics.goal and reading.goal is not None:
+            content = self._joints(reading.time, reading.goal, topics.goal_type)
+            found.append(Outgoing(topics.goal, topics.goal_type, content))
         if topics.tool and np.isfinite(reading.tool).all():
             found.append(Outgoing(topics.tool, topics.tool_type, self._tool(reading)))
         return found

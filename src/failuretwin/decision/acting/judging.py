@@ -221,4 +221,5 @@ def settled_evidence_of(windows: Sequence[Sequence[Seen]]) -> SettledEvidence:
         begin=rest - zero,
         end=rest - zero,
         first_reading_delay=np.full(start.shape, np.nan),
+        arrived=np.full(movements.target.shape, np.nan),
     )

@@ -34,7 +34,7 @@ SUSPICION = 100.0
 """A fault is suspected at odds so many times smaller than those of an alarm."""
 NAMED = 0.95
 """Share of one hypothesis among all faults from which an alarm names it."""
-PATIENCE = 3
+PATIENCE = 4
 """Movements for which an alarm waits for a name."""
 LARGEST_BUDGET = 1000.0
 """False alarms in 100 hours that can be allowed at most."""

@@ -36,15 +36,14 @@ from failuretwin.inference.posterior import (
     shows_in_transients,
 )
 from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.sensors import TOOL_ALONE
 
 MOVEMENTS = 5
 """Movements that are remembered, the present one included: as many as a run of the paper has."""
 SILENCE_S = 5.0
 """Without a reading for so long nothing is known of the present [s]; the bus of the ArmPi stalls
 for 4 s."""
-WITH_ENCODERS = (*TOOL_ALONE, "encoders")
-"""Sensors that a stream sees by beside the tool's position alone."""
+STREAMED = ("tool", "tool+encoders", "tool+goals", "tool+encoders+goals")
+"""What a stream may believe."""
 DEAD = LogQuality(
     fatal="the tool stands still though motors are told to move: the sensor or the arm is dead"
 )
@@ -109,12 +108,11 @@ class StreamingFleet:
                 "robot and one movement at least, and a rate above 0 or None."
             )
         model = diagnoser.healthy_model
-        known = model.sensing in (TOOL_ALONE, WITH_ENCODERS)
+        known = "+".join(model.sensing) in STREAMED
         if not known or (not model.sensors.tool_alone and diagnoser.whole_run):
             raise InputError(
-                f"sensing {diagnoser.sensing}: a stream sees by the tool's position, alone or with "
-                "encoders (tool+encoders, and whole_run=False). Diagnose recorded runs, or leave "
-                "sensing out."
+                f"sensing {diagnoser.sensing}: a stream sees by {', '.join(STREAMED)}; with "
+                "encoders, whole_run=False. Diagnose recorded runs, or leave sensing out."
             )
         self.diagnoser = diagnoser
         self.hypotheses = [str(hypothesis) for hypothesis in diagnoser.hypothesis_set]
@@ -161,6 +159,7 @@ class StreamingFleet:
         command: ArrayLike | None,
         measured: ArrayLike | None,
         position: ArrayLike | None = None,
+        goal: ArrayLike | None = None,
     ) -> IntArray:
         """Take a sample and return the robots of which something new is believed, (robot,).
 
@@ -170,6 +169,8 @@ class StreamingFleet:
             measured: Tool positions, (robot, axis) [m]; NaN or None: no reading.
             position: What the motors report of themselves, (robot, motor) [rad], where it is
                 believed; a reading counts where both are there.
+            goal: Goals that the motors report to have received, (robot, motor) [rad], where they
+                are believed.
 
         Raises:
             InputError: If the shapes do not fit, or the time is not finite or far older than the
@@ -186,6 +187,9 @@ class StreamingFleet:
         points = sensors.reading(points, self._reported(position))
         begun, at_rest = self._tracker.take(time, reference, points, away)
         self._beliefs.point[begun] = np.nan
+        if sensors.goals and goal is not None:
+            told = self._tracker.see_goals(self._reported(goal))
+            self._beliefs.point[told] = np.nan
         self._untold.begin(np.union1d(begun, np.flatnonzero(self._tracker.references.moved)))
         judged = self._judge(self._with_news(at_rest))
         odd = np.flatnonzero((self._odd != before).any(axis=0))

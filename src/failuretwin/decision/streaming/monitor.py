@@ -27,6 +27,7 @@ from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.fault_filter import RATES, FaultFilter, FaultRates
+from failuretwin.inference.healthy_density import healthy_log_density
 from failuretwin.inference.healthy_mixture import FOREIGN, HealthyMixture
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.posterior import StreamPosition
@@ -34,6 +35,9 @@ from failuretwin.inference.run_likelihood import RunLikelihood
 
 WORTH_LEARNING = 0.01
 """Probability that the calibration that was given is not this robot's from which it learns."""
+
+UNHEARD = 3
+"""Commands in a row of which a motor reports that they did not arrive, from which it is told."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +116,7 @@ class FaultMonitor:
         self._explained: dict[int, float] = {}
         self._diagnosis: Diagnosis | None = None
         self._set_up = SetUpWatch(diagnoser)
+        self._arrived = np.full((0, len(known.scatter)), np.nan)
 
     @property
     def set_up(self) -> str | None:
@@ -140,6 +145,7 @@ class FaultMonitor:
         command: Mapping[str, float] | ArrayLike | None,
         measured: ArrayLike | None,
         position: ArrayLike | None = None,
+        goal: ArrayLike | None = None,
     ) -> Answer:
         """Take what is known at a time and return what is believed then.
 
@@ -148,6 +154,7 @@ class FaultMonitor:
             command: Reference of every motor, by name or (motor,) [rad]; None: not known.
             measured: Tool position, (axis,) [m]; None or NaN: no reading.
             position: What the motors report of themselves, (motor,) [rad], where that is believed.
+            goal: Goals that they report to have received, (motor,) [rad], where these are believed.
 
         Raises:
             InputError: If a motor is missing, shapes do not fit or the time is not finite.
@@ -156,7 +163,8 @@ class FaultMonitor:
         reference = None if command is None else reference_of(motors, command)[None]
         point = None if measured is None else as_floats(measured)[None]
         motors_say = None if position is None else as_floats(position)[None]
-        if len(self._fleet.update(time, reference, point, motors_say)):
+        goals = None if goal is None else as_floats(goal)[None]
+        if len(self._fleet.update(time, reference, point, motors_say, goals)):
             self._judge()
         self._set_up.see(time, _row(reference), _row(point))
         return self._answer()
@@ -170,11 +178,23 @@ class FaultMonitor:
     def _answer(self) -> Answer:
         """Return what is believed; where the set-up is in doubt, no motor is blamed."""
         state = STALE if self._fleet.stale[0] else OK
-        reason = self._set_up.against(self._rule.alarm)
+        reason = self._set_up.against(self._rule.alarm) or self._unheard(self._rule.alarm.cause)
         if not reason:
             return Answer(self._fleet.time, state, self._diagnosis, self._rule.alarm)
         undecided = replace(self._fleet.undecided(0, reason, self._diagnosis), run="stream")
         return Answer(self._fleet.time, state, undecided)
+
+    def _unheard(self, cause: str) -> str:
+        """Return that commands do not reach the motor that a fault is blamed on; else nothing."""
+        names, motor = self._fleet.diagnoser.twin.robot.motor_names, cause.partition(":")[0]
+        if motor not in names:
+            return ""
+        arrived = self._arrived[:, names.index(motor)]
+        last = arrived[np.isfinite(arrived)][-UNHEARD:]
+        if len(last) < UNHEARD or last.any():
+            return ""
+        name = motor.replace("_", " ")
+        return f"{name} reports that its commands do not arrive: what it does is not known"
 
     def _judge(self) -> None:
         """Renew what is believed by what the last movements say."""
@@ -200,6 +220,7 @@ class FaultMonitor:
             position: Where they lie in the stream.
         """
         count, before = likelihood.usable.shape[1], position.movements
+        self._arrived = likelihood.evidence.arrived[0]
         new = max(self._movements - before, 0)
         part = slice(max(new - 1, 0), count)
         says = [
@@ -227,8 +248,9 @@ class FaultMonitor:
         if model is not likelihood.model:
             likelihood = RunLikelihood(likelihood.evidence, model)
         rows = slice(None), part
-        evidence, findings = likelihood.evidence[rows], likelihood.findings[rows]
-        return RunLikelihood(evidence, model, remembered=findings)
+        evidence, findings = likelihood.evidence, likelihood.findings
+        healthy = healthy_log_density(evidence, findings)[rows]
+        return RunLikelihood(evidence[rows], model, remembered=findings[rows], healthy=healthy)
 
     def _learn(self, evidence: SettledEvidence, movement: int, begin_s: float) -> None:
         """Learn from a movement that is over; what is known better counts from the next on.
@@ -274,7 +296,7 @@ def monitor(
         imperfections: How the healthy robot differs from it, or a calibration by name or path;
             None: as its profile says.
         false_alarms_per_100h: False alarms that are allowed in 100 hours of work.
-        sensing: ``tool`` or ``tool+encoders``; None: the tool's position alone.
+        sensing: ``tool``, with ``+encoders``, ``+goals`` or both; None: the tool's position alone.
     """
     diagnoser = BayesDiagnoser(twin, imperfections, whole_run=False, sensing=sensing)
     return FaultMonitor(diagnoser, false_alarms_per_100h)

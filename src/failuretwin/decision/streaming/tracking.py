@@ -155,6 +155,25 @@ class MovementTracker:
         self.window.read_s[read] = np.maximum(self.window.read_s[read], time)
         return begun, self.look(read[~away[read]])
 
+    def see_goals(self, goal: FloatArray) -> IntArray:
+        """Take the goals that motors have received and return the robots of which that is news.
+
+        They tell of the present movement, once the reference has come to rest.
+
+        Args:
+            goal: (robot, motor) [rad]; NaN where a motor does not tell.
+        """
+        window = self.window
+        some = np.flatnonzero((window.count > 0) & ~self.references.moved)
+        at = some, window.count[some] - 1
+        arrived = self._sensors.has_arrived(goal[some], window.settled.movements.target[at])
+        before = window.settled.arrived[at]
+        arrived = np.where(np.isfinite(arrived), arrived, before)
+        news = ~((arrived == before) | np.isnan(arrived)).all(axis=1)
+        window.settled.arrived[at] = arrived
+        window.judged[at[0][news], at[1][news]] = False
+        return some[news]
+
     def rest(self) -> FloatArray:
         """Return where tools rest after their present movement, (robot, axis) [m].
 
