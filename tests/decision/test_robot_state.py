@@ -50,6 +50,7 @@ def test_runs_that_are_unsure_stay_so_however_many_they_are():
     assert found.sureness == "likely, but not sure (87 %)"
     assert found.step.startswith("Record again, with motor 2 moving")
     assert "Replace" not in found.step
+    assert found.step.endswith("--self-calibrate.")
 
 
 def test_a_fault_that_began_is_told_by_the_runs_since_then():

@@ -11,13 +11,14 @@ import pytest
 from failuretwin import BayesDiagnoser, SetupPrior
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.decision.robot_state import WELL, robot_state
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.log_correction import CorrectionTable, LogCorrection
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.set_up_weighing import ANOTHER, SetUpPosterior, WeighedSetUp
-from failuretwin.inference.set_ups import SetUp, mistakes, zero_off
+from failuretwin.inference.set_ups import FAULT_OF_EVERY_RUN, SetUp, mistakes, zero_off
 
 TRUTHS = ["healthy", "motor_2:stuck", "motor_3:steady_state_error"]
 NONE = LogCorrection.none(4)
@@ -198,6 +199,38 @@ def test_what_every_run_has_is_set_up_and_what_one_has_is_a_fault(twin, armpi, k
     found = diagnoser.diagnose(one)
     assert found[0].diagnosis == "motor_3:encoder_bias"
     assert not any(remarks(d) for d in found)
+
+
+def test_what_most_runs_have_and_some_have_not_is_a_fault_of_those(twin, armpi, known):
+    """Undoing it as a zero would call the healthy runs faulty and the faulty ones healthy."""
+    runs = simulate(Plan(armpi, ["healthy"], 5, 5, known, RandomMovements(count=5)))
+    late = runs.copy(deep=True)
+    off = replace(NONE, z=-0.12 * I4[2]).runs(runs)["command"].values
+    late["command"].values[2:] = off[2:]
+    names = ["healthy", "motor_3:encoder_bias", "motor_3:steady_state_error"]
+    found = BayesDiagnoser(twin, hypotheses=names).diagnose(late)
+    assert not any(remarks(d) for d in found)
+    assert [d.diagnosis for d in found[2:]] == ["motor_3:encoder_bias"] * 3
+    right = BayesDiagnoser(twin, hypotheses=names).diagnose(runs)
+    assert [d.diagnosis for d in found[:2]] == [d.diagnosis for d in right[:2]]
+
+
+@pytest.mark.parametrize("off_rad", [0.0, 0.06])
+def test_a_zero_far_off_what_such_robots_do_is_told_of_one_run(twin, armpi, known, off_rad):
+    """Nobody has calibrated the robot: nine deviations of what hobby servos differ by."""
+    seen = simulate(Plan(armpi, ["healthy"], 1, 6, known, RandomMovements(count=6)))
+    seen = replace(NONE, z=-off_rad * I4[2]).runs(seen)
+    names, priors = ["healthy", "motor_2:stuck"], Priors(setup=SetupPrior(wrong_rate=(0.0, 0.0)))
+    (found,) = BayesDiagnoser(twin, "generic", names, priors).diagnose(seen)
+    told = [line for line in found.quality if "off what such robots do" in line]
+    assert found.diagnosis == "healthy"
+    assert len(told) == (off_rad > 0.0)
+    for line in told:
+        assert re.match(r"motor 3 rests \+1[345] counts off", line)  # 0.06 rad is 14.3 counts
+        assert line.endswith(FAULT_OF_EVERY_RUN)
+    state = robot_state([found], armpi)
+    assert (state.state.kind == WELL) == (off_rad == 0.0)
+    assert ("zero mark" in state.step) == (off_rad > 0.0)
 
 
 def test_a_log_of_another_world_gets_no_motor(twin, runs):

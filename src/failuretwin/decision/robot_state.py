@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -38,6 +38,7 @@ from failuretwin.inference.explanation import (
 )
 from failuretwin.inference.fault_course import FaultCourse
 from failuretwin.inference.posterior import log_prior
+from failuretwin.inference.set_ups import FAULT_OF_EVERY_RUN
 
 WELL, FAULTY, OPEN = "healthy", "faulty", "cannot tell"
 """What a robot, a motor or a run may be."""
@@ -48,6 +49,13 @@ RUN = "run"
 DIFFERENT_STEP = (
     "If these are runs of one robot in their order, weigh them together with --track or "
     "--self-calibrate; else diagnose the runs of each state alone."
+)
+
+TOGETHER_STEP = "Runs of one robot say more together: diagnose them with --self-calibrate."
+ZERO_STEP = (
+    "Look at the zero mark of this motor, and at the zero in the profile. If the profile is wrong, "
+    "`failuretwin doctor LOG --out FILE` writes the zero down. If the zero was right before, this "
+    "is a fault: stop and repair the motor."
 )
 
 
@@ -73,6 +81,7 @@ class MotorState:
     Attributes:
         motor: Its name.
         joint: Name of its joint in the URDF.
+        column: Its column in raw logs, which may name it by its servo; empty: none is known.
         kind: What it is over all runs.
         faulty: In how many runs it is named.
         suspected: In how many it is suspected, and not named.
@@ -82,6 +91,7 @@ class MotorState:
 
     motor: str
     joint: str
+    column: str
     kind: str
     faulty: int
     suspected: int
@@ -182,6 +192,7 @@ def robot_state(
         found = _of_course(course, robot)
     else:
         found = _one_by_one(diagnoses, states, decided, robot)
+    found = _with_zero(found, diagnoses)
     chance = found.state.probability
     return RobotState(
         found.state,
@@ -204,6 +215,17 @@ def course_of(diagnoses: Sequence[Diagnosis], diagnoser: BayesDiagnoser) -> Faul
     """
     prior = np.exp(log_prior(diagnoser.hypothesis_set, diagnoser.priors))
     return FaultCourse.of(diagnoses, prior)
+
+
+def _with_zero(found: _Found, diagnoses: Sequence[Diagnosis]) -> _Found:
+    """Return a healthy state with what runs have that is a zero off or a fault of them all."""
+    told = [line for d in diagnoses for line in d.quality if FAULT_OF_EVERY_RUN in line]
+    if found.state.kind != WELL or not told:
+        return found
+    off = told[-1].split("sure): ")[-1].split("; ")[0]
+    where = f"in {len(told)} of {counted(len(diagnoses), 'run')}"
+    headline = f"Cannot tell yet; healthy but for one thing {where}: {off}"
+    return replace(found, state=State(OPEN), headline=headline, step=ZERO_STEP)
 
 
 def _nothing(diagnoses: Sequence[Diagnosis]) -> _Found:
@@ -238,6 +260,8 @@ def _one_by_one(
     if any(states[i].kind == WELL for i in decided if i < since):
         remarks.append(f"since run {since + 1} of {len(diagnoses)} ({diagnoses[since].run})")
     step = " ".join(next_steps(posterior, class_name(robot), alone))
+    if state.kind == OPEN and len(used) > 1:
+        step = f"{step} {TOGETHER_STEP}"
     return _Found(state, _headline(state, posterior), step, "; ".join(remarks), posterior)
 
 
@@ -300,6 +324,7 @@ def _motor_states(
             MotorState(
                 name,
                 motor.joint,
+                motor.log_column,
                 found.state.kind if name in found.state.motors else kind,
                 sum(s.kind == FAULTY and name in s.motors for s in states),
                 sum(s.kind == OPEN and name in s.motors for s in states),

@@ -81,7 +81,7 @@ class ConsecutiveLossHmm:
         follows = csr_array(self.transition.reshape(-1, len(self.missed)))  # one of each row
         for m in range(count):
             pairs = rates[:, m, :, None] * state[:, None]
-            chances[:, m] = state = np.asarray(pairs.reshape(runs, -1) @ follows)
+            chances[:, m] = state = np.asarray(pairs.reshape(runs, follows.shape[0]) @ follows)
             if log_likelihood is not None:
                 says = np.where(state > 0.0, log_likelihood[:, m], -np.inf)
                 state = state * np.exp(says - says.max(axis=-1, keepdims=True))

@@ -25,12 +25,13 @@ from failuretwin.inference.shared_posterior import set_up_in_doubt
 from failuretwin.inference.shared_unknowns import REGISTRATION
 from failuretwin.inference.shared_weighing import SharedWeighing
 
-PASSES = 4
-"""Times that every run is judged; later ones change nothing that matters."""
+PASSES, MOST_PASSES, MOVED = 4, 12, 0.2
+"""Times that every run is judged, and at most: until a pass moves theta by no more than this share
+of its deviation."""
 DAMPING = 0.7
 """Share of a new site that is taken, from the second pass on."""
 Advance = Callable[[int], None]
-"""Told how many passes over the runs have just been done, of `PASSES`."""
+"""Told how many passes over the runs have just been done, of `PASSES`; more are not told."""
 
 
 @dataclass(frozen=True)
@@ -88,12 +89,17 @@ def folder_posterior(
         advance: Told of progress.
     """
     together, usual = begun(SharedWeighing(likelihood, hypotheses, priors))
-    rows = np.arange(together.runs)
-    for done in range(PASSES):
+    rows, moved = np.arange(together.runs), np.inf
+    for done in range(MOST_PASSES):
         found = together.judge(rows)
-        if done < PASSES - 1:
-            together.learn(found, 1.0 if done == 0 else DAMPING)
-        advance(1)
+        advance(int(done < PASSES))
+        if done == MOST_PASSES - 1 or (done >= PASSES - 1 and moved <= MOVED):
+            break
+        before = together.here
+        together.learn(found, 1.0 if done == 0 else DAMPING)
+        (_,), (covariance,) = together.belief.moments
+        spread = together.unit * np.sqrt(np.diag(covariance))
+        moved = float(np.abs((together.here - before) / spread).max())
     (mean,), (covariance,) = together.belief.moments
     unit, sites = together.unit, together.sites
     taught = 0.5 * np.linalg.slogdet(np.eye(len(unit)) + sites.precision @ covariance)[1]

@@ -290,6 +290,7 @@ class Posterior:
         log_posterior: (run, hypothesis).
         weights: What the runs say of each hypothesis, in their order.
         set_up: What is to be said of the set-up of each run; empty: nothing of any.
+        offsets: The same of zeros that are far off what such robots do.
         explained: Log density of each settled position given all before it, (run, movement), where
             more is known than the runs say; None: what the best hypothesis makes of it counts.
         no_verdict: Why no set-up allows a verdict on each run; empty: nothing keeps from any.
@@ -301,6 +302,7 @@ class Posterior:
     log_posterior: FloatArray
     weights: Sequence[MarginalLikelihood]
     set_up: Sequence[str] = ()
+    offsets: Sequence[str] = ()
     explained: FloatArray | None = None
     no_verdict: Sequence[str] = ()
 
@@ -366,7 +368,7 @@ class Posterior:
             posterior={str(h): float(p) for h, p in zip(self.hypotheses, posterior, strict=True)},
             quality=(
                 *quality.remarks,
-                *self._set_up(run),
+                *(said[run] for said in (self.set_up, self.offsets) if said and said[run]),
                 *unused,
                 *commands_beyond(robot, evidence.movements, run),
             ),
@@ -381,9 +383,6 @@ class Posterior:
             losses = self._losses(estimate, ranked[0])
             diagnosis = _with_estimate(diagnosis, ranked[0], estimate, place, robot)
         return with_joint_names(worded(diagnosis, ranked, losses, class_name(robot)), robot)
-
-    def _set_up(self, run: int) -> tuple[str, ...]:
-        return (self.set_up[run],) if self.set_up and self.set_up[run] else ()
 
     def _evidence(
         self, run: int, order: IntArray, place: StreamPosition

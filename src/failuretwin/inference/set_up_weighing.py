@@ -19,7 +19,7 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_of, log_sum
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.log_correction import LogCorrection
 from failuretwin.inference.posterior import Posterior, log_prior, marginal_likelihoods
@@ -319,14 +319,15 @@ class SetUpWeighing:
         for k, width in enumerate(model.least_visible):
             says = likelihood.profile(k)
             seen = likelihood.usable & (says.min_distance2[..., 0] < EXPLAINED)
-            off = says.turned(says.mode - says.expected)[..., 0][seen]
+            away = says.turned(says.mode - says.expected)[..., 0]
+            off = away[seen]
             together = np.abs(off[:, None] - off) < CLUSTER * width
             if model.twin.robot.slides[k] or len(off) < LEAST_AGREEING:
                 continue
             members = together[together.sum(axis=1).argmax()]
             zero = float(np.median(off[members]))
             agree = members.sum() >= max(LEAST_AGREEING, AGREEING * likelihood.usable.sum())
-            if agree and abs(zero) > CLUSTER * width:
+            if agree and abs(zero) > CLUSTER * width and not _right_in_some(away, seen, zero):
                 found.append(self._zero(first, k, zero, float(width)))
         return found
 
@@ -350,6 +351,21 @@ class SetUpWeighing:
         volume = 0.5 * float(np.log(2.0 * np.pi / curvature))
         known = replace(best.set_up, log_prior=best.set_up.log_prior + volume)
         return replace(best, set_up=known)
+
+
+def _right_in_some(away: FloatArray, seen: BoolArray, zero: float) -> bool:
+    """Return whether a motor stands where it should in most movements of some run, not at a zero.
+
+    A zero that is wrong is so in every run; what only some have is a fault.
+
+    Args:
+        away: By how much the motor is off, (run, movement) [rad].
+        seen: Which movements tell, (run, movement).
+        zero: The zero [rad].
+    """
+    right = (np.abs(away) < 0.5 * abs(zero)) & seen
+    most = 2 * right.sum(axis=1) > seen.sum(axis=1)
+    return bool((most & (right.sum(axis=1) >= LEAST_AGREEING)).any())
 
 
 def _weighed(

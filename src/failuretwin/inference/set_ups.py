@@ -225,6 +225,10 @@ ZERO_RAD = np.deg2rad(10.0)
 """Half of the zeros that are off are so by about this [rad], the rest by anything; assumed."""
 
 
+FAULT_OF_EVERY_RUN = "a fault that every run has"
+"""What no log tells from a zero that is off."""
+
+
 def zero_off(robot: Robot, motor: int, zero: float) -> SetUp:
     """Return the mistake that the zero of a motor is not where the profile has it.
 
@@ -239,7 +243,7 @@ def zero_off(robot: Robot, motor: int, zero: float) -> SetUp:
     log_prior = np.log(SHARES["zero"] / len(robot.motors)) + np.log(near + 0.25 / np.pi)
     return SetUp(
         f"{spoken(robot, motor)} stands {size * zero:+.3g} {unit} off in every movement",
-        "a zero that is not where the profile has it, or a fault that every run has",
+        f"a zero that is not where the profile has it, or {FAULT_OF_EVERY_RUN}",
         replace(none, z=np.where(np.arange(len(none.z)) == motor, zero, 0.0)),
         float(log_prior),
         "zero",

@@ -21,6 +21,7 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.digital_model.robot import shown_unit
 from failuretwin.inference.linear_response import LinearResponse
 from failuretwin.inference.marginal import MarginalLikelihood
 from failuretwin.inference.posterior import (
@@ -30,14 +31,13 @@ from failuretwin.inference.posterior import (
 )
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.shared_likelihood import (
-    has_score,
-)
-from failuretwin.inference.shared_unknowns import (
-    registered,
-)
+from failuretwin.inference.set_ups import FAULT_OF_EVERY_RUN, spoken
+from failuretwin.inference.shared_likelihood import has_score
+from failuretwin.inference.shared_unknowns import REGISTRATION, registered
 from failuretwin.inference.shared_weighing import Candidate, SharedWeighing
 
+FAR = 3.0
+"""Zeros so many deviations off what such robots do are told."""
 SURE = 0.9
 """Probability of a wrong set-up from which it is told."""
 ALLOWED_FOR = "; allowed for"
@@ -128,6 +128,7 @@ class Mixture:
             log_posterior,
             weights,
             self.remarks(),
+            self.odd_zeros(),
         )
 
     def weights(self) -> list[MarginalLikelihood]:
@@ -193,6 +194,41 @@ class Mixture:
         hypotheses = self.weighing.hypotheses
         asked = [hypotheses[h]] if hypotheses[h].known else hypotheses
         return marginal_likelihoods(whole, asked, self.weighing.priors)[0 if len(asked) == 1 else h]
+
+    def odd_zeros(self) -> list[str]:
+        """Return which zero of each run is far off what such robots do, empty where none is.
+
+        By the best theta of the most probable hypothesis, less two of its deviations; a motor that
+        it calls faulty has none.
+        """
+        layout, count = self.weighing.layout, len(self.weighing.nowhere)
+        if not layout.offsets:
+            return []
+        zeros = slice(REGISTRATION, REGISTRATION + layout.motors)
+        usual, parts = self.weighing.parts[0].deviation[zeros], self.weighing.parts
+        height = self.log_evidence + self.weighing.log_odds
+        first = height.reshape(count, -1).argmax(axis=1)
+        told = []
+        for run, (c, h) in enumerate(zip(*np.unravel_index(first, height.shape[1:]), strict=True)):
+            each = self.candidates[c]
+            row = int(np.flatnonzero(each.rows == run)[0])
+            zero = (each.found.theta[row, h] + each.found.expansion.place[row])[zeros]
+            precision = np.diag(parts[each.component].deviation ** -2.0)
+            covariance = np.linalg.inv(precision + each.found.information[row, h])
+            open_by = 2.0 * np.sqrt(np.diag(covariance)[zeros])
+            told.append(self._odd_zero(zero, np.maximum(np.abs(zero) - open_by, 0.0) / usual))
+        return told
+
+    def _odd_zero(self, zero: FloatArray, deviations: FloatArray) -> str:
+        motor = int(np.argmax(deviations))
+        if deviations[motor] < FAR:
+            return ""
+        robot = self.weighing.likelihood.model.twin.robot
+        size, unit = shown_unit("rad", robot, robot.motor_names[motor])
+        return (
+            f"{spoken(robot, motor)} rests {size * zero[motor]:+.2g} {unit} off what such robots "
+            f"do (by {deviations[motor]:.1f} deviations at least): a zero that is off, or {FAULT_OF_EVERY_RUN}"
+        )
 
     def remarks(self) -> list[str]:
         """Return what is to be said of the set-up of each run, empty where nothing is."""

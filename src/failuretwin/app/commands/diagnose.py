@@ -350,6 +350,7 @@ def _write(
         from failuretwin.app.technician_page import write_report
 
         write_report(runs, diagnoses, twin, state, plot)
+        click.echo(f"the page: {plot / 'index.html'}", err=True)
 
 
 def _learn_together(
