@@ -227,7 +227,8 @@ class Mixture:
         size, unit = shown_unit("rad", robot, robot.motor_names[motor])
         return (
             f"{spoken(robot, motor)} rests {size * zero[motor]:+.2g} {unit} off what such robots "
-            f"do (by {deviations[motor]:.1f} deviations at least): a zero that is off, or {FAULT_OF_EVERY_RUN}"
+            f"do (by {deviations[motor]:.1f} deviations at least): a zero that is off, or "
+            f"{FAULT_OF_EVERY_RUN}"
         )
 
     def remarks(self) -> list[str]:
