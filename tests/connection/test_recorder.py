@@ -75,6 +75,7 @@ def test_a_recording_by_the_eyes_of_the_mcap_library(armpi, measured_armpi, tmp_
     assert found == {
         "/command": ("trajectory_msgs/msg/JointTrajectory", "cdr"),
         "/joint_states": ("sensor_msgs/msg/JointState", "cdr"),
+        "/joint_goals": ("sensor_msgs/msg/JointState", "cdr"),
         "/tool_point": ("geometry_msgs/msg/PointStamped", "cdr"),
         "/diagnostics": ("diagnostic_msgs/msg/DiagnosticArray", "cdr"),
         "/failuretwin/probability/healthy": ("std_msgs/msg/Float64", "cdr"),

@@ -67,7 +67,8 @@ def runs():
 def test_table_becomes_a_run_set_with_the_names_of_the_contract():
     runs = everything().to_dataset()
 
-    others = {"temperature", "voltage", "tool_orientation", "accelerometer", "gyroscope", "wire"}
+    sensed = {"tool_orientation", "accelerometer", "gyroscope", "wire"}
+    others = {"temperature", "voltage", "goal"} | sensed
     assert {str(name) for name in runs.data_vars} == VARIABLES.keys() - others
     assert {name: runs[name].dims for name in runs.data_vars} == {
         name: VARIABLES[str(name)][0] for name in runs.data_vars

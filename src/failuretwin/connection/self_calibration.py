@@ -24,7 +24,7 @@ from failuretwin.connection.population import Population
 from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.movements import Movements
-from failuretwin.core.runs import truth_of
+from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.read import RunsLike, as_runs
 from failuretwin.digital_model.arm_classes import generic_imperfections
@@ -139,6 +139,7 @@ class SelfCalibratingDiagnoser:
         """
         robot = self.twin.robot
         runs = as_runs(runs, robot)
+        check_motors(runs, robot.name, robot.motor_names)
         movements = Evidence(runs).settled.movements
         if movements.start.shape[1] == 0:
             raise InputError(

@@ -22,7 +22,7 @@ from failuretwin.connection.self_calibration import as_calibration, more_when_la
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.movements import Movements
-from failuretwin.core.runs import truth_of
+from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
@@ -124,8 +124,10 @@ def diagnose_tracked(
         advance: Called with the number of runs just diagnosed.
 
     Raises:
-        InputError: If no run holds a movement.
+        InputError: If no run holds a movement, or they are of another robot.
     """
+    robot = diagnoser.twin.robot
+    check_motors(runs, robot.name, robot.motor_names)
     life, known = copy.deepcopy(history.life), set(history.keys)
     seen = _Seen.of(runs, diagnoser, life)
     diagnoses: list[Diagnosis | None] = [None] * len(seen.names)

@@ -238,8 +238,7 @@ class SetUpWatch:
         except InputError:  # no movement in it yet
             return
         as_told = self._found.fits and not self._found.best.set_up.what
-        few = self.movements < PROOF  # a frame a little off and a fault look alike in few
-        self._elsewhere = seen.elsewhere() if as_told and not few else ""
+        self._elsewhere = seen.elsewhere() if as_told else ""
         best = self._found.best
         self._fitted |= best.fits and not best.set_up.what and self.movements >= PROOF
 

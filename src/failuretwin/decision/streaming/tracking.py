@@ -129,7 +129,7 @@ class MovementTracker:
     def adopt(self, model: HealthyModel) -> None:
         """Judge all movements anew, by another healthy robot."""
         self._latest_start_s, self._late_after_s = _lateness(model)
-        self.window.judged[:] = False
+        self.window = self.window.looked_at_by(model)
 
     def take(
         self, time: float, command: FloatArray, points: FloatArray, away: BoolArray

@@ -68,6 +68,13 @@ class MovementWindow(ArrayStruct):
         )
         return none.blank(robots, movements)
 
+    def looked_at_by(self, model: HealthyModel) -> MovementWindow:
+        """Return the same, nothing judged: another healthy robot may have other outcomes."""
+        judged = np.zeros_like(self.judged)
+        likelihoods = movement_likelihoods(self.settled[:0], model).blank(*judged.shape)
+        first = likelihoods.explanation.blank(*judged.shape)
+        return replace(self, first=first, likelihoods=likelihoods, judged=judged)
+
     def append(self, robot: int, movements: Movements, number: int) -> None:
         """Add a movement of a robot; where there is no room, the oldest is forgotten.
 
