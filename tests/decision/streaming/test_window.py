@@ -1,0 +1,28 @@
+"""Windows of movements that another healthy robot looks at."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from failuretwin.decision.streaming.window import MovementWindow
+from failuretwin.digital_model.arm_classes import generic_imperfections
+from failuretwin.inference.healthy_model import HealthyModel
+
+
+def test_a_window_takes_the_outcomes_of_another_robot(twin):
+    """One that hardly loses commands has fewer outcomes than one that often does."""
+    usual = HealthyModel(twin, generic_imperfections(twin.robot))
+    rare = [replace(e, rate=1e-6, rate_when_late=1e-6) for e in usual.imperfections.lost_commands]
+    calm = replace(usual, imperfections=replace(usual.imperfections, lost_commands=tuple(rare)))
+    window = MovementWindow.of(usual, 2, 4)
+    window.judged[:] = True
+    after, fresh = window.looked_at_by(calm), MovementWindow.of(calm, 2, 4)
+    assert not after.judged.any()
+    shapes = [
+        [one.first.density.shape, one.likelihoods.outcomes.log_weight.shape]
+        for one in (after, fresh, window)
+    ]
+    assert shapes[0] == shapes[1] != shapes[2]
+    assert np.shares_memory(after.settled.point, window.settled.point)
