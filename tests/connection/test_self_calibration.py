@@ -166,7 +166,7 @@ def test_a_constant_error_in_every_run_is_not_swallowed(armpi, motor, size):
     else:
         assert np.mean(faulty) >= 0.5 or odd
     for line in odd:
-        assert line.endswith("a fault that is there in every run looks like this")
+        assert line.endswith("do: a zero that is off, or a fault that every run has")
         told = float(line.split(": +")[1].split(" deviations")[0])
         estimate = value(found.calibration, "bias", f"motor_{motor}").value
         assert told == pytest.approx(estimate / 0.0065, abs=0.06)

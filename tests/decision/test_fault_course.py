@@ -16,8 +16,8 @@ PRIOR = np.array([0.5, 0.2, 0.3])
 STEP = np.array(
     [
         [0.98, 0.02 * 0.4, 0.02 * 0.6],  # a healthy robot fails once in fifty runs, by the odds
-        [0.02, 0.98, 0.0],  # a fault is repaired once in fifty; no fault becomes another
-        [0.02, 0.0, 0.98],
+        [0.02 * 0.98 / 0.992, 0.98, 0.02 * 0.012 / 0.992],  # repaired once in fifty, and failed
+        [0.02 * 0.98 / 0.988, 0.02 * 0.008 / 0.988, 0.98],  # anew by then as a healthy one fails
     ]
 )
 
@@ -120,3 +120,12 @@ def test_runs_that_say_nothing_are_no_healthy_robot():
     silent = FaultCourse.of(judged(*[third] * 4, undecided=range(4)), third)
     (said,) = silent.verdict
     assert said.startswith("cannot tell, because healthy in all runs is only")
+
+
+def test_one_fault_may_follow_another_without_a_healthy_run_between():
+    surely = np.eye(3) * 0.997 + 0.001
+    runs = judged(*surely[[0, 0, 1, 1, 1, 2, 2, 2]])
+    found = FaultCourse.of(runs, PRIOR)
+    told = [(str(e.hypothesis), e.first, e.last) for e in found.episodes]
+    assert told == [(NAMES[0], 0, 1), (NAMES[1], 2, 4), (NAMES[2], 5, 7)]
+    assert found.verdict[1].startswith("motor 2 misses its targets since run 6 of 8")

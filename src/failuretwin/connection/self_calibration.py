@@ -46,18 +46,24 @@ from failuretwin.inference.mixed_runs import of_second_robot, two_robots
 from failuretwin.inference.posterior import log_prior
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.set_ups import FAULT_OF_EVERY_RUN
+from failuretwin.inference.shared_posterior import FAR
 from failuretwin.inference.shared_unknowns import ORIGIN, REGISTRATION, SCALE, TURN, registered
 
 LATE_LOSSES = 4.0
 """How many times as often a movement that starts late loses its command, where nobody has counted:
 a stalled bus does both; assumed."""
-FAR = 3.0
-"""Offsets so many deviations off what such robots do are told."""
 FRAME_OFF = 14.1
 """Squared distance of the sensor's frame from that of the profile, in deviations, from which it is
 told: 95 % of seven normal numbers are nearer."""
 IDENTIFIED = 0.7
 """An offset is learned where the runs narrow it to this share of the prior's deviation."""
+ODD = {
+    "bias": f"a zero that is off, or {FAULT_OF_EVERY_RUN}",
+    "compliance": "a fault that is there in every run looks like this",
+    "friction": "a fault that is there in every run looks like this",
+}
+"""What it may mean that one is."""
 UNITS = {"bias": "rad", "compliance": "rad/(N m)", "friction": "rad"}
 
 
@@ -290,7 +296,7 @@ def _remarks(
 ) -> list[str]:
     """Return what else is to be known of what was learned."""
     lines = [
-        f"{p.name} of {p.motor}: {p.note}; a fault that is there in every run looks like this"
+        f"{p.name} of {p.motor}: {p.note}: {ODD[p.name]}"
         for p in parameters
         if p.identified and p.note
     ]

@@ -169,7 +169,10 @@ class _Found:
 
 
 def robot_state(
-    diagnoses: Sequence[Diagnosis], robot: Robot, course: FaultCourse | None = None
+    diagnoses: Sequence[Diagnosis],
+    robot: Robot,
+    course: FaultCourse | None = None,
+    learned: Sequence[str] = (),
 ) -> RobotState:
     """Return the state of a robot over all its runs.
 
@@ -178,6 +181,7 @@ def robot_state(
         robot: The robot.
         course: Of the robot over these runs, where they were weighed together; None: they were
             judged one by one.
+        learned: What the runs have taught of the robot, in sentences.
 
     Raises:
         InputError: If there is no run.
@@ -192,7 +196,7 @@ def robot_state(
         found = _of_course(course, robot)
     else:
         found = _one_by_one(diagnoses, states, decided, robot)
-    found = _with_zero(found, diagnoses)
+    found = _with_zero(found, [*(line for d in diagnoses for line in d.quality), *learned])
     chance = found.state.probability
     return RobotState(
         found.state,
@@ -217,15 +221,14 @@ def course_of(diagnoses: Sequence[Diagnosis], diagnoser: BayesDiagnoser) -> Faul
     return FaultCourse.of(diagnoses, prior)
 
 
-def _with_zero(found: _Found, diagnoses: Sequence[Diagnosis]) -> _Found:
-    """Return a healthy state with what runs have that is a zero off or a fault of them all."""
-    told = [line for d in diagnoses for line in d.quality if FAULT_OF_EVERY_RUN in line]
+def _with_zero(found: _Found, lines: Sequence[str]) -> _Found:
+    """Return a healthy state with what was said of a zero that is off, or a fault of every run."""
+    told = [line for line in lines if FAULT_OF_EVERY_RUN in line]
     if found.state.kind != WELL or not told:
         return found
-    off = told[-1].split("sure): ")[-1].split("; ")[0]
-    where = f"in {len(told)} of {counted(len(diagnoses), 'run')}"
-    headline = f"Cannot tell yet; healthy but for one thing {where}: {off}"
-    return replace(found, state=State(OPEN), headline=headline, step=ZERO_STEP)
+    remark = "; ".join(filter(None, (found.remark, told[-1])))
+    headline = "Cannot tell yet; healthy, but for a zero that may be a fault"
+    return replace(found, state=State(OPEN), headline=headline, step=ZERO_STEP, remark=remark)
 
 
 def _nothing(diagnoses: Sequence[Diagnosis]) -> _Found:

@@ -4,7 +4,8 @@ A hidden Markov chain over the runs in their order. Its states are the hypothese
 likelihood of a state is its posterior over its prior:
 
     p(s_1) = prior,    p(s_i | s_i-1): a healthy robot fails with rate a, to h by its prior odds;
-                       a fault stays but for a rate r, by which it is repaired
+                       a fault stays but for a rate r, by which it is repaired; by then the robot
+                       may have failed anew, by another fault
 
 forward-backward gives p(s_i | all runs), Viterbi the course that is told. Each run keeps its own
 size and onset: that these stay too is not used.
@@ -105,9 +106,12 @@ class FaultCourse:
         healthy = np.array([h.is_healthy for h in self.hypotheses])
         odds = np.where(healthy, 0.0, np.exp(self.log_prior))
         failing = FAULT_RATE * odds / max(float(odds.sum()), LEAST)
-        step = np.where(healthy, REPAIR_RATE, 0.0) + (1.0 - REPAIR_RATE) * np.eye(len(healthy))
-        after_repair = failing + np.where(healthy, 1.0 - FAULT_RATE, 0.0)
-        return log_of(np.where(healthy[:, None], after_repair, step))
+        sound = failing + np.where(healthy, 1.0 - FAULT_RATE, 0.0)
+        stays = np.eye(len(healthy))
+        repaired = sound * (1.0 - stays)
+        repaired /= np.maximum(repaired.sum(axis=1, keepdims=True), LEAST)
+        faulty = (1.0 - REPAIR_RATE) * stays + REPAIR_RATE * repaired
+        return log_of(np.where(healthy[:, None], sound, faulty))
 
     @cached_property
     def _forward(self) -> FloatArray:

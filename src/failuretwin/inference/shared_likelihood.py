@@ -16,10 +16,12 @@ Section: docs/shared_unknowns.md
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.failure_behavior.mode import Signature
@@ -33,9 +35,12 @@ from failuretwin.inference.explained_movements import (
 from failuretwin.inference.linear_response import LinearResponse
 from failuretwin.inference.priors import Priors
 
+ByRun = Annotated[FloatArray, Axes("run")]
+ByTheta = Annotated[FloatArray, Axes("run", "theta")]
+
 
 @dataclass(frozen=True)
-class LocalLikelihood:
+class LocalLikelihood(ArrayStruct):
     """The log likelihood of some runs near one theta of each.
 
     Attributes:
@@ -46,20 +51,11 @@ class LocalLikelihood:
         misfit: Mean D^2 of what is explained, (run,); 3 if all is well.
     """
 
-    theta: FloatArray
-    log_likelihood: FloatArray
-    score: FloatArray
-    information: FloatArray
-    misfit: FloatArray
-
-    def __getitem__(self, rows: IntArray) -> LocalLikelihood:
-        """Return that of some of the runs alone."""
-        return LocalLikelihood(*(getattr(self, field.name)[rows] for field in fields(self)))
-
-    def with_rows(self, rows: IntArray, some: LocalLikelihood) -> LocalLikelihood:
-        """Return the same with that of some of the runs replaced."""
-        names = [field.name for field in fields(self)]
-        return LocalLikelihood(*(_put(getattr(self, n), rows, getattr(some, n)) for n in names))
+    theta: ByTheta
+    log_likelihood: ByRun
+    score: ByTheta
+    information: Annotated[FloatArray, Axes("run", "theta", "theta")]
+    misfit: ByRun
 
 
 OUTLYING = 100.0
@@ -169,7 +165,7 @@ SHORTEST = 0.2
 
 
 @dataclass(frozen=True)
-class Fit:
+class Fit(ArrayStruct):
     """What some runs say of one hypothesis with theta normal, by Laplace's method.
 
     Attributes:
@@ -181,10 +177,10 @@ class Fit:
     """
 
     says: LocalLikelihood
-    top: FloatArray
-    promised: FloatArray
-    height: FloatArray
-    width: FloatArray
+    top: ByTheta
+    promised: ByRun
+    height: ByRun
+    width: ByRun
 
     @classmethod
     def of(cls, prior: Normal, says: LocalLikelihood) -> Fit:
@@ -196,17 +192,6 @@ class Fit:
         promised = 0.5 * np.einsum("rt,rt->r", slope, step)
         curved = 0.5 * np.linalg.slogdet(precision)[1]
         return cls(says, says.theta + step, promised, height, curved)
-
-    def __getitem__(self, rows: IntArray) -> Fit:
-        """Return that of some of the runs."""
-        rest = (getattr(self, field.name)[rows] for field in fields(self)[1:])
-        return Fit(self.says[rows], *rest)
-
-    def with_rows(self, rows: IntArray, some: Fit) -> Fit:
-        """Return the same with that of some of the runs replaced."""
-        names = [field.name for field in fields(self)[1:]]
-        rest = (_put(getattr(self, name), rows, getattr(some, name)) for name in names)
-        return Fit(self.says.with_rows(rows, some.says), *rest)
 
     @property
     def found(self) -> BoolArray:
@@ -248,7 +233,7 @@ def search(
         start: Where to start, (run, hypothesis, theta).
     """
     fits = [
-        Fit.of(prior, local_likelihood(response, h, priors, start[:, i]))
+        Fit.of(prior, local_likelihood(response, h, priors, start[:, i].copy()))
         for i, h in enumerate(hypotheses)
     ]
     share, gained = np.ones(start.shape[:2]), np.full(start.shape[:2], np.inf)
@@ -264,7 +249,7 @@ def search(
             new = Fit.of(prior[rows], local_likelihood(some, hypotheses[i], priors, theta))
             gain = new.height - old.height
             rose = gain > 0.0
-            fits[i] = fits[i].with_rows(rows[rose], new[np.flatnonzero(rose)])
+            fits[i].put(rows[rose], new[rose])
             share[rows, i] = np.where(rose, 1.0, 0.5 * share[rows, i])
             gained[rows, i] = np.where(rose, gain, gained[rows, i])
     return fits
@@ -287,9 +272,3 @@ def _worth_following(
     rising = np.minimum(promised, gained) > FOUND_NATS
     rising &= np.maximum(promised, np.where(np.isinf(gained), 0.0, gained)) > enough
     return np.asarray(rising & ~(hopeless & (promised < RISING_NATS)))
-
-
-def _put(values: FloatArray, rows: IntArray, some: FloatArray) -> FloatArray:
-    changed = np.array(values)
-    changed[rows] = some
-    return changed

@@ -37,7 +37,7 @@ from failuretwin.inference.shared_unknowns import REGISTRATION, registered
 from failuretwin.inference.shared_weighing import Candidate, SharedWeighing
 
 FAR = 3.0
-"""Zeros so many deviations off what such robots do are told."""
+"""Offsets so many deviations off what such robots do are told."""
 SURE = 0.95
 """Probability of a wrong set-up from which it is told."""
 ALLOWED_FOR = "; allowed for"

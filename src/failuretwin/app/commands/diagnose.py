@@ -191,7 +191,7 @@ def diagnose(
     if (sse_range or error_range) and diagnoser is bayes:
         _tell_ruled_out(runs, bayes, diagnoses, priors_of(model, None, onset))
     course = None if independent or not together else course_of(diagnoses, bayes)
-    state = robot_state(diagnoses, model, course)
+    state = robot_state(diagnoses, model, course, () if learned is None else learned.remarks)
     _write(runs, diagnoses, known.twin, state, json_file, csv_file, plot)
     if tracked is not None:
         _keep(tracked, runs, out)
