@@ -41,6 +41,16 @@ def test_what_is_found_can_be_accepted(failuretwin, reversed_log, tmp_path):
     assert "3 of 3 runs right" in alone.stdout
 
 
+def test_runs_with_a_gap_are_named(failuretwin, simulated, tmp_path):
+    runs = load_run_set(simulated).isel(run=[0, 2, 7]).copy(deep=True)
+    runs["measured"][1, 300:450] = float("nan")  # 1.5 s
+    save_run_set(runs, tmp_path / "gap.nc")
+    answer = failuretwin("doctor", tmp_path / "gap.nc")
+    remarks = [line for line in answer.stdout.splitlines() if "no readings" in line]
+    assert any(line.endswith(f" ({runs['run'].values[1]})") for line in remarks)
+    assert all(line.endswith(")") for line in remarks)
+
+
 def test_a_file_that_exists_is_left_alone(failuretwin, reversed_log, tmp_path):
     taken = tmp_path / "map.toml"
     taken.write_text("mine")

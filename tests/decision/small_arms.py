@@ -30,6 +30,12 @@ SCARA = [
 ]
 """A lift and two links in the plane."""
 
+PLANAR = [
+    ("revolute", "0 0 0.2", "0 0 1", (-1.2, 1.2)),
+    ("revolute", "0.25 0 0", "0 0 1", (-1.2, 1.2)),
+]
+"""Two links in a plane 0.2 m above the base."""
+
 
 def small_twin(folder, name, joints, tool="0 0 0"):
     """Return the twin of an arm; its files are written to `folder`."""

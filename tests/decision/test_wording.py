@@ -113,6 +113,15 @@ def test_a_motor_held_near_zero_is_told_without_a_sign():
     assert size_words(Fault("motor_3", "stuck"), -0.005) == " at 0 deg"
 
 
+@pytest.mark.parametrize(
+    ("onset_90", "words"),
+    [((11.8, 12.6), "since 12.3 s (11.8 to 12.6 s), "), ((12.2, 12.4), "since 12.3 s, ")],
+)
+def test_an_onset_that_is_open_is_told_with_its_interval(onset_90, words):
+    facts = {"magnitude": 0.1, "magnitude_unit": "rad", "onset_s": 12.3}
+    assert words in told(single("stuck"), onset_90=onset_90, **facts)
+
+
 def test_two_faults_are_both_named():
     assert told(PAIR, onset_s=1.26) == "motor 1 stuck and motor 3 drifts since 1.3 s, 98 % sure"
     assert told(PAIR, onset_s=0.0) == "motor 1 stuck and motor 3 drifts, 98 % sure"

@@ -61,6 +61,28 @@ def check(tmp_path):
             [joint("fore", "EndEffector", "fixed"), joint("fore", "longer", "fixed", "0.9 0 0")],
             "EndEffector",
         ),
+        # A jaw that turns against the hand, by whatever name.
+        (
+            [joint("fore", "gripperStator", "fixed"), joint("gripperStator", "gripperMover")],
+            "gripperStator",
+        ),
+        (
+            [
+                joint("fore", "back_tcp", "fixed", "0.02 0 0"),
+                joint("fore", "gripper_tcp", "fixed", "0.06 0 0"),
+                joint("fore", "gripper"),
+                joint("gripper", "gripper_tcp2", "fixed", "0.05 0 0"),
+            ],
+            "gripper_tcp",
+        ),
+        (
+            [joint("fore", "hand", "fixed"), joint("hand", "grasptarget", "fixed")],
+            "grasptarget",
+        ),
+        (
+            [joint("upper", "elbow_tip_link", "fixed"), joint("fore", "hand_link")],
+            "hand_link",
+        ),
     ],
 )
 def test_the_tool_is_chosen_by_name_and_never_a_finger_or_a_camera(check, parts, tool):

@@ -354,6 +354,13 @@ def levers(chain: SerialChain) -> FloatArray:
     return np.linalg.norm(jacobian, axis=-2).max(axis=0)
 
 
+def idle_axes(chain: SerialChain) -> tuple[bool, bool, bool]:
+    """Return along which axes of the base no joint moves the tool, such as z of a planar arm."""
+    _, jacobian = chain.position_and_jacobian(_poses(chain)[2])
+    x, y, z = (np.abs(jacobian).max(axis=(0, 2)) < CANNOT_MOVE).tolist()
+    return x, y, z
+
+
 def mobility(chain: SerialChain) -> Mobility:
     """Return what the joints do; poses climb together to where the tool is farthest away."""
     low, high, poses = _poses(chain)

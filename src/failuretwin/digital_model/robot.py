@@ -30,6 +30,7 @@ from failuretwin.digital_model.kinematics import (
     Loads,
     SerialChain,
     has_range,
+    idle_axes,
     levers,
 )
 from failuretwin.digital_model.sensor_profile import SensorProfile
@@ -257,6 +258,11 @@ class Robot:
             return unit
         slides = self.slides[self.motor_names.index(motor)]
         return unit.replace("rad", "m", 1) if slides else unit
+
+    @cached_property
+    def idle_axes(self) -> tuple[bool, bool, bool]:
+        """Axes of the tool's position along which no motor moves it."""
+        return idle_axes(self.chain)
 
     @cached_property
     def reach(self) -> float:

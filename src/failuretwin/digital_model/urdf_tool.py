@@ -11,7 +11,7 @@ from failuretwin.digital_model.urdf import Urdf
 
 TOOL_NAMES = (
     r"tool0",
-    r"tcp|tool_?cent(er|re)_?point",
+    r"tcp|tool_?cent(er|re)_?point|grasp(ing)?_?(target|point|frame)",
     r"end_?effector|eef|ee",
     r"tool|tip",
     r"gripper|hand",
@@ -20,6 +20,8 @@ TOOL_NAMES = (
 """Names of links that carry a tool, the surest first; a name counts where it stands as a word."""
 BESIDE = r"finger|jaw|knuckle|thumb|pad|camera|cam|optical|imu|lidar|laser|sensor|marker|inertial"
 """Names of what hangs on a hand and is no tool."""
+HALFWAY = r"shoulder|elbow"
+"""Names of places on an arm; their tips are no tools."""
 COMPARED = 100
 """Candidates for the tool that are compared with the best one."""
 OWN_MOTORS = 2
@@ -74,18 +76,37 @@ def _word(pattern: str, link: str) -> bool:
 
 def _named(urdf: Urdf, base: str) -> list[str]:
     """Return links with the surest name that moving joints carry, most motors first."""
-    counts = {link: motors for link, (motors, _) in urdf.lengths(base).items()}
+    ways = urdf.lengths(base)
     for pattern in TOOL_NAMES:
-        links = [
-            link
-            for link, count in counts.items()
-            if count and _word(pattern, link) and not is_beside(link)
-        ]
+        links = [link for link in _tool_like(urdf, base) if _word(pattern, link)]
         if links:
-            most = max(counts[link] for link in links)
-            links = [link for link in links if counts[link] == most]
-            return sorted(links, key=lambda link: (-len(urdf.path(base, link)), link))
+            most = max(ways[link][0] for link in links)
+            links = [link for link in links if ways[link][0] == most]
+            return sorted(
+                links, key=lambda link: (-len(urdf.path(base, link)), -ways[link][1], link)
+            )
     return []
+
+
+def _tool_like(urdf: Urdf, base: str) -> list[str]:
+    """Return links named like a tool that moving joints carry.
+
+    What a motor moves against a body that is named so itself is a jaw, whatever its name.
+    """
+    last: dict[str, tuple[str, str]] = {}  # of each link: the last motors before it, if any
+    for link, joint in urdf.steps(base).items():
+        before, motor = last[joint.parent] if joint else ("", "")
+        last[link] = (motor, joint.name) if joint and joint.has_motor else (before, motor)
+    links = [
+        link
+        for link, (_, motor) in last.items()
+        if motor
+        and _word("|".join(TOOL_NAMES), link)
+        and not is_beside(link)
+        and not _word(HALFWAY, link)
+    ]
+    hands = {last[link][1] for link in links}
+    return [link for link in links if last[link][0] not in hands]
 
 
 def _counts(urdf: Urdf, base: str, links: list[str]) -> dict[str, int]:

@@ -12,7 +12,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from failuretwin.core.hypothesis import Diagnosis, Fault, Hypothesis, MovementEvidence
+from failuretwin.core.hypothesis import (
+    Diagnosis,
+    Fault,
+    Hypothesis,
+    Interval,
+    MovementEvidence,
+)
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import Signature
@@ -135,14 +141,26 @@ _TOLD_UNITS = {
 """Factor to the unit that people read, and its name, by unit; any other is told as it is."""
 
 
+OPEN_ONSET_S = 0.6
+"""Width of the 90 % interval of an onset from which it is told [s]."""
+
+
 def _size_and_onset(diagnosis: Diagnosis, hypothesis: Hypothesis) -> str:
     onset = round(diagnosis.onset_s or 0.0, 1)
-    since = f" since {onset:.1f} s" if onset else " since before the run"
+    since = f" since {onset:.1f} s{_told_range(diagnosis.onset_90)}"
+    since = since if onset else " since before the run"
     if len(hypothesis.faults) != 1 or diagnosis.magnitude is None:
         return since if onset else ""
     fault, size = hypothesis.faults[0], diagnosis.magnitude
     told = onset or MODES.find(fault.mode).signature is Signature.HELD
     return size_words(fault, size, diagnosis.magnitude_unit) + (since if told else "")
+
+
+def _told_range(onset_90: Interval | None) -> str:
+    """Return the interval of an onset [s] where the tenths of the onset promise too much."""
+    if onset_90 is None or onset_90[1] - onset_90[0] < OPEN_ONSET_S:
+        return ""
+    return f" ({onset_90[0]:.1f} to {onset_90[1]:.1f} s)"
 
 
 def size_words(fault: Fault, size: float, unit: str | None = None) -> str:

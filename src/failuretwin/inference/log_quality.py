@@ -78,12 +78,12 @@ def log_quality(
     Args:
         runs: A run set; `command` and `measured` are read.
         readings: The readings of the same runs, where they are known already.
-        settings: How near is still.
+        settings: How near is still, and which axes always are.
     """
     time, rate = as_floats(runs["time"].values), measured_rate(runs)
     command = as_floats(runs["command"].values)
-    point, near = (readings or measured_samples(runs)).point, settings.nearly_still_m
-    return [_quality(time, c, m, rate, near) for c, m in zip(command, point, strict=True)]
+    point = (readings or measured_samples(runs)).point
+    return [_quality(time, c, m, rate, settings) for c, m in zip(command, point, strict=True)]
 
 
 SLACK = 0.01
@@ -173,7 +173,11 @@ def drop_invalid(runs: xr.Dataset, quality: Sequence[LogQuality]) -> xr.Dataset:
 
 
 def _quality(
-    time: FloatArray, command: FloatArray, measured: FloatArray, rate: float, near: float
+    time: FloatArray,
+    command: FloatArray,
+    measured: FloatArray,
+    rate: float,
+    settings: InferenceSettings,
 ) -> LogQuality:
     seen = np.asarray(np.isfinite(measured).all(axis=1))
     if seen.sum() < 2:
@@ -188,12 +192,14 @@ def _quality(
     still = [stretch for stretch in frozen if stretch is not None]
     if len(still) == len(frozen):
         return _still_tool(tuple(remarks), still, time[seen])
+    near = settings.nearly_still_m
     nearly = _nearly_still(time, command, measured[seen], time[seen], near)
     if nearly is not None:
         return _still_tool(tuple(remarks), [nearly], time[seen])
     spoilt = []
-    for axis, values, stretch in zip(AXES, measured.T, frozen, strict=True):
-        if stretch is None:
+    channels = zip(AXES, measured.T, frozen, settings.idle_axes, strict=True)
+    for axis, values, stretch, idle in channels:
+        if stretch is None or idle:
             continue
         remark = f"{axis} stands still {_times([stretch])} while the arm moves"
         if abs(values[np.searchsorted(time, stretch[0] - 1e-9)]) < NEAR_ZERO_M:

@@ -5,7 +5,7 @@ Section: docs/diagnosis.md#settled-evidence-where-the-tool-rests
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -58,6 +58,7 @@ class InferenceSettings(Bounded):
             links, bearings [m]; ArmPi: assumed.
         least_error_rad: Least size of a steady-state error of any motor [rad]; ArmPi: four counts
             of 0.24 deg, just above its healthy scatter. 0: what can be seen of each motor.
+        idle_axes: Axes along which no motor moves the tool: one that stands still is not dead.
     """
 
     moving_spread_m: AtLeastZero = 0.004
@@ -68,6 +69,7 @@ class InferenceSettings(Bounded):
     path_roughness_m: AtLeastZero = 0.002
     least_noise_m: AtLeastZero = 0.0003
     least_error_rad: AtLeastZero = 0.0
+    idle_axes: tuple[bool, bool, bool] = (False, False, False)
 
     @property
     def error_ranges(self) -> tuple[Range, ...]:
@@ -111,7 +113,8 @@ class InferenceSettings(Bounded):
             "path_roughness_m": ROUGHNESS * robot.reach,
             "least_noise_m": NOISE_OF_FIT * fitted if fitted else NOISE_OF_REACH * robot.reach,
         }
-        return from_table(cls, table | robot.profile.inference, f"{robot.name}: inference")
+        read = from_table(cls, table | robot.profile.inference, f"{robot.name}: inference")
+        return replace(read, idle_axes=robot.idle_axes)
 
 
 USUAL = InferenceSettings()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 SHOWN = 5
 """So many kinds of remarks on logs are listed."""
+NAMED = 3
+"""So many runs are named beside a remark."""
 
 
 @click.command()
@@ -92,16 +94,26 @@ def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior) -> list[str]:
     if fits is not None:
         lines.insert(0, f"set-up: {calibration_told(undone.model.imperfections.name, fits)}")
     lines += [f"log: {line}" for line in undone.rounding()]
-    remarks = [
-        line
-        for quality in undone.evidence.quality
-        for line in (*quality.remarks, *filter(None, [quality.fatal]))
-    ]
-    found = Counter(remarks).most_common()
-    lines += [f"log: {line}" + (f" ({n} runs)" if n > 1 else "") for line, n in found[:SHOWN]]
+    names = [str(name) for name in seen.runs["run"].values]
+    where: dict[str, list[str]] = {}
+    for name, quality in zip(names, undone.evidence.quality, strict=True):
+        for line in (*quality.remarks, *filter(None, [quality.fatal])):
+            where.setdefault(line, []).append(name)
+    found = sorted(where, key=lambda line: -len(where[line]))
+    lines += [f"log: {line}{_in_runs(where[line], len(names))}" for line in found[:SHOWN]]
     if len(found) > SHOWN:
         lines.append(f"log: and {counted(len(found) - SHOWN, 'remark')} more")
     return lines if found else [*lines, "log: nothing is wrong with the readings"]
+
+
+def _in_runs(named: Sequence[str], count: int) -> str:
+    """Return in which of `count` runs something was found, as it stands behind a remark."""
+    if count == 1:
+        return ""
+    if len(named) == count:
+        return f" (all {count} runs)"
+    more = f" and {len(named) - NAMED} more" if len(named) > NAMED else ""
+    return f" ({', '.join(named[:NAMED])}{more})"
 
 
 def _write(set_ups: SetUpPosterior, columns: Path | None, out: Path) -> None:

@@ -42,6 +42,7 @@ from failuretwin.decision.learned.networks import (
 from failuretwin.digital_model.arm_classes import class_name
 from failuretwin.inference.explanation import worded
 from failuretwin.inference.log_quality import LogQuality, drop_invalid, log_quality
+from failuretwin.inference.settings import InferenceSettings
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -220,7 +221,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         runs = as_runs(runs, robot)
         check_runs(runs, "the run set")
         check_motors(runs, robot.name, robot.motor_names)
-        quality = log_quality(runs)
+        quality = log_quality(runs, settings=InferenceSettings.of(robot))
         chances = self.predict_proba(drop_invalid(runs, quality)).tolist()
         names, faults = runs["run"].values.tolist(), truth_of(runs)
         truth: Sequence[str | None] = [None] * len(names) if faults is None else faults

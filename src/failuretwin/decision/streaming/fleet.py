@@ -391,6 +391,7 @@ class StreamingFleet:
         known = np.where(np.isfinite(command), command, last)
         near_m = self._settings.nearly_still_m
         still, alone = self._frozen.see(time, read, points, known, near_m)
+        alone &= ~np.array(self._settings.idle_axes)
         still |= beliefs.dead & ~read
         died = still & ~beliefs.dead
         beliefs.dead[:] = still
