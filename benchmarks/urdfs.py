@@ -111,9 +111,7 @@ def try_urdf(
     return Tried(**asdict(tried) | {"seconds": time.monotonic() - start})
 
 
-def _try(
-    urdf: Path, expected: Expected | None, words: tuple[str, str], command: Command
-) -> Tried:
+def _try(urdf: Path, expected: Expected | None, words: tuple[str, str], command: Command) -> Tried:
     arm, link = urdf.stem, []
     checked = command("robot", "check", str(urdf))
     asked = ASKED in checked.stdout + checked.stderr
@@ -121,8 +119,10 @@ def _try(
         link = ["--tool", expected.tools[0]]
     steps = [
         ["robot", "init", str(urdf), "--out", "arm.toml", *link],
-        ["simulate", "--robot", "arm.toml", "--out", "runs.nc", "--runs-per-class", words[0]]
-        + ["--imperfections", words[1]],
+        [
+            *("simulate", "--robot", "arm.toml", "--out", "runs.nc"),
+            *("--runs-per-class", words[0], "--imperfections", words[1]),
+        ],
         ["diagnose", "runs.nc", "--robot", "arm.toml", "--json", "results.jsonl"],
     ]
     done = checked
