@@ -275,6 +275,17 @@ def test_slides_have_a_unit_of_their_own_and_names_within_names_are_told_apart(t
     np.testing.assert_allclose(again["command"].values, runs["command"].values)
 
 
+def test_the_lines_of_a_guess_that_wait_for_use_fit_the_robot(tmp_path):
+    robot = arm_on_a_lift(tmp_path)
+    (tmp_path / "log.csv").write_text(
+        "time,lift_mm,shoulder_lift_deg,x,y,z\n0,0,0,0,0,0\n1,1,1,1,1,1\n"
+    )
+    text = column_map_text(guess_columns(tmp_path / "log.csv", robot), "log.csv", robot)
+    text = text.replace("# sign", "sign").replace("# zero", "zero")
+    (tmp_path / "map.toml").write_text(text)
+    assert read_column_map(tmp_path / "map.toml", robot) is not None
+
+
 def test_a_map_wins_over_names(armpi, twin, tmp_path):
     log, command, _ = plain_log(tmp_path, twin, ["q1", "q2", "q3", "q4"])
     mapping = """

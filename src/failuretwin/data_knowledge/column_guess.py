@@ -379,6 +379,7 @@ def column_map_text(guess: Guess, source: str, robot: Robot) -> str:
         robot: The robot, whose motors the comments name.
     """
     motors = ", ".join(f"{motor.name} ({motor.joint})" for motor in robot.motors)
+    each = [1] * len(robot.motors)
     parts = [
         f"# Column map for {source}: which column is what. A GUESS: check every line.",
         f"# Columns of the file: {', '.join(guess.names)}",
@@ -398,8 +399,8 @@ def column_map_text(guess: Guess, source: str, robot: Robot) -> str:
         f"unit = {_quote(guess.command[1])}      # rad, deg, or servo (counts of the profile)",
         *([f"slide_unit = {_quote(guess.slide_unit)}"] if robot.slides.any() else []),
         *_duration_lines(guess),
-        "# sign = [1, 1, -1, 1]   # where the log turns the other way",
-        "# zero = [0, 0, 0, 0]    # value that the robot calls 0, in the unit above",
+        f"# sign = {[-1, *each[1:]]}   # where the log turns the other way: here the first",
+        f"# zero = {[0 for _ in each]}   # value that the robot calls 0, in the unit above",
         "",
         *_tool_lines(guess),
         *_position_lines(guess),
