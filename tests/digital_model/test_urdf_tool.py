@@ -83,6 +83,18 @@ def check(tmp_path):
             [joint("upper", "elbow_tip_link", "fixed"), joint("fore", "hand_link")],
             "hand_link",
         ),
+        # A surer name, and names on every link.
+        ([joint("fore", "hand", "fixed"), joint("hand", "arm_tcp")], "arm_tcp"),
+        (
+            [
+                joint("upper", "tip_1", "fixed"),
+                joint("fore", "tip_2", "fixed"),
+                joint("fore", "last"),
+                joint("last", "tip_3", "fixed"),
+            ],
+            "tip_3",
+        ),
+        ([joint("base", "longer", xyz="0.9 0 0")], "fore"),
     ],
 )
 def test_the_tool_is_chosen_by_name_and_never_a_finger_or_a_camera(check, parts, tool):

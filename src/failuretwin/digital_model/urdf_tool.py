@@ -76,37 +76,47 @@ def _word(pattern: str, link: str) -> bool:
 
 def _named(urdf: Urdf, base: str) -> list[str]:
     """Return links with the surest name that moving joints carry, most motors first."""
-    ways = urdf.lengths(base)
-    for pattern in TOOL_NAMES:
-        links = [link for link in _tool_like(urdf, base) if _word(pattern, link)]
-        if links:
-            most = max(ways[link][0] for link in links)
-            links = [link for link in links if ways[link][0] == most]
-            return sorted(
-                links, key=lambda link: (-len(urdf.path(base, link)), -ways[link][1], link)
-            )
-    return []
+    ways, surest = urdf.lengths(base), _surest_names(urdf, base)
+    if not surest:
+        return []
+    links = [link for link, rank in surest.items() if rank == min(surest.values())]
+    most = max(ways[link][0] for link in links)
+    links = [link for link in links if ways[link][0] == most]
+    return sorted(links, key=lambda link: (-len(urdf.path(base, link)), -ways[link][1], link))
 
 
-def _tool_like(urdf: Urdf, base: str) -> list[str]:
-    """Return links named like a tool that moving joints carry.
+def _surest_names(urdf: Urdf, base: str) -> dict[str, int]:
+    """Return links named like a tool that moving joints carry, and how sure that is, 0 the surest.
 
-    What a motor moves against a body that is named so itself is a jaw, whatever its name.
+    What a motor moves against a body that has no less sure a name is a jaw and left out, unless
+    link after link has such a name.
     """
-    last: dict[str, tuple[str, str]] = {}  # of each link: the last motors before it, if any
+    movers: dict[str, tuple[str, ...]] = {}  # of each link: the last three motors before it
     for link, joint in urdf.steps(base).items():
-        before, motor = last[joint.parent] if joint else ("", "")
-        last[link] = (motor, joint.name) if joint and joint.has_motor else (before, motor)
-    links = [
-        link
-        for link, (_, motor) in last.items()
-        if motor
-        and _word("|".join(TOOL_NAMES), link)
-        and not is_beside(link)
-        and not _word(HALFWAY, link)
-    ]
-    hands = {last[link][1] for link in links}
-    return [link for link in links if last[link][0] not in hands]
+        before = movers[joint.parent] if joint else ()
+        movers[link] = (*before, joint.name)[-3:] if joint and joint.has_motor else before
+    ranks = {
+        link: rank
+        for link, motors in movers.items()
+        if motors and (rank := _rank(link)) is not None
+    }
+    bodies: dict[str, int] = {}
+    for link, rank in ranks.items():
+        body = movers[link][-1]
+        bodies[body] = min(rank, bodies.get(body, rank))
+
+    def is_jaw(link: str) -> bool:
+        first, hand = ("", "", *movers[link])[-3:-1]
+        return hand in bodies and bodies[hand] <= ranks[link] and first not in bodies
+
+    return {link: rank for link, rank in ranks.items() if not is_jaw(link)}
+
+
+def _rank(link: str) -> int | None:
+    """Return how sure the name of a tool is, 0 the surest; None: it is none."""
+    if is_beside(link) or _word(HALFWAY, link):
+        return None
+    return next((k for k, pattern in enumerate(TOOL_NAMES) if _word(pattern, link)), None)
 
 
 def _counts(urdf: Urdf, base: str, links: list[str]) -> dict[str, int]:
