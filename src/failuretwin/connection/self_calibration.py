@@ -280,14 +280,14 @@ def _parameters(found: FolderPosterior, believed: Imperfections, robot: Robot) -
         for i, motor in enumerate(motors):
             at = REGISTRATION + k * len(motors) + i
             spread, prior = found.deviation[at], found.usual_deviation[at]
-            off = (values[i] - expected[i]) / prior
+            off = float((values[i] - expected[i]) / prior)
             note = f"{off:+.1f} deviations off what such robots do" if abs(off) > FAR else ""
             known = bool(spread < IDENTIFIED * prior)
             if not known:
                 note = "the runs do not tell it from what such robots differ by"
             low, high = values[i] - 1.96 * spread, values[i] + 1.96 * spread
             value = float(values[i])
-            told.append(Parameter(name, motor, UNITS[name], value, low, high, known, note))
+            told.append(Parameter(name, motor, UNITS[name], value, low, high, known, note, off))
     return told
 
 
