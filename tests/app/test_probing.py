@@ -304,12 +304,27 @@ def test_an_emulated_arm_is_watched_that_may_be_asked(failuretwin):
     assert "last answer: healthy" in answer.stdout
 
 
-@pytest.mark.parametrize("source", [".", "ros2", "somewhere.mcap"])
+@pytest.mark.parametrize("source", [".", "ros2", "ros2://here:1", "recorded.mcap"])
 def test_sources_that_only_listen_are_refused(failuretwin, tmp_path, source):
+    (tmp_path / "recorded.mcap").touch()
     answer = failuretwin("watch", source, "--probe", 2, folder=tmp_path)
     assert answer.returncode == 2
     assert "can only be listened to, but --probe orders movements" in answer.stderr
     assert answer.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("nosuch.csv", "--probe", 2), "source 'nosuch.csv' does not exist"),
+        (("emulated", "--move"), "without --probe N: leave out --move"),
+        (("emulated", "--idle", 20, "--floor", 0.1), "leave out --idle and --floor"),
+    ],
+)
+def test_what_is_refused(failuretwin, tmp_path, arguments, said):
+    answer = failuretwin("watch", *arguments, folder=tmp_path)
+    assert answer.returncode == 2
+    assert said in answer.stderr
 
 
 LISTENER = """

@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from failuretwin.app.acting import emulation_of
 from failuretwin.app.commands.options import LiveOptions
+from failuretwin.app.emulation import emulation_of
 from failuretwin.app.live import topics_of
 from failuretwin.connection.commanded_arm import CommandedArm
 from failuretwin.connection.links.base import CommandSent, Pace, Reading
