@@ -69,10 +69,10 @@ def test_an_emulated_robot_is_watched_and_recorded(failuretwin, tmp_path):
 
 
 def test_an_emulated_robot_has_a_fault_of_a_size_that_begins_at_a_time(failuretwin):
-    fault = ("--fault", "motor_3:steady_state_error=0.3@20")
+    fault = ("--fault", "motor_2:steady_state_error=0.1@20")
     answer = failuretwin("watch", "emulated", "--speed", 0, "--duration", 40, *fault)
     assert answer.returncode == 0, answer.stderr
-    assert "last answer: motor 3 misses its targets by about 1" in answer.stdout
+    assert "last answer: motor 2 misses its targets by about 5.9 deg" in answer.stdout
 
 
 def test_a_robot_on_a_ros_network_is_watched(roscore):
