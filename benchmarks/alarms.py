@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 from alarms_world import Lives, live
-from scipy import stats
+from telling import per_100_hours
 
 import failuretwin as ft
 from failuretwin.core.alarm import RAISED
@@ -214,11 +214,8 @@ def cusum(residual: FloatArray, drift: float) -> FloatArray:
 
 
 def false_alarms(told: Told, hours: float) -> str:
-    """Return false alarms in 100 hours with their 95 % Poisson interval."""
-    count = sum(map(len, told.raised))
-    low = stats.chi2.ppf(0.025, 2 * count) / 2.0 if count else 0.0
-    high = stats.chi2.ppf(0.975, 2 * count + 2) / 2.0
-    return f"{100 * count / hours:6.1f} [{100 * low / hours:5.1f} to {100 * high / hours:5.1f}]"
+    """Return false alarms in 100 hours with their 95 % interval."""
+    return per_100_hours(sum(map(len, told.raised)), hours)
 
 
 @dataclass(frozen=True)

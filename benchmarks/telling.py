@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy import stats
 
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import BoolArray, FloatArray
@@ -17,6 +18,13 @@ def share(count: int, total: int) -> str:
     told = Share(count, total)
     low, high = told.interval
     return f"{count} of {total} ({told.value:.1%}, {low:.1%} to {high:.1%})"
+
+
+def per_100_hours(count: int, hours: float) -> str:
+    """Return so many in so many hours as a rate in 100 hours, with the 95 % Poisson interval."""
+    low = stats.chi2.ppf(0.025, 2 * count) / 2.0 if count else 0.0
+    high = stats.chi2.ppf(0.975, 2 * count + 2) / 2.0
+    return f"{100 * count / hours:6.1f} [{100 * low / hours:5.1f} to {100 * high / hours:5.1f}]"
 
 
 def right(found: Sequence[Diagnosis]) -> BoolArray:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import re
+from dataclasses import replace
 
 import pytest
 from click.testing import CliRunner
@@ -12,6 +15,7 @@ from failuretwin.connection.calibration.result import read_calibration
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.store import save_run_set
+from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.settling import Settling
 
@@ -54,6 +58,55 @@ def test_runs_are_judged_together_and_the_robot_is_kept(runs, armpi, tmp_path):
     # The file is a calibration like any other, and may be learned from again.
     diagnose(runs, "--self-calibrate", "--calibration", out, "--json", file)
     assert {r["protocol"] for r in records(file)} == {"P1"}
+
+
+def test_the_page_tells_what_was_learned_of_the_robot(runs, armpi, tmp_path):
+    """Sentences, every offset beside such robots, every run; the motor that is off stands out."""
+    diagnose(runs, "--self-calibrate", "--plot", tmp_path / "page", "--out", tmp_path / "own.toml")
+    page = (tmp_path / "page" / "index.html").read_text()
+    section = page[page.index("What the runs taught") : page.index("<h2>Runs</h2>")]
+    rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in section.split("<tr>")]
+    of_bias = {row[0]: row for row in rows if row and row[0].startswith("bias")}
+    learned = read_calibration(tmp_path / "own.toml", armpi)
+    for p in learned.parameters:
+        spread = generic_imperfections(armpi).variation.bias[0]
+        if p.name == "bias":
+            assert p.deviations == pytest.approx(p.value / spread, rel=1e-4)
+            assert of_bias[f"bias, {p.motor}"][4] == f"{p.deviations:+.1f} deviations"
+    off = {p.motor: abs(p.deviations) for p in learned.parameters if p.name == "bias"}
+    assert max(off, key=off.get) == "motor_2"
+    taught = [row for row in rows if len(row) == 2]
+    assert len(taught) == 6
+    assert all(float(nats) > 0.0 for _, nats in taught)
+    assert section.count("<li>") == len(learned.remarks)
+
+
+@pytest.mark.parametrize("option", ["--self-calibrate", "--track"])
+def test_what_all_runs_say_of_each_is_written_too(runs, tmp_path, option):
+    file, table, alone = tmp_path / "out.jsonl", tmp_path / "out.csv", tmp_path / "alone.jsonl"
+    answer = diagnose(runs, option, "--json", file, "--csv", table)
+    told, (header, *cells) = records(file), csv.reader(table.read_text().splitlines())
+    assert "over all runs: " in answer.output
+    assert all(0.0 < r["course_probability"] <= 1.0 for r in told)
+    assert [row[header.index("course")] for row in cells] == [r["course"] for r in told]
+    assert {r["course"] for r in told} <= {*told[0]["posterior"]}
+    diagnose(runs, option, "--independent", "--json", alone)
+    assert not any("course" in r for r in records(alone))
+
+
+def test_runs_of_two_robots_are_noticed_on_the_way(armpi, tmp_path):
+    """Eight healthy runs of a robot, then eight of one whose motors 2 and 3 are 2.3 degrees off."""
+    other = replace(ROBOT, bias=(0.0, -0.02, 0.04, 0.0))
+    made = [
+        simulate(Plan(armpi, ["healthy"], 8, seed, Imperfections("made up", "test", settling=own)))
+        for seed, own in enumerate((ROBOT, other))
+    ]
+    for name, some in zip(("a.nc", "b.nc"), made, strict=True):
+        save_run_set(some.assign_coords(run=[f"{name[0]}{i}" for i in range(8)]), tmp_path / name)
+    one = diagnose(tmp_path / "a.nc", "--track")
+    assert "two robots" not in one.output
+    both = diagnose(tmp_path / "a.nc", tmp_path / "b.nc", "--track")
+    assert "the runs seem to be of two robots" in both.output
 
 
 def test_hypotheses_count(runs, tmp_path):

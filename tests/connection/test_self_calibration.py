@@ -173,6 +173,18 @@ def test_a_constant_error_in_every_run_is_not_swallowed(armpi, motor, size):
         assert told >= 3.0
 
 
+def test_a_zero_far_off_is_told_however_little_the_runs_narrow_it(armpi):
+    """Six deviations at the last motor, which the tool hardly shows: it is found as four."""
+    known = load_calibration("armpi_fpv", armpi).imperfections
+    bias = (*known.settling.bias[:3], known.settling.bias[3] - 6.0 * 0.0065)
+    own = replace(known, settling=replace(known.settling, bias=bias), variation=None)
+    found = learned(armpi, simulate(Plan(armpi, ["healthy"], 10, 31, own)))
+    of_motor = value(found.calibration, "bias", "motor_4")
+    assert of_motor.deviations < -3.0
+    assert of_motor.high - of_motor.low > 0.7 * 2.0 * 1.96 * 0.0065
+    assert any(line.startswith("bias of motor_4: -") for line in found.remarks)
+
+
 def test_a_robot_like_others_of_its_kind_has_no_such_remark(armpi):
     found = learned(armpi, made(armpi, ["healthy"], 6, 5, bias=(0.004, -0.006, 0.005, 0.0)))
     assert len(found.remarks) == 2

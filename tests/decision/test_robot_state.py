@@ -53,6 +53,24 @@ def test_runs_that_are_unsure_stay_so_however_many_they_are():
     assert found.step.endswith("--self-calibrate.")
 
 
+def test_runs_that_were_weighed_together_are_not_told_to_be():
+    unsure = [run(f"{i}", motor_2__stuck=0.87) for i in range(5)]
+    assert "--self-calibrate" not in robot_state(unsure, ROBOT, learned=()).step
+    apart = [run("a", motor_1__stuck=0.99), run("b")]
+    assert "--self-calibrate" in robot_state(apart, ROBOT).step
+    assert "leave out --independent" in robot_state(apart, ROBOT, learned=()).step
+
+
+def test_a_zero_that_may_be_a_fault_of_every_run_is_no_healthy_robot():
+    odd = "bias of motor_2: +4.1 deviations off: a zero that is off, or a fault that every run has"
+    found = robot_state([run("a"), run("b")], ROBOT, learned=("most was learned from a", odd))
+    assert found.state.kind == OPEN
+    assert found.headline == "Cannot tell yet; healthy, but for a zero that may be a fault"
+    assert "+4.1 deviations off" in found.remark
+    assert found.step.startswith("Look at the zero mark")
+    assert robot_state([run("a")], ROBOT, learned=("most was learned",)).state.kind == WELL
+
+
 def test_a_fault_that_began_is_told_by_the_runs_since_then():
     runs = [run("a"), run("b"), run("c", motor_1__stuck=0.98), run("d", motor_1__stuck=0.99)]
     found = robot_state(runs, ROBOT)

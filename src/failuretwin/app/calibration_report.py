@@ -40,7 +40,7 @@ def print_calibration(found: Calibration, robot: Robot) -> None:
     """Print everything that was learned and how far it can be trusted."""
     way = "motor readings" if found.used_readings else "the tool path alone"
     show(f"{robot.name}: {found.movements} settled movements of {found.runs} runs, {way}\n")
-    show(_parameter_table(found.parameters, robot))
+    show(parameter_table(found.parameters, robot))
     show(*(f"  {_title(p)}: {p.note}" for p in found.parameters if not p.identified))
     show(*(f"  {remark}" for remark in found.remarks))
     if found.left_out:
@@ -54,20 +54,31 @@ def print_calibration(found: Calibration, robot: Robot) -> None:
 def print_population(found: Calibration, robot: Robot) -> None:
     """Print what the robots of a fleet are like and what they differ by."""
     show(f"{robot.name}: {found.imperfections.name}: {', '.join(found.sessions)}\n")
-    show(_parameter_table(found.parameters, robot, "95 % of such robots"))
+    show(parameter_table(found.parameters, robot, "95 % of such robots"))
     show(*(f"  {_title(p)}: {p.note}" for p in found.parameters if not p.identified))
 
 
-def _parameter_table(
-    parameters: tuple[Parameter, ...], robot: Robot, interval: str = "95 % interval"
+def parameter_table(
+    parameters: Sequence[Parameter], robot: Robot, interval: str = "95 % interval"
 ) -> Table:
+    """Return a row for each figure: value, interval, unit, and how far it lies from such robots.
+
+    Args:
+        parameters: The figures.
+        robot: The robot, for the units that people read.
+        interval: What the interval is of.
+    """
+    beside = any(p.deviations is not None for p in parameters)
     rows = []
     for p in parameters:
         scale, unit = shown_unit(p.unit, robot, p.motor)
         value, low, high = (f"{scale * x:.4g}" for x in (p.value, p.low, p.high))
+        off = "" if p.deviations is None else f"{p.deviations + 0.0:+.1f} deviations"
         known = "" if p.identified else "not identified"
-        rows.append((_title(p), value, f"{low} to {high}", unit, known))
-    return Table(("parameter", "value", interval, "unit", ""), rows)
+        own = (_title(p), value, f"{low} to {high}", unit)
+        rows.append((*own, *[off] * beside, known))
+    headings = ("parameter", "value", interval, "unit", *["from such robots"] * beside, "")
+    return Table(headings, rows)
 
 
 def _title(parameter: Parameter) -> str:

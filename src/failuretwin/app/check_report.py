@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from failuretwin.app.tables import Table, figures_table
-from failuretwin.app.technician_page import write_page
+from failuretwin.app.technician_page import Section, write_page
 from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.data_knowledge.store import filling, replacing
@@ -65,10 +65,11 @@ def write_check_page(results: Sequence[CheckResult], robot: Robot, folder: Path)
         folder: Where `index.html` goes.
     """
     diagnoses = [result.diagnosis for result in results]
-    measured = motor_table(results[0], robot) if len(results) == 1 else None
+    tables = [motor_table(result, robot) for result in results] if len(results) == 1 else []
+    measured = [Section("What the check measured", tables=tables)] if tables else []
     with filling(folder) as partial:
         state = robot_state(diagnoses, robot)
-        write_page(diagnoses, state, robot, partial / "index.html", measured=measured)
+        write_page(diagnoses, state, robot, partial / "index.html", sections=measured)
 
 
 def shown_cell(found: IsolabilityReport, motor: str, robot: Robot) -> str:

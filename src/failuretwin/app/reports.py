@@ -84,8 +84,10 @@ def state_lines(state: RobotState, together: bool) -> list[str]:
     return ["", f"over all runs: {state.line}", f"what to do: {state.step}"]
 
 
-def course_lines(course: FaultCourse, state: RobotState, robot: Robot) -> list[str]:
-    """Return what runs that were weighed together say of their robot, and what to do."""
+def course_lines(course: FaultCourse | None, state: RobotState, robot: Robot) -> list[str]:
+    """Return what runs say together of their robot, and what to do; None: each was judged alone."""
+    if course is None:
+        return []
     told = [f"over all runs: {joint_names_in(line, robot)}" for line in course.verdict]
     return [*told, f"what to do: {state.step}"]
 
@@ -414,6 +416,8 @@ def tracking_line(tracked: Tracked) -> str:
     told = f"tracked: {', '.join(parts)}; {_largest_changes(tracked)}"
     if life.alarm:
         told += f"; learning is stopped: {life.alarm}"
+    if tracked.mixed:
+        told += f"; {tracked.mixed}"
     return told if history.path is None else f"{told}; history: {history.path}"
 
 

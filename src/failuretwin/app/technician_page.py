@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,6 +60,23 @@ class _Row:
     told: bool
 
 
+@dataclass(frozen=True)
+class Section:
+    """What else a page tells, between its motors and its runs.
+
+    Attributes:
+        title: Its heading.
+        lines: Sentences.
+        tables: Shown below them.
+        folded: Tables below those by what they tell, shown when asked for.
+    """
+
+    title: str
+    lines: Sequence[str] = ()
+    tables: Sequence[Table] = ()
+    folded: Mapping[str, Table] = field(default_factory=dict)
+
+
 def chosen_runs(diagnoses: Sequence[Diagnosis], robot: Robot, most: int) -> list[int]:
     """Return the runs that are shown in full, in their order.
 
@@ -91,6 +108,7 @@ def write_report(
     twin: DigitalTwin,
     state: RobotState,
     folder: Path,
+    sections: Sequence[Section] = (),
 ) -> None:
     """Write the page of diagnosed runs into a folder, with the pictures that it holds as files.
 
@@ -100,11 +118,12 @@ def write_report(
         twin: The twin of their robot.
         state: Of the robot over all of them.
         folder: Where `index.html` goes.
+        sections: What else is told.
     """
     chosen = chosen_runs(diagnoses, twin.robot, MOST_PICTURES)
     with filling(folder) as partial:
         pictures = plot_runs(runs, diagnoses, twin, partial, chosen)
-        write_page(diagnoses, state, twin.robot, partial / "index.html", pictures)
+        write_page(diagnoses, state, twin.robot, partial / "index.html", pictures, sections)
 
 
 def write_page(
@@ -113,7 +132,7 @@ def write_page(
     robot: Robot,
     path: Path,
     pictures: Mapping[int, Path | None] | None = None,
-    measured: Table | None = None,
+    sections: Sequence[Section] = (),
 ) -> None:
     """Write the page of some runs.
 
@@ -124,7 +143,7 @@ def write_page(
         path: The file.
         pictures: PNG files of some runs, by index; these runs are shown in full. None: of none,
             and the first ones are shown in full.
-        measured: What a check measured of every motor; None: it was none.
+        sections: What else is told.
     """
     judged = Judged.of(diagnoses)
     rows = _rows(diagnoses, pictures or dict.fromkeys(range(MOST_PICTURES)), robot)
@@ -136,7 +155,7 @@ def write_page(
         "told": [row for row in rows if row.told],
         "count": len(diagnoses),
         "robot": robot.name,
-        "measured": measured,
+        "sections": sections,
         "method": diagnoses[0].method,
         "protocol": diagnoses[0].protocol,
         "version": __version__,

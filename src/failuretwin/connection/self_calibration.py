@@ -57,7 +57,8 @@ FRAME_OFF = 14.1
 """Squared distance of the sensor's frame from that of the profile, in deviations, from which it is
 told: 95 % of seven normal numbers are nearer."""
 IDENTIFIED = 0.7
-"""An offset is learned where the runs narrow it to this share of the prior's deviation."""
+"""An offset is learned where the runs narrow it to this share of the prior's deviation, or move it
+by more than `FAR` of them."""
 ODD = {
     "bias": f"a zero that is off, or {FAULT_OF_EVERY_RUN}",
     "compliance": "a fault that is there in every run looks like this",
@@ -280,14 +281,14 @@ def _parameters(found: FolderPosterior, believed: Imperfections, robot: Robot) -
         for i, motor in enumerate(motors):
             at = REGISTRATION + k * len(motors) + i
             spread, prior = found.deviation[at], found.usual_deviation[at]
-            off = (values[i] - expected[i]) / prior
+            off = float((values[i] - expected[i]) / prior)
             note = f"{off:+.1f} deviations off what such robots do" if abs(off) > FAR else ""
-            known = bool(spread < IDENTIFIED * prior)
+            known = bool(spread < IDENTIFIED * prior) or abs(off) > FAR
             if not known:
                 note = "the runs do not tell it from what such robots differ by"
             low, high = values[i] - 1.96 * spread, values[i] + 1.96 * spread
             value = float(values[i])
-            told.append(Parameter(name, motor, UNITS[name], value, low, high, known, note))
+            told.append(Parameter(name, motor, UNITS[name], value, low, high, known, note, off))
     return told
 
 

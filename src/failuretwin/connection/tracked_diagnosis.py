@@ -31,6 +31,7 @@ from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.evidence import Evidence, SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.life_filter import LifeFilter
+from failuretwin.inference.mixed_runs import of_second_robot, two_robots
 from failuretwin.inference.shared_likelihood import has_score
 from failuretwin.inference.wear_limits import WearLimits, wear_unit
 
@@ -53,6 +54,7 @@ class Tracked:
         rows: What is kept of each run; of runs that the history knew, nothing.
         life: What is believed of the robot after them.
         known: Number of runs that the history knew.
+        mixed: What tells that the runs are of two robots, a sentence; empty: nothing does.
     """
 
     diagnoses: list[Diagnosis]
@@ -60,6 +62,7 @@ class Tracked:
     rows: tuple[dict[str, Any], ...]
     life: LifeFilter
     known: int
+    mixed: str
 
 
 def begin(diagnoser: BayesDiagnoser, cold: bool, limits: WearLimits | None = None) -> LifeFilter:
@@ -132,6 +135,7 @@ def diagnose_tracked(
     seen = _Seen.of(runs, diagnoser, life)
     diagnoses: list[Diagnosis | None] = [None] * len(seen.names)
     rows: list[dict[str, Any]] = []
+    mixed = ""
     for batch in _batches(runs, seen.keys, known, history.cold, life):
         told = seen.diagnose(batch, life, history.cold)
         said = zip(*life.bias_by_run(), strict=True)
@@ -140,6 +144,7 @@ def diagnose_tracked(
             known.add(seen.keys[run])
             number = len(history.keys) + len(rows) + 1
             rows.append(_row(number, seen.keys[run], diagnosis, life, alone))
+        mixed = mixed or _mixed(life, rows)
         advance(len(batch))
     again = [run for run, diagnosis in enumerate(diagnoses) if diagnosis is None]
     for first in range(0, len(again), BATCH):
@@ -149,7 +154,17 @@ def diagnose_tracked(
             diagnoses[run] = diagnosis
         advance(len(batch))
     found = [diagnosis for diagnosis in diagnoses if diagnosis is not None]
-    return Tracked(found, history, tuple(rows), life, len(again))
+    return Tracked(found, history, tuple(rows), life, len(again), mixed)
+
+
+def _mixed(life: LifeFilter, rows: list[dict[str, Any]]) -> str:
+    """Return that the latest runs are of two robots; empty: nothing tells so."""
+    if life.window is None:
+        return ""
+    latest = rows[-life.window.runs :]
+    sites = life.window.sites[np.arange(life.window.runs)[-len(latest) :]]
+    second = of_second_robot(sites)
+    return "" if second is None else two_robots(second, [row["run"] for row in latest])
 
 
 def _batches(

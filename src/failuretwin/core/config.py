@@ -74,7 +74,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     Raises:
         InputError: If the file cannot be read or is not TOML.
     """
-    text = read_text(path, "text")
+    text = read_text(path, "text", "Expected a TOML file.")
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import as_cell, check_memory, reading, stored_bytes
 from failuretwin.core.hypothesis import Diagnosis, Interval
 from failuretwin.data_knowledge.store import replacing
+from failuretwin.inference.fault_course import FaultCourse
 
 SUM_ERROR = 1e-6
 """Probabilities of a run may sum to 1 plus or minus this."""
@@ -79,11 +80,33 @@ def some_names(names: Sequence[str]) -> str:
     return ", ".join(names[:NAMED_RUNS]) + (", ..." if len(names) > NAMED_RUNS else "")
 
 
-def write_json_lines(diagnoses: Iterable[Diagnosis], path: Path) -> None:
-    """Write an object a line; the file appears whole or not at all."""
+def write_json_lines(
+    diagnoses: Sequence[Diagnosis], path: Path, course: FaultCourse | None = None
+) -> None:
+    """Write an object a line; the file appears whole or not at all.
+
+    Args:
+        diagnoses: One a line.
+        path: The file.
+        course: Of the robot over these runs, told beside each; None: they were judged one by one.
+    """
+    records = [diagnosis.to_record() | told for diagnosis, told in _with_course(diagnoses, course)]
     with replacing(path) as partial:
-        text = "".join(json.dumps(diagnosis.to_record()) + "\n" for diagnosis in diagnoses)
+        text = "".join(json.dumps(record) + "\n" for record in records)
         partial.write_text(text, encoding="utf-8")
+
+
+def _with_course(
+    diagnoses: Sequence[Diagnosis], course: FaultCourse | None
+) -> Iterator[tuple[Diagnosis, dict[str, Any]]]:
+    """Yield each diagnosis with what all runs together say of its run."""
+    for run, diagnosis in enumerate(diagnoses):
+        if course is None:
+            yield diagnosis, {}
+            continue
+        state = int(course.path[run])
+        name, chance = str(course.hypotheses[state]), float(course.posterior[run, state])
+        yield diagnosis, {"course": name, "course_probability": round(chance, 6)}
 
 
 def read_results(path: str | Path) -> Results:
@@ -134,10 +157,18 @@ def _check_probabilities(record: Record, where: str) -> None:
         )
 
 
-def write_csv(diagnoses: Iterable[Diagnosis], path: Path) -> None:
-    """Write a row a run: plain columns, then the probability of each hypothesis."""
+def write_csv(
+    diagnoses: Sequence[Diagnosis], path: Path, course: FaultCourse | None = None
+) -> None:
+    """Write a row a run: plain columns, then the probability of each hypothesis.
+
+    Args:
+        diagnoses: One a row.
+        path: The file.
+        course: As of `write_json_lines`.
+    """
     with replacing(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
-        rows = [_csv_row(diagnosis) for diagnosis in diagnoses]
+        rows = [_csv_row(diagnosis) | told for diagnosis, told in _with_course(diagnoses, course)]
         columns = dict.fromkeys(column for row in rows for column in row)
         writer = csv.DictWriter(file, fieldnames=list(columns))
         writer.writeheader()

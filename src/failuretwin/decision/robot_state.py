@@ -47,10 +47,10 @@ SUSPECT = 0.05
 RUN = "run"
 """The single thing that a verdict over several runs may rest on."""
 DIFFERENT_STEP = (
-    "If these are runs of one robot in their order, weigh them together with --track or "
-    "--self-calibrate; else diagnose the runs of each state alone."
+    "If these are runs of one robot in their order, {how}; else diagnose the runs of each state "
+    "alone."
 )
-
+WEIGH, ORDERED = "weigh them together with --track or --self-calibrate", "leave out --independent"
 TOGETHER_STEP = "Runs of one robot say more together: diagnose them with --self-calibrate."
 ZERO_STEP = (
     "Look at the zero mark of this motor, and at the zero in the profile. If the profile is wrong, "
@@ -172,7 +172,7 @@ def robot_state(
     diagnoses: Sequence[Diagnosis],
     robot: Robot,
     course: FaultCourse | None = None,
-    learned: Sequence[str] = (),
+    learned: Sequence[str] | None = None,
 ) -> RobotState:
     """Return the state of a robot over all its runs.
 
@@ -181,7 +181,7 @@ def robot_state(
         robot: The robot.
         course: Of the robot over these runs, where they were weighed together; None: they were
             judged one by one.
-        learned: What the runs have taught of the robot, in sentences.
+        learned: What the runs have taught of the robot, in sentences; None: each was judged alone.
 
     Raises:
         InputError: If there is no run.
@@ -195,8 +195,8 @@ def robot_state(
     elif course is not None:
         found = _of_course(course, robot)
     else:
-        found = _one_by_one(diagnoses, states, decided, robot)
-    found = _with_zero(found, [*(line for d in diagnoses for line in d.quality), *learned])
+        found = _one_by_one(diagnoses, states, decided, robot, learned is None)
+    found = _with_zero(found, [*(line for d in diagnoses for line in d.quality), *(learned or ())])
     chance = found.state.probability
     return RobotState(
         found.state,
@@ -247,23 +247,31 @@ def _of_course(course: FaultCourse, robot: Robot) -> _Found:
 
 
 def _one_by_one(
-    diagnoses: Sequence[Diagnosis], states: Sequence[State], decided: Sequence[int], robot: Robot
+    diagnoses: Sequence[Diagnosis],
+    states: Sequence[State],
+    decided: Sequence[int],
+    robot: Robot,
+    each_alone: bool,
 ) -> _Found:
-    """Return the state that runs agree on, from the first on that names its motor."""
+    """Return the state that runs agree on, from the first on that names its motor.
+
+    Of runs that were not judged each alone it is not advised to weigh them together.
+    """
     faulty = [i for i in decided if states[i].kind == FAULTY]
     since = faulty[0] if faulty else 0
     used = [i for i in decided if i >= since]
     posterior = _pooled([diagnoses[i].posterior for i in used])
     named = {states[i].motors for i in faulty}
     if len(named) > 1 or (faulty and any(states[i].kind == WELL for i in used)):
-        return _different(states, decided, posterior)
+        step = DIFFERENT_STEP.format(how=WEIGH if each_alone else ORDERED)
+        return _different(states, decided, posterior, step)
     state = state_of(posterior, robot.motor_names)
     alone = _alone(diagnoses, faulty, len(decided))
     remarks = [f"one {alone} alone shows it"] if alone else []
     if any(states[i].kind == WELL for i in decided if i < since):
         remarks.append(f"since run {since + 1} of {len(diagnoses)} ({diagnoses[since].run})")
     step = " ".join(next_steps(posterior, class_name(robot), alone))
-    if state.kind == OPEN and len(used) > 1:
+    if state.kind == OPEN and len(used) > 1 and each_alone:
         step = f"{step} {TOGETHER_STEP}"
     return _Found(state, _headline(state, posterior), step, "; ".join(remarks), posterior)
 
@@ -284,14 +292,14 @@ def _pooled(posteriors: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def _different(
-    states: Sequence[State], decided: Sequence[int], posterior: Mapping[str, float]
+    states: Sequence[State], decided: Sequence[int], posterior: Mapping[str, float], step: str
 ) -> _Found:
     """Return what is said of runs that show different states."""
     counts = Counter(_short(states[i]) for i in decided)
     told = ", ".join(f"{name} in {counted(count, 'run')}" for name, count in counts.most_common())
     motors = dict.fromkeys(m for i in decided if states[i].kind == FAULTY for m in states[i].motors)
     headline = "Different states in different runs"
-    return _Found(State(OPEN, tuple(motors)), headline, DIFFERENT_STEP, told, posterior)
+    return _Found(State(OPEN, tuple(motors)), headline, step, told, posterior)
 
 
 def _short(state: State) -> str:

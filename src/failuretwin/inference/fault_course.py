@@ -188,13 +188,18 @@ class FaultCourse:
         least = float(self.posterior[:, healthy].min())
         sure = percent(least)
         if least < EVEN:
-            return (f"cannot tell, because healthy in all runs is only {sure} sure",)
-        return (f"healthy in all {counted(len(self.runs), 'run')}, {sure} sure",)
+            return (f"cannot tell, because healthy {self._in_all} is only {sure} sure",)
+        return (f"healthy {self._in_all}, {sure} sure",)
+
+    @property
+    def _in_all(self) -> str:
+        count = len(self.runs)
+        return "in the one run" if count == 1 else f"in all {counted(count, 'run')}"
 
     def _sentence(self, episode: Episode) -> str:
         count, first, last = len(self.runs), episode.first + 1, episode.last + 1
         low, high = (end + 1 for end in episode.first_90)
-        when = f"in all {counted(count, 'run')}"
+        when = self._in_all
         if first > 1 or last < count:
             when = f"in runs {first} to {last} of {count}" if last > first else f"in run {first}"
         if first > 1:

@@ -89,13 +89,14 @@ def folder_posterior(
         advance: Told of progress.
     """
     together, usual = begun(SharedWeighing(likelihood, hypotheses, priors))
-    rows, moved = np.arange(together.runs), np.inf
+    rows, moved, asked = np.arange(together.runs), np.inf, None
     for done in range(MOST_PASSES):
-        found = together.judge(rows)
+        last = done == MOST_PASSES - 1 or (done >= PASSES - 1 and moved <= MOVED)
+        found = together.judge(rows, asked=None if last else asked)
         advance(int(done < PASSES))
-        if done == MOST_PASSES - 1 or (done >= PASSES - 1 and moved <= MOVED):
+        if last:
             break
-        before = together.here
+        before, asked = together.here, np.concatenate([each.likely for each in found])
         together.learn(found, 1.0 if done == 0 else DAMPING)
         (_,), (covariance,) = together.belief.moments
         spread = together.unit * np.sqrt(np.diag(covariance))

@@ -27,6 +27,9 @@ from failuretwin.inference.shared_weighing import Candidate, SharedWeighing
 LEAST_TOLD = 1e-3
 """What is less probable is not asked for scatter and losses."""
 
+LEAST_LIKELY = 1e-8
+"""What is less probable is not weighed again before the last pass over the runs."""
+
 
 @dataclass(frozen=True)
 class Judged:
@@ -53,6 +56,11 @@ class Judged:
         """Probability of each hypothesis with each candidate, (run, candidate, hypothesis)."""
         height = self.log_evidence + self.weighing.log_odds
         return np.exp(height - log_sum(height, axis=(1, 2))[:, None, None])
+
+    @property
+    def likely(self) -> BoolArray:
+        """Which hypotheses of each run may teach something, (run, hypothesis)."""
+        return np.asarray(self.share.sum(axis=1) > LEAST_LIKELY)
 
     def posterior(self) -> Posterior:
         """Return the posterior over hypotheses of each run."""

@@ -125,7 +125,7 @@ class LinearResponse:
         model: The healthy robot at theta.
         layout: What stands in theta.
         usual: What may become of each movement, whatever was seen.
-        findings: What every movement says by itself at theta.
+        findings: What every movement says of a healthy robot by itself at theta.
         healthy: Residuals of a healthy robot under each outcome.
         motors: Residuals with each motor where it is best.
         moving: Readings on the way, registered at theta; None: they are left aside.
@@ -175,7 +175,7 @@ class LinearResponse:
             sharp,
             layout,
             usual,
-            MovementLikelihoods(sharp, outcomes, explanation, tuple(profiles)),
+            MovementLikelihoods(sharp, outcomes, explanation, ()),
             place.whitened(pose, usual.direction, sharp.scatter),
             tuple(place.motor(k, profile, outcomes) for k, profile in enumerate(profiles)),
             moving,
@@ -205,7 +205,7 @@ class LinearResponse:
             self.healthy.square(delta), self.model.settling.tail_dof, self.model.sensors.dims
         )
         outcomes = self.model.filtered_outcomes(self.evidence, self.usual, density)
-        profiles = list(self.findings.profiles)
+        profiles = [motor.profile for motor in self.motors]
         for k in motors:
             profiles[k] = self.motors[k].at(delta, outcomes, self.layout.own(k))
         explanation = replace(self.findings.explanation, density=density)

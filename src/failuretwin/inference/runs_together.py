@@ -143,15 +143,25 @@ class RunsTogether:
             counted=self.counted[rows],
         )
 
-    def judge(self, rows: IntArray, moving: TransientSamples | None = None) -> list[Judged]:
+    def judge(
+        self, rows: IntArray, moving: TransientSamples | None = None, asked: BoolArray | None = None
+    ) -> list[Judged]:
         """Return what some runs say, each with its cavity; so many at a time as fit.
 
         Args:
             rows: The runs.
             moving: Their readings on the way; None: they are left aside.
+            asked: Hypotheses that are weighed, (of these runs, hypothesis); None: all.
         """
         parts = np.split(np.arange(len(rows)), np.arange(CHUNK_RUNS, len(rows), CHUNK_RUNS))
-        return [self._judge(rows[p], None if moving is None else moving[p]) for p in parts]
+        return [
+            self._judge(
+                rows[p],
+                None if moving is None else moving[p],
+                None if asked is None else asked[p],
+            )
+            for p in parts
+        ]
 
     def learn(self, found: Sequence[Judged], damping: float = 1.0, of_habits: float = 1.0) -> None:
         """Take in what runs say: sites, scatter, rates.
@@ -224,7 +234,9 @@ class RunsTogether:
         precision = normal.precision / np.outer(self.unit, self.unit)
         return Normal(precision, normal.shift / self.unit - precision @ self.here)
 
-    def _judge(self, rows: IntArray, moving: TransientSamples | None) -> Judged:
+    def _judge(
+        self, rows: IntArray, moving: TransientSamples | None, of: BoolArray | None
+    ) -> Judged:
         cavity, model = self._cavity(rows), self.at(self.here)
         likelihood = RunLikelihood(self.given.evidence[rows], model, moving)
         weighing = SharedWeighing(likelihood, self.hypotheses, self.priors, self.layout)
@@ -233,7 +245,7 @@ class RunsTogether:
         at = weighing.expand(np.arange(len(rows)), place)
         start = self._start(weighing, rows, place)
         asked = np.flatnonzero((cavity.weight > LEAST_SHARE).any(axis=0))
-        found = [weighing.search(at, self._local(cavity[int(c)]), start) for c in asked]
+        found = [weighing.search(at, self._local(cavity[int(c)]), start, of) for c in asked]
         candidates = [Candidate(0, np.arange(len(rows)), each) for each in found]
         height = np.stack([each.log_evidence for each in found], axis=1)
         height += cavity.log_weight[:, asked, None]

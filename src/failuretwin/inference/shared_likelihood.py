@@ -179,7 +179,7 @@ class Fit(ArrayStruct):
     says: LocalLikelihood
     top: ByTheta
     promised: ByRun
-    height: ByRun
+    height: Annotated[FloatArray, Axes("run", empty=-np.inf)]
     width: ByRun
 
     @classmethod
@@ -219,6 +219,7 @@ def search(
     priors: Priors,
     prior: Normal,
     start: FloatArray,
+    asked: BoolArray | None = None,
 ) -> list[Fit]:
     """Return what runs say of hypotheses near the most probable theta of each: Newton's steps.
 
@@ -231,28 +232,62 @@ def search(
         priors: Beliefs about onset and size.
         prior: Of theta, beside that of the response.
         start: Where to start, (run, hypothesis, theta).
+        asked: Hypotheses of each run that are weighed, (run, hypothesis); the others have no
+            evidence; None: all.
     """
+    which = np.ones(start.shape[:2], dtype=bool) if asked is None else asked
     fits = [
-        Fit.of(prior, local_likelihood(response, h, priors, start[:, i].copy()))
+        _begun(response, h, priors, prior, start[:, i], np.flatnonzero(which[:, i]))
         for i, h in enumerate(hypotheses)
     ]
     share, gained = np.ones(start.shape[:2]), np.full(start.shape[:2], np.inf)
     for step in range(MOST_STEPS):
         enough = FOUND_NATS if step < STEPS else RISING_NATS
-        asked = _worth_following(fits, log_odds, gained, enough) & (share > SHORTEST)
-        if not asked.any():
+        followed = _worth_following(fits, log_odds, gained, enough) & (share > SHORTEST)
+        if not followed.any():
             break
-        for i in map(int, np.flatnonzero(asked.any(axis=0))):
-            rows = np.flatnonzero(asked[:, i])
-            old, some = fits[i][rows], response if len(rows) == len(start) else response[rows]
+        for i in map(int, np.flatnonzero(followed.any(axis=0))):
+            rows = np.flatnonzero(followed[:, i])
+            old = fits[i][rows]
             theta = old.says.theta + share[rows, i, None] * (old.top - old.says.theta)
-            new = Fit.of(prior[rows], local_likelihood(some, hypotheses[i], priors, theta))
+            new = _fit(response, hypotheses[i], priors, prior, theta, rows)
             gain = new.height - old.height
             rose = gain > 0.0
             fits[i].put(rows[rose], new[rose])
             share[rows, i] = np.where(rose, 1.0, 0.5 * share[rows, i])
             gained[rows, i] = np.where(rose, gain, gained[rows, i])
     return fits
+
+
+def _fit(
+    response: LinearResponse,
+    hypothesis: Hypothesis,
+    priors: Priors,
+    prior: Normal,
+    theta: FloatArray,
+    rows: IntArray,
+) -> Fit:
+    """Return what some of the runs say of a hypothesis near theta of each, (some, theta)."""
+    some = response if len(rows) == len(prior.shift) else response[rows]
+    return Fit.of(prior[rows], local_likelihood(some, hypothesis, priors, theta))
+
+
+def _begun(
+    response: LinearResponse,
+    hypothesis: Hypothesis,
+    priors: Priors,
+    prior: Normal,
+    start: FloatArray,
+    rows: IntArray,
+) -> Fit:
+    """Return what some of the runs say where the search begins; the others say nothing."""
+    some = rows if len(rows) else np.zeros(1, dtype=np.int64)
+    fit = _fit(response, hypothesis, priors, prior, start[some], some)
+    if len(rows) == len(start):
+        return fit
+    whole = fit.blank(len(start))
+    whole.put(rows, fit[: len(rows)])
+    return whole
 
 
 def _worth_following(

@@ -17,7 +17,7 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
-from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.inference.linear_response import LinearResponse
 from failuretwin.inference.posterior import (
     log_prior,
@@ -227,7 +227,9 @@ class SharedWeighing:
         way = None if way is None else registered_samples(way[rows], place, model.sensors)
         return Expansion(LinearResponse.of(seen, model, self.layout, self._suspects, way), place)
 
-    def search(self, at: Expansion, prior: Normal, start: FloatArray) -> Weighed:
+    def search(
+        self, at: Expansion, prior: Normal, start: FloatArray, asked: BoolArray | None = None
+    ) -> Weighed:
         """Return what runs say with theta normal.
 
         Hypotheses without a score of their own are weighed at the best theta of the others, and
@@ -237,14 +239,16 @@ class SharedWeighing:
             at: The runs.
             prior: Of theta, as seen from there.
             start: Where to start, (run, theta) or (run, hypothesis, theta).
+            asked: Hypotheses of each run that are weighed, (run, hypothesis); None: all.
         """
         shape = (len(start), len(self.hypotheses), self.layout.size)
         start = np.broadcast_to(start if start.ndim == 3 else start[:, None], shape)
         scored = [i for i, h in enumerate(self.hypotheses) if has_score(h)]
-        asked, odds = [self.hypotheses[i] for i in scored], self.log_odds[scored]
-        fits = search(at.response, asked, odds, self.priors, prior, start[:, scored])
+        of, odds = [self.hypotheses[i] for i in scored], self.log_odds[scored]
+        which = None if asked is None else asked[:, scored]
+        fits = search(at.response, of, odds, self.priors, prior, start[:, scored], which)
         known = Weighed.of(at, fits)
-        if len(asked) == len(self.hypotheses):
+        if len(of) == len(self.hypotheses):
             return known
         theta, misfit = known.best(odds)
         rows, best = np.arange(len(theta)), np.argmax(known.log_evidence + odds, axis=1)
@@ -276,12 +280,12 @@ class SharedWeighing:
             return [Candidate(0, rows, self.search(at, priors[0], self.nowhere))]
         untold = COARSE_TO_FINE[1] * self.likelihood.model.twin.robot.reach
         coarse = self.search(self.expand(rows, self.nowhere, untold), priors[-1], self.nowhere)
-        starts = (coarse.theta, self.nowhere)
-        return [
-            Candidate(c, rows, self.search(at, prior, start))
-            for c, prior in enumerate(priors)
-            for start in starts
-        ]
+        usual = [self.search(at, priors[0], start) for start in (coarse.theta, self.nowhere)]
+        found = [Candidate(0, rows, each) for each in usual]
+        start = usual[0].better(usual[1]).theta
+        for c, prior in enumerate(priors[1:], 1):
+            found.append(Candidate(c, rows, self.search(at, prior, start)))
+        return found
 
     def _here(self, at: Expansion) -> list[LocalLikelihood]:
         """Return what runs say of the hypotheses that have a score, where they are expanded."""

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from failuretwin.decision.robot_state import RobotState
     from failuretwin.digital_model.twin import DigitalTwin
     from failuretwin.inference.diagnoser import BayesDiagnoser
+    from failuretwin.inference.fault_course import FaultCourse
     from failuretwin.inference.priors import Priors
 
 
@@ -191,25 +192,30 @@ def diagnose(
     if (sse_range or error_range) and diagnoser is bayes:
         _tell_ruled_out(runs, bayes, diagnoses, priors_of(model, None, onset))
     course = None if independent or not together else course_of(diagnoses, bayes)
-    state = robot_state(diagnoses, model, course, () if learned is None else learned.remarks)
-    _write(runs, diagnoses, known.twin, state, json_file, csv_file, plot)
-    if tracked is not None:
-        _keep(tracked, runs, out)
+    state = robot_state(diagnoses, model, course, _taught(learned) if together else None)
+    _write_files(diagnoses, course, json_file, csv_file)
+    if plot is not None:
+        _write_page(runs, diagnoses, known.twin, state, learned, plot)
+    _keep(tracked, runs, out)
     reports.print_diagnoses(diagnoses)
     if method == "bayes" and sensing_of(runs, sensing) == TOOL_ALONE:
         show(*reports.isolability_summary(runs, bayes))
     show(*reports.state_lines(state, together=course is not None))
     reports.print_scores(Judged.of(diagnoses))
-    lines = [] if course is None else reports.course_lines(course, state, model)
-    lines += _learned_lines(learned, tracked)
+    lines = reports.course_lines(course, state, model) + _learned_lines(learned, tracked)
     show(*(["", *lines] if lines else []))
+
+
+def _taught(learned: SelfCalibration | None) -> tuple[str, ...]:
+    """Return what runs that were weighed together taught of the robot, where it is told."""
+    return () if learned is None else learned.remarks
 
 
 def _learned_lines(learned: SelfCalibration | None, tracked: Tracked | None) -> list[str]:
     """Return what runs that were weighed together taught of the robot."""
     from failuretwin.app.reports import tracking_line
 
-    lines = [] if learned is None else [f"self-calibrated: {line}" for line in learned.remarks]
+    lines = [f"self-calibrated: {line}" for line in _taught(learned)]
     return lines if tracked is None else [*lines, tracking_line(tracked)]
 
 
@@ -319,38 +325,49 @@ def _history(bayes: BayesDiagnoser, calibration: Path | None, out: Path | None) 
     return History(start, cold) if beside is None else open_history(beside, start, cold)
 
 
-def _keep(tracked: Tracked, runs: xr.Dataset, out: Path | None) -> None:
-    """Keep what was learned of the runs."""
+def _keep(tracked: Tracked | None, runs: xr.Dataset, out: Path | None) -> None:
+    """Keep what was learned of the runs; nothing was where they were not tracked."""
     from failuretwin.connection.calibration.result import save_calibration
     from failuretwin.connection.life_history import keep_history
     from failuretwin.connection.tracked_diagnosis import calibration_of
 
+    if tracked is None:
+        return
     if out is not None:
         save_calibration(calibration_of(tracked.life, runs), tracked.life.model.twin.robot, out)
     keep_history(tracked.history, tracked.life, tracked.rows)
 
 
-def _write(
-    runs: xr.Dataset,
+def _write_files(
     diagnoses: list[Diagnosis],
-    twin: DigitalTwin,
-    state: RobotState,
+    course: FaultCourse | None,
     json_file: Path | None,
     csv_file: Path | None,
-    plot: Path | None,
 ) -> None:
     """Write results to the files that were asked for."""
     from failuretwin.decision.results import write_csv, write_json_lines
 
     if json_file is not None:
-        write_json_lines(diagnoses, json_file)
+        write_json_lines(diagnoses, json_file, course)
     if csv_file is not None:
-        write_csv(diagnoses, csv_file)
-    if plot is not None:
-        from failuretwin.app.technician_page import write_report
+        write_csv(diagnoses, csv_file, course)
 
-        write_report(runs, diagnoses, twin, state, plot)
-        click.echo(f"the page: {plot / 'index.html'}", err=True)
+
+def _write_page(
+    runs: xr.Dataset,
+    diagnoses: list[Diagnosis],
+    twin: DigitalTwin,
+    state: RobotState,
+    learned: SelfCalibration | None,
+    folder: Path,
+) -> None:
+    """Write the technician's page, with what was learned where runs were weighed together."""
+    from failuretwin.app.taught_report import taught_section
+    from failuretwin.app.technician_page import write_report
+
+    sections = [] if learned is None else [taught_section(learned, twin.robot)]
+    write_report(runs, diagnoses, twin, state, folder, sections)
+    click.echo(f"the page: {folder / 'index.html'}", err=True)
 
 
 def _learn_together(

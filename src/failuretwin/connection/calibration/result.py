@@ -37,6 +37,8 @@ class Parameter:
         high: Upper end.
         identified: Whether the logs say it; otherwise the interval is mostly that of the prior.
         note: What keeps the logs from saying it and which movement would, or empty.
+        deviations: How far it lies from the mean of such robots, in their standard deviations;
+            None: such robots were no prior.
     """
 
     name: str
@@ -47,6 +49,7 @@ class Parameter:
     high: float
     identified: bool = True
     note: str = ""
+    deviations: float | None = None
 
 
 @dataclass(frozen=True)
