@@ -193,7 +193,9 @@ def _together(ways: list[Way], late: FloatArray, lag_s: float, unmoved_m: float)
     rows = []
     for way in ways:
         says = way.log_density(as_floats(asked * FINE_S), lag_s, unmoved_m)
-        says = TEMPER * READINGS * np.where(np.isfinite(says), says, np.nanmin(says))
+        told = np.isfinite(says)  # none where no reading falls into the movement
+        least = says[told].min() if told.any() else 0.0
+        says = TEMPER * READINGS * np.where(told, says, least)
         punctual, delayed = says[place[: len(late)]], says[place[len(late) :]]
         delayed = log_sum(delayed.reshape(len(late), -1), axis=1) - np.log(len(delays))
         rows.append(np.logaddexp(np.log1p(-LATE_RATE) + punctual, np.log(LATE_RATE) + delayed))
