@@ -7,7 +7,8 @@ import pytest
 
 import failuretwin as ft
 from failuretwin import DigitalTwin, InputError, load_robot
-from failuretwin.app.acting import emulated_faults, spared_of
+from failuretwin.app.acting import spared_of
+from failuretwin.app.emulation import emulated_faults
 from failuretwin.app.reach_report import held_of
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from failuretwin.inference.healthy_model import HealthyModel
@@ -123,6 +124,8 @@ def test_faults_of_an_emulated_arm(armpi):
     assert not found.modes["encoder_bias"].both_signs
     with pytest.raises(InputError, match="expected a number"):
         emulated_faults(["motor_1:drift=x"], armpi)
+    with pytest.raises(InputError, match="one size of each mode"):
+        emulated_faults(["motor_1:slow=0.5", "motor_2:slow=0.4"], armpi)
     model = HealthyModel.of(DigitalTwin(armpi), NO_IMPERFECTIONS)
     assert spared_of(["motor_2=0.5", "motor_4"], None, model, print).tolist() == [
         0.0,

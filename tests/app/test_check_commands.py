@@ -12,8 +12,9 @@ pytest.importorskip("mujoco")
 
 def test_a_check_names_the_motor_and_what_to_do(failuretwin, tmp_path):
     out, kept = tmp_path / "out.json", tmp_path / "kept.json"
-    arguments = ("check", "--seconds", 14, "--seed", 2, "--keep", kept)
-    healthy = failuretwin(*arguments, "--json", out, "--plot", tmp_path / "green")
+    arguments = ("check", "--seed", 2, "--keep", kept)
+    first = ("--seconds", 14, "--json", out, "--plot", tmp_path / "green")
+    healthy = failuretwin(*arguments, *first)
     assert healthy.returncode == 0, healthy.stderr
     assert healthy.stdout.startswith("GREEN: healthy")
     assert "green rules out what the last column says" in healthy.stdout
@@ -43,6 +44,32 @@ def test_a_check_names_the_motor_and_what_to_do(failuretwin, tmp_path):
     checks = json.loads(kept.read_text())
     assert [row["light"] for row in checks["checks"]] == ["green", "red"]
     assert len(checks["motions"]["ramp_s"]) == checks["checks"][0]["movements"]
+    for more, said in (
+        (("--seconds", 30), "says which motions are made"),
+        (("--motions", kept), "leave out --motions"),
+        (("--json", tmp_path / "nowhere" / "out.json"), "nowhere does not exist"),
+    ):
+        refused = failuretwin(*arguments, *more)
+        assert refused.returncode == 2
+        assert said in refused.stderr
+    assert json.loads(kept.read_text()) == checks
+
+
+def test_what_cannot_be_written_is_refused_before_anything_moves(failuretwin, tmp_path):
+    (tmp_path / "file").touch()
+    (tmp_path / "motions.json").write_text('{"motions": 1}')
+    nowhere = tmp_path / "nowhere" / "out.json"
+    for option, path, said in (
+        ("--keep", nowhere, "does not exist"),
+        ("--json", nowhere, "does not exist"),
+        ("--plot", tmp_path / "file", "is a file"),
+        ("--plot", tmp_path / "file" / "page", "cannot be made"),
+        ("--keep", tmp_path / "motions.json", "cannot be read as kept checks"),
+    ):
+        answer = failuretwin("check", option, path)
+        assert (answer.returncode, answer.stdout) == (2, "")
+        assert said in answer.stderr
+        assert answer.stderr.count("\n") == 1
 
 
 def test_motions_are_written_and_nothing_moves(failuretwin, tmp_path):
@@ -60,9 +87,7 @@ def test_motions_are_written_and_nothing_moves(failuretwin, tmp_path):
     )  # fmt: skip
     assert said.returncode == 0, said.stderr
     assert "told from all others" in said.stdout
-    again = failuretwin(
-        "check", "--seconds", 8, "--write", path.with_suffix(".csv"), "--motions", path
-    )
+    again = failuretwin("check", "--write", path.with_suffix(".csv"), "--motions", path)
     assert again.returncode == 0, again.stderr
     only = ("--hypotheses", "motor_3:steady_state_error,healthy")
     tables = [
@@ -70,6 +95,17 @@ def test_motions_are_written_and_nothing_moves(failuretwin, tmp_path):
         for each in (path, path.with_suffix(".csv"))
     ]
     assert tables[0] == tables[1]
+    for suffix in (".bag", ".mcap"):
+        bag, back = path.with_suffix(suffix), path.with_name(f"back{suffix}.json")
+        for source, written in ((path, bag), (bag, back)):
+            passed = failuretwin("check", "--motions", source, "--write", written)
+            assert passed.returncode == 0, passed.stderr
+        read, made = (json.loads(each.read_text()) for each in (back, path))
+        for name in ("start_rad", "target_rad", "ramp_s"):
+            np.testing.assert_allclose(read[name], made[name], atol=1e-6)
+        np.testing.assert_allclose(read["seconds"][:-1], made["seconds"][:-1], atol=1e-6)
+    said = failuretwin("isolability", "armpi_fpv", "--motions", bag, *only)
+    assert said.stdout == tables[0]
     assert picture.read_bytes().startswith(b"\x89PNG")
     rows = [json.loads(line) for line in (tmp_path / "s").read_text().splitlines()]
     sizes = {row["hypothesis"]: row["isolated"] for row in rows}
@@ -110,6 +146,11 @@ def test_a_design_beside_random_movements(failuretwin):
         (("check", "--fault", "motor_9:stuck"), "motor_9"),
         (("check", "--write", "motions.txt"), "expected .json, .csv, .mcap, .bag"),
         (("check", "--motions", "nothing.json"), "cannot be read as motions"),
+        (("check", "--motions", "nothing.bag"), "cannot be read as motions"),
+        (("check", "--motions", "nothing.json", "--seconds", 9), "leave out --seconds"),
+        (("check", "--log", "some.nc", "--keep", "k.json", "--rest", 1), "out --keep and --rest"),
+        (("check", "--log", "some.nc", "--motions", "m.json"), "leave out --motions"),
+        (("check", "--write", "m.csv", "--json", "o"), "nothing is moved: leave out --json"),
         (("check", "--floor", 2.0), "--floor"),
         (("isolability", "armpi_fpv", "--motions", "nothing.json"), "cannot be read as motions"),
     ],

@@ -68,6 +68,13 @@ def test_an_emulated_robot_is_watched_and_recorded(failuretwin, tmp_path):
     assert [text for _, text in told(again)][-1:] == [text for _, text in told(answer)][-1:]
 
 
+def test_an_emulated_robot_has_a_fault_of_a_size_that_begins_at_a_time(failuretwin):
+    fault = ("--fault", "motor_2:steady_state_error=0.1@20")
+    answer = failuretwin("watch", "emulated", "--speed", 0, "--duration", 40, *fault)
+    assert answer.returncode == 0, answer.stderr
+    assert "last answer: motor 2 misses its targets by about 5.9 deg" in answer.stdout
+
+
 def test_a_robot_on_a_ros_network_is_watched(roscore):
     """Three programs on a real roscore: a robot, its shadow, and one that reads /diagnostics."""
     environment = {
@@ -129,7 +136,7 @@ def test_without_a_master_the_user_is_told_to_start_one(failuretwin, monkeypatch
         (("emulate", "--robot", "ur5e"), "cm/msg_cm holds servo counts"),
         (("watch", "ros1", "--robot", "ur5e"), "file for --topics"),
         (("emulate", "--to", "robot.bag"), "expected ros1, ros2 or a file that ends in .mcap"),
-        (("emulate", "--to", "a.mcap", "--fault", "motor_3:stuck"), "is not of the form"),
+        (("emulate", "--to", "a.mcap", "--fault", "motor_3:stuck@soon"), "is not of the form"),
         (("emulate", "--to", "no/such/folder.mcap"), "cannot be written"),
         (("watch", "emulated", "--record", "live.bag"), "Give a name that ends in .mcap"),
         (("watch", ".", "--fault", "motor_3:stuck@5"), "--fault and --imperfections are of an"),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from dataclasses import replace
+from threading import Event, Thread
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ import pytest
 from failuretwin.app.shadow import Shadow
 from failuretwin.connection.links.base import OK, Answer, CommandSent, LinkCounts, Reading
 from failuretwin.connection.links.commander import Order
+from failuretwin.connection.links.ros_messages import RosTopics, RosWriter
 from failuretwin.core.alarm import ALL_CLEAR, CLEAR, RAISED, SUSPECTED, Alarm
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
@@ -20,6 +23,9 @@ from failuretwin.decision.streaming.monitor import Believed, monitor
 from failuretwin.decision.test_motions.probing import Prober, ProbeRules
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.inference.healthy_model import HealthyModel
+from fake_rosbridge import FakeRosbridge
+from roscores import free_port
+from waiting import WAIT_S, wait_for
 
 COUNT_RAD = np.deg2rad(0.24)
 HEALTHY_MOVES, FAULTY_MOVES, PERIOD_S = 11, 4, 2.2
@@ -227,11 +233,15 @@ def test_nothing_is_asked_that_is_settled_or_where_nothing_is_decided(known):
     clear = unsure(known, alarm=ALL_CLEAR)
     strange = unsure(known, undecided="the log does not fit the profile")
     named = unsure(known, alarm=Alarm(RAISED, "motor_3:steady_state_error"))
-    named.watch.believed = replace(named.watch.believed, probability=np.array([0.1, 0.89, 0.01]))
+    named.watch.believed = replace(named.watch.believed, probability=np.array([0.03, 0.96, 0.01]))
     for watched in (clear, strange, named, unsure(known, ProbeRules(0))):
         assert watched.until(20.0).arm.sent == []
     unnamed = unsure(known, alarm=Alarm(RAISED, "motor_3:steady_state_error"))
     assert unnamed.until(20.0).arm.sent != []
+    unsettled = unsure(known, alarm=Alarm(RAISED, "motor_3:steady_state_error"))
+    doubtful = np.array([0.64, 0.359, 0.001])  # the fault is the only one, healthy more probable
+    unsettled.watch.believed = replace(unsettled.watch.believed, probability=doubtful)
+    assert len(unsettled.until(40.0).arm.sent) == 4
 
 
 def test_an_arm_that_is_commanded_or_moves_is_never_asked(known):
@@ -294,6 +304,64 @@ def test_numbers_that_make_no_sense():
             ProbeRules(most, idle_s)
 
 
+# Over a network.
+
+
+STANDARD = RosTopics(
+    command="/arm/command", command_type="trajectory_msgs/JointTrajectory",
+    position="/joint_states", position_type="sensor_msgs/JointState",
+)  # fmt: skip
+FASTER = 4.0
+"""The arm's time in ours."""
+
+
+def arm_on_rosbridge(server, arm, robot, over):
+    """Let a server say what an arm does, orders of others too, and the arm do what it hears."""
+    writer, done = RosWriter(robot, STANDARD), 0
+    writer.start_at(arm.pose)
+    while not over.wait(0.1 / FASTER):
+        for call in server.published[done:]:
+            last = call["msg"]["points"][-1]
+            at, target = last["time_from_start"], np.array(last["positions"])
+            arm.send(Order(target, np.full(4, at["secs"] + 1e-9 * at["nsecs"])))
+            done += 1
+        event = arm.poll(0.0)
+        while isinstance(event, CommandSent):
+            for message in writer.command(event):
+                server.publish(message.topic, message.content)
+            event = arm.poll(0.0)
+        for message in writer.reading(event):
+            server.publish(message.topic, message.content)
+
+
+def test_an_arm_is_asked_over_rosbridge_and_is_back(known):
+    pytest.importorskip("roslibpy")
+    from failuretwin.connection.links import rosbridge
+
+    arm, server, over = Arm(known, program(3)), FakeRosbridge(free_port()), Event()
+    ros = rosbridge.connect("127.0.0.1", server.port)
+    robot = Thread(target=arm_on_rosbridge, args=(server, arm, known.robot, over))
+    try:
+        with rosbridge.RosbridgeCommander(known.robot, STANDARD, ros) as link:
+            wait_for(lambda: server.has_subscriber("/arm/command"))
+            wait_for(lambda: server.has_subscriber("/joint_states"))
+            robot.start()
+            watched = Watched(known, link, ProbeRules(1, 2.0), Unsure(known))
+            until = time.monotonic() + WAIT_S
+            while not watched.said and time.monotonic() < until:
+                watched.shadow.step(0.02)
+                if watched.prober.due:
+                    watched.prober.ask(watched.shadow.hear, watched.said.append)
+            wait_for(lambda: len(arm.sent) == 2)
+    finally:
+        over.set()
+        robot.join()
+        rosbridge.disconnect(ros)
+        server.stop()
+    assert watched.said[-1] == "asked by 1 movement, the arm is back where it was"
+    np.testing.assert_allclose(arm.sent[-1].target, program(3)[-1][1].target, atol=1e-6)
+
+
 # From the command line.
 
 
@@ -304,12 +372,27 @@ def test_an_emulated_arm_is_watched_that_may_be_asked(failuretwin):
     assert "last answer: healthy" in answer.stdout
 
 
-@pytest.mark.parametrize("source", [".", "ros2", "somewhere.mcap"])
+@pytest.mark.parametrize("source", [".", "ros2", "ros2://here:1", "recorded.mcap"])
 def test_sources_that_only_listen_are_refused(failuretwin, tmp_path, source):
+    (tmp_path / "recorded.mcap").touch()
     answer = failuretwin("watch", source, "--probe", 2, folder=tmp_path)
     assert answer.returncode == 2
     assert "can only be listened to, but --probe orders movements" in answer.stderr
     assert answer.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("nosuch.csv", "--probe", 2), "source 'nosuch.csv' does not exist"),
+        (("emulated", "--move"), "without --probe N: leave out --move"),
+        (("emulated", "--idle", 20, "--floor", 0.1), "leave out --idle and --floor"),
+    ],
+)
+def test_what_is_refused(failuretwin, tmp_path, arguments, said):
+    answer = failuretwin("watch", *arguments, folder=tmp_path)
+    assert answer.returncode == 2
+    assert said in answer.stderr
 
 
 LISTENER = """

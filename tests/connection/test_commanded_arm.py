@@ -1,14 +1,15 @@
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from failuretwin import Fault
-from failuretwin.connection.commanded_arm import CommandedArm
+from failuretwin.connection.commanded_arm import PACED_SLICE_S, CommandedArm
 from failuretwin.connection.emulated_arm import Emulation
-from failuretwin.connection.links.base import CommandSent, Reading
+from failuretwin.connection.links.base import CommandSent, Pace, Reading
 from failuretwin.connection.links.commander import Order
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
@@ -52,6 +53,20 @@ def test_it_goes_where_it_is_told_and_says_so(armpi):
     np.testing.assert_allclose(readings[-1].position, target, atol=0.06)  # sag and friction
     times = [event.time for event in events]
     assert times == sorted(times)
+
+
+def test_by_a_clock_an_order_begins_at_once(armpi):
+    """The time of a slice does not pass before it is due, however long polls may wait."""
+    arm = CommandedArm(Emulation(armpi, PLAIN), Pace(1.0))
+    arm.poll(0.0)
+    begun = time.monotonic()
+    while time.monotonic() < begun + 0.4:
+        arm.poll(0.01)
+    sent = time.monotonic() - begun
+    arm.send(order([0.4, -0.3, 0.5, 0.2]))
+    while not isinstance(event := arm.poll(0.01), CommandSent):
+        pass
+    assert event.time <= sent + PACED_SLICE_S + 0.02
 
 
 def test_it_rests_until_it_is_told(armpi):

@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from failuretwin import BayesDiagnoser, SetupPrior
+from failuretwin import BayesDiagnoser, SetupPrior, load_robot
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.decision.robot_state import WELL, robot_state
 from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.log_correction import CorrectionTable, LogCorrection
@@ -182,6 +183,16 @@ def test_a_clock_that_is_apart_is_named_with_its_sign(twin, runs, as_told, late_
     assert float(told[1]) == pytest.approx(abs(late_s), abs=0.05)
     assert told[2] == ("behind" if late_s > 0.0 else "ahead")
     same_verdicts(found, as_told)
+
+
+@pytest.mark.parametrize(("late_s", "told"), [(0.14, 0), (0.4, 3), (-0.2, 3)])
+def test_an_arm_that_nobody_has_calibrated_may_trail_its_commands(late_s, told):
+    """By how much is not known, so a clock that is a little behind is not blamed for it."""
+    robot = load_robot("ur5e")
+    runs = simulate(Plan(robot, ["healthy"], 3, 3, NO_IMPERFECTIONS, RandomMovements(count=6)))
+    late = replace(LogCorrection.none(len(robot.motors)), late_s=-late_s).runs(runs)
+    found = BayesDiagnoser(robot).diagnose(late)
+    assert sum("clock" in line for one in found for line in remarks(one)) == told
 
 
 def test_what_every_run_has_is_set_up_and_what_one_has_is_a_fault(twin, armpi, known):

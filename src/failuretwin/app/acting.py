@@ -6,12 +6,12 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from failuretwin.app.emulation import emulated_faults, number_of
 from failuretwin.app.live import EMULATED, ROS1, ROSBRIDGE, address_of, topics_of
 from failuretwin.connection.links.commander import Commander
 from failuretwin.core.errors import InputError
@@ -23,84 +23,12 @@ from failuretwin.digital_model.calibrated_robot import (
     CalibratedRobot,
     RobotLike,
     calibrated,
-    load_calibration,
 )
-from failuretwin.digital_model.robot import Robot
-from failuretwin.failure_behavior.injection import ScheduledFault
-from failuretwin.failure_behavior.mode import FaultMode, SizedMode
-from failuretwin.failure_behavior.modes import SteadyStateError, Stuck
-from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.healthy_model import HealthyModel
-
-if TYPE_CHECKING:
-    from failuretwin.app.commands.options import LiveOptions
-    from failuretwin.connection.emulated_arm import Emulation
 
 PLACES = f"{EMULATED}, {ROS1} or {ROSBRIDGE}://HOST[:PORT]"
 
 # The arm.
-
-
-@dataclass(frozen=True)
-class EmulatedFaults:
-    """Faults that an emulated arm has: when, how large, and where it stands at first.
-
-    Attributes:
-        schedule: What comes when.
-        modes: Fault modes with the sizes that were asked for.
-        start: Where the motors stand at first, (motor,) [rad].
-    """
-
-    schedule: tuple[ScheduledFault, ...]
-    modes: dict[str, FaultMode]
-    start: tuple[float, ...]
-
-
-def emulated_faults(texts: Sequence[str], robot: Robot) -> EmulatedFaults:
-    """Read faults such as ``motor_3:stuck``, ``motor_3:stuck=-0.4@20`` or ``motor_2:slow=0.5``.
-
-    Args:
-        texts: MOTOR:MODE[=SIZE][@START[-END]], the size in the unit of the mode; of a stuck motor
-            it is where it stands. Without a start it is there from the beginning.
-        robot: The robot.
-
-    Raises:
-        InputError: If one cannot be read, or its mode has no size to choose.
-    """
-    schedule, modes = [], dict(MODES)
-    start = [float(np.clip(0.0, *motor.movement_range)) for motor in robot.motors]
-    for text in texts:
-        name, _, when = text.partition("@")
-        kind, _, size = name.partition("=")
-        scheduled = ScheduledFault.parse(f"{kind}@{when or '0'}", robot.motor_names)
-        schedule.append(scheduled)
-        if size:
-            value = _number(size, f"fault {text!r}: size")
-            mode = modes[scheduled.fault.mode]
-            if isinstance(mode, Stuck):
-                start[robot.motor_names.index(scheduled.fault.motor)] = value
-            else:
-                modes[mode.mode] = _of_size(mode, value, text)
-    return EmulatedFaults(tuple(schedule), modes, tuple(start))
-
-
-def _of_size(mode: FaultMode, size: float, text: str) -> FaultMode:
-    if isinstance(mode, SteadyStateError):
-        return replace(mode, magnitude=(size, size))
-    if not isinstance(mode, SizedMode):
-        raise InputError(f"fault {text!r}: mode {mode.mode!r} has no size to choose. Leave it out.")
-    signs: dict[str, Any] = {"both_signs": False} if mode.signed else {}
-    return replace(mode, magnitude=(size, size), **signs)
-
-
-def _number(value: str, what: str) -> float:
-    try:
-        number = float(value)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise InputError(f"{what} is {value!r}, expected a number.")
-    return number
 
 
 def emulated_arm(
@@ -125,27 +53,6 @@ def emulated_arm(
     own = emulated_faults(faults, known.robot)
     return CommandedArm(
         Emulation(known.robot, known.imperfections, own.schedule, seed, own.modes, own.start)
-    )
-
-
-def emulation_of(robot: Robot, live: LiveOptions, seed: int) -> Emulation:
-    """Return what an emulated arm is that others command, with faults of sizes that are asked for.
-
-    Args:
-        robot: The robot, as it is without faults.
-        live: Its imperfections and faults.
-        seed: Seed of all chance.
-
-    Raises:
-        InputError: If a fault or the imperfections cannot be read.
-    """
-    from failuretwin.connection.emulated_arm import Emulation
-
-    own = "none" if robot.imperfections_file is None else robot.name
-    known = load_calibration(live.imperfections or own, robot)
-    asked = emulated_faults(live.faults, robot)
-    return Emulation(
-        known.robot, known.imperfections, asked.schedule, seed, asked.modes, asked.start
     )
 
 
@@ -265,7 +172,7 @@ def spared_of(
     for text in texts:
         name, _, share = text.partition("=")
         Hypothesis.parse(f"{name}:stuck", names)
-        value = _number(share or "1", f"--spare {text!r}: the weight")
+        value = number_of(share or "1", f"--spare {text!r}: the weight")
         if value < 0.0:
             raise InputError(f"--spare {text!r}: the weight is below 0. Leave the motor out.")
         weight[names.index(name)] = value

@@ -161,22 +161,22 @@ def kept_checks(path: Path) -> list[dict[str, Any]]:
         InputError: If it cannot be read.
     """
     try:
-        return list(json.loads(path.read_text(encoding="utf-8"))["checks"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        checks = json.loads(path.read_text(encoding="utf-8"))["checks"]
+        _ = checks[-1]["date"], checks[-1]["motors"][0]["zero"]
+        return list(checks)
+    except (OSError, ValueError, LookupError, TypeError) as error:
         raise InputError(
             f"{path}: cannot be read as kept checks ({error}). Expected what `check --keep` wrote."
         ) from error
 
 
-def keep_check(path: Path, motions: Motions, record: dict[str, Any]) -> None:
-    """Add a check to a kept file, or begin one.
+def keep_check(path: Path, motions: Motions, checks: Sequence[dict[str, Any]]) -> None:
+    """Keep motions, and the checks that were made by them, the oldest first.
 
     Raises:
-        InputError: If it cannot be read.
         OutputError: If it cannot be written.
     """
-    before = kept_checks(path) if path.exists() else []
-    write_records([{"motions": motions.record(), "checks": [*before, record]}], path)
+    write_records([{"motions": motions.record(), "checks": checks}], path)
 
 
 def changes(before: dict[str, Any], now: dict[str, Any]) -> list[str]:

@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.live import Live
 
 from failuretwin.app.commands.options import LiveOptions
+from failuretwin.app.emulation import emulation_of
 from failuretwin.app.live_view import View
 from failuretwin.app.shadow import SILENCE_S, Changes, Shadow
 from failuretwin.app.terminal import tell
@@ -26,9 +27,7 @@ from failuretwin.core.errors import InputError, counted
 from failuretwin.data_knowledge.bag_messages import BagTopics
 from failuretwin.decision.streaming.monitor import FaultMonitor, Fit
 from failuretwin.decision.test_motions.probing import Prober
-from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
-from failuretwin.failure_behavior.injection import ScheduledFault
 from failuretwin.inference.calibration_fit import MISFIT
 from failuretwin.inference.explanation import percent
 
@@ -49,22 +48,9 @@ def emulated_robot(
     robot: Robot, live: LiveOptions, seed: int, pace: Pace, duration_s: float, zero_s: float = 0.0
 ) -> Source:
     """Return an emulated robot; it works for `duration_s` and its clock starts at `zero_s` [s]."""
-    from failuretwin.connection.emulated_arm import Emulation, emulated
+    from failuretwin.connection.emulated_arm import emulated
 
-    own = "none" if robot.imperfections_file is None else robot.name
-    known = load_calibration(live.imperfections or own, robot)
-    emulation = Emulation(
-        robot=known.robot,
-        imperfections=known.imperfections,
-        schedule=schedule_of(live, robot),
-        seed=seed,
-    )
-    return emulated(emulation, pace, duration_s, zero_s)
-
-
-def schedule_of(live: LiveOptions, robot: Robot) -> tuple[ScheduledFault, ...]:
-    """Return the faults of an emulated robot."""
-    return tuple(ScheduledFault.parse(text, robot.motor_names) for text in live.faults)
+    return emulated(emulation_of(robot, live, seed), pace, duration_s, zero_s)
 
 
 def topics_of(path: Path | None) -> RosTopics:
@@ -106,10 +92,15 @@ def connect(
         sys.path.insert(0, "")  # the user's module may lie in the folder that the user is in
         return stack.enter_context(source_from_text(text, robot)), []
     if not path.exists():
-        raise InputError(f"source {text!r} does not exist. Expected {SOURCES}.")
+        raise missing(text)
     recorded = BagTopics(topics.command, topics.tool or None, topics.position or None)
     named = None if topics == RosTopics() else recorded
     return stack.enter_context(replay(path, robot, pace, named)), []
+
+
+def missing(text: str) -> InputError:
+    """Return the error of a SOURCE that is no link and no file."""
+    return InputError(f"source {text!r} does not exist. Expected {SOURCES}.")
 
 
 def _ros1(

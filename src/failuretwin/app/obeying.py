@@ -7,14 +7,17 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from failuretwin.app.acting import emulation_of
 from failuretwin.app.commands.options import LiveOptions
+from failuretwin.app.emulation import emulation_of
 from failuretwin.app.live import topics_of
 from failuretwin.connection.commanded_arm import CommandedArm
 from failuretwin.connection.links.base import CommandSent, Pace, Reading
 from failuretwin.connection.links.commander import Order
 from failuretwin.connection.links.ros1 import Ros1Robot, Ros1Source
 from failuretwin.digital_model.robot import Robot
+
+POLL_S = 0.01
+"""Longest wait for the arm before commands are heard again [s]."""
 
 
 def obey_commands(robot: Robot, live: LiveOptions, seed: int, tell: Callable[[str], None]) -> None:
@@ -27,15 +30,15 @@ def obey_commands(robot: Robot, live: LiveOptions, seed: int, tell: Callable[[st
         tell: Called with what happens.
     """
     emulation = emulation_of(robot, live, seed)
-    topics, zero = topics_of(live.topics), time.time()
+    topics = topics_of(live.topics)
     arm = CommandedArm(emulation, Pace(live.speed))
     length = live.duration or math.inf
     with Ros1Robot(robot, topics) as sink, Ros1Source(robot, topics) as ears:
         tell("an emulated robot obeys; stop with Ctrl-C")
         try:
-            now = 0.0
+            now, zero = 0.0, time.time()
             while now < length:
-                event = arm.poll(0.02)
+                event = arm.poll(POLL_S)
                 if isinstance(event, Reading):
                     now = event.time
                     sink.put(replace(event, time=event.time + zero))

@@ -7,9 +7,17 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import cast
 
-from failuretwin.app.acting import emulation_of
 from failuretwin.app.commands.options import LiveOptions
-from failuretwin.app.live import EMULATED, OWN_CLASS, ROS1, ROSBRIDGE, connect
+from failuretwin.app.emulation import emulation_of
+from failuretwin.app.live import (
+    EMULATED,
+    OWN_CLASS,
+    ROS1,
+    ROS2,
+    ROSBRIDGE,
+    connect,
+    missing,
+)
 from failuretwin.connection.links.base import Pace, Sink
 from failuretwin.connection.links.commander import Commander
 from failuretwin.core.errors import InputError
@@ -28,7 +36,8 @@ def commanded(
         return stack.enter_context(_at_work(robot, live, seed)), []
     own = OWN_CLASS.fullmatch(text) and not Path(text).exists()
     if not own and text != ROS1 and not text.startswith(f"{ROSBRIDGE}://"):
-        raise _listens(text)
+        listens = text == ROS2 or text.startswith(f"{ROS2}://") or Path(text).exists()
+        raise _listens(text) if listens else missing(text)
     link, sinks = connect(text, robot, live, seed, stack, commands=True)
     if not (hasattr(link, "send") and hasattr(link, "standing")):
         raise _listens(text)

@@ -1,8 +1,8 @@
 """The physics engine's arm, told from outside where to go: a `Commander` without a robot.
 
-Time passes when it is polled, in slices. An order is carried out at once, unless the bus stalls:
-then readings stop, and what was ordered waits until it comes back. A motor that is told nothing new
-keeps the place that it has.
+Time passes when it is polled, in slices, none before it is due. An order is carried out at once,
+unless the bus stalls: then readings stop, and what was ordered waits until it comes back. A motor
+that is told nothing new keeps the place that it has.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.disturbances import Disturbances, sense, stack
 
-SLICE_S = 0.1
-"""Time that passes at a time [s]."""
+SLICE_S, PACED_SLICE_S = 0.1, 0.05
+"""Time that passes at a time, as fast as possible and by a clock: so long an order may wait [s]."""
 UNMOVED_RAD = 1e-9
 """Commands nearer than this are the same [rad]."""
 
@@ -59,6 +59,8 @@ class _Ramp:
 class CommandedArm(EmulatedArm):
     """An emulated arm that does what it is told; the same seed gives the same arm and bad luck.
 
+    Bad luck is drawn for each slice of time, so it is another by a clock than as fast as possible.
+
     Args:
         emulation: What to emulate.
         pace: How fast its time passes; None: as fast as possible.
@@ -73,6 +75,7 @@ class CommandedArm(EmulatedArm):
         super().__init__(emulation)
         self.name = f"emulated {emulation.robot.name}, commanded"
         self._pace = pace or Pace(AS_FAST_AS_POSSIBLE)
+        self._slice_s = SLICE_S if self._pace.speed == AS_FAST_AS_POSSIBLE else PACED_SLICE_S
         self._queue: deque[Event] = deque()
         self._given = 0
         self._waiting: list[Order] = []
@@ -101,8 +104,10 @@ class CommandedArm(EmulatedArm):
         self._ordered = order.target
 
     def poll(self, timeout_s: float) -> Event | None:
-        """Return the next event."""
+        """Return the next event; None if it is not due in time."""
         while not self._queue:
+            if not self._pace.due(self._index * STEP_S, timeout_s):
+                return None
             self._pass()
         if not self._pace.due(self._queue[0].time, timeout_s):
             return None
@@ -117,7 +122,7 @@ class CommandedArm(EmulatedArm):
 
     def _pass(self) -> None:
         """Let one slice of time pass."""
-        steps = round(SLICE_S / STEP_S)
+        steps = round(self._slice_s / STEP_S)
         time = as_floats(np.arange(self._index, self._index + steps + 1) * STEP_S)
         now = float(time[0])
         if self._waiting and not self._silent[0] <= now < self._silent[1]:

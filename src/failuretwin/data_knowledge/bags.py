@@ -40,7 +40,7 @@ from failuretwin.data_knowledge.bag_messages import (
 from failuretwin.data_knowledge.timed_log import Samples, Targets, TimedLog
 from failuretwin.digital_model.robot import Robot
 
-__all__ = ["BagTopics", "Track", "is_bag", "motor_track", "read_bag"]
+__all__ = ["BagTopics", "Track", "is_bag", "motor_track", "read_bag", "read_targets"]
 
 CLOCK_GAP_NS = 3600 * NS_PER_S
 """A silence of this length [ns] means that the stamps come from more than one clock."""
@@ -88,6 +88,32 @@ def read_bag(path: Path, robot: Robot, topics: BagTopics | None = None) -> list[
             sensors={} if goal is None else {GOAL_VARIABLE: _samples(goal, zero_ns)},
         )
     ]
+
+
+def read_targets(path: Path, robot: Robot) -> Targets | None:
+    """Read targets from a bag that holds commands alone, such as `failuretwin design` writes.
+
+    Args:
+        path: The file or folder.
+        robot: The robot it is of.
+
+    Returns:
+        The targets, their times from the first; None: it holds readings too, or no targets.
+
+    Raises:
+        InputError: If it cannot be read, or lacks a joint.
+    """
+    found = read_topics(path)
+    fitting = {role: fitting_topics(role, None, found, path) for role in ROLES}
+    if fitting["tool"] or fitting["position"] or not fitting["command"]:
+        return None
+    messages = read_messages(path, [topic.name for topic in fitting["command"]])
+    command = _Recording(path, robot, messages).motors("command", fitting["command"], needed=True)
+    if command is None or command.duration is None:
+        return None
+    _check_commanded(command, robot)
+    told = _command(command, None, int(command.stamp_ns[0]))
+    return told if isinstance(told, Targets) else None
 
 
 @dataclass(frozen=True)

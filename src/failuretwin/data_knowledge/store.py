@@ -189,8 +189,7 @@ def filling(folder: Path) -> Iterator[Path]:
     partial = folder.with_name(f".{folder.name}.{_owner()}.partial")
     made = [parent for parent in folder.parents if not parent.exists()]
     try:
-        if folder.exists() and not folder.is_dir():
-            raise OutputError(f"{folder}: is a file. Give the name of a folder.")
+        check_fillable(folder)
         _sweep(folder.parent, folder.name)
         partial.mkdir(parents=True)
         yield partial
@@ -266,6 +265,15 @@ def check_writable(path: Path) -> None:
         )
     if path.is_file() and path.suffix == ".zarr":
         raise OutputError(f"{path}: is a file, and a Zarr store is a folder. Choose another name.")
+
+
+def check_fillable(folder: Path) -> None:
+    """Raise OutputError unless files can be written to a folder, which need not exist yet."""
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: is a file. Give the name of a folder.")
+    above = next(parent for parent in [folder, *folder.absolute().parents] if parent.exists())
+    if not (above.is_dir() and os.access(above, os.W_OK)):
+        raise OutputError(f"{folder}: cannot be made in {above}. Choose another.")
 
 
 # One writer at a time: a lock that ends with the process that holds it.

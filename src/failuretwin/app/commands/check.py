@@ -23,6 +23,7 @@ from failuretwin.app.commands.options import (
     common_options,
     gathered,
     plugin_option,
+    refuse_unused,
 )
 
 if TYPE_CHECKING:
@@ -84,6 +85,14 @@ seconds_option = click.option(
 )
 
 
+DESIGN = ("seconds", "usual", "rest")
+"""Options that say how motions are designed."""
+ARM = ("place", "faults", "move", "topics", "further")
+"""Options that say which arm is moved, and how far."""
+MOTIONS = ("written", "motions", "keep", "speed_share", "floor", "radius")
+"""Options that say which motions are made, or where they go."""
+
+
 @click.command()
 @seconds_option
 @click.option(
@@ -107,14 +116,15 @@ seconds_option = click.option(
     "--motions",
     type=PATH,
     metavar="FILE",
-    help="Make these motions (.json, .csv). Default: they are designed anew.",
+    help="Make these motions (.json, .csv, .mcap, .bag, or what --keep wrote). Default: they are "
+    "designed anew.",
 )
 @click.option(
     "--keep",
     type=PATH,
     metavar="FILE.json",
     help="Keep motions and results of this robot there; if it exists, make the same motions again "
-    "and say what has changed.",
+    "(without --seconds) and say what has changed.",
 )
 @click.option(
     "--further",
@@ -160,13 +170,15 @@ def check(
     from failuretwin.app.terminal import tell
     from failuretwin.decision.test_motions.motions import write_motions
 
+    _refuse_what_does_nothing(logs, written, motions, keep)
+    before = report.kept_checks(keep) if keep is not None and keep.exists() else []
+    _check_outputs(keep, json_file, plot)
     asking = motion.checking(safety, calibration, robot, seed)
     model = asking.known.robot
     if logs:
         _check_logs(asking.of_logs(logs), model, json_file, plot)
         return
-    repeat = keep if keep is not None and keep.exists() else motions
-    planned = asking.motions(seconds, repeat)
+    planned = asking.motions(seconds, keep if before else motions)
     if written is not None:
         write_motions(planned, model, written)
         show(*report.motion_lines(planned, model), f"written to {written}; nothing was moved")
@@ -183,14 +195,40 @@ def check(
     record = report.check_record(result, model, planned.duration_s)
     show(*report.check_lines(result, model, planned.duration_s))
     if keep is not None:
-        before = report.kept_checks(keep) if keep.exists() else []
+        report.keep_check(keep, planned, [*before, record])
         show(*(report.changes(before[-1], record) if before else [f"kept in {keep}"]))
-        report.keep_check(keep, planned, record)
     if json_file is not None:
         report.write_records([record], json_file)
     if plot is not None:
         report.write_check_page([result], model, plot)
     show(*report.closing_lines(result, model))
+
+
+def _refuse_what_does_nothing(
+    logs: Sequence[Path], written: Path | None, motions: Path | None, keep: Path | None
+) -> None:
+    """Raise InputError if options were given that would do nothing beside these."""
+    if logs:
+        why = "with --log nothing is moved and nothing is kept"
+        refuse_unused(why, *DESIGN, *ARM, *MOTIONS)
+    if written is not None:
+        refuse_unused("with --write nothing is moved", *ARM, "keep", "json_file", "plot")
+    if motions is not None:
+        refuse_unused(f"{motions} says which motions are made", *DESIGN)
+    if keep is not None and keep.exists():
+        why = f"{keep} exists and says which motions are made; to make others, keep them elsewhere"
+        refuse_unused(why, "motions", *DESIGN)
+
+
+def _check_outputs(keep: Path | None, json_file: Path | None, plot: Path | None) -> None:
+    """Raise OutputError unless all that is to be written can be, before anything moves."""
+    from failuretwin.data_knowledge.store import check_fillable, check_writable
+
+    for path in (keep, json_file):
+        if path is not None:
+            check_writable(path)
+    if plot is not None:
+        check_fillable(plot)
 
 
 def _check_logs(
@@ -250,7 +288,7 @@ def design(
     type=PATH,
     required=True,
     metavar="FILE",
-    help="Motions that `design` or `check` wrote (.json, .csv), or any log or run set.",
+    help="Motions that `design` or `check` wrote (.json, .csv, .mcap, .bag), or a log or run set.",
 )
 @click.option(
     "--hypotheses",

@@ -24,6 +24,7 @@ from failuretwin.app.commands.options import (
     common_options,
     live_options,
     plugin_option,
+    refuse_unused,
 )
 from failuretwin.app.terminal import tell
 
@@ -32,6 +33,10 @@ if TYPE_CHECKING:
     from failuretwin.digital_model.nonidealities import Imperfections
     from failuretwin.digital_model.robot import Robot
     from failuretwin.failure_behavior.injection import ScheduledFault
+
+
+PROBING = ("idle", "move", "speed_share", "floor", "radius")
+"""Options of `watch` that say how it moves an arm."""
 
 
 @click.command()
@@ -103,6 +108,8 @@ def watch(
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
 
+    if not probe.probes:
+        refuse_unused("nothing is moved without --probe N", *PROBING)
     model = load_robot(robot)
     known, motors = load_calibration(calibration, model), model.motor_names
     diagnoser = monitor(known.twin, known.imperfections, budget, sensing)
@@ -228,13 +235,14 @@ def _play(target: str, live: LiveOptions, robot: str, seed: int) -> None:
     """Play a robot that moves at random."""
     from contextlib import ExitStack
 
-    from failuretwin.app.live import NETWORKS, emulated_robot, robot_sink, schedule_of
+    from failuretwin.app.emulation import emulated_faults
+    from failuretwin.app.live import NETWORKS, emulated_robot, robot_sink
     from failuretwin.connection.links.base import AS_FAST_AS_POSSIBLE, Pace
     from failuretwin.core.errors import InputError
     from failuretwin.digital_model.robot import load_robot
 
     model = load_robot(robot)
-    schedule = schedule_of(live, model)
+    schedule = emulated_faults(live.faults, model).schedule
     zero, on_ros = time.time(), target.partition("://")[0] in NETWORKS
     if not on_ros and Path(target).suffix != ".mcap":
         raise InputError(f"--to is {target!r}, expected ros1, ros2 or a file that ends in .mcap.")

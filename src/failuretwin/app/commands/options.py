@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -30,6 +31,29 @@ def gathered(kind: type, name: str, *options: Callable[[F], F]) -> Callable[[F],
         return decorated
 
     return decorate
+
+
+def refuse_unused(why: str, *names: str) -> None:
+    """Refuse options that would do nothing, where the user has given some.
+
+    Args:
+        why: Why they would do nothing, the beginning of a sentence.
+        names: Names of the parameters.
+
+    Raises:
+        InputError: If one was given.
+    """
+    from failuretwin.core.errors import InputError
+
+    context = click.get_current_context()
+    given = [
+        option.opts[0]
+        for option in context.command.params
+        if option.name in names
+        and context.get_parameter_source(option.name) is ParameterSource.COMMANDLINE
+    ]
+    if given:
+        raise InputError(f"{why}: leave out {' and '.join(given)}.")
 
 
 def common_options(command: F) -> F:
@@ -157,9 +181,10 @@ live_options = gathered(
         "--fault",
         "faults",
         multiple=True,
-        metavar="MOTOR:MODE@START-END",
-        help="A fault of an emulated robot, such as motor_3:stuck@40-80 (repaired after 80 s) or "
-        "motor_3:stuck@40. Can be given several times.",
+        metavar="MOTOR:MODE[=SIZE][@START[-END]]",
+        help="A fault of an emulated robot, such as motor_3:stuck@40-80 (repaired after 80 s), "
+        "motor_3:stuck@40, or motor_2:slow=0.5 (SIZE in the unit of its mode). Can be given "
+        "several times.",
     ),
     click.option(
         "--imperfections",

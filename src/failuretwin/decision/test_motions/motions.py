@@ -1,6 +1,7 @@
 """A sequence of test movements as a value and as a file: JSON, CSV, or a bag of commands.
 
-A check is repeated from JSON or CSV; bags are for robots that we cannot command.
+Bags are for robots that we cannot command. They say neither where the arm stands at first nor when
+all ends: read back, it stands where designs begin, and the last movement lasts as the longest does.
 """
 
 from __future__ import annotations
@@ -19,17 +20,24 @@ from failuretwin.connection.links.base import CommandSent
 from failuretwin.connection.links.commander import Order
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
+from failuretwin.data_knowledge.bags import read_targets
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision.test_motions.design import Movement
 from failuretwin.digital_model.robot import Robot
 
 STEP_S = 0.01
 """Step of a reference [s]."""
-SUFFIXES = (".json", ".csv", ".mcap", ".bag")
+BAGS = (".mcap", ".bag")
+SUFFIXES = (".json", ".csv", *BAGS)
 TABLE_RAD = 1e-5
 """Angles of a table that are nearer to each other are the same [rad]; it has six digits."""
 NEEDED = ("robot", "motors", "start_rad", "target_rad", "ramp_s", "seconds")
 """What a JSON file must hold."""
+
+
+def resting_pose(robot: Robot) -> FloatArray:
+    """Return where an arm is taken to stand that is not asked, (motor,) [rad]."""
+    return np.array([float(np.clip(0.0, *motor.movement_range)) for motor in robot.motors])
 
 
 @dataclass(frozen=True)
@@ -159,11 +167,13 @@ class Motions:
 
 
 def read_motions(path: Path, robot: Robot) -> Motions:
-    """Read motions from a JSON file, as `write_motions` or a kept check has them, or from its CSV.
+    """Read motions from a file, as `write_motions` or a kept check has them.
 
     Raises:
         InputError: If it cannot be read, or is of another robot.
     """
+    if path.suffix in BAGS:
+        return _bag_motions(path, robot)
     try:
         text = path.read_text(encoding="utf-8")
         record = _table_record(text, str(path)) if path.suffix == ".csv" else json.loads(text)
@@ -176,6 +186,8 @@ def read_motions(path: Path, robot: Robot) -> Motions:
 
 def holds_motions(path: Path, robot: Robot) -> bool:
     """Return whether a file is one that `write_motions` wrote and `read_motions` reads."""
+    if path.suffix in BAGS and path.exists():
+        return read_targets(path, robot) is not None
     if path.suffix != ".csv":
         return path.suffix == ".json"
     try:
@@ -183,6 +195,28 @@ def holds_motions(path: Path, robot: Robot) -> bool:
             return file.readline().strip().split(",") == _columns(robot.motor_names)
     except (OSError, ValueError):
         return False
+
+
+def _bag_motions(path: Path, robot: Robot) -> Motions:
+    """Return the motions of a bag of commands; see `read_motions`."""
+    if not path.exists():
+        raise InputError(f"{path}: cannot be read as motions (it does not exist).")
+    targets = read_targets(path, robot)
+    if targets is None:
+        raise InputError(
+            f"{path}: holds no motions. Expected a bag of commands alone, as `failuretwin design "
+            "--write` writes it."
+        )
+    ramp, seconds = targets.duration.max(axis=1), np.diff(targets.time)
+    record = {
+        "robot": robot.name,
+        "motors": robot.motor_names,
+        "start_rad": resting_pose(robot),
+        "target_rad": targets.target,
+        "ramp_s": ramp,
+        "seconds": np.append(seconds, max([*seconds.tolist(), ramp[-1]])),
+    }
+    return Motions.from_record(record, robot, str(path))
 
 
 def _columns(motors: Sequence[str]) -> list[str]:
@@ -227,7 +261,7 @@ def write_motions(motions: Motions, robot: Robot, path: Path) -> None:
     """
     if path.suffix not in SUFFIXES:
         raise InputError(f"{path}: ends in {path.suffix!r}, expected {', '.join(SUFFIXES)}.")
-    if path.suffix in (".mcap", ".bag"):
+    if path.suffix in BAGS:
         _write_commands(motions, robot, path)
         return
     text = json.dumps(motions.record()) + "\n" if path.suffix == ".json" else _csv(motions)

@@ -241,9 +241,12 @@ class Prober:
 
 
 def _named(believed: Believed) -> bool:
-    """Return whether one fault has nearly all of the probability that faults have."""
+    """Return whether one fault has nearly all of the probability.
+
+    An alarm is raised long before that: it costs more to miss a fault than to look.
+    """
     faults = believed.probability[[not h.is_healthy for h in believed.hypotheses]]
-    return bool(faults.max() >= NAMED * faults.sum())
+    return bool(faults.max() >= NAMED)
 
 
 def _would(order: Order | None) -> str:

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-
 from failuretwin.connection.links.commander import Commander
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
 from failuretwin.core.types import FloatArray, as_floats
@@ -22,7 +20,7 @@ from failuretwin.decision.test_motions.health_check import (
     faults_at_rest,
     result_of,
 )
-from failuretwin.decision.test_motions.motions import Motions, read_motions
+from failuretwin.decision.test_motions.motions import Motions, read_motions, resting_pose
 from failuretwin.decision.test_motions.outlook import Outlook, of_priors
 from failuretwin.digital_model.calibrated_robot import (
     CalibratedRobot,
@@ -75,8 +73,7 @@ class Checking:
     @property
     def home(self) -> FloatArray:
         """Where an arm is taken to stand that is not asked, (motor,) [rad]."""
-        motors = self.known.robot.motors
-        return np.array([float(np.clip(0.0, *motor.movement_range)) for motor in motors])
+        return resting_pose(self.known.robot)
 
     @property
     def designer(self) -> Designer:
