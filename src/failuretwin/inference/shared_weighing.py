@@ -280,12 +280,12 @@ class SharedWeighing:
             return [Candidate(0, rows, self.search(at, priors[0], self.nowhere))]
         untold = COARSE_TO_FINE[1] * self.likelihood.model.twin.robot.reach
         coarse = self.search(self.expand(rows, self.nowhere, untold), priors[-1], self.nowhere)
-        usual = [self.search(at, priors[0], start) for start in (coarse.theta, self.nowhere)]
-        found = [Candidate(0, rows, each) for each in usual]
-        start = usual[0].better(usual[1]).theta
-        for c, prior in enumerate(priors[1:], 1):
-            found.append(Candidate(c, rows, self.search(at, prior, start)))
-        return found
+        starts = (coarse.theta, self.nowhere)
+        return [
+            Candidate(c, rows, self.search(at, prior, start))
+            for c, prior in enumerate(priors)
+            for start in starts
+        ]
 
     def _here(self, at: Expansion) -> list[LocalLikelihood]:
         """Return what runs say of the hypotheses that have a score, where they are expanded."""
