@@ -41,6 +41,27 @@ def test_what_is_found_can_be_accepted(failuretwin, reversed_log, tmp_path):
     assert "3 of 3 runs right" in alone.stdout
 
 
+def test_a_tool_that_is_off_by_as_much_after_every_movement_is_no_other_robot(
+    failuretwin, simulated, tmp_path
+):
+    runs = load_run_set(simulated)
+    save_run_set(runs.assign(measured=runs["measured"] + [0.0, 0.0, 0.008]), tmp_path / "off.nc")
+    told = failuretwin("doctor", tmp_path / "off.nc").stdout
+    assert told.startswith("set-up: the sensor does not seem to stand where the profile says")
+    assert "fits the profile" not in told
+    assert "another robot" not in told
+
+
+def test_calibrate_names_the_set_up_of_logs_that_it_refuses(failuretwin, reversed_log, tmp_path):
+    healthy = load_run_set(reversed_log).isel(run=[0, 0, 0, 0])
+    healthy = healthy.assign_coords(run=[f"healthy/{i}" for i in range(4)])
+    save_run_set(healthy.drop_vars("position", errors="ignore"), tmp_path / "healthy.nc")
+    answer = failuretwin("calibrate", tmp_path / "healthy.nc", "--out", tmp_path / "own.toml")
+    assert answer.returncode == 2
+    assert "motor 2 turns the other way" in answer.stderr
+    assert not (tmp_path / "own.toml").exists()
+
+
 def test_runs_with_a_gap_are_named(failuretwin, simulated, tmp_path):
     runs = load_run_set(simulated).isel(run=[0, 2, 7]).copy(deep=True)
     runs["measured"][1, 300:450] = float("nan")  # 1.5 s

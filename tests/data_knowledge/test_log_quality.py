@@ -188,3 +188,12 @@ def test_a_noisy_sensor_that_stands_still_says_nothing_of_the_arm(clean, twin):
     assert any("the tool stands still from 4." in remark for remark in diagnosis.quality)
     assert diagnosis.diagnosis in ("healthy", None) or diagnosis.probability < 0.9
     assert not any("movement 5" in line for line in diagnosis.explanation)
+
+
+def test_milliseconds_taken_for_seconds_are_named(clean, twin):
+    slow = clean.assign_coords(time=clean["time"] * 1000.0)
+    (found,) = log_quality(slow)
+    assert "times seem to be in milliseconds, expected seconds" in found.fatal
+    assert not log_quality(clean)[0].fatal
+    (told,) = BayesDiagnoser(twin, "armpi_fpv").diagnose(slow)
+    assert "milliseconds" in told.undecided

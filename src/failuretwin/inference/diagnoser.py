@@ -168,7 +168,7 @@ class BayesDiagnoser:
         for first in range(0, len(names), chunk):
             rows = slice(first, first + chunk)
             says = [one.posterior(rows, way) for one, way in zip(seen, moving, strict=True)]
-            posterior_of_runs = mixed(says, set_ups)
+            posterior_of_runs = mixed(says, set_ups, seen[0].rounding())
             for at in range(len(names))[rows]:
                 results.append(
                     posterior_of_runs.to_diagnosis(at - first, names[at], quality[at], truth[at])

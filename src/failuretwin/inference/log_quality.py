@@ -27,6 +27,9 @@ GAP_S = 0.5
 """A longer silence is a gap [s], whatever the rate."""
 CLOCK_JUMP_S = 5.0
 """A longer silence is more likely a jump of the clock [s]; stalls of the bus last up to 4 s."""
+SPARSE_S, FEW_READINGS = 10.0, 20
+"""Readings that come so far apart [s], more than a few, show nothing of an arm; milliseconds taken
+for seconds do."""
 LEAST_RATE_HZ = 2.0
 """Slower readings can miss a plateau of a second [Hz]."""
 GLITCH_M = 0.03
@@ -182,6 +185,12 @@ def _quality(
     seen = np.asarray(np.isfinite(measured).all(axis=1))
     if seen.sum() < 2:
         return LogQuality(fatal="the log holds no readings of the tool")
+    apart = float(np.median(np.diff(time[seen])))
+    if apart > SPARSE_S and seen.sum() > FEW_READINGS:
+        return LogQuality(
+            fatal=f"readings come {apart:.3g} s apart: times seem to be in milliseconds, expected "
+            "seconds"
+        )
     remarks = [
         *_partial_readings(time, measured, seen),
         *_timing(time[seen], rate),

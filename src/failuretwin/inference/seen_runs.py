@@ -88,12 +88,13 @@ class SeenRuns:
         readings = self.evidence.readings
         return tool_rounding(readings.point[readings.seen], self.model)
 
-    def rounding(self) -> list[str]:
-        """Return what is to be said of how coarsely the runs were written down, a line each."""
+    @cached_property
+    def command_rounding(self) -> tuple[Rounding | None, float]:
+        """How coarsely the log alone rounded commands, and how surely; None: it did not."""
         evidence = self.sample.evidence
         command = command_rounding(evidence.movements.target[evidence.usable], self.model)
-        if command is None:
-            return told_of(self.tool_rounding, None, 0.0)
+        if command is None or not self.model.sensors.tool_alone:
+            return None, 0.0
         few = SetUpWeighing(self.sample, self.hypotheses, self.priors).few
         coarse = replace(few.likelihood, model=rounded(self.healthy, None, command))
         says = [
@@ -101,7 +102,11 @@ class SeenRuns:
             for one in (few, SetUpWeighing(coarse, self.hypotheses, self.priors))
         ]
         share = float(np.exp(-np.logaddexp(0.0, says[0] - says[1])))
-        return told_of(self.tool_rounding, command if share > SURE else None, share)
+        return (command if share > SURE else None), share
+
+    def rounding(self) -> list[str]:
+        """Return what is to be said of how coarsely the runs were written down, a line each."""
+        return told_of(self.tool_rounding, *self.command_rounding)
 
     @cached_property
     def sample(self) -> RunLikelihood:
@@ -164,7 +169,8 @@ class SeenRuns:
             moving: Readings on the way of all runs; None: they are left aside.
         """
         way = None if moving is None else moving[rows]
-        likelihood = RunLikelihood(self.evidence.sound.settled[rows], self.healthy, way)
+        model = rounded(self.healthy, None, self.command_rounding[0])
+        likelihood = RunLikelihood(self.evidence.sound.settled[rows], model, way)
         return shared_posterior(likelihood, self.hypotheses, self.priors, self.in_doubt)
 
     def elsewhere(self) -> str:
@@ -177,7 +183,9 @@ class SeenRuns:
         return said[-1].replace(ALLOWED_FOR, "")
 
 
-def mixed(posteriors: Sequence[Posterior], set_ups: SetUpPosterior) -> Posterior:
+def mixed(
+    posteriors: Sequence[Posterior], set_ups: SetUpPosterior, rounding: Sequence[str] = ()
+) -> Posterior:
     """Return the posterior of runs whose set-up is believed to be one of several.
 
     Sizes and onsets are those behind the most probable set-up.
@@ -185,6 +193,7 @@ def mixed(posteriors: Sequence[Posterior], set_ups: SetUpPosterior) -> Posterior
     Args:
         posteriors: Of the same runs behind each.
         set_ups: What is believed of the set-up.
+        rounding: What is to be said of how coarsely the runs were written down.
     """
     likeliest, weight = posteriors[0], np.log(set_ups.probability)
     if len(posteriors) > 1:
@@ -194,8 +203,8 @@ def mixed(posteriors: Sequence[Posterior], set_ups: SetUpPosterior) -> Posterior
     if set_ups.fits and set_ups.wrong >= SURE:
         remark = f"{remark}; judged with that undone"
     known = likeliest.set_up or [""] * count
-    if remark:
-        said = ["; ".join(filter(None, (remark, one))) for one in known]
+    if remark or rounding:
+        said = ["; ".join(filter(None, (remark, *rounding, one))) for one in known]
         likeliest = replace(likeliest, set_up=said)
     if set_ups.fits:
         return likeliest

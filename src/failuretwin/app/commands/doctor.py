@@ -66,20 +66,24 @@ def doctor(
     runs = read_inputs(logs, model, reading)
     seen = BayesDiagnoser(known.twin, known.imperfections).seen(runs)
     set_ups = seen.set_ups()
-    for line in (_set_up_line(set_ups), *_log_lines(seen, set_ups)):
+    elsewhere = seen.under(set_ups.best.set_up.correction).elsewhere() if set_ups.fits else ""
+    for line in (_set_up_line(set_ups, elsewhere), *_log_lines(seen, set_ups, bool(elsewhere))):
         tell(line)
     if out is not None:
         _write(set_ups, reading.columns, out)
 
 
-def _set_up_line(set_ups: SetUpPosterior) -> str:
+def _set_up_line(set_ups: SetUpPosterior, elsewhere: str) -> str:
     from failuretwin.inference.seen_runs import set_up_finding
 
-    return f"set-up: {set_up_finding(set_ups) or 'the log fits the profile'}"
+    return f"set-up: {set_up_finding(set_ups) or elsewhere or 'the log fits the profile'}"
 
 
-def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior) -> list[str]:
-    """Return what the logs hold, and what is wrong with them."""
+def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior, elsewhere: bool) -> list[str]:
+    """Return what the logs hold, and what is wrong with them.
+
+    Where the sensor stands elsewhere it is not asked whether the calibration is of another robot.
+    """
     from failuretwin.core.errors import counted
     from failuretwin.core.runs import measured_rate
     from failuretwin.inference.calibration_fit import calibration_told, fits_this_robot
@@ -90,7 +94,7 @@ def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior) -> list[str]:
         f"the tool is seen at rest, {measured_rate(seen.runs):.3g} readings a second"
     ]
     undone = seen.under(set_ups.best.set_up.correction)
-    fits = fits_this_robot(undone) if set_ups.fits else None
+    fits = fits_this_robot(undone) if set_ups.fits and not elsewhere else None
     if fits is not None:
         lines.insert(0, f"set-up: {calibration_told(undone.model.imperfections.name, fits)}")
     lines += [f"log: {line}" for line in undone.rounding()]

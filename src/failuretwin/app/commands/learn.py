@@ -66,6 +66,7 @@ def calibrate(
     from failuretwin.connection.calibration import step_parameters
     from failuretwin.connection.calibration.calibrate import calibrate as learn
     from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
+    from failuretwin.core.errors import InputError
     from failuretwin.digital_model.robot import load_robot
 
     check_calibration_file(out)
@@ -79,9 +80,14 @@ def calibrate(
     model = steps.robot
     runs = read_inputs(others, model, reading)
     source = ", ".join(str(log) for log in logs)
-    found = learn(runs, model, name or out.stem, source, hold_out)
+    wrong = _wrong_set_up(runs, model)
+    try:
+        found = learn(runs, model, name or out.stem, source, hold_out)
+    except InputError as error:
+        raise InputError(f"{wrong} {error}" if wrong else str(error)) from error
     found = step_parameters.with_step_tests(found, steps)
-    _tell_set_up(runs, model)
+    if wrong:
+        tell(f"warning: {wrong}", err=True)
     if report is not None:
         from failuretwin.app.calibration_report import write_calibration_page
         from failuretwin.data_knowledge.store import filling
@@ -95,19 +101,22 @@ def calibrate(
         tell(f"use it with `failuretwin diagnose --calibration {out}`")
 
 
-def _tell_set_up(runs: xr.Dataset, robot: Robot) -> None:
-    """Tell where logs do not fit the profile: a calibration would learn that as the robot."""
+def _wrong_set_up(runs: xr.Dataset, robot: Robot) -> str:
+    """Return where logs do not fit the profile, which a calibration would learn as the robot.
+
+    Small zeros are left to it: that is what a calibration is for.
+    """
     from failuretwin.inference.diagnoser import BayesDiagnoser
     from failuretwin.inference.seen_runs import set_up_remark
 
     set_ups = BayesDiagnoser(robot).seen(runs).set_ups()
     remark = set_up_remark(set_ups)
-    if remark and set_ups.best.set_up.kind != "zero":  # that is what a calibration is for
-        tell(
-            f"warning: {remark}; what was learned here is not. Put it right first: `failuretwin "
-            "doctor LOG --out MAP.toml`",
-            err=True,
-        )
+    if not remark or set_ups.best.set_up.kind == "zero":
+        return ""
+    return (
+        f"{remark}; what is learned of such logs is not the robot. Put it right first: "
+        "`failuretwin doctor LOG --out MAP.toml`."
+    )
 
 
 def _pool(calibrations: tuple[Path, ...], out: Path, name: str | None, robot: str) -> None:
