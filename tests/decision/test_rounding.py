@@ -72,7 +72,7 @@ def test_commands_that_the_log_rounded_are_told_from_whole_ones(twin, runs):
     assert all(any(line in remark for remark in d.quality) for d in diagnoses)
     likelihood = rounded.posterior(slice(None), None).likelihood
     off = step / np.sqrt(12.0)
-    known = np.array(BayesDiagnoser(twin).healthy_model.scatter)
+    known = np.array(rounded.healthy.settling.scatter)
     np.testing.assert_allclose(likelihood.model.settling.scatter, np.hypot(known, off), rtol=1e-9)
     found, told = (
         find_movements(one["command"].values, runs["time"].values)
