@@ -52,6 +52,15 @@ def test_a_tool_that_is_off_by_as_much_after_every_movement_is_no_other_robot(
     assert "another robot" not in told
 
 
+def test_a_log_without_a_verdict_does_not_fit(failuretwin, simulated, tmp_path):
+    runs = load_run_set(simulated).isel(run=[0, 2])
+    save_run_set(runs.assign_coords(time=runs["time"] * 1000.0), tmp_path / "ms.nc")
+    told = failuretwin("doctor", tmp_path / "ms.nc").stdout
+    assert told.startswith("set-up: cannot tell, because readings come")
+    assert "milliseconds" in told.splitlines()[0]
+    assert "fits the profile" not in told
+
+
 def test_calibrate_names_the_set_up_of_logs_that_it_refuses(failuretwin, reversed_log, tmp_path):
     healthy = load_run_set(reversed_log).isel(run=[0, 0, 0, 0])
     healthy = healthy.assign_coords(run=[f"healthy/{i}" for i in range(4)])

@@ -66,23 +66,34 @@ def doctor(
     runs = read_inputs(logs, model, reading)
     seen = BayesDiagnoser(known.twin, known.imperfections).seen(runs)
     set_ups = seen.set_ups()
-    elsewhere = seen.under(set_ups.best.set_up.correction).elsewhere() if set_ups.fits else ""
-    for line in (_set_up_line(set_ups, elsewhere), *_log_lines(seen, set_ups, bool(elsewhere))):
+    unfit = _unfit(seen, set_ups)
+    for line in (_set_up_line(set_ups, unfit), *_log_lines(seen, set_ups, bool(unfit))):
         tell(line)
     if out is not None:
         _write(set_ups, reading.columns, out)
 
 
-def _set_up_line(set_ups: SetUpPosterior, elsewhere: str) -> str:
+def _unfit(seen: SeenRuns, set_ups: SetUpPosterior) -> str:
+    """Return what else keeps the log from fitting; empty if nothing does.
+
+    No run of it allows a verdict, or the sensor stands a little elsewhere.
+    """
+    fatal = [quality.fatal for quality in seen.evidence.quality]
+    if all(fatal):
+        return f"cannot tell, because {fatal[0]}"
+    return seen.under(set_ups.best.set_up.correction).elsewhere() if set_ups.fits else ""
+
+
+def _set_up_line(set_ups: SetUpPosterior, unfit: str) -> str:
     from failuretwin.inference.seen_runs import set_up_finding
 
-    return f"set-up: {set_up_finding(set_ups) or elsewhere or 'the log fits the profile'}"
+    return f"set-up: {set_up_finding(set_ups) or unfit or 'the log fits the profile'}"
 
 
-def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior, elsewhere: bool) -> list[str]:
+def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior, unfit: bool) -> list[str]:
     """Return what the logs hold, and what is wrong with them.
 
-    Where the sensor stands elsewhere it is not asked whether the calibration is of another robot.
+    Of a log that does not fit it is not asked whether the calibration is of another robot.
     """
     from failuretwin.core.errors import counted
     from failuretwin.core.runs import measured_rate
@@ -94,7 +105,7 @@ def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior, elsewhere: bool) -> list
         f"the tool is seen at rest, {measured_rate(seen.runs):.3g} readings a second"
     ]
     undone = seen.under(set_ups.best.set_up.correction)
-    fits = fits_this_robot(undone) if set_ups.fits and not elsewhere else None
+    fits = fits_this_robot(undone) if set_ups.fits and not unfit else None
     if fits is not None:
         lines.insert(0, f"set-up: {calibration_told(undone.model.imperfections.name, fits)}")
     lines += [f"log: {line}" for line in undone.rounding()]
