@@ -169,8 +169,7 @@ class SeenRuns:
             moving: Readings on the way of all runs; None: they are left aside.
         """
         way = None if moving is None else moving[rows]
-        model = rounded(self.healthy, None, self.command_rounding[0])
-        likelihood = RunLikelihood(self.evidence.sound.settled[rows], model, way)
+        likelihood = RunLikelihood(self.evidence.sound.settled[rows], self.healthy, way)
         return shared_posterior(likelihood, self.hypotheses, self.priors, self.in_doubt)
 
     def elsewhere(self) -> str:
