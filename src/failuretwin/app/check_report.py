@@ -65,8 +65,11 @@ def write_check_page(results: Sequence[CheckResult], robot: Robot, folder: Path)
         folder: Where `index.html` goes.
     """
     diagnoses = [result.diagnosis for result in results]
-    tables = [motor_table(result, robot) for result in results] if len(results) == 1 else []
-    measured = [Section("What the check measured", tables=tables)] if tables else []
+    measured = [
+        Section("What the check measured", tables=[motor_table(result, robot)])
+        for result in results
+        if len(results) == 1
+    ]
     with filling(folder) as partial:
         state = robot_state(diagnoses, robot)
         write_page(diagnoses, state, robot, partial / "index.html", sections=measured)

@@ -18,8 +18,9 @@ from failuretwin.app.commands.advise import advise
 from failuretwin.app.commands.check import check, design, isolability
 from failuretwin.app.commands.data import import_, robot, simulate
 from failuretwin.app.commands.demo import demo
-from failuretwin.app.commands.diagnose import diagnose, evaluate
+from failuretwin.app.commands.diagnose import diagnose
 from failuretwin.app.commands.doctor import doctor
+from failuretwin.app.commands.evaluate import evaluate
 from failuretwin.app.commands.learn import calibrate, study, train
 from failuretwin.app.commands.live import emulate, watch
 from failuretwin.app.commands.reach import reach

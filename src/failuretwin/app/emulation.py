@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from failuretwin.core.errors import InputError
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
@@ -49,7 +47,7 @@ def emulated_faults(texts: Sequence[str], robot: Robot) -> EmulatedFaults:
         InputError: If one cannot be read, its mode has no size to choose, or two sizes.
     """
     schedule, modes, sizes = [], dict(MODES), dict[str, float]()
-    start = [float(np.clip(0.0, *motor.movement_range)) for motor in robot.motors]
+    start = robot.resting_pose.tolist()
     for text in texts:
         name, _, when = text.partition("@")
         kind, _, size = name.partition("=")

@@ -260,6 +260,11 @@ class Robot:
         return unit.replace("rad", "m", 1) if slides else unit
 
     @cached_property
+    def resting_pose(self) -> FloatArray:
+        """Where an arm stands that is not asked, taken as near 0 as it moves, (motor,) [rad]."""
+        return np.array([float(np.clip(0.0, *motor.movement_range)) for motor in self.motors])
+
+    @cached_property
     def idle_axes(self) -> tuple[bool, bool, bool]:
         """Axes of the tool's position along which no motor moves it."""
         return idle_axes(self.chain)

@@ -142,7 +142,7 @@ _TOLD_UNITS = {
 
 
 OPEN_ONSET_S = 0.6
-"""Width of the 90 % interval of an onset from which it is told [s]."""
+"""Width of the 90 % interval of an onset from which it is told [s]; assumed."""
 
 
 def _size_and_onset(diagnosis: Diagnosis, hypothesis: Hypothesis) -> str:

@@ -84,7 +84,9 @@ def calibrate(
     try:
         found = learn(runs, model, name or out.stem, source, hold_out)
     except InputError as error:
-        raise InputError(f"{wrong} {error}" if wrong else str(error)) from error
+        if not wrong:
+            raise
+        raise InputError(f"{wrong} {error}") from error
     found = step_parameters.with_step_tests(found, steps)
     if wrong:
         tell(f"warning: {wrong}", err=True)

@@ -35,11 +35,6 @@ NEEDED = ("robot", "motors", "start_rad", "target_rad", "ramp_s", "seconds")
 """What a JSON file must hold."""
 
 
-def resting_pose(robot: Robot) -> FloatArray:
-    """Return where an arm is taken to stand that is not asked, (motor,) [rad]."""
-    return np.array([float(np.clip(0.0, *motor.movement_range)) for motor in robot.motors])
-
-
 @dataclass(frozen=True)
 class Motions:
     """Movements of a robot, one after the other.
@@ -211,7 +206,7 @@ def _bag_motions(path: Path, robot: Robot) -> Motions:
     record = {
         "robot": robot.name,
         "motors": robot.motor_names,
-        "start_rad": resting_pose(robot),
+        "start_rad": robot.resting_pose,
         "target_rad": targets.target,
         "ramp_s": ramp,
         "seconds": np.append(seconds, max([*seconds.tolist(), ramp[-1]])),

@@ -20,7 +20,7 @@ from failuretwin.decision.test_motions.health_check import (
     faults_at_rest,
     result_of,
 )
-from failuretwin.decision.test_motions.motions import Motions, read_motions, resting_pose
+from failuretwin.decision.test_motions.motions import Motions, read_motions
 from failuretwin.decision.test_motions.outlook import Outlook, of_priors
 from failuretwin.digital_model.calibrated_robot import (
     CalibratedRobot,
@@ -73,7 +73,7 @@ class Checking:
     @property
     def home(self) -> FloatArray:
         """Where an arm is taken to stand that is not asked, (motor,) [rad]."""
-        return resting_pose(self.known.robot)
+        return self.known.robot.resting_pose
 
     @property
     def designer(self) -> Designer:
