@@ -373,15 +373,47 @@ def test_trouble_with_the_link_is_told(armpi):
     assert [c.text for c in changes.notice(still, counts, 1, ())] == ["over: disk full"]
 
 
-def test_stamps_that_leap_without_end_are_told_now_and_then(armpi):
+def test_stamps_that_leap_without_end_are_told_ever_more_seldom(armpi):
     changes = Changes(armpi.motor_names)
-    told = [changes.notice(moment(float(k), OK, None), LinkCounts(), k, ()) for k in range(25)]
+    told = [changes.notice(moment(float(k), OK, None), LinkCounts(), k, ()) for k in range(70)]
     texts = [(c.stream_time, c.text) for found in told for c in found]
     assert texts == [
         (1.0, "the robot's clock jumped; going on by our own"),
         (11.0, "the robot's clock jumped, 11 times so far; going on by our own"),
-        (21.0, "the robot's clock jumped, 21 times so far; going on by our own"),
+        (31.0, "the robot's clock jumped, 31 times so far; going on by our own"),
     ]
+
+
+def test_a_reason_is_told_anew_only_where_it_is_another(armpi):
+    """More or less sure of the same is no news; a verdict after it is."""
+    said = "the log does not fit the profile ({} sure): motor 2 turns the other way"
+    reasons = [said.format(sure) for sure in ("97.1 %", "over 99.9 %")]
+    moments = [moment(0.0, OK, HEALTHY)]
+    moments += [
+        moment(1.0 + k, OK, Diagnosis("live", {"healthy": 1.0}, undecided=reason))
+        for k, reason in enumerate([*reasons, "no motor is told to move"])
+    ]
+    assert lines(Changes(armpi.motor_names), [*moments, moment(9.0, OK, HEALTHY)]) == [
+        "healthy, 99 % sure",
+        f"undecided: {reasons[0]}",
+        "undecided: no motor is told to move",
+        "healthy, 99 % sure",
+    ]
+
+
+@pytest.mark.parametrize("stamp", [0.0, 4.0e9, -1.0])
+def test_a_third_of_senseless_stamps_does_not_move_the_stream(twin, clock, stamp):
+    """Such a reading counts when it comes; they are counted."""
+    notebook, script = Notebook(), Script([])
+    shadow = Shadow(script, notebook, twin)
+    senseless = np.append(False, np.random.default_rng(0).random(599) < 0.3)
+    for k, bad in enumerate(senseless):
+        script.events.append(reading(stamp if bad else 1.7e9 + 0.1 * k))
+        shadow.step(0.0)
+        clock[0] += 0.1
+    np.testing.assert_allclose([t for t, _, _ in notebook.told], 0.1 * np.arange(600), atol=1e-6)
+    assert shadow.clock_jumps == 0
+    assert shadow.senseless_stamps == senseless.sum()
 
 
 def test_the_posterior_over_time_goes_by_the_robots_clock(armpi):

@@ -318,9 +318,10 @@ def test_what_a_terminal_acts_on_is_written_out(text, shown):
 
 @pytest.mark.parametrize("text", ["=cmd|' /C calc'!A0", "+1", "-1", "@x", "\tx", "\rx"])
 def test_text_like_a_formula_is_quoted_in_cells(text):
-    assert as_cell(text) == f"'{text}"
+    assert as_cell(text) == f"'{printable(text)}"
     assert as_cell(-1.5) == -1.5
     assert as_cell("motor_1=") == "motor_1="
+    assert as_cell("a\x1b[31mb") == "a\\x1b[31mb"
 
 
 def test_names_of_runs_are_quoted_in_csv(runs, tmp_path):

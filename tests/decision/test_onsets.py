@@ -61,7 +61,7 @@ def test_onsets_are_spread_as_their_prior_says(parts, early):
         (1.0 - early) * total / 2.0, abs=1e-6 + 1e-9 * total
     )
     assert onset.min() >= 0.0
-    assert onset.max() <= total
+    assert onset.max() <= total * (1.0 + 1e-12)  # sum rounds otherwise from Python 3.12 on
 
 
 def test_a_run_has_the_onsets_that_it_has_among_longer_ones():

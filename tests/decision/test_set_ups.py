@@ -244,6 +244,52 @@ def test_a_zero_far_off_what_such_robots_do_is_told_of_one_run(twin, armpi, know
     assert ("zero mark" in state.step) == (off_rad > 0.0)
 
 
+@pytest.mark.parametrize("motor", [0, 1, 2, 3])
+@pytest.mark.parametrize("off_deg", [3.0, -5.0, 10.0])
+def test_of_one_run_a_zero_is_never_surely_a_motor(armpi, known, motor, off_deg):
+    """A fault of every movement and a zero show the same: the prior alone tells them apart."""
+    runs = simulate(Plan(armpi, ["healthy"], 3, 11, known, RandomMovements(count=5)))
+    wrong = replace(NONE, z=np.deg2rad(off_deg) * I4[motor]).runs(runs)
+    for run in range(3):
+        (found,) = BayesDiagnoser("armpi_fpv").diagnose(wrong.isel(run=[run]))
+        name, size = max(found.posterior.items(), key=lambda item: item[1])
+        assert name == "healthy" or size < 0.9
+        assert size < 0.6 or any(f"motor {motor + 1} stands" in line for line in found.quality)
+
+
+@pytest.mark.parametrize("truth", ["motor_1:stuck", "motor_2:steady_state_error"])
+def test_of_one_run_a_fault_does_not_hide_a_zero(armpi, known, truth):
+    """From the fault on no single motor explains the movements."""
+    runs = simulate(Plan(armpi, [truth], 2, 5, known, RandomMovements(count=5)))
+    wrong = replace(NONE, z=np.deg2rad(8.0) * I4[2]).runs(runs)
+    for run in range(2):
+        (found,) = BayesDiagnoser("armpi_fpv").diagnose(wrong.isel(run=[run]))
+        other = {name: p for name, p in found.posterior.items() if name != truth}
+        assert max(other.values()) < 0.9
+        assert any("motor 3 stands" in line for line in found.quality)
+
+
+def test_errors_that_are_drawn_anew_are_no_zero(armpi, known):
+    """Nothing is lost of what only a fault does."""
+    truth = "motor_3:steady_state_error"
+    runs = simulate(Plan(armpi, [truth], 12, 7, known, RandomMovements(count=5)))
+    found = [BayesDiagnoser("armpi_fpv").diagnose(runs.isel(run=[run]))[0] for run in range(12)]
+    assert np.mean([one.posterior[truth] for one in found]) > 0.93
+    assert sum(bool(remarks(one)) for one in found) <= 2
+
+
+def test_what_is_weighed_twice_fits_as_it_fits_best():
+    """As it was told, and with a sensor that may stand elsewhere."""
+    told = SetUp("", "", NONE)
+    twice = [
+        WeighedSetUp(told, np.array([-4.0]), 0.31),
+        WeighedSetUp(told, np.array([-5.0]), 0.1, moved=True),
+    ]
+    found = SetUpPosterior.of(twice)
+    assert found.fits
+    assert [one.log_joint for one in found.found] == [-4.0]
+
+
 def test_a_log_of_another_world_gets_no_motor(twin, runs):
     """Tool positions that have nothing to do with the commands: no set-up, and no motor either."""
     strange = runs.assign(measured=(runs["measured"].dims, np.roll(runs["measured"].values, 1, 0)))

@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -21,7 +21,14 @@ from failuretwin.app.emulation import emulation_of
 from failuretwin.app.live_view import View
 from failuretwin.app.shadow import SILENCE_S, Changes, Shadow
 from failuretwin.app.terminal import tell
-from failuretwin.connection.links.base import Event, Pace, Sink, Source, source_from_text
+from failuretwin.connection.links.base import (
+    Event,
+    LinkCounts,
+    Pace,
+    Sink,
+    Source,
+    source_from_text,
+)
 from failuretwin.connection.links.ros_messages import RosTopics, load_topics
 from failuretwin.core.errors import InputError, counted
 from failuretwin.data_knowledge.bag_messages import BagTopics
@@ -217,7 +224,8 @@ class _Screen:
         shadow, changes, monitor = self.shadow, self.changes, self.monitor
         troubles = _troubles(shadow, self.source, self.sinks, time.monotonic() - self._begun_s)
         troubles += () if monitor is None else _misfit(monitor.fit)
-        found = changes.notice(shadow.snapshot, self.source.counts, shadow.clock_jumps, troubles)
+        counts = _with_stamps(self.source.counts, shadow.senseless_stamps)
+        found = changes.notice(shadow.snapshot, counts, shadow.clock_jumps, troubles)
         if monitor is not None and monitor.set_up is not None and not self._looked:
             self._looked = True
             found.append(changes.add(shadow.snapshot.stream_time, fit_of(monitor)))
@@ -269,6 +277,14 @@ def watch_until_end(
             if going and prober is not None and prober.due:
                 prober.ask(screen.hear, screen.say)
     return screen.changes
+
+
+def _with_stamps(counts: LinkCounts, senseless: int) -> LinkCounts:
+    """Return what a link has seen, with stamps that make no sense among what makes none."""
+    if not senseless:
+        return counts
+    last = counts.last_garbage or "stamps that leap; such events count when they come"
+    return replace(counts, garbage=counts.garbage + senseless, last_garbage=last)
 
 
 def _misfit(fit: Fit) -> tuple[str, ...]:

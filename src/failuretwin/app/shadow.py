@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -91,6 +92,11 @@ class Shadow:
     def clock_jumps(self) -> int:
         """How often the robot's clock was set while it ran."""
         return self._clock.jumps
+
+    @property
+    def senseless_stamps(self) -> int:
+        """Events whose stamps made no sense, so that they count when they came."""
+        return self._clock.senseless
 
     @property
     def late_s(self) -> float:
@@ -207,8 +213,27 @@ def _with_doubt(answer: Answer) -> Answer:
 
 KEPT = 1000
 """Changes that are remembered; the recording holds all of them."""
-GARBAGE_EVERY_S = 10.0
-"""Time between two reports of messages that make no sense, and of stamps that leap [s]."""
+GARBAGE_AFTER_S, GARBAGE_EVERY_S = 10.0, 3600.0
+"""Time between the first two reports of messages that make no sense, or of stamps that leap; it
+doubles with each, up to the second [s]."""
+
+
+SURENESS = re.compile(r" \([^()]*%[^()]*\)")
+"""How surely something is said, which changes while what is said does not."""
+
+
+class _NowAndThen:
+    """Says when to report again what goes on without end."""
+
+    def __init__(self) -> None:
+        self._due_s, self._wait_s = -np.inf, GARBAGE_AFTER_S
+
+    def due(self, at: float) -> bool:
+        """Return whether to report at a time of the stream [s]; then it is taken to be done."""
+        if at < self._due_s:
+            return False
+        self._due_s, self._wait_s = at + self._wait_s, min(2.0 * self._wait_s, GARBAGE_EVERY_S)
+        return True
 
 
 def _over(episode: Episode | None) -> str:
@@ -243,7 +268,7 @@ class Changes:
         self._troubles: tuple[str, ...] = ()
         self._counts = LinkCounts()
         self._jumps = 0
-        self._garbage_at = self._jump_at = -GARBAGE_EVERY_S
+        self._of_garbage, self._of_jumps = _NowAndThen(), _NowAndThen()
 
     def notice(
         self, snapshot: Snapshot, counts: LinkCounts, jumps: int, troubles: tuple[str, ...]
@@ -274,15 +299,17 @@ class Changes:
             return []
         undecided, self._undecided = self._undecided, answer.diagnosis.undecided
         if self._undecided:
-            return [] if self._undecided == undecided else [f"undecided: {self._undecided}"]
+            same = SURENESS.sub("", self._undecided) == SURENESS.sub("", undecided)
+            return [] if same else [f"undecided: {self._undecided}"]
         before, self._alarm = self._alarm, answer.alarm
-        if before is not None and (before.state, before.cause) == (
+        same = before is not None and (before.state, before.cause) == (
             self._alarm.state,
             self._alarm.cause,
-        ):
+        )
+        if same and not undecided:
             return []
         message = statuses(answer, self._motors)[0].message
-        if before is None or self._alarm.state in (SUSPECTED, RAISED):
+        if same or before is None or self._alarm.state in (SUSPECTED, RAISED):
             return [message]
         if before.state == SUSPECTED:
             return [f"no longer suspected: {message}"]
@@ -296,13 +323,12 @@ class Changes:
             texts.append("the link is back")
         if counts.dropped > before.dropped:
             texts.append(f"{counts.dropped} events dropped so far: this computer is too slow")
-        if jumps > self._jumps and at >= self._jump_at + GARBAGE_EVERY_S:
-            self._jump_at, self._jumps = at, jumps
+        if jumps > self._jumps and self._of_jumps.due(at):
+            self._jumps = jumps
             often = f", {jumps} times so far" if jumps > 1 else ""
             texts.append(f"the robot's clock jumped{often}; going on by our own")
         garbage = before.garbage
-        if counts.garbage > garbage and at >= self._garbage_at + GARBAGE_EVERY_S:
-            self._garbage_at = at
+        if counts.garbage > garbage and self._of_garbage.due(at):
             garbage = counts.garbage
             texts.append(f"{garbage} messages made no sense so far: {counts.last_garbage}")
         texts += [trouble for trouble in troubles if trouble not in self._troubles]

@@ -186,5 +186,10 @@ def _shown(letter: str) -> str:
 
 
 def as_cell(value: object) -> object:
-    """Return what goes into a cell of a CSV file: text that looks like a formula gets a ``'``."""
-    return f"'{value}" if isinstance(value, str) and value.startswith(FORMULA) else value
+    """Return what goes into a cell of a CSV file.
+
+    Text becomes `printable`; where it looks like a formula it gets a ``'``.
+    """
+    if not isinstance(value, str):
+        return value
+    return f"'{printable(value)}" if value.startswith(FORMULA) else printable(value)

@@ -45,9 +45,20 @@ FAR = 0.08
 """A frame that moves the tool by less than this share of the reach is a matter of registration."""
 CHOICE_NATS = 12.0
 """What seven numbers of a registration, chosen anew for each run, cost of its evidence [nats]."""
-EXPLAINED, CLUSTER, LEAST_AGREEING, AGREEING = 25.0, 3.0, 2, 0.2
-"""A zero is weighed where so many movements, and such a share, agree on it within so many
-deviations, and it is further off: only movements count that one motor explains, by D0^2."""
+EXPLAINED, CLUSTER, OFF, AGREEING = 25.0, 3.0, 2.0, 0.2
+"""A zero is weighed where such a share of the movements agrees on it within `CLUSTER` deviations,
+and it is off by `OFF`: only movements count that one motor explains, by D0^2."""
+RIGHT = 2
+"""Movements of a run in which a motor stands right show that its zero is."""
+ZEROS_RAD = tuple(np.deg2rad([z for z in range(-15, 16) if z]).tolist())
+"""Zeros that are tried where nothing explains the runs: most that are off are so by less, and one
+beside a fault is not what movements agree on."""
+HOPELESS_NATS = 12.0
+"""A zero that is so much less probable than the set-up as told is not looked at more closely."""
+DOUBT, MAY_BE = 1.0 / 9.0, 0.03
+"""A zero that is probable by this second share where set-ups are as likely wrong as right is never
+less probable than the first: five movements off by the same angle are what a fault and a zero both
+show, and only the prior tells them apart."""
 ROUNDS = 2
 """Newton steps to the zero that explains the runs best."""
 CHUNK_RUNS = 64
@@ -239,8 +250,27 @@ class SetUpWeighing:
         if not told[0].fits:
             told = self.weigh([self.as_told], everything=True)
         if told[0].fits and not thorough:
-            return SetUpPosterior.of([*told, *self.zeros(self.as_told)])
+            return self.believed([*told, *self.zeros(self.as_told, told[0].log_joint)])
         return self.few.searched()
+
+    def believed(self, weighed: Sequence[WeighedSetUp]) -> SetUpPosterior:
+        """Return the posterior over set-ups, a zero that may well be no less probable than `DOUBT`.
+
+        Whoever believes that a set-up is as likely wrong as right may believe in it; then it is a
+        matter of the prior alone, which must not make anybody sure of a fault.
+        """
+        told = next(one for one in weighed if not one.set_up.what)
+        least = told.log_joint + float(log_of(DOUBT / (1.0 - DOUBT)))
+        even = float(log_of(1.0 - self.rate)) - self.log_rate
+        found = []
+        for one in weighed:
+            lacks = least - one.log_joint
+            may_be = one.log_joint + even - told.log_joint > np.log(MAY_BE / (1.0 - MAY_BE))
+            if one.set_up.kind == "zero" and may_be and lacks > 0.0:
+                set_up = replace(one.set_up, log_prior=one.set_up.log_prior + lacks)
+                one = replace(one, set_up=set_up)
+            found.append(one)
+        return SetUpPosterior.of(found)
 
     def taken_as_told(self) -> SetUpPosterior:
         """Return the belief that nothing is wrong, whatever the runs say."""
@@ -263,22 +293,20 @@ class SetUpWeighing:
         a mistake with such a sensor, until something explains the runs.
         """
         single = self.options(self.as_told)
-        found = [
-            *self.weigh([self.as_told], everything=True),
-            *self.weigh(single),
-            *self.zeros(self.as_told),
-        ]
+        told = self.weigh([self.as_told], everything=True)[0]
+        zeros = self.zeros(self.as_told, told.log_joint, ZEROS_RAD)
+        found = [told, *self.weigh(single), *zeros]
         fitting = any(one.fits for one in found)
         found.append(self.weigh_moved(self.as_told))
         if fitting or found[-1].fits:
-            return SetUpPosterior.of(found)
+            return self.believed(found)
         likely = self.nearest([two.beside(one) for one in mistakes(self.robot) for two in single])
         found += self.weigh(likely)
         for first in self.nearest(single)[:FINALISTS]:
-            found += self.zeros(first)
+            found += self.zeros(first, told.log_joint)
         if not any(one.fits for one in found):
             found += [self.weigh_moved(s) for s in self.nearest(single)[:FINALISTS]]
-        return SetUpPosterior.of(found)
+        return self.believed(found)
 
     def options(self, first: SetUp) -> list[SetUp]:
         """Return every mistake behind one that is undone."""
@@ -312,45 +340,70 @@ class SetUpWeighing:
         away = np.linalg.norm(found.correction.point(point) - point, axis=1)
         return [found] if np.median(away) > FAR * model.twin.robot.reach else []
 
-    def zeros(self, first: SetUp) -> list[WeighedSetUp]:
-        """Return the zeros that many movements agree on behind a mistake."""
-        likelihood, model = self.behind([first]), self.likelihood.model
+    def zeros(self, first: SetUp, told: float, also: Sequence[float] = ()) -> list[WeighedSetUp]:
+        """Return the likeliest zero of each motor behind a mistake.
+
+        Args:
+            first: What is undone before.
+            told: Log of prior times evidence of the set-up as told.
+            also: Zeros that are tried beside those that movements agree on [rad].
+        """
+        likelihood, robot = self.behind([first]), self.robot
+        least = AGREEING * likelihood.usable.sum()
         found = []
-        for k, width in enumerate(model.least_visible):
+        for k in np.flatnonzero(~robot.slides).tolist():
+            width = float(likelihood.model.least_visible[k])
             says = likelihood.profile(k)
             seen = likelihood.usable & (says.min_distance2[..., 0] < EXPLAINED)
             away = says.turned(says.mode - says.expected)[..., 0]
-            off = away[seen]
-            together = np.abs(off[:, None] - off) < CLUSTER * width
-            if model.twin.robot.slides[k] or len(off) < LEAST_AGREEING:
-                continue
-            members = together[together.sum(axis=1).argmax()]
-            zero = float(np.median(off[members]))
-            agree = members.sum() >= max(LEAST_AGREEING, AGREEING * likelihood.usable.sum())
-            if agree and abs(zero) > CLUSTER * width and not _right_in_some(away, seen, zero):
-                found.append(self._zero(first, k, zero, float(width)))
+            agreed = _agreed(away[seen], width, least)
+            values = [z for z in agreed if not _right_in_some(away, seen, z)] + list(also)
+            tried = self.weigh([self._off(first, k, value) for value in values])
+            log_joint = [one.log_joint for one in tried]
+            if max(log_joint, default=-np.inf) > told - HOPELESS_NATS:
+                likeliest = values[int(np.argmax(log_joint))]
+                found.append(self._zero(first, k, likeliest, width))
         return found
+
+    def _off(self, first: SetUp, motor: int, zero: float) -> SetUp:
+        """Return the mistake that a zero is so far off, behind another."""
+        known = zero_off(self.robot, motor, zero)
+        return replace(known, log_prior=known.log_prior + self.log_rate).beside(first)
 
     def _zero(self, first: SetUp, motor: int, zero: float, width: float) -> WeighedSetUp:
         """Return what the runs say of a zero near some value, the value integrated out."""
-        robot = self.robot
-
-        def at(value: float) -> SetUp:
-            known = zero_off(robot, motor, value)
-            return replace(known, log_prior=known.log_prior + self.log_rate).beside(first)
-
         for _ in range(ROUNDS):
             low, middle, high = (
                 float(one.log_evidence.sum())
-                for one in self.weigh([at(zero + width * step) for step in (-1.0, 0.0, 1.0)])
+                for one in self.weigh(
+                    [self._off(first, motor, zero + width * step) for step in (-1.0, 0.0, 1.0)]
+                )
             )
             curvature = max((2.0 * middle - low - high) / width**2, 0.1 / width**2)
             zero += float(np.clip((high - low) / (2.0 * width * curvature), -width, width))
             width = float(np.clip(curvature**-0.5, 0.1 * width, width))
-        best = self.weigh([at(zero)])[0]
+        best = self.weigh([self._off(first, motor, zero)])[0]
         volume = 0.5 * float(np.log(2.0 * np.pi / curvature))
         known = replace(best.set_up, log_prior=best.set_up.log_prior + volume)
         return replace(best, set_up=known)
+
+
+def _agreed(off: FloatArray, width: float, least: float) -> list[float]:
+    """Return the values off 0 that enough movements agree on, each once.
+
+    Args:
+        off: By how much a motor is off in each movement, (movement,) [rad].
+        width: Deviation of each [rad].
+        least: Movements that must agree.
+    """
+    values = list[float]()
+    together = np.abs(off[:, None] - off) < CLUSTER * width
+    for members in together[np.argsort(-together.sum(axis=1), kind="stable")]:
+        value = float(np.median(off[members]))
+        new = all(abs(value - known) > CLUSTER * width for known in values)
+        if members.sum() >= least and abs(value) > OFF * width and new:
+            values.append(value)
+    return values
 
 
 def _right_in_some(away: FloatArray, seen: BoolArray, zero: float) -> bool:
@@ -365,7 +418,7 @@ def _right_in_some(away: FloatArray, seen: BoolArray, zero: float) -> bool:
     """
     right = (np.abs(away) < 0.5 * abs(zero)) & seen
     most = 2 * right.sum(axis=1) > seen.sum(axis=1)
-    return bool((most & (right.sum(axis=1) >= LEAST_AGREEING)).any())
+    return bool((most & (right.sum(axis=1) >= RIGHT)).any())
 
 
 def _weighed(
@@ -382,7 +435,7 @@ def _weighed(
         log_evidence: What these say, (set-up and run,).
         choice_nats: What numbers that were chosen for each run cost, which is no misfit.
     """
-    best, worst = highest_and_outlier(likelihood)
+    best, worst = (says.sum(axis=1) for says in highest_and_outlier(likelihood))
     best = best - choice_nats
     lost, most, says = (
         values.reshape(len(set_ups), -1)
@@ -396,31 +449,48 @@ def _weighed(
 
 
 def _distinct(weighed: Sequence[WeighedSetUp]) -> list[WeighedSetUp]:
-    """Return the set-ups with each correction once, as it was weighed best."""
+    """Return the set-ups with each correction once, as it was weighed best, as it fits best."""
     found: dict[bytes, WeighedSetUp] = {}
     for one in sorted(weighed, key=lambda w: -w.log_joint):
         undo = one.set_up.correction
         parts = [np.round(part, 9) + 0.0 for part in (undo.C, undo.z, undo.M, undo.t)]
-        found.setdefault(b"".join(part.tobytes() for part in parts), one)
+        key = b"".join(part.tobytes() for part in parts)
+        known = found.setdefault(key, one)
+        found[key] = replace(known, misfit=min(known.misfit, one.misfit))
     return list(found.values())
 
 
 def highest_and_outlier(likelihood: RunLikelihood) -> tuple[FloatArray, FloatArray]:
-    """Return the log density of each run at its best, and of a tool that may be anywhere, (run,).
+    """Return log densities of a healthy arm at its best, and of a tool that may be anywhere.
 
     Args:
         likelihood: Runs by their settled positions.
+
+    Returns:
+        (run, movement) each; 0 where a movement is not usable.
     """
     model, evidence = likelihood.model, likelihood.evidence
     healthy = likelihood.findings.expected[:, :, 0]
     _, _, spread = model.residual(evidence.point, healthy, model.scatter)
     highest = np.where(likelihood.usable, spread.log_norm(model.settling.tail_dof), 0.0)
-    return highest.sum(axis=1), likelihood.usable.sum(axis=1) * model.outlier_log_density
+    return highest, np.where(likelihood.usable, model.outlier_log_density, 0.0)
 
 
 def run_misfit(posterior: Posterior, run: int) -> float:
     """Return the misfit of one run under its most probable hypothesis, as of `WeighedSetUp`."""
-    highest, outlier = highest_and_outlier(posterior.likelihood[run])
     best = int(np.argmax(posterior.log_posterior[run]))
-    says = float(posterior.weights[best].settled(run).sum())
-    return float((highest[0] - says) / max(highest[0] - outlier[0], 1.0))
+    return misfit(posterior.likelihood[run], posterior.weights[best].settled(run))
+
+
+def misfit(likelihood: RunLikelihood, says: FloatArray) -> float:
+    """Return the misfit of one run, as of `WeighedSetUp`.
+
+    Args:
+        likelihood: The run.
+        says: Log density of each movement as it is explained, (movement,); those that are not
+            finite do not count.
+    """
+    counts = likelihood.usable[0] & np.isfinite(says)
+    highest, outlier = (values[0, counts] for values in highest_and_outlier(likelihood))
+    lost, most = (highest - says[counts]).sum(), (highest - outlier).sum()
+    return float(lost / max(most, 1.0))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from failuretwin import BayesDiagnoser
+from failuretwin.connection.links.base import OK
 from failuretwin.core.alarm import CLEAR, RAISED, Alarm, Episode
 from failuretwin.core.runs import concatenate, run_set
 from failuretwin.decision.streaming.monitor import monitor
@@ -50,6 +51,31 @@ def test_a_mistake_is_named_and_no_motor_blamed(twin, work, wrong, words):
     assert words in last.undecided
     assert words in watch.set_up
     assert last.run == "stream"
+
+
+def test_movements_that_fit_nothing_are_not_healthy(twin, work):
+    """Faults are rarer than odd movements of an arm that nobody has seen at work yet."""
+    told = answers(monitor(twin), work(13), made(twin.robot, "motor 3 and motor 4"))
+    shown = [a.diagnosis for a in told if a.diagnosis is not None and a.time > 5.8]
+    assert shown[0].undecided.startswith("the first movements do not end where")
+    decided = [d for d in shown if not d.undecided]
+    assert max(d.posterior["healthy"] for d in decided) < 0.95
+    assert len(decided) < 0.3 * len(shown)
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 5e-4, 1e-3])
+def test_an_arm_that_obeys_nothing_is_not_healthy(twin, work, rng, noise_m):
+    """Also where the sensor's noise hides that it stands still."""
+    samples = work(13)
+    still = [(t, c, samples[0][2] + rng.normal(0.0, noise_m, 3)) for t, c, _ in samples]
+    watch = monitor(twin)
+    told = answers(watch, still)
+    known = [a.diagnosis for a in told if a.diagnosis is not None]
+    assert known
+    assert all(d.undecided for d in known)
+    assert "stands still" in known[-1].undecided
+    assert {a.state for a in told if a.time > 1.0} == {OK}  # there are readings
+    assert watch.set_up is None
 
 
 @pytest.mark.parametrize(

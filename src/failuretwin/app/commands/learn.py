@@ -111,8 +111,11 @@ def _wrong_set_up(runs: xr.Dataset, robot: Robot) -> str:
     from failuretwin.inference.diagnoser import BayesDiagnoser
     from failuretwin.inference.seen_runs import set_up_remark
 
-    set_ups = BayesDiagnoser(robot).seen(runs).set_ups()
+    seen = BayesDiagnoser(robot).seen(runs)
+    set_ups = seen.set_ups()
     remark = set_up_remark(set_ups)
+    if not remark and set_ups.fits:
+        remark = "; ".join(filter(None, (seen.elsewhere(), *seen.rounding())))
     if not remark or set_ups.best.set_up.kind == "zero":
         return ""
     return (

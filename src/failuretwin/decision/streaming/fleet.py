@@ -66,12 +66,14 @@ class FleetPosterior(ArrayStruct):
         point: Where the tool was taken to rest after the present movement, (robot, axis) [m]; NaN
             if that movement does not count yet.
         dead: Robots whose tools stand still though they should move, (robot,).
+        heard_s: When each last had a reading, whatever it was worth, (robot,) [s].
     """
 
     posterior: Annotated[FloatArray, Axes("run", "hypothesis")]
     judged: Annotated[BoolArray, Axes("run", empty=False)]
     point: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
     dead: Annotated[BoolArray, Axes("run", empty=False)]
+    heard_s: Annotated[FloatArray, Axes("run", empty=-np.inf)]
 
 
 class StreamingFleet:
@@ -149,9 +151,9 @@ class StreamingFleet:
 
     @property
     def stale(self) -> BoolArray:
-        """Robots that have not been seen for a while: nothing is known of their present."""
-        read_s = self._tracker.window.read_s
-        return np.asarray(np.isinf(read_s) | (read_s < self._now - SILENCE_S))
+        """Robots that have not been heard of for a while: nothing is known of their present."""
+        heard_s = self._beliefs.heard_s
+        return np.asarray(np.isinf(heard_s) | (heard_s < self._now - SILENCE_S))
 
     def update(
         self,
@@ -178,6 +180,8 @@ class StreamingFleet:
         """
         reference, points = self._checked(time, command, measured)
         time = self._by_own_clock(time)
+        heard_s, read = self._beliefs.heard_s, np.isfinite(points).all(axis=1)
+        heard_s[read] = np.maximum(heard_s[read], time)
         points, died = self._alive(time, reference, points)
         before = self._odd
         split = self._split.see(points, self._settings.unmoved_m)

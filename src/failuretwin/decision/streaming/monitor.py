@@ -14,14 +14,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from failuretwin.connection.links.base import OK, STALE, Answer
+from failuretwin.core.alarm import RAISED
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.numerics import Weighted, log_of
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.decision.streaming.alarm_rule import AlarmRule
 from failuretwin.decision.streaming.diagnoser import reference_of
-from failuretwin.decision.streaming.fleet import StreamingFleet
+from failuretwin.decision.streaming.fleet import DEAD, StreamingFleet
 from failuretwin.decision.streaming.learning import LifeLearner
-from failuretwin.decision.streaming.set_up_watch import SetUpWatch
+from failuretwin.decision.streaming.set_up_watch import PROOF, SetUpWatch
+from failuretwin.decision.streaming.trouble import rests_throughout
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
@@ -32,12 +34,18 @@ from failuretwin.inference.healthy_mixture import FOREIGN, HealthyMixture
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.posterior import StreamPosition
 from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.set_up_weighing import FITS, misfit
 
 WORTH_LEARNING = 0.01
 """Probability that the calibration that was given is not this robot's from which it learns."""
 
 UNHEARD = 3
 """Commands in a row of which a motor reports that they did not arrive, from which it is told."""
+BEGINS_ODDLY = (
+    "the first movements do not end where those of a healthy arm do: a fault, lost commands, or a "
+    "log that does not fit the profile; a few movements more tell"
+)
+"""Why the first movements allow no verdict where they do not fit."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +125,7 @@ class FaultMonitor:
         self._diagnosis: Diagnosis | None = None
         self._set_up = SetUpWatch(diagnoser)
         self._arrived = np.full((0, len(known.scatter)), np.nan)
+        self._rests, self._misfit = False, 0.0
 
     @property
     def set_up(self) -> str | None:
@@ -176,13 +185,25 @@ class FaultMonitor:
         return self._answer()
 
     def _answer(self) -> Answer:
-        """Return what is believed; where the set-up is in doubt, no motor is blamed."""
-        state = STALE if self._fleet.stale[0] else OK
-        reason = self._set_up.against(self._rule.alarm) or self._unheard(self._rule.alarm.cause)
+        """Return what is believed; where something is in doubt, no motor is blamed."""
+        state, reason = STALE if self._fleet.stale[0] else OK, self._in_doubt()
         if not reason:
             return Answer(self._fleet.time, state, self._diagnosis, self._rule.alarm)
         undecided = replace(self._fleet.undecided(0, reason, self._diagnosis), run="stream")
         return Answer(self._fleet.time, state, undecided)
+
+    def _in_doubt(self) -> str:
+        """Return why nothing can be said of the motors, though one hypothesis is far ahead.
+
+        Faults are so rare that of an arm that nobody has seen at work yet a healthy one is far
+        ahead, whatever its first movements do.
+        """
+        if self._rests:
+            return DEAD.fatal
+        alarm = self._rule.alarm
+        young = self._set_up.movements <= PROOF and alarm.state != RAISED
+        odd = BEGINS_ODDLY if young and self._misfit > FITS else ""
+        return self._set_up.against(alarm) or odd or self._unheard(alarm.cause)
 
     def _unheard(self, cause: str) -> str:
         """Return that commands do not reach the motor that a fault is blamed on; else nothing."""
@@ -205,6 +226,8 @@ class FaultMonitor:
             window = range(before, before + likelihood.usable.shape[1])
             explained = np.array([self._explained.get(m, np.inf) for m in window])
             told = log_of(posterior), explained
+            self._rests = rests_throughout(likelihood.evidence, likelihood.model.settings)
+            self._misfit = misfit(likelihood, explained)
         found = self._fleet.diagnosis(0, self._diagnosis, told)
         if found is not None:
             self._diagnosis = replace(found, run="stream")

@@ -21,6 +21,7 @@ from failuretwin.core.polyline import TURN_RAD
 from failuretwin.core.runs import concatenate, time_step
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.timed_log import Samples, TimedLog, timed_run
+from failuretwin.decision.streaming.trouble import rests_throughout
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
@@ -234,6 +235,9 @@ class SetUpWatch:
             return
         try:
             seen = self._diagnoser.seen(runs)
+            evidence = seen.sample.evidence
+            if not evidence.usable.any() or rests_throughout(evidence, seen.model.settings):
+                return
             self._found = seen.set_ups(thorough or bool(self.finding))
         except InputError:  # no movement in it yet
             return

@@ -9,6 +9,7 @@ import numpy as np
 
 from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.log_quality import (
     FROZEN_S,
     NEAR_ZERO_M,
@@ -16,6 +17,7 @@ from failuretwin.inference.log_quality import (
     STILL_M,
     should_move,
 )
+from failuretwin.inference.settings import InferenceSettings
 
 # Tools that stand still though motors are told to move: a dead sensor, or a dead arm.
 
@@ -82,6 +84,22 @@ class FrozenSensorDetector(ArrayStruct):
         # One at zero may be held there by a stuck motor; see `log_quality`.
         alone = still[:, :3] & ~dead[:, None] & (np.abs(self.number) > NEAR_ZERO_M)
         return dead, alone
+
+
+def rests_throughout(evidence: SettledEvidence, settings: InferenceSettings) -> bool:
+    """Return whether a tool rests in one place though motors were told to move.
+
+    It sees what no reading shows that comes with more noise than the tool may move.
+
+    Args:
+        evidence: Where it came to rest after each movement of some runs.
+        settings: How near is still.
+    """
+    usable = evidence.usable
+    points, target = evidence.point[usable][:, :3], evidence.movements.target[usable]
+    if len(points) < 2 or not should_move(np.ptp(target, axis=0)):
+        return False
+    return bool(np.linalg.norm(np.ptp(points, axis=0)) <= settings.nearly_still_m)
 
 
 # Tools that move though nobody has told the motors to.
