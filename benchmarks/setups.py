@@ -2,12 +2,15 @@
 
     FAILURETWIN_DATA=DATA python benchmarks/setups.py [--arm armpi_fpv|ur10|ur5] [--size 1]
         [--folders 10] [--only PART_OF_A_NAME ...]
+    python benchmarks/setups.py --simulated 1000
 
 The measurements stay; what the log claims is changed by the correction that undoes each mistake,
 the other way round. Runs are judged in folders of --size, drawn at random: named is how many are
 said to be set up so, sure is how many runs are blamed on another motor above 90 %. The ArmPi has
 the 90 runs of DATA/real_robot_b_20241003 and its bundled calibration (in sample); UR10 and UR5 have
-the runs of benchmarks/real_arms.py and the calibration of other poses.
+the runs of benchmarks/real_arms.py and the calibration of other poses. With --simulated N, so many
+healthy and so many faulty simulated runs, set up as told and judged one by one: how many are
+called wrong above 90 %, and what it costs beside never asking.
 """
 
 from __future__ import annotations
@@ -27,10 +30,12 @@ from scipy.spatial.transform import Rotation
 
 import failuretwin as ft
 from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.read import ReadOptions, read_runs
 from failuretwin.digital_model.profile_text import profile_text
 from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.urdf_check import check_urdf
+from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.inference.log_correction import LogCorrection
 from failuretwin.inference.set_ups import mistakes
 
@@ -38,6 +43,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 SURE = 0.9
+PROGRESS = 200
+"""Runs after which a row is printed."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +71,11 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=1, help="runs a folder")
     parser.add_argument("--folders", type=int, default=10)
     parser.add_argument("--only", nargs="+", default=[""], help="parts of names of mistakes")
+    parser.add_argument("--simulated", type=int, default=0, help="so many simulated runs instead")
     options = parser.parse_args()
+    if options.simulated:
+        _print_simulated(options.simulated)
+        return
     with tempfile.TemporaryDirectory() as folder:
         runs, diagnoser = _armpi() if options.arm == "armpi_fpv" else _ur(options.arm, Path(folder))
     order = np.random.default_rng(1).permutation(runs.sizes["run"])
@@ -96,6 +107,30 @@ def _ur(arm: str, folder: Path) -> tuple[xr.Dataset, ft.BayesDiagnoser]:
         truths = {row["run"]: row["truth"] for row in csv.DictReader(file)}
     names = [truths[str(name).rpartition("/")[2]] for name in runs["run"].values]
     return runs.assign(fault=("run", names)), ft.BayesDiagnoser(robot, _calibrated(made, robot))
+
+
+def _print_simulated(count: int) -> None:
+    """Print what asking for set-ups does to runs that are set up as told."""
+    asking = ft.BayesDiagnoser("armpi_fpv")
+    never = replace(asking.priors, setup=replace(asking.priors.setup, wrong_rate=(0.0, 0.0)))
+    trusting = ft.BayesDiagnoser("armpi_fpv", priors=never)
+    robot = asking.twin.robot
+    names = [str(one) for one in asking.hypothesis_set]
+    print("runs | called wrong above 90 % | may be wrong | nats | nats where it is never asked")
+    for kind, truths in (("healthy", names[:1]), ("faulty", names[1:])):
+        each, wrong, may_be = -(-count // len(truths)), 0, 0
+        plan = Plan(robot, truths, each, 1, "armpi_fpv", RandomMovements())
+        runs, nats = simulate(plan), []
+        for row in range(runs.sizes["run"]):
+            says = [d.diagnose(runs.isel(run=[row]))[0] for d in (asking, trusting)]
+            told = [line for line in says[0].quality if "fit the profile" in line]
+            wrong += any("does not fit" in line for line in told)
+            may_be += any("may not fit" in line for line in told)
+            nats.append([-np.log(max(d.posterior[d.truth or ""], 1e-9)) for d in says])
+            if (row + 1) % PROGRESS == 0 or row + 1 == runs.sizes["run"]:
+                asked, trusted = np.mean(nats, axis=0)
+                cells = f"{row + 1} {kind}", str(wrong), str(may_be), f"{asked:.4f}"
+                print(" | ".join((*cells, f"{trusted:.4f}")), flush=True)
 
 
 def _truths(robot: Robot) -> Iterator[Truth]:
