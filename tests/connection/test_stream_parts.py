@@ -21,7 +21,6 @@ from failuretwin.connection.links.base import (
     Reading,
     Sink,
     Source,
-    StreamClock,
     source_from_text,
 )
 from failuretwin.connection.links.live_events import ReorderBuffer
@@ -35,6 +34,7 @@ from failuretwin.connection.links.statuses import (
     Status,
     statuses,
 )
+from failuretwin.connection.links.stream_clock import StreamClock
 from failuretwin.core.alarm import ALL_CLEAR, CLEAR, RAISED, SUSPECTED, Alarm, Episode
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis

@@ -18,7 +18,8 @@ from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.inference.evidence import Evidence
 from failuretwin.inference.log_correction import CorrectionTable, LogCorrection
 from failuretwin.inference.priors import Priors
-from failuretwin.inference.set_up_weighing import ANOTHER, SetUpPosterior, WeighedSetUp
+from failuretwin.inference.set_up_posterior import SetUpPosterior, WeighedSetUp
+from failuretwin.inference.set_up_weighing import ANOTHER
 from failuretwin.inference.set_ups import FAULT_OF_EVERY_RUN, SetUp, mistakes, zero_off
 
 TRUTHS = ["healthy", "motor_2:stuck", "motor_3:steady_state_error"]

@@ -20,10 +20,10 @@ from failuretwin.connection.links.base import (
     Reading,
     Sink,
     Source,
-    StreamClock,
 )
 from failuretwin.connection.links.live_events import LiveReference, ReorderBuffer
 from failuretwin.connection.links.statuses import statuses
+from failuretwin.connection.links.stream_clock import StreamClock
 from failuretwin.core.alarm import RAISED, SUSPECTED, Alarm, Episode
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray

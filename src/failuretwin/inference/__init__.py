@@ -25,6 +25,7 @@ section of docs/diagnosis.md or docs/shared_unknowns.md (words and symbols: docs
     registration, wrong_setup    the simple mistake that explains a log which fits nothing
     set_ups, log_correction  wrong set-ups, and what undoes each
     clock, set_up_weighing   how probable each is, with all faults behind it
+    misfit, set_up_posterior    whether anything explains the runs, and what is believed of it
     seen_runs                runs under one set-up or several, from evidence to posterior
     posterior                evidence times prior; the diagnosis of each run
     shared_unknowns, linear_response    theta: where the sensor stands and motors rest

@@ -21,6 +21,7 @@ from failuretwin.inference.clock import clock_posterior
 from failuretwin.inference.evidence import Evidence, TransientSamples
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.log_correction import LogCorrection
+from failuretwin.inference.misfit import FITS, run_misfit
 from failuretwin.inference.posterior import Posterior
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.rounding import (
@@ -31,13 +32,8 @@ from failuretwin.inference.rounding import (
     tool_rounding,
 )
 from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.set_up_weighing import (
-    ANOTHER,
-    FITS,
-    SetUpPosterior,
-    SetUpWeighing,
-    run_misfit,
-)
+from failuretwin.inference.set_up_posterior import SetUpPosterior
+from failuretwin.inference.set_up_weighing import ANOTHER, SetUpWeighing
 from failuretwin.inference.set_ups import SetUp, clocks_apart, gross_unit
 from failuretwin.inference.shared_posterior import ALLOWED_FOR, set_up_in_doubt, shared_posterior
 

@@ -22,18 +22,16 @@ from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.log_correction import LogCorrection
-from failuretwin.inference.posterior import Posterior, log_prior, marginal_likelihoods
+from failuretwin.inference.misfit import highest_and_outlier
+from failuretwin.inference.posterior import log_prior, marginal_likelihoods
 from failuretwin.inference.priors import Priors
 from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.set_up_posterior import SetUpPosterior, WeighedSetUp, with_doubt
 from failuretwin.inference.set_ups import FEWEST_TO_TURN, SetUp, mistakes, turned, zero_off
 from failuretwin.inference.shared_posterior import Mixture
 from failuretwin.inference.shared_unknowns import layout_of
 from failuretwin.inference.shared_weighing import SharedWeighing
 
-FITS = 0.3
-"""Misfit up to which a set-up explains runs, as a share of that of a tool that may be anywhere.
-Runs of real arms with faults stay below 0.35 each and below 0.25 in the mean; with a motor
-reversed all but those in which it is stuck are above 0.4."""
 FEW = 8
 """Runs that set-ups are weighed by, evenly spread: five name what shows."""
 FINALISTS = 2
@@ -55,103 +53,12 @@ ZEROS_RAD = tuple(np.deg2rad([z for z in range(-15, 16) if z]).tolist())
 beside a fault is not what movements agree on."""
 HOPELESS_NATS = 12.0
 """A zero that is so much less probable than the set-up as told is not looked at more closely."""
-DOUBT, MAY_BE = 1.0 / 9.0, 0.03
-"""A zero that is probable by this second share where set-ups are as likely wrong as right is never
-less probable than the first: five movements off by the same angle are what a fault and a zero both
-show, and only the prior tells them apart."""
 ROUNDS = 2
 """Newton steps to the zero that explains the runs best."""
 CHUNK_RUNS = 64
 """Runs that are weighed at a time, whatever the set-up."""
-NEGLIGIBLE = 0.003
-"""Set-ups less probable than this are left out; it bounds what they could change."""
 ANOTHER = "no fault explains it, and the set-up is not wrong in one way that is known"
 """What is said where no set-up explains the runs."""
-
-
-@dataclass(frozen=True)
-class WeighedSetUp:
-    """What runs say of a set-up.
-
-    Attributes:
-        set_up: The set-up.
-        log_evidence: log sum over h of p(h) p(run | w, h), (run,).
-        misfit: How much worse the best hypotheses explain the runs than the density of a healthy
-            arm at its best, as a share of what a tool that may be anywhere would be.
-        moved: Whether the sensor may stand a little elsewhere too.
-    """
-
-    set_up: SetUp
-    log_evidence: FloatArray
-    misfit: float
-    moved: bool = False
-
-    @property
-    def log_joint(self) -> float:
-        """Log of prior times evidence."""
-        return float(self.set_up.log_prior + self.log_evidence.sum())
-
-    @property
-    def fits(self) -> bool:
-        """Whether it explains the runs as the healthy model says."""
-        return self.misfit <= FITS
-
-    @property
-    def left_as_told(self) -> WeighedSetUp:
-        """The same with nothing undone: a wrong guess must not spoil what the log shows."""
-        none = LogCorrection.none(len(self.set_up.correction.z))
-        return replace(self, set_up=replace(self.set_up, correction=none))
-
-
-@dataclass(frozen=True)
-class SetUpPosterior:
-    """What is believed of the set-up of some runs.
-
-    Attributes:
-        found: Set-ups that are not negligible, the most probable first.
-        probability: Of each.
-    """
-
-    found: Sequence[WeighedSetUp]
-    probability: FloatArray
-
-    @classmethod
-    def of(cls, weighed: Sequence[WeighedSetUp]) -> SetUpPosterior:
-        """Return the posterior over set-ups that were weighed by the same runs.
-
-        Two ways to say the same count once. Nothing is undone where the most probable does not fit.
-        """
-        weighed = _distinct(weighed)
-        log_joint = np.array([one.log_joint for one in weighed])
-        share = np.exp(log_joint - log_sum(log_joint, axis=0))
-        order = [i for i in np.argsort(-share, kind="stable") if share[i] > NEGLIGIBLE]
-        if not weighed[order[0]].fits:  # no verdict is had behind it
-            return cls([weighed[order[0]].left_as_told], np.ones(1))
-        return cls([weighed[i] for i in order], share[order] / share[order].sum())
-
-    def beside(self, first: SetUp) -> SetUpPosterior:
-        """Return the same where something else is wrong for sure."""
-        both = [
-            replace(w, set_up=w.set_up.beside(first) if w.set_up.what else first)
-            for w in self.found
-        ]
-        return SetUpPosterior(both, self.probability)
-
-    @property
-    def best(self) -> WeighedSetUp:
-        """The most probable set-up."""
-        return self.found[0]
-
-    @property
-    def wrong(self) -> float:
-        """Probability that the set-up is not as told."""
-        pairs = zip(self.found, self.probability, strict=True)
-        return float(sum(share for one, share in pairs if one.set_up.what))
-
-    @property
-    def fits(self) -> bool:
-        """Whether the most probable set-up explains the runs."""
-        return self.best.fits
 
 
 @dataclass(frozen=True)
@@ -250,27 +157,12 @@ class SetUpWeighing:
         if not told[0].fits:
             told = self.weigh([self.as_told], everything=True)
         if told[0].fits and not thorough:
-            return self.believed([*told, *self.zeros(self.as_told, told[0].log_joint)])
+            return self._believed([*told, *self.zeros(self.as_told, told[0].log_joint)])
         return self.few.searched()
 
-    def believed(self, weighed: Sequence[WeighedSetUp]) -> SetUpPosterior:
-        """Return the posterior over set-ups, a zero that may well be no less probable than `DOUBT`.
-
-        Whoever believes that a set-up is as likely wrong as right may believe in it; then it is a
-        matter of the prior alone, which must not make anybody sure of a fault.
-        """
-        told = next(one for one in weighed if not one.set_up.what)
-        least = told.log_joint + float(log_of(DOUBT / (1.0 - DOUBT)))
-        even = float(log_of(1.0 - self.rate)) - self.log_rate
-        found = []
-        for one in weighed:
-            lacks = least - one.log_joint
-            may_be = one.log_joint + even - told.log_joint > np.log(MAY_BE / (1.0 - MAY_BE))
-            if one.set_up.kind == "zero" and may_be and lacks > 0.0:
-                set_up = replace(one.set_up, log_prior=one.set_up.log_prior + lacks)
-                one = replace(one, set_up=set_up)
-            found.append(one)
-        return SetUpPosterior.of(found)
+    def _believed(self, weighed: Sequence[WeighedSetUp]) -> SetUpPosterior:
+        """Return the posterior over set-ups that were weighed."""
+        return SetUpPosterior.of(with_doubt(weighed, self.rate))
 
     def taken_as_told(self) -> SetUpPosterior:
         """Return the belief that nothing is wrong, whatever the runs say."""
@@ -299,14 +191,14 @@ class SetUpWeighing:
         fitting = any(one.fits for one in found)
         found.append(self.weigh_moved(self.as_told))
         if fitting or found[-1].fits:
-            return self.believed(found)
+            return self._believed(found)
         likely = self.nearest([two.beside(one) for one in mistakes(self.robot) for two in single])
         found += self.weigh(likely)
         for first in self.nearest(single)[:FINALISTS]:
             found += self.zeros(first, told.log_joint)
         if not any(one.fits for one in found):
             found += [self.weigh_moved(s) for s in self.nearest(single)[:FINALISTS]]
-        return self.believed(found)
+        return self._believed(found)
 
     def options(self, first: SetUp) -> list[SetUp]:
         """Return every mistake behind one that is undone."""
@@ -446,51 +338,3 @@ def _weighed(
         WeighedSetUp(set_up, row, float(share))
         for set_up, row, share in zip(set_ups, says, misfit, strict=True)
     ]
-
-
-def _distinct(weighed: Sequence[WeighedSetUp]) -> list[WeighedSetUp]:
-    """Return the set-ups with each correction once, as it was weighed best, as it fits best."""
-    found: dict[bytes, WeighedSetUp] = {}
-    for one in sorted(weighed, key=lambda w: -w.log_joint):
-        undo = one.set_up.correction
-        parts = [np.round(part, 9) + 0.0 for part in (undo.C, undo.z, undo.M, undo.t)]
-        key = b"".join(part.tobytes() for part in parts)
-        known = found.setdefault(key, one)
-        found[key] = replace(known, misfit=min(known.misfit, one.misfit))
-    return list(found.values())
-
-
-def highest_and_outlier(likelihood: RunLikelihood) -> tuple[FloatArray, FloatArray]:
-    """Return log densities of a healthy arm at its best, and of a tool that may be anywhere.
-
-    Args:
-        likelihood: Runs by their settled positions.
-
-    Returns:
-        (run, movement) each; 0 where a movement is not usable.
-    """
-    model, evidence = likelihood.model, likelihood.evidence
-    healthy = likelihood.findings.expected[:, :, 0]
-    _, _, spread = model.residual(evidence.point, healthy, model.scatter)
-    highest = np.where(likelihood.usable, spread.log_norm(model.settling.tail_dof), 0.0)
-    return highest, np.where(likelihood.usable, model.outlier_log_density, 0.0)
-
-
-def run_misfit(posterior: Posterior, run: int) -> float:
-    """Return the misfit of one run under its most probable hypothesis, as of `WeighedSetUp`."""
-    best = int(np.argmax(posterior.log_posterior[run]))
-    return misfit(posterior.likelihood[run], posterior.weights[best].settled(run))
-
-
-def misfit(likelihood: RunLikelihood, says: FloatArray) -> float:
-    """Return the misfit of one run, as of `WeighedSetUp`.
-
-    Args:
-        likelihood: The run.
-        says: Log density of each movement as it is explained, (movement,); those that are not
-            finite do not count.
-    """
-    counts = likelihood.usable[0] & np.isfinite(says)
-    highest, outlier = (values[0, counts] for values in highest_and_outlier(likelihood))
-    lost, most = (highest - says[counts]).sum(), (highest - outlier).sum()
-    return float(lost / max(most, 1.0))

@@ -32,9 +32,9 @@ from failuretwin.inference.fault_filter import RATES, FaultFilter, FaultRates
 from failuretwin.inference.healthy_density import healthy_log_density
 from failuretwin.inference.healthy_mixture import FOREIGN, HealthyMixture
 from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.misfit import FITS, misfit
 from failuretwin.inference.posterior import StreamPosition
 from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.set_up_weighing import FITS, misfit
 
 WORTH_LEARNING = 0.01
 """Probability that the calibration that was given is not this robot's from which it learns."""

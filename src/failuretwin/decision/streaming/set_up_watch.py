@@ -28,7 +28,8 @@ from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.explanation import plain_name
 from failuretwin.inference.seen_runs import SURE, set_up_finding, set_up_remark
-from failuretwin.inference.set_up_weighing import FEW, SetUpPosterior
+from failuretwin.inference.set_up_posterior import SetUpPosterior
+from failuretwin.inference.set_up_weighing import FEW
 
 if TYPE_CHECKING:
     import xarray as xr
