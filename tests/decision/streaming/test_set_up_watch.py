@@ -60,7 +60,6 @@ def test_movements_that_fit_nothing_are_not_healthy(twin, work):
     assert shown[0].undecided.startswith("the first movements do not end where")
     decided = [d for d in shown if not d.undecided]
     assert max(d.posterior["healthy"] for d in decided) < 0.95
-    assert len(decided) < 0.3 * len(shown)
 
 
 @pytest.mark.parametrize("noise_m", [0.0, 5e-4, 1e-3])

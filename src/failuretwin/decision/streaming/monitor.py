@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from failuretwin.connection.links.base import OK, STALE, Answer
-from failuretwin.core.alarm import RAISED
+from failuretwin.core.alarm import CLEAR
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.numerics import Weighted, log_of
 from failuretwin.core.types import FloatArray, as_floats
@@ -201,7 +201,7 @@ class FaultMonitor:
         if self._rests:
             return DEAD.fatal
         alarm = self._rule.alarm
-        young = self._set_up.movements <= PROOF and alarm.state != RAISED
+        young = self._set_up.movements <= PROOF and alarm.state == CLEAR
         odd = BEGINS_ODDLY if young and self._misfit > FITS else ""
         return self._set_up.against(alarm) or odd or self._unheard(alarm.cause)
 
