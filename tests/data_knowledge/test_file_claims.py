@@ -12,6 +12,7 @@ import subprocess
 import sys
 import zipfile
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +21,14 @@ import scipy.io
 from failuretwin import read_runs
 from failuretwin.core import foreign
 from failuretwin.core.errors import InputError
-from failuretwin.core.foreign import EXPANSION, LEAST_BYTES, as_cell, check_size, printable
+from failuretwin.core.foreign import (
+    EXPANSION,
+    LEAST_BYTES,
+    as_cell,
+    check_size,
+    printable,
+    read_text,
+)
 from failuretwin.core.hypothesis import parse_hypotheses
 from failuretwin.data_knowledge.bag_claims import check_chunks
 from failuretwin.data_knowledge.file_claims import check_matlab, check_npz
@@ -371,3 +379,10 @@ def test_matlab_exports_of_our_own_pass(runs, twin, tmp_path):
         for path in sorted(tmp_path.rglob("*.mat")):
             check_matlab(path)
     shutil.rmtree(tmp_path / "pairs")
+
+
+def test_what_has_no_end_is_no_file():
+    with pytest.raises(InputError, match="device or a pipe"):
+        read_runs("/dev/zero")
+    with pytest.raises(InputError, match="device or a pipe"):
+        read_text(Path("/dev/zero"), "a profile")

@@ -270,6 +270,20 @@ def test_of_one_run_a_fault_does_not_hide_a_zero(armpi, known, truth):
         assert any("motor 3 stands" in line for line in found.quality)
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        replace(NONE, z=np.deg2rad([5.0, 0.0, -5.0, 0.0])),
+        replace(NONE, z=np.deg2rad([0.0, 10.0, 0.0, 0.0]), t=np.array([0.0, 0.0, 0.005])),
+    ],
+)
+def test_two_zeros_or_one_and_a_shift_blame_no_motor(armpi, known, wrong):
+    runs = simulate(Plan(armpi, ["healthy"], 4, 21, known, RandomMovements(count=5)))
+    for found in BayesDiagnoser("armpi_fpv").diagnose(wrong.runs(runs)):
+        assert found.diagnosis == "healthy" or max(found.posterior.values()) < 0.9
+        assert any("motor" in line for line in remarks(found))
+
+
 def test_errors_that_are_drawn_anew_are_no_zero(armpi, known):
     """Nothing is lost of what only a fault does."""
     truth = "motor_3:steady_state_error"

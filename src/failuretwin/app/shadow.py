@@ -218,8 +218,8 @@ GARBAGE_AFTER_S, GARBAGE_EVERY_S = 10.0, 3600.0
 doubles with each, up to the second [s]."""
 
 
-SURENESS = re.compile(r" \([^()]*%[^()]*\)")
-"""How surely something is said, which changes while what is said does not."""
+FIGURE = re.compile(r"(?:over )?(?<!motor )[-+]?\b\d[\d.]*")
+"""How much and how surely, which changes while what is said does not."""
 
 
 class _NowAndThen:
@@ -299,7 +299,7 @@ class Changes:
             return []
         undecided, self._undecided = self._undecided, answer.diagnosis.undecided
         if self._undecided:
-            same = SURENESS.sub("", self._undecided) == SURENESS.sub("", undecided)
+            same = FIGURE.sub("", self._undecided) == FIGURE.sub("", undecided)
             return [] if same else [f"undecided: {self._undecided}"]
         before, self._alarm = self._alarm, answer.alarm
         same = before is not None and (before.state, before.cause) == (

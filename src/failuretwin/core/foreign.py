@@ -72,6 +72,12 @@ def reading(path: Path | str, kind: str, fix: str = "") -> Iterator[None]:
         raise InputError(f"{path}: cannot be {read} ({why}). {fix}".rstrip()) from error
 
 
+def check_is_file(path: Path, kind: str) -> None:
+    """Raise InputError for what is there and has no end, such as a device or a pipe."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError(f"{path}: is a device or a pipe. Expected a file, {kind}.")
+
+
 def read_text(path: Path, kind: str, fix: str = "") -> str:
     """Return the text of a file.
 
@@ -79,6 +85,7 @@ def read_text(path: Path, kind: str, fix: str = "") -> str:
         InputError: If it cannot be read, is no UTF-8, or is longer than such a text can be.
     """
     with reading(path, kind, fix):
+        check_is_file(path, kind)
         size = path.stat().st_size
         if size > TEXT_BYTES:
             raise InputError(

@@ -220,6 +220,10 @@ class DenseCovariance(Covariance):
 # Integrated over some of the d directions it is a Student t of the others, with the same nu.
 
 
+NORMAL_DOF = 1e8
+"""Degrees of freedom from which lgamma has no digits left that tell a Student t from a normal."""
+
+
 def log_norm(dof: float, dims: int = 3) -> float:
     """Return log c, the log density at the centre of a Student t with S = I.
 
@@ -227,7 +231,7 @@ def log_norm(dof: float, dims: int = 3) -> float:
         dof: nu; infinite: normal.
         dims: d.
     """
-    if np.isinf(dof):
+    if dof > NORMAL_DOF:
         return -0.5 * dims * log(2.0 * pi)
     return lgamma((dof + dims) / 2.0) - lgamma(dof / 2.0) - 0.5 * dims * log(dof * pi)
 

@@ -115,6 +115,8 @@ def as_runs(runs: RunsLike, robot: Robot | str = "armpi_fpv") -> xr.Dataset:
 def _read_source(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
     if not path.exists():
         raise InputError(f"{path}: does not exist. Expected a run set, a log or a folder of logs.")
+    if not (path.is_file() or path.is_dir()):
+        raise InputError(f"{path}: is a device or a pipe. Expected a file or a folder of logs.")
     if path.suffix in SUFFIXES:
         return [load_run_set(path)]
     if is_bag(path):

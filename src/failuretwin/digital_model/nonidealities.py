@@ -20,8 +20,10 @@ from failuretwin.digital_model.settling import Settling
 
 Range = Annotated[tuple[float, float], Bounds(in_order=True)]
 """Lowest and highest value, from zero on."""
+LONGEST_LAG_S = 5.0
+"""No arm that is watched at work trails its commands by more [s]."""
 LONGEST_S = 60.0
-"""Longest delay, lag or time between movements [s]: logs with a longer silence are not read."""
+"""Longest delay or time between movements [s]: logs with a longer silence are not read."""
 Seconds = Annotated[tuple[float, float], Bounds(0.0, LONGEST_S, in_order=True)]
 Spreads = Annotated[tuple[float, ...], Bounds()]
 
@@ -46,7 +48,7 @@ class Timing(Bounded):
     """
 
     delay_s: Annotated[tuple[float, float], Bounds(-1.0, LONGEST_S, in_order=True)] = (0.0, 0.0)
-    lag_s: Seconds = (0.0, 0.0)
+    lag_s: Annotated[tuple[float, float], Bounds(0.0, LONGEST_LAG_S, in_order=True)] = (0.0, 0.0)
     ramp_shortening: Annotated[tuple[float, float], Bounds(-1.0, 0.99, in_order=True)] = (0.0, 0.0)
     late_rate: Share = 0.0
     late_s: Seconds = (0.0, 0.0)

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from failuretwin.core.errors import InputError, unknown_name
-from failuretwin.core.foreign import TEXT_BYTES, reading
+from failuretwin.core.foreign import TEXT_BYTES, check_is_file, reading
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.kinematics import Joint, Loads, SerialChain, rotation_to_z
 
@@ -294,6 +294,7 @@ def read_root(path: Path) -> ElementTree.Element:
             "it is used as --robot; make one of a URDF by: failuretwin robot init URDF --out FILE."
         )
     with reading(path, "a URDF"):
+        check_is_file(path, "a URDF")
         if path.stat().st_size > TEXT_BYTES:
             raise InputError(f"{path}: is larger than a URDF can be. Check the name of the file.")
         data = path.read_bytes()

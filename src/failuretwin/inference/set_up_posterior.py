@@ -121,7 +121,7 @@ def with_doubt(weighed: Sequence[WeighedSetUp], rate: float) -> list[WeighedSetU
         weighed: Weighed by the same runs; nothing is wrong with one of them.
         rate: Probability of a wrong set-up that they were weighed with.
     """
-    told = next(one for one in weighed if not one.set_up.what)
+    told = max((w for w in weighed if not w.set_up.what), key=lambda one: one.log_joint)
     least = told.log_joint + float(log_of(DOUBT / (1.0 - DOUBT)))
     even = float(log_of(1.0 - rate) - log_of(rate))
     found = []

@@ -51,6 +51,8 @@ RIGHT = 2
 ZEROS_RAD = tuple(np.deg2rad([z for z in range(-15, 16) if z]).tolist())
 """Zeros that are tried where nothing explains the runs: most that are off are so by less, and one
 beside a fault is not what movements agree on."""
+BESIDE_RAD = tuple(np.deg2rad([2.0, 1.0]).tolist())
+"""Steps by which a zero is looked for beside a sensor that stands elsewhere."""
 HOPELESS_NATS = 12.0
 """A zero that is so much less probable than the set-up as told is not looked at more closely."""
 ROUNDS = 2
@@ -172,11 +174,14 @@ class SetUpWeighing:
     @cached_property
     def few(self) -> SetUpWeighing:
         """The same by few of the runs."""
+        return replace(self, likelihood=self._some(FEW))
+
+    def _some(self, most: int) -> RunLikelihood:
+        """Return so many of the runs at most, evenly spread."""
         count = len(self.likelihood.usable)
-        if count <= FEW:
-            return self
-        some = np.unique(np.linspace(0, count - 1, FEW).astype(np.int64))
-        return replace(self, likelihood=self.likelihood[some])
+        if count <= most:
+            return self.likelihood
+        return self.likelihood[np.unique(np.linspace(0, count - 1, most).astype(np.int64))]
 
     def searched(self) -> SetUpPosterior:
         """Return what is believed of the set-up of runs that do not fit it.
@@ -188,9 +193,14 @@ class SetUpWeighing:
         told = self.weigh([self.as_told], everything=True)[0]
         zeros = self.zeros(self.as_told, told.log_joint, ZEROS_RAD)
         found = [told, *self.weigh(single), *zeros]
+        likeliest = max(zeros, key=lambda one: one.log_joint, default=None)
+        if likeliest is not None:
+            found += self.zeros(likeliest.set_up, likeliest.log_joint, ZEROS_RAD)
         fitting = any(one.fits for one in found)
         found.append(self.weigh_moved(self.as_told))
-        if fitting or found[-1].fits:
+        if likeliest is not None and not fitting:
+            found.append(self._moved_zero(likeliest.set_up))
+        if any(one.fits for one in found):
             return self._believed(found)
         likely = self.nearest([two.beside(one) for one in mistakes(self.robot) for two in single])
         found += self.weigh(likely)
@@ -257,10 +267,28 @@ class SetUpWeighing:
                 found.append(self._zero(first, k, likeliest, width))
         return found
 
+    def _moved_zero(self, near: SetUp) -> WeighedSetUp:
+        """Return the zero that is likeliest beside a sensor that stands elsewhere.
+
+        Args:
+            near: That of a sensor that stands where it should.
+        """
+        motor = int(np.argmax(np.abs(near.correction.z)))
+        value, few = float(near.correction.z[motor]), replace(self, likelihood=self._some(FEW // 2))
+
+        def log_joint(zero: float) -> float:
+            return few.weigh_moved(self._off(self.as_told, motor, zero)).log_joint
+
+        says = {value: log_joint(value)}
+        for step in BESIDE_RAD:
+            says |= {zero: log_joint(zero) for zero in (value - step, value + step)}
+            value = max(says, key=lambda zero: says[zero])
+        return self.weigh_moved(self._off(self.as_told, motor, value))
+
     def _off(self, first: SetUp, motor: int, zero: float) -> SetUp:
         """Return the mistake that a zero is so far off, behind another."""
-        known = zero_off(self.robot, motor, zero)
-        return replace(known, log_prior=known.log_prior + self.log_rate).beside(first)
+        known, rate = zero_off(self.robot, motor, zero), 0.0 if first.what else self.log_rate
+        return replace(known, log_prior=known.log_prior + rate).beside(first)
 
     def _zero(self, first: SetUp, motor: int, zero: float, width: float) -> WeighedSetUp:
         """Return what the runs say of a zero near some value, the value integrated out."""

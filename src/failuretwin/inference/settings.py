@@ -6,14 +6,17 @@ Section: docs/diagnosis.md#settled-evidence-where-the-tool-rests
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
-from failuretwin.core.config import AtLeastZero, Bounded, from_table
+from failuretwin.core.config import AtLeastZero, Bounded, Bounds, from_table
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import Range
 
+LEAST_NOISE_M = 1e-7
+"""No settled position is told better than this [m]."""
 NOISE_FACTOR = 3.0
 """Lengths by which rest is told from motion are at least so many times the sensor's noise: the
 distance of a reading from the median of many exceeds that once in 34 times if it is normal."""
@@ -67,7 +70,7 @@ class InferenceSettings(Bounded):
     unmoved_m: AtLeastZero = 0.02
     update_m: AtLeastZero = 0.0005
     path_roughness_m: AtLeastZero = 0.002
-    least_noise_m: AtLeastZero = 0.0003
+    least_noise_m: Annotated[float, Bounds(LEAST_NOISE_M)] = 0.0003
     least_error_rad: AtLeastZero = 0.0
     idle_axes: tuple[bool, bool, bool] = (False, False, False)
 

@@ -114,14 +114,13 @@ def _wrong_set_up(runs: xr.Dataset, robot: Robot) -> str:
     seen = BayesDiagnoser(robot).seen(runs)
     set_ups = seen.set_ups()
     remark = set_up_remark(set_ups)
-    if not remark and set_ups.fits:
-        remark = "; ".join(filter(None, (seen.elsewhere(), *seen.rounding())))
-    if not remark or set_ups.best.set_up.kind == "zero":
-        return ""
-    return (
-        f"{remark}; what is learned of such logs is not the robot. Put it right first: "
-        "`failuretwin doctor LOG --out MAP.toml`."
-    )
+    not_learned = "what is learned of such logs is not the robot"
+    if remark and set_ups.best.set_up.kind != "zero":
+        right = "Put it right first: `failuretwin doctor LOG --out MAP.toml`."
+        return f"{remark}; {not_learned}. {right}"
+    noticed = [seen.elsewhere(), *seen.rounding()] if set_ups.fits else []
+    lines = "; ".join(filter(None, noticed))
+    return f"{lines}; {not_learned}" if lines else ""
 
 
 def _pool(calibrations: tuple[Path, ...], out: Path, name: str | None, robot: str) -> None:

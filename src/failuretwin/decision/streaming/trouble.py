@@ -99,7 +99,8 @@ def rests_throughout(evidence: SettledEvidence, settings: InferenceSettings) -> 
     points, target = evidence.point[usable][:, :3], evidence.movements.target[usable]
     if len(points) < 2 or not should_move(np.ptp(target, axis=0)):
         return False
-    return bool(np.linalg.norm(np.ptp(points, axis=0)) <= settings.nearly_still_m)
+    away = np.linalg.norm(points - points.mean(axis=0), axis=1)
+    return bool(np.sqrt(np.mean(away**2)) <= 0.5 * settings.nearly_still_m)
 
 
 # Tools that move though nobody has told the motors to.
@@ -183,8 +184,9 @@ class UntoldMotion(ArrayStruct):
 
 JUMP_BACK, NO_JUMP = 3.0, -1.0
 """What a reading counts that is back where the one before the last was, and any other."""
-SPLIT, MOST_JUMPS = 9.0, 15.0
-"""Sum from which readings come from two places: three in a row; and what it is at most."""
+SPLIT, MOST_JUMPS = 9.0, 300.0
+"""Sum from which readings come from two places: three in a row; and what it then is: one that
+pauses is still there for half a minute of ten readings a second."""
 BACK = 0.5
 """A reading is back if it is nearer to the one before the last than this share of the jump."""
 
@@ -221,5 +223,6 @@ class TwoPlaces(ArrayStruct):
         self.jumps[read] = np.clip(self.jumps + step, 0.0, MOST_JUMPS)[read]
         self.before[read], self.last[read] = self.last[read], points[read]
         self.split[self.jumps >= SPLIT] = True
+        self.jumps[self.split & (self.jumps >= SPLIT) & jumped & read] = MOST_JUMPS
         self.split[self.jumps <= 0.0] = False
         return self.split.copy()
