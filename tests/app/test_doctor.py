@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
@@ -50,6 +52,17 @@ def test_a_tool_that_is_off_by_as_much_after_every_movement_is_no_other_robot(
     assert told.startswith("set-up: the sensor does not seem to stand where the profile says")
     assert "fits the profile" not in told
     assert "another robot" not in told
+
+
+def test_a_shift_of_the_tool_can_be_accepted(failuretwin, simulated, tmp_path):
+    runs = load_run_set(simulated).isel(run=[0, 0, 0, 2])
+    runs = runs.assign_coords(run=[f"run_{i}" for i in range(4)])
+    off, fix = tmp_path / "off.nc", tmp_path / "map.toml"
+    save_run_set(runs.assign(measured=runs["measured"] + [0.0, 0.0, 0.008]), off)
+    told = failuretwin("doctor", off, "--out", fix).stdout
+    assert re.search(r"off by the same . mm|in a frame turned by", told)
+    accepted = failuretwin("doctor", off, "--columns", fix).stdout
+    assert accepted.startswith("set-up: the log fits the profile")
 
 
 def test_a_log_without_a_verdict_does_not_fit(failuretwin, simulated, tmp_path):

@@ -34,7 +34,14 @@ from failuretwin.inference.rounding import (
 from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.set_up_posterior import SetUpPosterior
 from failuretwin.inference.set_up_weighing import ANOTHER, SetUpWeighing
-from failuretwin.inference.set_ups import SetUp, clocks_apart, gross_unit
+from failuretwin.inference.set_ups import (
+    FEWEST_TO_TURN,
+    SetUp,
+    clocks_apart,
+    gross_unit,
+    shifted,
+    turned,
+)
 from failuretwin.inference.shared_posterior import ALLOWED_FOR, set_up_in_doubt, shared_posterior
 
 if TYPE_CHECKING:
@@ -176,6 +183,22 @@ class SeenRuns:
         if 2 * len(said) <= self.runs.sizes["run"]:
             return ""
         return said[-1].replace(ALLOWED_FOR, "")
+
+    def frame(self) -> SetUp | None:
+        """Return the shift of the sensor, or else its turn, that leaves no doubt where it stands.
+
+        None where none does.
+        """
+        sample, robot = self.sample, self.model.twin.robot
+        usable, healthy = sample.usable, sample.findings.expected[:, :, 0]
+        if not usable.any():
+            return None
+        poses = self.model.twin.path(healthy[usable]), sample.evidence.point[usable][:, :3]
+        ways = [shifted, turned] if usable.sum() >= FEWEST_TO_TURN else [shifted]
+        for found in (way(robot, *poses) for way in ways):
+            if not self.under(found.correction).elsewhere():
+                return found
+        return None
 
 
 def mixed(

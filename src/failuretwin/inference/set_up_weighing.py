@@ -199,7 +199,7 @@ class SetUpWeighing:
         fitting = any(one.fits for one in found)
         found.append(self.weigh_moved(self.as_told))
         if likeliest is not None and not fitting:
-            found.append(self._moved_zero(likeliest.set_up))
+            found += self._moved_zeros(likeliest.set_up)
         if any(one.fits for one in found):
             return self._believed(found)
         likely = self.nearest([two.beside(one) for one in mistakes(self.robot) for two in single])
@@ -264,11 +264,13 @@ class SetUpWeighing:
             log_joint = [one.log_joint for one in tried]
             if max(log_joint, default=-np.inf) > told - HOPELESS_NATS:
                 likeliest = values[int(np.argmax(log_joint))]
-                found.append(self._zero(first, k, likeliest, width))
+                zero = self._zero(first, k, likeliest, width)
+                off = zero.set_up.correction.z[k] - first.correction.z[k]
+                found += [zero] if abs(off) > OFF * width else []
         return found
 
-    def _moved_zero(self, near: SetUp) -> WeighedSetUp:
-        """Return the zero that is likeliest beside a sensor that stands elsewhere.
+    def _moved_zeros(self, near: SetUp) -> list[WeighedSetUp]:
+        """Return the zero that is likeliest beside a sensor that stands elsewhere, if one is off.
 
         Args:
             near: That of a sensor that stands where it should.
@@ -283,7 +285,9 @@ class SetUpWeighing:
         for step in BESIDE_RAD:
             says |= {zero: log_joint(zero) for zero in (value - step, value + step)}
             value = max(says, key=lambda zero: says[zero])
-        return self.weigh_moved(self._off(self.as_told, motor, value))
+        if abs(value) <= OFF * self.likelihood.model.least_visible[motor]:
+            return []
+        return [self.weigh_moved(self._off(self.as_told, motor, value))]
 
     def _off(self, first: SetUp, motor: int, zero: float) -> SetUp:
         """Return the mistake that a zero is so far off, behind another."""

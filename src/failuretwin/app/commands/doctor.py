@@ -20,6 +20,7 @@ from failuretwin.app.terminal import tell
 if TYPE_CHECKING:
     from failuretwin.inference.seen_runs import SeenRuns
     from failuretwin.inference.set_up_posterior import SetUpPosterior
+    from failuretwin.inference.set_ups import SetUp
 
 SHOWN = 5
 """So many kinds of remarks on logs are listed."""
@@ -67,10 +68,14 @@ def doctor(
     seen = BayesDiagnoser(known.twin, known.imperfections).seen(runs)
     set_ups = seen.set_ups()
     unfit = _unfit(seen, set_ups)
+    undo = set_ups.best.set_up if set_ups.fits else None
+    frame = seen.under(set_ups.best.set_up.correction).frame() if undo and unfit else None
+    if undo and frame:
+        unfit, undo = f"{unfit}: {frame.what}", frame.beside(undo)
     for line in (_set_up_line(set_ups, unfit), *_log_lines(seen, set_ups, bool(unfit))):
         tell(line)
     if out is not None:
-        _write(set_ups, reading.columns, out)
+        _write(undo, reading.columns, out)
 
 
 def _unfit(seen: SeenRuns, set_ups: SetUpPosterior) -> str:
@@ -87,7 +92,8 @@ def _unfit(seen: SeenRuns, set_ups: SetUpPosterior) -> str:
 def _set_up_line(set_ups: SetUpPosterior, unfit: str) -> str:
     from failuretwin.inference.seen_runs import set_up_finding
 
-    return f"set-up: {set_up_finding(set_ups) or unfit or 'the log fits the profile'}"
+    said = "; ".join(filter(None, (set_up_finding(set_ups), unfit)))
+    return f"set-up: {said or 'the log fits the profile'}"
 
 
 def _log_lines(seen: SeenRuns, set_ups: SetUpPosterior, unfit: bool) -> list[str]:
@@ -131,15 +137,14 @@ def _in_runs(named: Sequence[str], count: int) -> str:
     return f" ({', '.join(named[:NAMED])}{more})"
 
 
-def _write(set_ups: SetUpPosterior, columns: Path | None, out: Path) -> None:
+def _write(undo: SetUp | None, columns: Path | None, out: Path) -> None:
     """Write what undoes a wrong set-up, beside the column map that the log was read with."""
     from failuretwin.data_knowledge.store import replacing
 
-    best = set_ups.best
-    if not (best.set_up.what and set_ups.fits):
+    if undo is None or not undo.what:
         tell("nothing to put right, so nothing is written")
         return
     map_text = "" if columns is None else columns.read_text(encoding="utf-8").rstrip() + "\n\n"
     with replacing(out) as partial:
-        partial.write_text(map_text + best.set_up.correction.text(best.set_up.what), "utf-8")
+        partial.write_text(map_text + undo.correction.text(undo.what), "utf-8")
     tell(f"written to {out}: what undoes it; once you believe it, use it with --columns {out}")

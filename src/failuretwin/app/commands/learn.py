@@ -113,14 +113,14 @@ def _wrong_set_up(runs: xr.Dataset, robot: Robot) -> str:
 
     seen = BayesDiagnoser(robot).seen(runs)
     set_ups = seen.set_ups()
-    remark = set_up_remark(set_ups)
-    not_learned = "what is learned of such logs is not the robot"
-    if remark and set_ups.best.set_up.kind != "zero":
-        right = "Put it right first: `failuretwin doctor LOG --out MAP.toml`."
-        return f"{remark}; {not_learned}. {right}"
-    noticed = [seen.elsewhere(), *seen.rounding()] if set_ups.fits else []
-    lines = "; ".join(filter(None, noticed))
-    return f"{lines}; {not_learned}" if lines else ""
+    remark = "" if set_ups.best.set_up.kind == "zero" else set_up_remark(set_ups)
+    if set_ups.fits and not remark:
+        remark = seen.elsewhere()
+    said = "; ".join(filter(None, (remark, *seen.rounding())))
+    if not said:
+        return ""
+    right = " Put it right first: `failuretwin doctor LOG --out MAP.toml`." if remark else ""
+    return f"{said}; what is learned of such logs is not the robot.{right}"
 
 
 def _pool(calibrations: tuple[Path, ...], out: Path, name: str | None, robot: str) -> None:
