@@ -27,7 +27,7 @@ from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.explanation import plain_name
-from failuretwin.inference.seen_runs import SURE, set_up_finding, set_up_remark
+from failuretwin.inference.seen_runs import SURE, TOLD, set_up_finding, set_up_remark
 from failuretwin.inference.set_up_posterior import SetUpPosterior
 from failuretwin.inference.set_up_weighing import FEW
 
@@ -212,7 +212,7 @@ class SetUpWatch:
         if new or not (young or self._proven) or self._asked_at < self.movements >= again:
             self._ask(thorough=new or not young)
             self._proven = not young
-        if self.finding:
+        if self.finding and not (_is_held(alarm.cause) and self._may_be_a_zero):
             return self.finding
         if len(self._blamed) > CHANGES:
             named = ", then ".join(motor.replace("_", " ") for motor in self._blamed)
@@ -224,6 +224,18 @@ class SetUpWatch:
             fault = plain_name(Hypothesis.parse(alarm.cause))
             return f"{fault}, or the log does not fit the profile: a few movements more tell"
         return ""
+
+    @property
+    def _may_be_a_zero(self) -> bool:
+        """Whether nothing but a zero may be wrong, and need not be: no zero holds a motor."""
+        found = self._found
+        if found is None or found.wrong >= SURE or not found.fits:
+            return False
+        if self._elsewhere:
+            return False
+        pairs = zip(found.found, found.probability, strict=True)
+        others = sum(share for one, share in pairs if one.set_up.kind not in ("", "zero"))
+        return bool(others < TOLD)
 
     def _ask(self, thorough: bool = False) -> None:
         """Weigh the set-ups by the runs so far; see `SeenRuns.set_ups`.
