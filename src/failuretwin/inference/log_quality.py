@@ -303,7 +303,7 @@ def _frozen(
     longest = int(np.argmax(np.diff(edges)))
     first, last = int(edges[longest]), int(edges[longest + 1]) - 1
     begin, end = float(at[first]), float(at[last])
-    if end - begin < FROZEN_S or not _told_to_move(time, command, begin, end):
+    if end - begin < FROZEN_S or not _told_to_move(time, command, at[first : last + 1]):
         return None
     return begin, end
 
@@ -329,14 +329,20 @@ def _nearly_still(
             best = (first, last)
     near = np.abs(point[best[1] :] - point[best[0]]).max(axis=1) <= radius
     leaves = len(near) if near.all() else int(np.argmin(near))
-    begin, end = float(at[best[0]]), float(at[best[1] + leaves - 1])
-    if end - begin < NEARLY_STILL_S or not _told_to_move(time, command, begin, end):
+    last = best[1] + leaves - 1
+    begin, end = float(at[best[0]]), float(at[last])
+    if end - begin < NEARLY_STILL_S or not _told_to_move(time, command, at[best[0] : last + 1]):
         return None
     return begin, end
 
 
-def _told_to_move(time: FloatArray, command: FloatArray, begin: float, end: float) -> bool:
-    return bool(should_move(np.ptp(command[(time >= begin) & (time <= end)], axis=0)))
+def _told_to_move(time: FloatArray, command: FloatArray, still: FloatArray) -> bool:
+    """Return whether motors are told to move between the readings of a stretch, (reading,) [s].
+
+    The first may bear a time from before the bus stalled, and the movement may have been then.
+    """
+    there = (time >= still[min(1, len(still) - 1)]) & (time <= still[-1])
+    return bool(should_move(np.ptp(command[there], axis=0)))
 
 
 def should_move(travel: FloatArray) -> BoolArray:

@@ -5,11 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from failuretwin.decision.streaming.trouble import TwoPlaces, UntoldMotion
+from failuretwin.app.shadow import Shadow
+from failuretwin.connection.links.base import AS_FAST_AS_POSSIBLE, Pace, PacedSource
+from failuretwin.connection.links.recording import session_events
+from failuretwin.data_knowledge.raw_sessions import read_session
+from failuretwin.decision.streaming.monitor import monitor
+from failuretwin.decision.streaming.trouble import FrozenSensorDetector, TwoPlaces, UntoldMotion
 
 UNTOLD = "the tool moves though no command came"
 TWO = "readings jump between two places"
 TOLD = np.array([True])
+NEAR_M = 0.002, 0.02
+
+
+def told_place(place):
+    """Return what says where tools were told to go."""
+    return lambda some: np.broadcast_to(place, (len(some), 3))
 
 
 def undecided(watcher, samples):
@@ -79,7 +90,7 @@ def test_a_glitch_is_neither(rng):
     for k in range(400):
         point = np.full((1, 3), 0.1) if k % 20 in (3, 4) or k % 33 == 7 else rest
         assert not jumps.see(point, 0.02)[0]
-        untold.see(0.1 * k, point, rest, TOLD, TOLD, (0.002, 0.02))
+        untold.see(0.1 * k, point, rest, TOLD, TOLD, NEAR_M, told_place(0.0))
         assert not untold.untold[0]
 
 
@@ -87,8 +98,48 @@ def test_a_movement_that_is_under_way_is_no_motion_without_a_command():
     seen = UntoldMotion.empty(run=1, axis=3)
     nowhere = np.full((1, 3), np.nan)
     for k in range(50):
-        seen.see(0.1 * k, np.full((1, 3), 0.01 * k), nowhere, TOLD, TOLD, (0.002, 0.02))
+        point = np.full((1, 3), 0.01 * k)
+        seen.see(0.1 * k, point, nowhere, TOLD, TOLD, NEAR_M, told_place(0.0))
     assert not seen.untold[0]
+
+
+@pytest.mark.parametrize(("aim", "untold"), [(0.3, False), (-0.3, True), (0.0, True)])
+def test_a_lost_command_that_is_sent_again_is_a_command(aim, untold):
+    """The tool rests elsewhere than it was told to, and goes there; not away from there."""
+    seen, rest = UntoldMotion.empty(run=1, axis=3), np.zeros((1, 3))
+    for k in range(40):
+        point = np.array([[min(max(0.02 * (k - 10), 0.0), 0.3), 0.0, 0.0]])
+        aims = told_place(np.array([aim, 0.0, 0.0]))
+        seen.see(0.1 * k, point, rest, TOLD, TOLD, NEAR_M, aims)
+    assert seen.untold[0] == untold
+
+
+@pytest.mark.parametrize("moved_after_s", [0.4, 3.0])
+def test_a_reading_from_before_a_stall_of_the_bus_shows_no_dead_tool(moved_after_s):
+    """It bears the time at which it was asked for, and says where the arm went since then.
+
+    A tool that the next readings show as still, too, while motors are told to move, is dead.
+    """
+    seen, place, told = FrozenSensorDetector.empty(run=1, axis=3, value=4, motor=4), 0.2, []
+    for time in (0.3, *np.arange(2.4, 8.0, 0.1)):
+        command = np.full((1, 4), 0.0 if time < moved_after_s else 1.0)
+        point = np.full((1, 3), place + 1e-4 * np.sin(time))
+        told.append(seen.see(time, TOLD, point, command, 0.002)[0][0])
+    assert any(told) == (moved_after_s == 3.0)
+
+
+@pytest.mark.parametrize("label", range(5))
+def test_healthy_sessions_get_no_other_verdict(data, twin, label):
+    """Real sessions with lost commands that are sent again and stalls of the bus of seconds."""
+    folder = next((data / f"real_robot_b_20241003/label_{label}").iterdir())
+    events = session_events(read_session(folder, twin.robot), twin.robot)
+    source = PacedSource("session", events, Pace(AS_FAST_AS_POSSIBLE))
+    shadow, said = Shadow(source, monitor(twin), twin), set()
+    while shadow.step(0.0):
+        found = shadow.snapshot.answer.diagnosis
+        if found is not None:
+            said.add(found.undecided or str(found.diagnosis))
+    assert said == {"healthy"}
 
 
 def test_the_first_command_of_a_recording_is_one(watcher, work):

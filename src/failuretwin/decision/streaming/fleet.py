@@ -212,8 +212,12 @@ class StreamingFleet:
         tracker, settings = self._tracker, self._settings
         told = (tracker.window.count > 0) | tracker.references.moved
         near_m = settings.same_place_m, settings.unmoved_m
-        known = np.isfinite(tracker.references.last[:, 0]) | np.isfinite(reference).all(axis=1)
-        return self._untold.see(time, points, tracker.rest(), told, known, near_m)
+        last = tracker.references.last
+        known = np.isfinite(last[:, 0]) | np.isfinite(reference).all(axis=1)
+        place = self.diagnoser.twin.path
+        return self._untold.see(
+            time, points, tracker.rest(), told, known, near_m, lambda some: place(last[some])
+        )
 
     @property
     def _odd(self) -> BoolArray:

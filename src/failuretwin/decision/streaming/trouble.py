@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -31,12 +32,13 @@ class FrozenSensorDetector(ArrayStruct):
     """Watches the tools of many robots, by the same rules as `log_quality`.
 
     Four values of each robot may stand still: each axis, as long as it reports the very same
-    number, and the tool as a whole, as long as it stays near one place.
+    number, and the tool as a whole, as long as it stays near one place. Either counts from the
+    second reading on: the first may bear a time from before the bus stalled.
 
     Attributes:
         number: What each axis reports, (robot, axis) [m].
         place: Where the tool is, (robot, axis) [m].
-        since_s: Since when each stands still, (robot, value) [s].
+        since_s: Since when each stands still, (robot, value) [s]; inf: one reading says so.
         low: Least references since then, (robot, value, motor) [rad].
         high: Greatest ones.
     """
@@ -72,9 +74,10 @@ class FrozenSensorDetector(ArrayStruct):
             anew[:, :3] &= ~(np.abs(points - self.number) <= STILL_M)
             anew[:, 3] &= ~(np.abs(points - self.place).max(axis=1) <= near_m)
         self.number[anew[:, :3]], self.place[anew[:, 3]] = points[anew[:, :3]], points[anew[:, 3]]
-        self.since_s[anew] = time
+        second = read[:, None] & ~anew & np.isposinf(self.since_s)
+        self.since_s[anew], self.since_s[second] = np.inf, time
         reference = np.broadcast_to(command[:, None], self.low.shape)
-        self.low[anew] = self.high[anew] = reference[anew]
+        self.low[anew | second] = self.high[anew | second] = reference[anew | second]
         np.fmin(self.low, reference, out=self.low)
         np.fmax(self.high, reference, out=self.high)
         with np.errstate(invalid="ignore"):
@@ -116,6 +119,8 @@ RESTED_S = 0.15
 class UntoldMotion(ArrayStruct):
     """Watches for tools that leave the place where they rest though no command came.
 
+    One that rests elsewhere than it was told to and gets nearer has had its last command again.
+
     Attributes:
         place: Where each tool stood when it was last seen to move, (robot, axis) [m].
         since_s: Since when it has stood there, (robot,) [s].
@@ -141,6 +146,7 @@ class UntoldMotion(ArrayStruct):
         told: BoolArray,
         known: BoolArray,
         near_m: tuple[float, float],
+        told_place: Callable[[IntArray], FloatArray],
     ) -> BoolArray:
         """Take readings and return which tools are away from where they rested, (robot,).
 
@@ -152,6 +158,7 @@ class UntoldMotion(ArrayStruct):
             told: Robots that have had a command, (robot,); of others the first rest counts.
             known: Robots whose reference is known, (robot,).
             near_m: How near is the same place, and how far away is moved [m].
+            told_place: Where the tools of some robots were told to go, (robot, axis) [m].
         """
         same_place_m, moved_m = near_m
         read = np.isfinite(points).all(axis=1)
@@ -169,6 +176,11 @@ class UntoldMotion(ArrayStruct):
         self.rest[rests] = rest[rests]
         with np.errstate(invalid="ignore"):
             away = read & (np.linalg.norm(points - self.rest, axis=1) > moved_m)
+        left = np.flatnonzero(away)
+        aim = told_place(left) if len(left) else points[left]
+        off_before = np.linalg.norm(self.rest[left] - aim, axis=1)
+        off = np.linalg.norm(points[left] - aim, axis=1)
+        away[left[(off_before > moved_m) & (off < off_before)]] = False
         self.away_s[read & ~away] = np.nan
         self.away_s[away & np.isnan(self.away_s)] = time
         with np.errstate(invalid="ignore"):
