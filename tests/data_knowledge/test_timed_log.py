@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.movements import find_movements
+from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.polyline import resolution, simplify
 from failuretwin.data_knowledge.timed_log import STEP_S, Samples, Targets, TimedLog, timed_run
 
@@ -43,6 +43,26 @@ def test_rounded_commands_keep_their_movements(armpi, twin, quantum):
 
     assert found.start.shape[1] == 2
     np.testing.assert_allclose(found.start[0], [0.5, 3.0], atol=0.05)
+
+
+@pytest.mark.parametrize("quantum_deg", [0.5, 1.0, 2.0])
+def test_stairs_of_all_motors_are_the_movements_that_were_rounded(armpi, twin, quantum_deg):
+    """Motors that take differently long, some by a step or two: no step is a movement."""
+    rng, quantum = np.random.default_rng(3), np.deg2rad(quantum_deg)
+    low, high = np.array([motor.movement_range for motor in armpi.motors]).T
+    target = rng.uniform(low, high, (1, 6, 4))
+    target[0, 2, 0] = target[0, 1, 0] + 1.2 * quantum
+    ramp = rng.choice([0.6, 0.8, 1.0], target.shape)
+    told = Movements(np.zeros((1, 4)), target, ramp, 0.1 + 2.04 * np.arange(6.0)[None])
+    time = np.arange(0.0, 12.5, 0.02)
+    command = np.rint(told.reference(time)[0] / quantum) * quantum
+
+    run = timed_run(log_of(twin, command, time), armpi)
+    found = find_movements(run.command, run.time)
+
+    assert found.start.shape[1] == 6
+    np.testing.assert_allclose(found.start, told.start, atol=0.05)
+    np.testing.assert_allclose(found.target, target, atol=0.51 * quantum)
 
 
 def test_the_quantum_of_rounded_values_is_found():

@@ -52,6 +52,7 @@ def test_rounded_tool_positions_are_noisier(twin, runs):
     assert "rounded to 5 mm: each is off by up to 2.5 mm" in line
     noise = np.hypot(as_is.model.path_noise, 0.005 / np.sqrt(12.0))
     assert seen.healthy.path_noise == pytest.approx(noise)
+    assert seen.elsewhere() == ""  # it is noise that is known
 
 
 def commanded(runs, step):

@@ -223,7 +223,9 @@ class _Screen:
         """Tell what has changed since the last call."""
         shadow, changes, monitor = self.shadow, self.changes, self.monitor
         troubles = _troubles(shadow, self.source, self.sinks, time.monotonic() - self._begun_s)
-        troubles += () if monitor is None or monitor.set_up else _misfit(monitor.fit)
+        if monitor is not None:
+            troubles += monitor.rounding
+            troubles += () if monitor.set_up else _misfit(monitor.fit)
         counts = _with_stamps(self.source.counts, shadow.senseless_stamps)
         found = changes.notice(shadow.snapshot, counts, shadow.clock_jumps, troubles)
         if monitor is not None and monitor.set_up is not None and not self._looked:

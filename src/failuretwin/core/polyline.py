@@ -71,6 +71,56 @@ def simplify(
     return times, _level(values, fixed, 2.0 * tolerance)
 
 
+def simplify_motors(
+    time: FloatArray, value: FloatArray, tolerance: float
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the corners of each motor's reference, as `simplify` does one by one.
+
+    Values that were rounded more coarsely than the tolerance are stairs, and of stairs nobody can
+    tell a bend from a step: where that keeps them within a quantum and a sample, each motor goes
+    straight from where all motors rest to where they rest next, until its own last step.
+
+    Args:
+        time: Increasing times, (sample,) [s].
+        value: Samples, (sample, motor) [rad]; NaN where there is none.
+        tolerance: Largest distance from the samples [rad].
+    """
+    quantum = max(resolution(column) for column in value.T)
+    if quantum > tolerance and np.isfinite(value).all():
+        lines = [_between_rests(time, column, value) for column in value.T]
+        pairs = zip(lines, value.T, strict=True)
+        off = [
+            np.abs(np.interp(time, *line) - column).max() - np.abs(np.diff(column)).max()
+            for line, column in pairs
+        ]
+        if max(off) <= quantum:
+            return lines
+    return [simplify(time, column, tolerance) for column in value.T]
+
+
+def _between_rests(
+    time: FloatArray, value: FloatArray, together: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return corners of straight lines between the rests of all motors.
+
+    Args:
+        time: (sample,) [s].
+        value: Of one motor, (sample,) [rad].
+        together: Of all, (sample, motor) [rad].
+    """
+    moves = np.abs(np.diff(together, axis=0)).max(axis=1) > TURN_RAD
+    edges = np.flatnonzero(np.concatenate([[True], moves, [True]]))
+    level = [(first, stop - 1) for first, stop in pairwise(edges.tolist())]
+    inner = [(a, b) for a, b in level[1:-1] if time[b] - time[a] >= REST_S]
+    ends = [end for rest in (level[0], *inner, level[-1]) for end in rest][1:-1]
+    corners = {0, *ends, len(time) - 1}
+    for last, following in zip(ends[::2], ends[1::2], strict=True):
+        steps = np.flatnonzero(np.abs(np.diff(value[last : following + 1])) > TURN_RAD)
+        corners |= {last + 1 + int(step) for step in steps[-1:]}
+    kept = np.array(sorted(corners))
+    return time[kept], value[kept]
+
+
 def _rests(time: FloatArray, value: FloatArray) -> list[tuple[int, int]]:
     """Return first and last sample of every stretch of `REST_S` or more without a turn."""
     moves = np.abs(np.diff(value)) > TURN_RAD

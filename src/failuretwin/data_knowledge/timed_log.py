@@ -13,7 +13,7 @@ import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import ROUNDING_RAD, Movements
-from failuretwin.core.polyline import simplify
+from failuretwin.core.polyline import simplify_motors
 from failuretwin.core.runs import RunTable
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.robot import Robot
@@ -228,10 +228,7 @@ def check_grid(samples: float, stamps: int, where: str) -> None:
 def _command(log: TimedLog, time: FloatArray, begin: float) -> tuple[FloatArray, Movements | None]:
     """Return the reference on the grid (time, motor) [rad] and the movements, where known."""
     if isinstance(log.command, Samples):
-        lines = [
-            simplify(log.command.time - begin, values, ROUNDING_RAD)
-            for values in log.command.value.T
-        ]
+        lines = simplify_motors(log.command.time - begin, log.command.value, ROUNDING_RAD)
         return np.stack([np.interp(time, *line) for line in lines], axis=1), None
     movements = Movements(
         initial=_initial(log, log.command)[None],

@@ -10,8 +10,9 @@ command stays where it was last seen to stand:
 
 with the scale matrix S and the Jacobian J of `HealthyModel.residual`, q_i the probability that the
 scatter of one motor is drawn with the variance w_i s^2 (a Student t is a normal of a variance that
-is drawn: w = nu / chi2_nu), and x_j what movement j, at which the motor already stood there, says
-of where it stands off its target, with precision L_j.
+is drawn: w = nu / chi2_nu; the last i is a blip, which no calibration knows), and x_j what movement
+j, at which the motor already stood there, says of where it stands off its target, with precision
+L_j.
 
 Section: docs/streaming.md#the-healthy-robot-in-the-filter
 """
@@ -33,6 +34,9 @@ from failuretwin.inference.joint_likelihood import MovementLikelihoods
 DECADES = (1e-2, 1e-3, 1e-4, 1e-5, 0.0)
 """Shares of movements with a wider scatter of one motor, between which one variance stands for all:
 a hundredth is what scatters by itself, the rest all motors share."""
+BLIP, BLIP_SCATTERS = 2.5e-5, 20.0
+"""How often a motor settles anywhere for one movement, which no model says, and how far off that
+is, in scatters; assumed: a hand on the arm, a reading of before."""
 NEARLY_ONE = 0.999
 """Most of its own variance that a motor may explain: rounding must not turn precisions negative."""
 LEAST = 1e-18
@@ -77,8 +81,6 @@ def _log_density(
     error, jacobian, spread = model.residual(point, pose, scale)
     dof, dims = model.settling.tail_dof, model.sensors.dims
     together = spread.log_student(error, dof)
-    if np.isinf(dof):
-        return together
     share, variance = wide_scatter(dof)
     pull = np.einsum("...ak,...a->...k", jacobian, spread.solve(error))[..., None]
     precision = _own_precision(jacobian, spread)[..., None]
@@ -93,14 +95,17 @@ def _log_density(
 
 
 def wide_scatter(dof: float) -> tuple[FloatArray, FloatArray]:
-    """Return how often one motor scatters far, and how far: q and w, (decade,) each.
+    """Return how often one motor scatters far, and how far: q and w, (decade + 1,) each.
 
     Args:
         dof: nu of the scatter's Student t.
     """
+    if np.isinf(dof):
+        return np.array([BLIP]), np.array([BLIP_SCATTERS**2])
     rarer = np.array(DECADES)
     share, middle = -np.diff(rarer), 0.5 * (rarer[:-1] + rarer[1:])
-    return share, dof / stats.chi2.ppf(middle, dof)
+    variance = dof / stats.chi2.ppf(middle, dof)
+    return np.append(share, BLIP), np.append(variance, BLIP_SCATTERS**2)
 
 
 def _own_precision(jacobian: FloatArray, spread: Covariance) -> FloatArray:

@@ -77,10 +77,12 @@ def tool_rounding(point: FloatArray, model: HealthyModel) -> Rounding | None:
     """Return how coarsely tool positions (..., axis) [m] were rounded; None: it does not matter."""
     grids = [grid_of(point[..., axis], {"mm": 1e-3}) for axis in range(3)]
     known = [one for one in grids if one is not None]
-    if len(known) < 3:
+    if not known:
         return None
     finest = min(known, key=lambda one: one.step)
-    return finest if finest.deviation > MATTERS * model.path_noise else None
+    in_steps = point[np.isfinite(point).all(axis=-1)] / finest.step
+    lies = bool((np.abs(in_steps - np.rint(in_steps)) < EXACT).all())  # the third may move little
+    return finest if lies and finest.deviation > MATTERS * model.path_noise else None
 
 
 def command_rounding(target: FloatArray, model: HealthyModel) -> Rounding | None:

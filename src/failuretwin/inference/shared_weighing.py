@@ -219,9 +219,10 @@ class SharedWeighing:
     # Weighing runs near some registration.
 
     def expand(self, rows: IntArray, place: FloatArray, untold_noise_m: float = 0.0) -> Expansion:
-        """Return some of the runs, registered."""
-        likelihood = self.likelihood
-        model = replace(likelihood.model, untold_noise_m=untold_noise_m)
+        """Return some of the runs, registered; with noise beside what is known, if any [m]."""
+        likelihood, known = self.likelihood, self.likelihood.model
+        noise = float(np.hypot(known.untold_noise_m, untold_noise_m))
+        model = replace(known, untold_noise_m=noise)
         seen = registered_evidence(likelihood.evidence[rows], place, model.sensors)
         way = likelihood.moving
         way = None if way is None else registered_samples(way[rows], place, model.sensors)

@@ -62,6 +62,26 @@ def test_movements_that_fit_nothing_are_not_healthy(twin, work):
     assert max(d.posterior["healthy"] for d in decided) < 0.95
 
 
+@pytest.mark.parametrize("step_m", [0.005, 0.01])
+def test_a_tool_that_is_rounded_is_noisier_and_no_fault(twin, work, step_m):
+    watch = monitor(twin)
+    before = watch.believed.model.path_noise
+    coarse = [(t, c, np.round(p / step_m) * step_m) for t, c, p in work(24)]
+    told = answers(watch, coarse)
+    assert blamed(told) == set()
+    assert not [a for a in told if a.diagnosis is not None and "stands still" in str(a.diagnosis)]
+    (line,) = watch.rounding
+    assert f"rounded to {1e3 * step_m:g} mm" in line
+    after = watch.believed.model.path_noise
+    assert after == pytest.approx(np.hypot(before, step_m / np.sqrt(12.0)))
+
+
+def test_a_tool_that_is_not_rounded_is_not_said_to_be(twin, work):
+    watch = monitor(twin)
+    answers(watch, work(6))
+    assert watch.rounding == ()
+
+
 @pytest.mark.parametrize("noise_m", [0.0, 5e-4, 1e-3])
 def test_an_arm_that_obeys_nothing_is_not_healthy(twin, work, rng, noise_m):
     """Also where the sensor's noise hides that it stands still."""

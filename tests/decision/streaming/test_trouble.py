@@ -128,6 +128,16 @@ def test_a_reading_from_before_a_stall_of_the_bus_shows_no_dead_tool(moved_after
     assert any(told) == (moved_after_s == 3.0)
 
 
+def test_an_arm_that_lags_after_a_long_rest_is_not_dead():
+    """Its axes report the very same number at rest: they are rounded, or without noise."""
+    seen, told = FrozenSensorDetector.empty(run=1, axis=3, value=4, motor=4), []
+    for time in np.arange(0.0, 8.0, 0.1):
+        command = np.full((1, 4), np.clip(time - 4.0, 0.0, 1.0))
+        point = np.full((1, 3), 0.2 + 0.1 * np.clip(time - 4.4, 0.0, 1.0))
+        told.append(seen.see(time, TOLD, point, command, 0.002)[0][0])
+    assert not any(told)
+
+
 @pytest.mark.parametrize("label", range(5))
 def test_healthy_sessions_get_no_other_verdict(data, twin, label):
     """Real sessions with lost commands that are sent again and stalls of the bus of seconds."""

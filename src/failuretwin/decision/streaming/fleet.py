@@ -35,6 +35,7 @@ from failuretwin.inference.posterior import (
     log_prior,
     shows_in_transients,
 )
+from failuretwin.inference.rounding import Rounding, rounded
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 MOVEMENTS = 5
@@ -109,7 +110,7 @@ class StreamingFleet:
                 f"a stream of {robots} robots, {movements} movements, {rate_hz} Hz. Expected one "
                 "robot and one movement at least, and a rate above 0 or None."
             )
-        model = diagnoser.healthy_model
+        model = self.model = diagnoser.healthy_model
         known = "+".join(model.sensing) in STREAMED
         if not known or (not model.sensors.tool_alone and diagnoser.whole_run):
             raise InputError(
@@ -117,6 +118,7 @@ class StreamingFleet:
                 "encoders, whole_run=False. Diagnose recorded runs, or leave sensing out."
             )
         self.diagnoser = diagnoser
+        self._rounding: Rounding | None = None
         self.hypotheses = [str(hypothesis) for hypothesis in diagnoser.hypothesis_set]
         self.robots, self.rate_hz, self.movements = robots, rate_hz, movements
         self._zero: float | None = None
@@ -187,7 +189,7 @@ class StreamingFleet:
         split = self._split.see(points, self._settings.unmoved_m)
         points = np.where(split[:, None], np.nan, points)
         away = self._astray(time, reference, points)
-        sensors = self.diagnoser.healthy_model.sensors
+        sensors = self.model.sensors
         points = sensors.reading(points, self._reported(position))
         begun, at_rest = self._tracker.take(time, reference, points, away)
         self._beliefs.point[begun] = np.nan
@@ -296,7 +298,16 @@ class StreamingFleet:
     def adopt(self, imperfections: Imperfections) -> None:
         """Judge by another healthy behaviour from now on, the last movements too."""
         self.diagnoser = replace(self.diagnoser, imperfections=imperfections)
-        self._tracker.adopt(self.diagnoser.healthy_model)
+        self._look_anew()
+
+    def count_as_noise(self, rounding: Rounding) -> None:
+        """Judge by a sensor that rounds like this from now on, the last movements too."""
+        self._rounding = rounding
+        self._look_anew()
+
+    def _look_anew(self) -> None:
+        self.model = rounded(self.diagnoser.healthy_model, self._rounding, None)
+        self._tracker.adopt(self.model)
         self._latest = {}
 
     def _known(self, robot: int) -> bool:
@@ -398,7 +409,8 @@ class StreamingFleet:
         read = np.asarray(np.isfinite(points).all(axis=1))
         known = np.where(np.isfinite(command), command, last)
         near_m = self._settings.nearly_still_m
-        still, alone = self._frozen.see(time, read, points, known, near_m)
+        flickers = self._rounding is None
+        still, alone = self._frozen.see(time, read, points, known, near_m, flickers)
         alone &= ~np.array(self._settings.idle_axes)
         still |= beliefs.dead & ~read
         died = still & ~beliefs.dead
@@ -450,7 +462,7 @@ class StreamingFleet:
         settled, transient = window.evidence(robots)
         counts = self._on_way(robots).any()
         moving = transient.where(diagnoser.transient_mask(settled.usable)) if counts else None
-        model = diagnoser.healthy_model
+        model = self.model
         likelihoods = window.judge(robots, settled, model)
         likelihood = RunLikelihood(settled, model, moving, remembered=likelihoods)
         return compute_posterior(likelihood, diagnoser.hypothesis_set, diagnoser.priors)

@@ -34,6 +34,7 @@ from failuretwin.inference.healthy_mixture import FOREIGN, HealthyMixture
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.misfit import FITS, misfit
 from failuretwin.inference.posterior import StreamPosition
+from failuretwin.inference.rounding import Rounding, rounded, told_of
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 WORTH_LEARNING = 0.01
@@ -126,11 +127,17 @@ class FaultMonitor:
         self._set_up = SetUpWatch(diagnoser)
         self._arrived = np.full((0, len(known.scatter)), np.nan)
         self._rests, self._misfit = False, 0.0
+        self._rounding: Rounding | None = None
 
     @property
     def set_up(self) -> str | None:
         """What is to be said of the set-up; empty: the log fits the profile; None: not looked."""
         return self._set_up.finding if self._set_up.looked else None
+
+    @property
+    def rounding(self) -> tuple[str, ...]:
+        """What is to be said of how coarsely readings are written down, a line each."""
+        return tuple(told_of(self._rounding, None, 0.0))
 
     @property
     def fit(self) -> Fit:
@@ -176,6 +183,7 @@ class FaultMonitor:
         if len(self._fleet.update(time, reference, point, motors_say, goals)):
             self._judge()
         self._set_up.see(time, _row(reference), _row(point))
+        self._count_rounding()
         return self._answer()
 
     def conclude(self) -> Answer:
@@ -204,6 +212,14 @@ class FaultMonitor:
         young = self._set_up.movements <= PROOF and alarm.state == CLEAR
         odd = BEGINS_ODDLY if young and self._misfit > FITS else ""
         return self._set_up.against(alarm) or odd or self._unheard(alarm.cause)
+
+    def _count_rounding(self) -> None:
+        """Count as noise what the sensor was found to round off."""
+        found = self._set_up.rounding
+        if self._rounding is None and found is not None:
+            self._rounding = found
+            self._fleet.count_as_noise(found)
+            self._models = [rounded(model, found, None) for model in self._models]
 
     def _unheard(self, cause: str) -> str:
         """Return that commands do not reach the motor that a fault is blamed on; else nothing."""
@@ -295,10 +311,10 @@ class FaultMonitor:
             start=one.movements.start + begin_s,
         )
         if self._learner.take(replace(one, movements=told), learns=own > WORTH_LEARNING):
-            self._models[-1] = self._learner.model
+            self._models[-1] = rounded(self._learner.model, self._rounding, None)
             if own > 0.5:
                 self._fleet.adopt(self._models[-1].imperfections)
-                self._models[-1] = self._fleet.diagnoser.healthy_model
+                self._models[-1] = self._fleet.model
 
 
 def _row(values: FloatArray | None) -> FloatArray | None:

@@ -27,6 +27,7 @@ from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.explanation import plain_name
+from failuretwin.inference.rounding import Rounding, tool_rounding
 from failuretwin.inference.seen_runs import SURE, TOLD, set_up_finding, set_up_remark
 from failuretwin.inference.set_up_posterior import SetUpPosterior
 from failuretwin.inference.set_up_weighing import FEW
@@ -86,6 +87,15 @@ class StreamRuns:
         told = command if known and command is not None else np.full_like(self._stood, np.nan)
         self._rows.append((time, told, np.full(3, np.nan) if point is None else point))
 
+    @property
+    def points(self) -> FloatArray:
+        """Tool positions that are kept, (reading, axis) [m]."""
+        return np.array([row[2] for run in self._kept for row in run]).reshape(-1, 3)
+
+    @property
+    def _kept(self) -> list[list[tuple[float, FloatArray, FloatArray]]]:
+        return [*self._first, *self._latest, self._rows]
+
     def _follow(self, time: float, command: FloatArray) -> None:
         """Note whether a movement begins, and where a run is over."""
         turns = self._stood is not None and np.abs(command - self._stood).max() > TURN_RAD
@@ -110,7 +120,7 @@ class StreamRuns:
     def runs(self, robot: Robot) -> xr.Dataset | None:
         """Return the first runs and the latest as a run set; None: there is nothing yet."""
         parts = []
-        for number, rows in enumerate([*self._first, *self._latest, self._rows]):
+        for number, rows in enumerate(self._kept):
             try:
                 parts.append(timed_run(_log(f"run_{number + 1}", rows), robot).to_dataset())
             except InputError:  # too short, or its clock jumped
@@ -135,12 +145,16 @@ def _log(name: str, rows: list[tuple[float, FloatArray, FloatArray]]) -> TimedLo
 class SetUpWatch:
     """Watches whether one robot is set up as its profile says.
 
+    Attributes:
+        rounding: How coarsely tool positions are rounded; None: it does not matter.
+
     Args:
         diagnoser: The method, with its hypotheses, healthy behaviour and priors.
     """
 
     def __init__(self, diagnoser: BayesDiagnoser) -> None:
         self._diagnoser = diagnoser
+        self.rounding: Rounding | None = None
         self._runs = StreamRuns()
         self._asked_at = 0
         self._fitted = False
@@ -176,8 +190,11 @@ class SetUpWatch:
         """Take a sample of the stream, and look at the set-up where that is due."""
         before = self._runs.begun
         self._runs.add(time, command, point)
+        begins, model = self._runs.begun > before, self._diagnoser.healthy_model
+        if begins and self.movements <= ASKED_AT[-1] and model.sensors.tool_alone:
+            self.rounding = self.rounding or tool_rounding(self._runs.points, model)
         # A movement is over when the next one begins.
-        due = self._runs.begun > before and self._runs.begun - 1 in ASKED_AT
+        due = begins and self._runs.begun - 1 in ASKED_AT
         if due and not self._episode:  # else it is looked at with the alarm
             self._ask()
 

@@ -25,6 +25,8 @@ from failuretwin.inference.settings import InferenceSettings
 
 STILL_FOR_S = np.array([FROZEN_S, FROZEN_S, FROZEN_S, NEARLY_STILL_S])
 """Shortest time for which each axis must stand still to be called frozen, and the tool [s]."""
+TOLD_FOR_S = 0.5
+"""Time for which motors must have been told to move by then [s]: an arm lags behind."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,8 @@ class FrozenSensorDetector(ArrayStruct):
         since_s: Since when each stands still, (robot, value) [s]; inf: one reading says so.
         low: Least references since then, (robot, value, motor) [rad].
         high: Greatest ones.
+        told_s: Since when these have been far enough apart that it should have moved,
+            (robot, value) [s]; inf: they are not.
     """
 
     number: Annotated[FloatArray, Axes("run", "axis", empty=np.nan)]
@@ -48,13 +52,20 @@ class FrozenSensorDetector(ArrayStruct):
     since_s: Annotated[FloatArray, Axes("run", "value", empty=np.nan)]
     low: Annotated[FloatArray, Axes("run", "value", "motor", empty=np.nan)]
     high: Annotated[FloatArray, Axes("run", "value", "motor", empty=np.nan)]
+    told_s: Annotated[FloatArray, Axes("run", "value", empty=np.inf)]
 
     def still_since(self, robot: int) -> float:
         """Return since when the tool of a robot has stood where it stands [s]."""
         return float(min(self.since_s[robot, 3], self.since_s[robot, :3].max()))
 
     def see(
-        self, time: float, read: BoolArray, points: FloatArray, command: FloatArray, near_m: float
+        self,
+        time: float,
+        read: BoolArray,
+        points: FloatArray,
+        command: FloatArray,
+        near_m: float,
+        flickers: bool = True,
     ) -> tuple[BoolArray, BoolArray]:
         """Take readings and say what is dead.
 
@@ -64,6 +75,8 @@ class FrozenSensorDetector(ArrayStruct):
             points: Tool positions of all, (robot, axis) [m].
             command: References of all, as far as known, (robot, motor) [rad].
             near_m: A tool that stays this near stands still [m].
+            flickers: Whether a live axis at rest reports another number now and then; one that
+                is rounded need not.
 
         Returns:
             Tools among those read that stand still, (robot,), and channels that do alone,
@@ -80,8 +93,11 @@ class FrozenSensorDetector(ArrayStruct):
         self.low[anew | second] = self.high[anew | second] = reference[anew | second]
         np.fmin(self.low, reference, out=self.low)
         np.fmax(self.high, reference, out=self.high)
+        told = should_move(self.high - self.low)
+        self.told_s[:] = np.where(told, np.minimum(self.told_s, time), np.inf)
+        still_for = STILL_FOR_S if flickers else STILL_FOR_S.max()
         with np.errstate(invalid="ignore"):
-            still = (time - self.since_s >= STILL_FOR_S) & should_move(self.high - self.low)
+            still = (time - self.since_s >= still_for) & (time - self.told_s >= TOLD_FOR_S)
         still &= read[:, None]
         dead = still[:, 3] | still[:, :3].all(axis=1)
         # One at zero may be held there by a stuck motor; see `log_quality`.
