@@ -279,7 +279,7 @@ def test_faulty_sessions_are_refused(failuretwin, data, tmp_path, label, listing
     )
     assert answer.returncode == 2
     motor = f"motor_{int(label[-1]) - 4}"
-    reasons = (f"error: {motor} settles anew with every movement", "runs look faulty")
+    reasons = (f"error: {motor} misses its targets", "runs look faulty")
     assert any(reason in answer.stderr for reason in reasons)
     assert "give logs of a healthy robot" in answer.stderr.lower()
     assert listing(tmp_path) == []

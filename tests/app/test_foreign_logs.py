@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import sys
@@ -145,3 +146,17 @@ def test_columns_whose_names_tell_all_need_no_map(failuretwin, log):
     assert "the unit of tcp_x" in refused.stderr
     assert result.returncode == 0, result.stderr
     assert "healthy" in result.stdout
+
+
+def test_a_frozen_reading_is_not_told_from_a_stuck_motor(failuretwin, data, tmp_path):
+    """Where the tool is computed from the motors' readings; the tool of its own says more."""
+    log = data / "killian_runs_dev/60_trajs_percentage_failure/092_stuck_motor_2_traj_18"
+    answer = failuretwin("diagnose", log, "--json", "out.json", folder=tmp_path)
+    assert answer.returncode == 0, answer.stderr
+    row = json.loads((tmp_path / "out.json").read_text("utf-8"))
+    assert row["verdict"].endswith("so a frozen reading of motor 2 looks the same")
+    assert failuretwin("simulate", "--out", "own.nc", "--hypotheses", "motor_2:stuck",
+                       "--runs-per-class", 1, folder=tmp_path).returncode == 0  # fmt: skip
+    own = failuretwin("diagnose", "own.nc", folder=tmp_path)
+    assert "motor 2 stuck" in own.stdout
+    assert "frozen reading" not in own.stdout

@@ -12,6 +12,7 @@ from failuretwin.connection.calibration.parameters import (
     rate_parameter,
     settling_parameters,
     spring_remarks,
+    zero_remarks,
 )
 from failuretwin.connection.calibration.settling_fit import SettlingPosterior
 from failuretwin.connection.calibration.timing_fit import joint_doubt
@@ -92,6 +93,15 @@ def test_a_compliance_below_zero_is_remarked_upon(armpi):
         "compliance of motor_4",
     ]
     assert "-0.05 rad/(N m) (-0.052 to -0.048) is negative" in remarks[0]
+
+
+def test_a_zero_that_is_off_is_remarked_upon(armpi):
+    """What hobby servos are off by, 0.37 deg, is not."""
+    mode, deviation = np.zeros(17), np.full(17, 1e-3)
+    mode[:4] = np.deg2rad([0.5, -5.0, 1.5, 1.9])
+    fit = SettlingPosterior(mode, np.diag(deviation**2), np.ones(17))
+    (remark,) = zero_remarks(settling_parameters(fit, armpi, 0.0), armpi)
+    assert remark.startswith("bias of motor_2: it stands -5.0 deg off (-5.1 to -4.9)")
 
 
 def test_a_session_with_many_suspect_runs_is_left_out_as_a_whole():

@@ -94,9 +94,10 @@ def calibration(tmp_path, measured_file):
 @pytest.mark.parametrize(
     ("entries", "said"),
     [
-        ({"friction": [9.0, 0.0, 0.0, 0.0]}, "friction of 'motor_1' is 9, expected 0.349 at most"),
+        ({"friction": [9.0, 0.0, 0.0, 0.0]}, "friction of 'motor_1' is 9, expected 0.116 at most"),
         ({"bias": [0.0, 0.0, -0.6, 0.0]}, "bias of 'motor_3' is -0.6"),
         ({"scatter": [0.0, 0.0, 0.0, 1.0]}, "scatter of 'motor_4' is 1"),
+        ({"friction": [0.0, 0.13, 0.0, 0.0]}, "4.2% of where the motor may stand"),
         ({"compliance": [0.0, 500.0, 0.0, 0.0]}, "compliance times the largest load of 'motor_2'"),
     ],
 )
@@ -105,7 +106,7 @@ def test_a_calibration_that_would_pass_for_a_fault_is_refused(calibration, armpi
     with pytest.raises(InputError) as error:
         load_calibration(calibration(**entries), armpi)
     assert said in str(error.value)
-    assert "an eighth of where the motor may stand" in str(error.value)
+    assert "of where the motor may stand" in str(error.value)
     assert "travel of its profile or the limits of its joint" in str(error.value)
 
 

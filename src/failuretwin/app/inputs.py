@@ -8,11 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+import numpy as np
+
 from failuretwin.app.commands.options import LogOptions
 from failuretwin.app.terminal import tell
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, needs_extra
-from failuretwin.core.hypothesis import Hypothesis, parse_hypotheses
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis, parse_hypotheses
+from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.bags import BagTopics
 from failuretwin.data_knowledge.column_guess import column_map_text, guess_columns
 from failuretwin.data_knowledge.csv_log import CORRECTION, read_column_map
@@ -24,8 +27,10 @@ from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, class_name
 from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser, Diagnoser, diagnoser_from_text
+from failuretwin.inference.explanation import with_reading_doubt
 from failuretwin.inference.log_correction import CorrectionTable, LogCorrection
 from failuretwin.inference.posterior import check_diagnosable
 
@@ -68,6 +73,29 @@ def _correction(path: Path, robot: Robot) -> LogCorrection | None:
     where = f"{path}: {CORRECTION}"
     stated = from_table(CorrectionTable, table, where)
     return LogCorrection.from_file(stated, len(robot.motors), where)
+
+
+SAME_PLACE_M = 1e-6
+"""Error by which a tool that is computed from motor readings may be off them: rounding [m]."""
+
+
+def with_doubts(
+    diagnoses: Sequence[Diagnosis], runs: xr.Dataset, twin: DigitalTwin
+) -> list[Diagnosis]:
+    """Return diagnoses with what the way doubts them in which the logs were made."""
+    if not _is_computed(runs, twin):
+        return list(diagnoses)
+    return [with_reading_doubt(one, one.diagnosis or "") for one in diagnoses]
+
+
+def _is_computed(runs: xr.Dataset, twin: DigitalTwin) -> bool:
+    """Return whether the tool of some logs is computed from the motors' own readings."""
+    if "position" not in runs or str(runs.attrs.get("source", "")).startswith("simulated"):
+        return False
+    position, measured = (as_floats(runs[name].values) for name in ("position", "measured"))
+    both = np.isfinite(position).all(axis=-1) & np.isfinite(measured).all(axis=-1)
+    off = np.abs(twin.path(position[both]) - measured[both])
+    return bool(both.any() and np.median(off.max(axis=-1)) < SAME_PLACE_M)
 
 
 def warn_mismatch(runs: xr.Dataset, expected: str) -> None:

@@ -30,11 +30,10 @@ from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser
 from failuretwin.decision.streaming.monitor import FaultMonitor
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.inference.explanation import plain_name
+from failuretwin.inference.explanation import plain_name, with_reading_doubt
 
 SILENCE_S = 5.0
 """Without a reading for so long on our own clock, the answer is stale [s]."""
-STUCK = "stuck"
 TOGETHER_S = 0.1
 """Motor readings count with a reading of the tool that is no further away in time [s]."""
 TICK_S = 0.5
@@ -187,26 +186,12 @@ class Shadow:
         silent = time.monotonic() - self._read_s > SILENCE_S
         state = STALE if silent or answer.state != OK else OK
         stamped = replace(answer, time=self._clock.stamp(answer.time), state=state)
-        if self._computed:
-            stamped = _with_doubt(stamped)
+        if self._computed and stamped.diagnosis is not None:
+            said = with_reading_doubt(stamped.diagnosis, stamped.alarm.cause)
+            stamped = replace(stamped, diagnosis=said)
         self.snapshot = Snapshot(stamped, answer.time, residual, self.snapshot.seconds)
         for sink in self._sinks:
             sink.put(stamped)
-
-
-def _with_doubt(answer: Answer) -> Answer:
-    """Return an answer that says that a frozen reading looks like a stuck motor.
-
-    Where the tool is computed from the motors' own readings nothing else tells the two apart.
-    """
-    motor, _, mode = answer.alarm.cause.partition(":")
-    if answer.diagnosis is None or mode != STUCK:
-        return answer
-    said = (
-        f"{answer.diagnosis.verdict}; the tool is computed from motor readings, so a frozen "
-        f"reading of {motor.replace('_', ' ')} looks the same"
-    )
-    return replace(answer, diagnosis=replace(answer.diagnosis, verdict=said))
 
 
 # What changes, in words: faults found, repairs noticed, silence, trouble with the link.

@@ -194,23 +194,26 @@ def _completed(imperfections: Imperfections, motors: int) -> Imperfections:
     return replace(imperfections, settling=replace(settling, **whole))
 
 
-LARGEST_ERROR = 1.0 / 8.0
-"""Largest error of a healthy motor as a share of where it may stand, such as 20 of 160 deg: a
-guess, ten times what hobby servos do. Far beyond it a healthy motor looks like a stuck one."""
+LARGEST_ERROR, LARGEST_PLAY = 1.0 / 8.0, 1.0 / 24.0
+"""Largest error of a healthy motor as a share of where it may stand, such as 20 of 160 deg, and
+largest friction and scatter, such as 7 deg: guesses, ten times what hobby servos do. Far beyond it
+a healthy motor looks like a stuck one."""
 
 
 def _check_sane(settling: Settling | None, robot: Robot, path: Path) -> None:
     """Raise InputError unless the settled errors of a file can be those of a healthy robot."""
     if settling is None:
         return
-    limit = LARGEST_ERROR * np.diff(robot.travel, axis=1)[:, 0]
+    travel = np.diff(robot.travel, axis=1)[:, 0]
     sag = np.asarray(settling.compliance) * largest_load(robot, settling.payload)
     errors = {name: np.asarray(getattr(settling, name)) for name in ("bias", "friction", "scatter")}
     for name, values in (errors | {"compliance times the largest load": sag}).items():
+        share = LARGEST_PLAY if name in ("friction", "scatter") else LARGEST_ERROR
+        limit = share * travel
         for k in np.flatnonzero(~(np.abs(values) <= limit)):
             raise InputError(
                 f"{path}: settling: {name} of {robot.motor_names[k]!r} is {values[k]:.3g}, "
-                f"expected {limit[k]:.3g} at most, an eighth of where the motor may stand "
+                f"expected {limit[k]:.3g} at most, {share:.1%} of where the motor may stand "
                 f"({robot.travel[k, 0]:.3g} to {robot.travel[k, 1]:.3g}, by the travel of its "
                 "profile or the limits of its joint). Check the unit (rad, or m where it slides), "
                 "or calibrate again."

@@ -229,6 +229,28 @@ def _evidence_lines(
     return lines
 
 
+STUCK = "stuck"
+
+
+def with_reading_doubt(diagnosis: Diagnosis, cause: str) -> Diagnosis:
+    """Return a diagnosis that says that a frozen reading looks like a stuck motor.
+
+    Where the tool is computed from the motors' own readings nothing else tells the two apart.
+
+    Args:
+        diagnosis: What is said.
+        cause: What is blamed, such as ``motor_2:stuck``.
+    """
+    motor, _, mode = cause.partition(":")
+    if mode != STUCK:
+        return diagnosis
+    said = (
+        f"{diagnosis.verdict}; the tool is computed from motor readings, so a frozen reading of "
+        f"{motor.replace('_', ' ')} looks the same"
+    )
+    return replace(diagnosis, verdict=said)
+
+
 LIKELY = 0.5
 """Probability from which a lost command is told [-]."""
 

@@ -141,6 +141,7 @@ def diagnose(
         parse_cli_hypotheses,
         read_inputs,
         warn_mismatch,
+        with_doubts,
     )
     from failuretwin.app.tables import progress_bar, show
     from failuretwin.connection import tracked_diagnosis as tracking
@@ -189,6 +190,7 @@ def diagnose(
         diagnoses = list(learned.diagnoses)
     else:
         diagnoses = diagnoser.diagnose(runs)
+    diagnoses = with_doubts(diagnoses, runs, known.twin)
     if (sse_range or error_range) and diagnoser is bayes:
         _tell_ruled_out(runs, bayes, diagnoses, priors_of(model, None, onset))
     course = None if independent or not together else course_of(diagnoses, bayes)
@@ -202,8 +204,7 @@ def diagnose(
         show(*reports.isolability_summary(runs, bayes))
     show(*reports.state_lines(state, together=course is not None))
     reports.print_scores(Judged.of(diagnoses))
-    lines = reports.course_lines(course, state, model) + _learned_lines(learned, tracked)
-    show(*(["", *lines] if lines else []))
+    show(*_learned_lines(reports.course_lines(course, state, model), learned, tracked))
 
 
 def _taught(learned: SelfCalibration | None) -> tuple[str, ...]:
@@ -211,12 +212,15 @@ def _taught(learned: SelfCalibration | None) -> tuple[str, ...]:
     return () if learned is None else learned.remarks
 
 
-def _learned_lines(learned: SelfCalibration | None, tracked: Tracked | None) -> list[str]:
-    """Return what runs that were weighed together taught of the robot."""
+def _learned_lines(
+    course: list[str], learned: SelfCalibration | None, tracked: Tracked | None
+) -> list[str]:
+    """Return the course of the robot and what runs that were weighed together taught of it."""
     from failuretwin.app.reports import tracking_line
 
-    lines = [f"self-calibrated: {line}" for line in _taught(learned)]
-    return lines if tracked is None else [*lines, tracking_line(tracked)]
+    lines = [*course, *(f"self-calibrated: {line}" for line in _taught(learned))]
+    lines += [] if tracked is None else [tracking_line(tracked)]
+    return ["", *lines] if lines else []
 
 
 def _check_tool(sensing: tuple[str, ...]) -> None:

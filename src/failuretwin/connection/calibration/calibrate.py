@@ -30,6 +30,7 @@ from failuretwin.connection.calibration.parameters import (
     spring_remarks,
     timing_of,
     timing_parameters,
+    zero_remarks,
 )
 from failuretwin.connection.calibration.result import Calibration, HeldOut, LeftOut, Parameter
 from failuretwin.connection.calibration.sensor_fit import (
@@ -177,7 +178,12 @@ def fit_calibration(
         used_readings=part.observations.of_motors,
         left_out=(*left_out, *part.left_out(robot)),
         held_out=_held_out(part, robot, judged) if thorough else (),
-        remarks=(*remarks, *part.remarks(), *spring_remarks(settling)),
+        remarks=(
+            *remarks,
+            *part.remarks(),
+            *spring_remarks(settling),
+            *zero_remarks(settling, robot),
+        ),
     )
 
 
@@ -338,9 +344,10 @@ def _refuse_scatter(first: Calibration, robot: Robot) -> None:
         if parameter.name == "scatter" and parameter.low > MOST_SCATTER_RAD:
             scale, unit = shown_unit("rad", robot, parameter.motor)
             raise InputError(
-                f"{parameter.motor} settles anew with every movement, with a scatter of "
-                f"{scale * parameter.value:.1f} {unit}; expected {scale * MOST_SCATTER_RAD:.1f} at "
-                "most. Nothing is learned from these logs; give logs of a healthy robot."
+                f"{parameter.motor} misses its targets by {scale * parameter.value:.1f} {unit}, "
+                f"typically; expected {scale * MOST_SCATTER_RAD:.1f} at most. Nothing is learned "
+                "from these logs; give logs of a healthy robot. `failuretwin doctor LOG` tells a "
+                "zero that is off, which is so in every movement, from a fault."
             )
 
 

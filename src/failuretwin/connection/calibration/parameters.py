@@ -223,6 +223,28 @@ def spring_remarks(settling: Sequence[Parameter]) -> list[str]:
     ]
 
 
+FAR_OFF = 5.0
+"""Constant errors beyond so many deviations of what arms of the class have are told."""
+
+
+def zero_remarks(settling: Sequence[Parameter], robot: Robot) -> list[str]:
+    """Return a sentence for each motor that stands further off than arms of its class do.
+
+    It is learned all the same: a calibration need not know whether motor or profile is off.
+    """
+    far = FAR_OFF * class_of(robot).bias_rad
+    told = []
+    for p in settling:
+        if p.name == "bias" and p.unit == "rad" and min(abs(p.low), abs(p.high)) > far:
+            low, value, high = np.rad2deg([p.low, p.value, p.high])
+            told.append(
+                f"bias of {p.motor}: it stands {value:+.1f} deg off ({low:+.1f} to {high:+.1f}) in "
+                "every movement, further than healthy arms of its class: a zero that is off. It "
+                "is learned as this robot's; if it is so in these logs alone, correct the logs"
+            )
+    return told
+
+
 def _tails(fit: SettlingPosterior, robot: Robot) -> Parameter:
     """Return the degrees of freedom, with an interval that is even about their inverse.
 
