@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 MM_PER_M = 1000.0
 TITLE_COLUMNS = 100
 """Letters of the title that fit on one line of the picture."""
+LONGEST_STEM = 80
+"""Most letters of a run's name that the name of its picture has; file systems take 255 bytes."""
 BLUE, RED, GREY = "#1f5f99", "#c8402f", "#9aa3ab"
 SMALL: dict[str, Any] = {"fontsize": 8, "frameon": False}
 """How legends look."""
@@ -77,7 +79,7 @@ def plot_runs(
         chosen: Indices of the runs that are drawn.
     """
     time = as_floats(runs["time"].values)
-    names = [re.sub(r"[^\w.+-]+", "_", diagnoses[i].run) for i in chosen]
+    names = [re.sub(r"[^\w.+-]+", "_", diagnoses[i].run)[:LONGEST_STEM] for i in chosen]
     written = {}
     for i, stem in zip(chosen, unique_names(names), strict=True):
         desired = twin.path(as_floats(runs["command"].values[i]))

@@ -90,7 +90,7 @@ def test_a_glitch_is_neither(rng):
     for k in range(400):
         point = np.full((1, 3), 0.1) if k % 20 in (3, 4) or k % 33 == 7 else rest
         assert not jumps.see(point, 0.02)[0]
-        untold.see(0.1 * k, point, rest, TOLD, TOLD, NEAR_M, told_place(0.0))
+        untold.see(0.1 * k, point, rest, TOLD, ~TOLD, TOLD, NEAR_M, told_place(0.0))
         assert not untold.untold[0]
 
 
@@ -99,7 +99,7 @@ def test_a_movement_that_is_under_way_is_no_motion_without_a_command():
     nowhere = np.full((1, 3), np.nan)
     for k in range(50):
         point = np.full((1, 3), 0.01 * k)
-        seen.see(0.1 * k, point, nowhere, TOLD, TOLD, NEAR_M, told_place(0.0))
+        seen.see(0.1 * k, point, nowhere, TOLD, ~TOLD, TOLD, NEAR_M, told_place(0.0))
     assert not seen.untold[0]
 
 
@@ -110,7 +110,7 @@ def test_a_lost_command_that_is_sent_again_is_a_command(aim, untold):
     for k in range(40):
         point = np.array([[min(max(0.02 * (k - 10), 0.0), 0.3), 0.0, 0.0]])
         aims = told_place(np.array([aim, 0.0, 0.0]))
-        seen.see(0.1 * k, point, rest, TOLD, TOLD, NEAR_M, aims)
+        seen.see(0.1 * k, point, rest, TOLD, ~TOLD, TOLD, NEAR_M, aims)
     assert seen.untold[0] == untold
 
 
@@ -150,6 +150,17 @@ def test_healthy_sessions_get_no_other_verdict(data, twin, label):
         if found is not None:
             said.add(found.undecided or str(found.diagnosis))
     assert said == {"healthy"}
+
+
+def test_an_arm_that_moves_long_after_it_should_rest_is_told_without_a_rest_seen():
+    """Its bus stalled while it rested; it may still be on its way, and then must have arrived."""
+    seen, nowhere, first = UntoldMotion.empty(run=1, axis=3), np.full((1, 3), np.nan), None
+    for k in range(60):
+        point = np.full((1, 3), 0.01 * k)
+        overdue = np.array([k > 30])
+        seen.see(0.1 * k, point, nowhere, TOLD, overdue, TOLD, NEAR_M, told_place(0.0))
+        first = k if first is None and seen.untold[0] else first
+    assert first == 34
 
 
 def test_the_first_command_of_a_recording_is_one(watcher, work):

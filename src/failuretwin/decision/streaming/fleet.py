@@ -218,7 +218,14 @@ class StreamingFleet:
         known = np.isfinite(last[:, 0]) | np.isfinite(reference).all(axis=1)
         place = self.diagnoser.twin.path
         return self._untold.see(
-            time, points, tracker.rest(), told, known, near_m, lambda some: place(last[some])
+            time,
+            points,
+            tracker.rest(),
+            told,
+            tracker.overdue(time),
+            known,
+            near_m,
+            lambda some: place(last[some]),
         )
 
     @property

@@ -103,6 +103,9 @@ class References(ArrayStruct):
 REST_S = 0.15
 """Time in the same place that shows a tool at rest while it may still be moving [s]."""
 
+OVERDUE_S = 1.0
+"""An arm that should have come to rest so long ago, however late it starts, must have [s]."""
+
 
 class MovementTracker:
     """What is known of the last movements of many robots.
@@ -184,6 +187,16 @@ class MovementTracker:
         last = np.maximum(window.count - 1, 0)
         known = window.settled.usable[robots, last] & (window.count > 0) & ~self.references.moved
         return np.where(known[:, None], window.settled.point[robots, last, :3], np.nan)
+
+    def overdue(self, time: float) -> BoolArray:
+        """Return which arms must have come to rest by a time [s], however late, (robot,)."""
+        window = self.window
+        robots, last = np.arange(len(window.count)), np.maximum(window.count - 1, 0)
+        now = window.settled.movements[robots, last]
+        lasts = now.ramp_duration.max(axis=-1) + self._latest_start_s + OVERDUE_S
+        there = (window.count > 0) & ~self.references.moved
+        with np.errstate(invalid="ignore"):
+            return np.asarray(there & (time - now.start > lasts))
 
     def find_movements(self, robot: int) -> None:
         """Add the movements of a reference, up to now."""

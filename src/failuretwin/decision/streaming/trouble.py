@@ -135,7 +135,7 @@ RESTED_S = 0.15
 class UntoldMotion(ArrayStruct):
     """Watches for tools that leave the place where they rest though no command came.
 
-    One that rests elsewhere than it was told to and gets nearer has had its last command again.
+    One that rests elsewhere than it was told to, and goes there, has had its last command again.
 
     Attributes:
         place: Where each tool stood when it was last seen to move, (robot, axis) [m].
@@ -160,6 +160,7 @@ class UntoldMotion(ArrayStruct):
         points: FloatArray,
         rest: FloatArray,
         told: BoolArray,
+        overdue: BoolArray,
         known: BoolArray,
         near_m: tuple[float, float],
         told_place: Callable[[IntArray], FloatArray],
@@ -172,6 +173,8 @@ class UntoldMotion(ArrayStruct):
             rest: Where tools came to rest after their last command, (robot, axis) [m]; NaN: they
                 may be on their way.
             told: Robots that have had a command, (robot,); of others the first rest counts.
+            overdue: Those that must have come to rest since, (robot,): so does theirs, and that
+                they move where none was seen.
             known: Robots whose reference is known, (robot,).
             near_m: How near is the same place, and how far away is moved [m].
             told_place: Where the tools of some robots were told to go, (robot, axis) [m].
@@ -186,17 +189,20 @@ class UntoldMotion(ArrayStruct):
             stands = read & (np.linalg.norm(points - self.place, axis=1) <= same_place_m)
         anew = read & ~stands
         self.place[anew], self.since_s[anew] = points[anew], time
-        rested = ~told & stands & (time - self.since_s >= RESTED_S) & np.isnan(self.rest[:, 0])
+        rested = stands & (~told | overdue) & np.isnan(self.rest[:, 0])
+        rested &= time - self.since_s >= RESTED_S
         self.rest[rested] = self.place[rested]
-        rests = told & np.isfinite(rest[:, 0]) & np.isnan(self.away_s)
+        rests = np.isfinite(rest[:, 0]) & np.isnan(self.away_s)
         self.rest[rests] = rest[rests]
         with np.errstate(invalid="ignore"):
             away = read & (np.linalg.norm(points - self.rest, axis=1) > moved_m)
+        away |= overdue & anew & np.isnan(self.rest[:, 0])
         left = np.flatnonzero(away)
         aim = told_place(left) if len(left) else points[left]
         off_before = np.linalg.norm(self.rest[left] - aim, axis=1)
         off = np.linalg.norm(points[left] - aim, axis=1)
-        away[left[(off_before > moved_m) & (off < off_before)]] = False
+        halts = stands[left] & (time - self.since_s[left] >= RESTED_S) & (off > moved_m)
+        away[left[(off_before > moved_m) & (off < off_before) & ~halts]] = False
         self.away_s[read & ~away] = np.nan
         self.away_s[away & np.isnan(self.away_s)] = time
         with np.errstate(invalid="ignore"):
