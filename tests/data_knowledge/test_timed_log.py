@@ -5,7 +5,7 @@ import pytest
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements, find_movements
-from failuretwin.core.polyline import resolution, simplify
+from failuretwin.core.polyline import resolution, simplify, simplify_motors
 from failuretwin.data_knowledge.timed_log import STEP_S, Samples, Targets, TimedLog, timed_run
 
 AT = np.arange(0.0, 6.0, 0.1)
@@ -63,6 +63,16 @@ def test_stairs_of_all_motors_are_the_movements_that_were_rounded(armpi, twin, q
     assert found.start.shape[1] == 6
     np.testing.assert_allclose(found.start, told.start, atol=0.05)
     np.testing.assert_allclose(found.target, target, atol=0.51 * quantum)
+
+
+def test_stairs_of_a_slow_ramp_are_not_taken_for_rests():
+    """Nothing becomes worse than each motor by itself."""
+    time = np.arange(0.0, 24.0, 0.02)
+    angle = np.interp(time, [1.0, 21.0], [0.0, 0.7])
+    command = np.rint(np.outer(angle, [1.0, -0.5, 0.2, 0.0]) / 0.0175) * 0.0175
+    together = simplify_motors(time, command, 2e-3)
+    for line, column in zip(together, command.T, strict=True):
+        np.testing.assert_array_equal(line, simplify(time, column, 2e-3))
 
 
 def test_the_quantum_of_rounded_values_is_found():

@@ -78,7 +78,8 @@ def simplify_motors(
 
     Values that were rounded more coarsely than the tolerance are stairs, and of stairs nobody can
     tell a bend from a step: where that keeps them within a quantum and a sample, each motor goes
-    straight from where all motors rest to where they rest next, until its own last step.
+    straight from where all motors rest to where they rest next, until its own last step. Where that
+    takes more lines, as of a ramp so slow that its stairs look like rests, it does not.
 
     Args:
         time: Increasing times, (sample,) [s].
@@ -86,6 +87,7 @@ def simplify_motors(
         tolerance: Largest distance from the samples [rad].
     """
     quantum = max(resolution(column) for column in value.T)
+    alone = [simplify(time, column, tolerance) for column in value.T]
     if quantum > tolerance and np.isfinite(value).all():
         lines = [_between_rests(time, column, value) for column in value.T]
         pairs = zip(lines, value.T, strict=True)
@@ -93,9 +95,10 @@ def simplify_motors(
             np.abs(np.interp(time, *line) - column).max() - np.abs(np.diff(column)).max()
             for line, column in pairs
         ]
-        if max(off) <= quantum:
+        fewer = sum(len(corner) for corner, _ in lines) < sum(len(corner) for corner, _ in alone)
+        if max(off) <= quantum and fewer:
             return lines
-    return [simplify(time, column, tolerance) for column in value.T]
+    return alone
 
 
 def _between_rests(
