@@ -21,7 +21,14 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.decision.streaming.tracking import MovementTracker
-from failuretwin.decision.streaming.trouble import FrozenSensorDetector, TwoPlaces, UntoldMotion
+from failuretwin.decision.streaming.trouble import (
+    DEAD,
+    TWO,
+    UNTOLD,
+    FrozenSensorDetector,
+    TwoPlaces,
+    UntoldMotion,
+)
 from failuretwin.decision.streaming.window import KEEP_S
 from failuretwin.digital_model.calibrated_robot import RobotLike
 from failuretwin.digital_model.nonidealities import Imperfections
@@ -45,16 +52,6 @@ SILENCE_S = 5.0
 for 4 s."""
 STREAMED = ("tool", "tool+encoders", "tool+goals", "tool+encoders+goals")
 """What a stream may believe."""
-DEAD = LogQuality(
-    fatal="the tool stands still though motors are told to move: the sensor or the arm is dead"
-)
-UNTOLD = LogQuality(
-    fatal="the tool moves though no command came: commands do not arrive here, or something else "
-    "moves the arm"
-)
-TWO = LogQuality(
-    fatal="readings jump between two places: two robots, or two sensors, speak on one topic"
-)
 
 
 @dataclass(frozen=True)

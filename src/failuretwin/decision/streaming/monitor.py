@@ -20,10 +20,10 @@ from failuretwin.core.numerics import Weighted, log_of
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.decision.streaming.alarm_rule import AlarmRule
 from failuretwin.decision.streaming.diagnoser import reference_of
-from failuretwin.decision.streaming.fleet import DEAD, StreamingFleet
+from failuretwin.decision.streaming.fleet import StreamingFleet
 from failuretwin.decision.streaming.learning import LifeLearner
 from failuretwin.decision.streaming.set_up_watch import PROOF, SetUpWatch
-from failuretwin.decision.streaming.trouble import rests_throughout
+from failuretwin.decision.streaming.trouble import DEAD, rests_throughout
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser

@@ -16,9 +16,21 @@ from failuretwin.inference.log_quality import (
     NEAR_ZERO_M,
     NEARLY_STILL_S,
     STILL_M,
+    LogQuality,
     should_move,
 )
 from failuretwin.inference.settings import InferenceSettings
+
+DEAD = LogQuality(
+    fatal="the tool stands still though motors are told to move: the sensor or the arm is dead"
+)
+UNTOLD = LogQuality(
+    fatal="the tool moves though no command came: commands do not arrive here, or something else "
+    "moves the arm"
+)
+TWO = LogQuality(
+    fatal="readings jump between two places: two robots, or two sensors, speak on one topic"
+)
 
 # Tools that stand still though motors are told to move: a dead sensor, or a dead arm.
 
