@@ -65,6 +65,22 @@ def test_stairs_of_all_motors_are_the_movements_that_were_rounded(armpi, twin, q
     np.testing.assert_allclose(found.target, target, atol=0.51 * quantum)
 
 
+@pytest.mark.parametrize("step_s", [0.02, 0.25])
+@pytest.mark.parametrize("jumps", [True, False])
+def test_a_motor_that_pans_while_others_go_keeps_their_movements(step_s, jumps):
+    """No time at which all rest for long: each motor is what it is by itself, jumps or ramps."""
+    time, rng = np.arange(0.0, 20.0, step_s), np.random.default_rng(0)
+    targets = rng.uniform(-1.0, 1.0, (10, 3))
+    first = np.repeat(2.0 * np.arange(10), 2) + np.tile([0.0, 1e-9 if jumps else 1.0], 10)
+    levels = [np.repeat(np.append(0.0, column), 2)[1:-1] for column in targets.T]
+    pan = 0.5 * np.abs(np.mod(time / 7.0, 2.0) - 1.0)
+    command = np.stack([pan, *(np.interp(time, first, v) for v in levels)], axis=-1)
+    command = np.rint(command / np.deg2rad(1.0)) * np.deg2rad(1.0)
+    together = simplify_motors(time, command, 2e-3)
+    for (at, values), column in zip(together, command.T, strict=True):
+        assert np.abs(np.interp(time, at, values) - column).max() < np.deg2rad(3.0)
+
+
 def test_stairs_of_a_slow_ramp_are_not_taken_for_rests():
     """Nothing becomes worse than each motor by itself."""
     time = np.arange(0.0, 24.0, 0.02)

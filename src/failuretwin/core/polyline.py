@@ -24,6 +24,9 @@ TURN_RAD = 1e-5
 REST_S = 0.3
 """A reference that a hand guides rests where no motor moves for this long [s]: twice the 0.15 s by
 which such an arm trails, so that it is seen at rest as well."""
+STAIR_QUANTA = 4.0
+"""A stair is no higher, in quanta: what moves by more from sample to sample is no stair but a ramp
+that rounding does not hide, or a jump."""
 SAME = 1e-9
 """What is as good as level, whatever the tolerance."""
 CREEP = 10.0
@@ -77,7 +80,7 @@ def simplify_motors(
     """Return the corners of each motor's reference, as `simplify` does one by one.
 
     Values that were rounded more coarsely than the tolerance are stairs, and of stairs nobody can
-    tell a bend from a step: where that keeps them within a quantum and a sample, each motor goes
+    tell a bend from a step: where that keeps them within a quantum and a stair, each motor goes
     straight from where all motors rest to where they rest next, until its own last step. Where that
     takes more lines, as of a ramp so slow that its stairs look like rests, it does not.
 
@@ -90,13 +93,11 @@ def simplify_motors(
     alone = [simplify(time, column, tolerance) for column in value.T]
     if quantum > tolerance and np.isfinite(value).all():
         lines = [_between_rests(time, column, value) for column in value.T]
-        pairs = zip(lines, value.T, strict=True)
-        off = [
-            np.abs(np.interp(time, *line) - column).max() - np.abs(np.diff(column)).max()
-            for line, column in pairs
-        ]
+        path = np.stack([np.interp(time, *line) for line in lines], axis=-1)
+        steps = np.abs(np.diff(value, axis=0, prepend=value[:1], append=value[-1:]))
+        sample = np.minimum(np.maximum(steps[:-1], steps[1:]), STAIR_QUANTA * quantum)
         fewer = sum(len(corner) for corner, _ in lines) < sum(len(corner) for corner, _ in alone)
-        if max(off) <= quantum and fewer:
+        if (np.abs(path - value) <= quantum + sample).all() and fewer:
             return lines
     return alone
 
