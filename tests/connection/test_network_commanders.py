@@ -126,7 +126,9 @@ def test_orders_over_ros1(armpi, roscore):
             np.testing.assert_array_equal(arm.standing, TARGET)
             until, heard = time.monotonic() + WAIT_S, None
             while heard is None and time.monotonic() < until:
-                heard = arm.poll(0.1)
+                heard = arm.poll(1.0)
+                if heard is None:  # the peer was connected before we were to ourselves
+                    arm.send(order())
         assert isinstance(heard, CommandSent)
         np.testing.assert_allclose(heard.target, TARGET, atol=1e-12)
     finally:
