@@ -115,7 +115,7 @@ class StreamingFleet:
                 "encoders, whole_run=False. Diagnose recorded runs, or leave sensing out."
             )
         self.diagnoser = diagnoser
-        self._rounding: Rounding | None = None
+        self.rounding: Rounding | None = None
         self.hypotheses = [str(hypothesis) for hypothesis in diagnoser.hypothesis_set]
         self.robots, self.rate_hz, self.movements = robots, rate_hz, movements
         self._zero: float | None = None
@@ -306,11 +306,11 @@ class StreamingFleet:
 
     def count_as_noise(self, rounding: Rounding) -> None:
         """Judge by a sensor that rounds like this from now on, the last movements too."""
-        self._rounding = rounding
+        self.rounding = rounding
         self._look_anew()
 
     def _look_anew(self) -> None:
-        self.model = rounded(self.diagnoser.healthy_model, self._rounding, None)
+        self.model = rounded(self.diagnoser.healthy_model, self.rounding, None)
         self._tracker.adopt(self.model)
         self._latest = {}
 
@@ -413,7 +413,7 @@ class StreamingFleet:
         read = np.asarray(np.isfinite(points).all(axis=1))
         known = np.where(np.isfinite(command), command, last)
         near_m = self._settings.nearly_still_m
-        flickers = self._rounding is None
+        flickers = self.rounding is None
         still, alone = self._frozen.see(time, read, points, known, near_m, flickers)
         alone &= ~np.array(self._settings.idle_axes)
         still |= beliefs.dead & ~read

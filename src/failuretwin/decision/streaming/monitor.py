@@ -34,7 +34,7 @@ from failuretwin.inference.healthy_mixture import FOREIGN, HealthyMixture
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.misfit import FITS, misfit
 from failuretwin.inference.posterior import StreamPosition
-from failuretwin.inference.rounding import Rounding, rounded, told_of
+from failuretwin.inference.rounding import rounded, told_of
 from failuretwin.inference.run_likelihood import RunLikelihood
 
 WORTH_LEARNING = 0.01
@@ -127,7 +127,6 @@ class FaultMonitor:
         self._set_up = SetUpWatch(diagnoser)
         self._arrived = np.full((0, len(known.scatter)), np.nan)
         self._rests, self._misfit = False, 0.0
-        self._rounding: Rounding | None = None
 
     @property
     def set_up(self) -> str | None:
@@ -137,7 +136,7 @@ class FaultMonitor:
     @property
     def rounding(self) -> tuple[str, ...]:
         """What is to be said of how coarsely readings are written down, a line each."""
-        return tuple(told_of(self._rounding, None, 0.0))
+        return tuple(told_of(self._fleet.rounding, None, 0.0))
 
     @property
     def fit(self) -> Fit:
@@ -216,8 +215,7 @@ class FaultMonitor:
     def _count_rounding(self) -> None:
         """Count as noise what the sensor was found to round off."""
         found = self._set_up.rounding
-        if self._rounding is None and found is not None:
-            self._rounding = found
+        if self._fleet.rounding is None and found is not None:
             self._fleet.count_as_noise(found)
             self._models = [rounded(model, found, None) for model in self._models]
 
@@ -311,7 +309,7 @@ class FaultMonitor:
             start=one.movements.start + begin_s,
         )
         if self._learner.take(replace(one, movements=told), learns=own > WORTH_LEARNING):
-            self._models[-1] = rounded(self._learner.model, self._rounding, None)
+            self._models[-1] = rounded(self._learner.model, self._fleet.rounding, None)
             if own > 0.5:
                 self._fleet.adopt(self._models[-1].imperfections)
                 self._models[-1] = self._fleet.model
