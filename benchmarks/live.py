@@ -61,7 +61,7 @@ class Outcome:
 def watch_state(robot: Robot, state: str, speed: float, seconds: float, seed: int) -> Outcome:
     """Let a robot of a state work in a process of its own and watch it over ROS."""
     command = [sys.executable, "-m", "failuretwin", "emulate", "--seed", str(seed)]
-    command += ["--speed", str(speed), "--duration", str(seconds)]
+    command += ["--speed", str(speed), "--seconds", str(seconds)]
     if state != "healthy":
         command += ["--fault", f"{state}@{ONSET_S}"]
     twin, commands, sure_since = DigitalTwin(robot), KeptCommands(), np.nan

@@ -121,7 +121,7 @@ def _try(urdf: Path, expected: Expected | None, words: tuple[str, str], command:
         ["robot", "init", str(urdf), "--out", "arm.toml", *link],
         [
             *("simulate", "--robot", "arm.toml", "--out", "runs.nc"),
-            *("--runs-per-class", words[0], "--imperfections", words[1]),
+            *("--runs-per-class", words[0], "--calibration", words[1]),
         ],
         ["diagnose", "runs.nc", "--robot", "arm.toml", "--json", "results.jsonl"],
     ]

@@ -50,7 +50,7 @@ def simulated(failuretwin, tmp_path_factory):
     """A run set of nine imperfect runs, one of each class."""
     path = tmp_path_factory.mktemp("simulated") / "runs.nc"
     answer = failuretwin(
-        "simulate", "--out", path, "--runs-per-class", 1, "--imperfections", "armpi_fpv"
+        "simulate", "--out", path, "--runs-per-class", 1, "--calibration", "armpi_fpv"
     )
     assert answer.returncode == 0, answer.stderr
     return path

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import failuretwin as ft
-from failuretwin import DigitalTwin, InputError, load_robot
+from failuretwin import DigitalTwin, InputError
 from failuretwin.app.acting import spared_of
 from failuretwin.app.emulation import emulated_faults
 from failuretwin.app.reach_report import held_of
@@ -74,7 +74,9 @@ def test_stop_is_for_real_arms(failuretwin):
 
 def test_reach_of_a_task_with_a_motor_held(failuretwin, task, tmp_path):
     out = tmp_path / "reach.jsonl"
-    answer = failuretwin("reach", task, "--held", "motor_4=10", "--json", out)
+    answer = failuretwin(
+        "reach", task, "--fault", f"motor_4:stuck={np.deg2rad(10.0)}", "--json", out
+    )
     assert answer.returncode == 0, answer.stderr
     record = json.loads(out.read_text())
     assert record["motor"] == "motor_4"
@@ -85,8 +87,10 @@ def test_reach_of_a_task_with_a_motor_held(failuretwin, task, tmp_path):
 
 def test_reach_draws_a_map(failuretwin, task, tmp_path):
     pytest.importorskip("matplotlib")
-    picture = tmp_path / "map.png"
-    answer = failuretwin("reach", task, "--held", "motor_2=-20", "--plot", picture)
+    picture = tmp_path / "maps" / "reach.png"
+    answer = failuretwin(
+        "reach", task, "--fault", "motor_2:stuck=-0.35", "--report", picture.parent
+    )
     assert answer.returncode == 0, answer.stderr
     assert picture.read_bytes().startswith(b"\x89PNG")
 
@@ -137,11 +141,12 @@ def test_faults_of_an_emulated_arm(armpi):
 
 
 def test_held_motors_in_words(armpi):
-    assert held_of("motor_2=-30", armpi) == ("motor_2", pytest.approx(np.deg2rad(-30.0)))
+    assert held_of("motor_2:stuck=-0.5", armpi) == ("motor_2", -0.5)
     with pytest.raises(InputError, match="motor_9"):
-        held_of("motor_9=1", load_robot("armpi_fpv"))
-    with pytest.raises(InputError, match="MOTOR=DEGREES"):
-        held_of("motor_2", armpi)
+        held_of("motor_9:stuck=1", armpi)
+    for text in ("motor_2:stuck", "motor_2:drift=1", "healthy"):
+        with pytest.raises(InputError, match="MOTOR:stuck=SIZE"):
+            held_of(text, armpi)
 
 
 def test_a_task_in_python():

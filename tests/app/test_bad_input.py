@@ -162,7 +162,7 @@ def test_options_that_make_no_sense(refused, simulated, arguments, words):
         (["--hypotheses", "unknown"], "'unknown' cannot be simulated"),
         (["--hypotheses", "motor_2:torque_loss"], "'motor_2:torque_loss' would not show"),
         (["--faults", "nowhere.toml"], "nowhere.toml: cannot be read"),
-        (["--imperfections", "armpi"], "no imperfections 'armpi'"),
+        (["--calibration", "armpi"], "no imperfections 'armpi'"),
         (["--out", "x.h5"], "ends in .nc"),
         (["--out", "nowhere/x.nc"], "folder nowhere does not exist"),
     ],
@@ -191,7 +191,7 @@ def test_distributions_of_faults_that_cannot_be_used(refused, tmp_path, text, wo
 
 
 OUTPUTS = pytest.mark.parametrize(
-    ("option", "name"), [("--json", "x.jsonl"), ("--csv", "x.csv"), ("--plot", "pictures")]
+    ("option", "name"), [("--json", "x.jsonl"), ("--csv", "x.csv"), ("--report", "pictures")]
 )
 
 

@@ -13,7 +13,7 @@ pytest.importorskip("mujoco")
 def test_a_check_names_the_motor_and_what_to_do(failuretwin, tmp_path):
     out, kept = tmp_path / "out.json", tmp_path / "kept.json"
     arguments = ("check", "--seed", 2, "--keep", kept)
-    first = ("--seconds", 14, "--json", out, "--plot", tmp_path / "green")
+    first = ("--seconds", 14, "--json", out, "--report", tmp_path / "green")
     healthy = failuretwin(*arguments, *first)
     assert healthy.returncode == 0, healthy.stderr
     assert healthy.stdout.startswith("GREEN: healthy")
@@ -24,7 +24,7 @@ def test_a_check_names_the_motor_and_what_to_do(failuretwin, tmp_path):
     *_, state, step = healthy.stdout.splitlines()
     assert state.startswith("Healthy: ")
     assert step == "what to do: Nothing to do now. Check again after a repair, or in a month."
-    fault = ("--fault", "motor_2:encoder_bias=0.08", "--json", out, "--plot", tmp_path / "page")
+    fault = ("--fault", "motor_2:encoder_bias=0.08", "--json", out, "--report", tmp_path / "page")
     answer = failuretwin(*arguments, *fault)
     assert answer.returncode == 0, answer.stderr
     assert answer.stdout.startswith("RED: motor 2")
@@ -62,8 +62,8 @@ def test_what_cannot_be_written_is_refused_before_anything_moves(failuretwin, tm
     for option, path, said in (
         ("--keep", nowhere, "does not exist"),
         ("--json", nowhere, "does not exist"),
-        ("--plot", tmp_path / "file", "is a file"),
-        ("--plot", tmp_path / "file" / "page", "cannot be made"),
+        ("--report", tmp_path / "file", "is a file"),
+        ("--report", tmp_path / "file" / "page", "cannot be made"),
         ("--keep", tmp_path / "motions.json", "cannot be read as kept checks"),
     ):
         answer = failuretwin("check", option, path)
@@ -73,7 +73,7 @@ def test_what_cannot_be_written_is_refused_before_anything_moves(failuretwin, tm
 
 
 def test_motions_are_written_and_nothing_moves(failuretwin, tmp_path):
-    path, picture = tmp_path / "motions.json", tmp_path / "smallest.png"
+    path, picture = tmp_path / "motions.json", tmp_path / "smallest" / "isolability.png"
     answer = failuretwin("check", "--seconds", 8, "--write", path)
     assert answer.returncode == 0, answer.stderr
     assert "nothing was moved" in answer.stdout
@@ -82,7 +82,7 @@ def test_motions_are_written_and_nothing_moves(failuretwin, tmp_path):
     counts = robot.servo_units.to_counts(target)
     np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
     said = failuretwin(
-        "isolability", "armpi_fpv", "--motions", path, "--plot", picture, "--json", tmp_path / "s",
+        "isolability", "--motions", path, "--report", picture.parent, "--json", tmp_path / "s",
         "--hypotheses", "motor_3:stuck,motor_3:steady_state_error,motor_4:steady_state_error",
     )  # fmt: skip
     assert said.returncode == 0, said.stderr
@@ -90,8 +90,9 @@ def test_motions_are_written_and_nothing_moves(failuretwin, tmp_path):
     again = failuretwin("check", "--write", path.with_suffix(".csv"), "--motions", path)
     assert again.returncode == 0, again.stderr
     only = ("--hypotheses", "motor_3:steady_state_error,healthy")
+    assert "smallest fault shown" in failuretwin("isolability", *only).stdout  # of random ones
     tables = [
-        failuretwin("isolability", "armpi_fpv", "--motions", each, *only).stdout
+        failuretwin("isolability", "--motions", each, *only).stdout
         for each in (path, path.with_suffix(".csv"))
     ]
     assert tables[0] == tables[1]
@@ -104,7 +105,7 @@ def test_motions_are_written_and_nothing_moves(failuretwin, tmp_path):
         for name in ("start_rad", "target_rad", "ramp_s"):
             np.testing.assert_allclose(read[name], made[name], atol=1e-6)
         np.testing.assert_allclose(read["seconds"][:-1], made["seconds"][:-1], atol=1e-6)
-    said = failuretwin("isolability", "armpi_fpv", "--motions", bag, *only)
+    said = failuretwin("isolability", "--motions", bag, *only)
     assert said.stdout == tables[0]
     assert picture.read_bytes().startswith(b"\x89PNG")
     rows = [json.loads(line) for line in (tmp_path / "s").read_text().splitlines()]
@@ -152,7 +153,7 @@ def test_a_design_beside_random_movements(failuretwin):
         (("check", "--log", "some.nc", "--motions", "m.json"), "leave out --motions"),
         (("check", "--write", "m.csv", "--json", "o"), "nothing is moved: leave out --json"),
         (("check", "--floor", 2.0), "--floor"),
-        (("isolability", "armpi_fpv", "--motions", "nothing.json"), "cannot be read as motions"),
+        (("isolability", "--motions", "nothing.json"), "cannot be read as motions"),
     ],
 )
 def test_what_is_refused(failuretwin, arguments, said):

@@ -191,7 +191,7 @@ def test_wrong_diagnoses_are_marked(failuretwin, simulated, tmp_path):
 
 def test_a_fault_that_is_not_named_is_rightly_called_unknown(failuretwin, simulated, tmp_path):
     save_run_set(load_run_set(simulated).isel(run=[0, 2]), tmp_path / "two.nc")
-    arguments = ("two.nc", "--hypotheses", "healthy,motor_1:stuck,unknown", "--plot", "page")
+    arguments = ("two.nc", "--hypotheses", "healthy,motor_1:stuck,unknown", "--report", "page")
     answer = failuretwin("diagnose", *arguments, folder=tmp_path)
     assert "WRONG" not in answer.stdout
     assert "2 of 2 runs right" in answer.stdout
@@ -281,7 +281,7 @@ def test_a_picture_for_every_run(failuretwin, simulated, tmp_path):
     runs = load_run_set(simulated).isel(run=[0, 1, 5])
     names = ["a/b", "a b", "c"]
     save_run_set(runs.assign_coords(run=names), tmp_path / "runs.nc")
-    answer = failuretwin("diagnose", "runs.nc", "--plot", "x/pictures", folder=tmp_path)
+    answer = failuretwin("diagnose", "runs.nc", "--report", "x/pictures", folder=tmp_path)
     assert answer.returncode == 0, answer.stderr
     pictures = list((tmp_path / "x" / "pictures").glob("*.png"))
     assert len(pictures) == 3
@@ -294,7 +294,7 @@ def test_a_picture_for_every_run(failuretwin, simulated, tmp_path):
 def test_the_page_and_the_screen_say_the_same_of_all_runs(failuretwin, simulated, tmp_path):
     runs = load_run_set(simulated).isel(run=[0, 2])
     save_run_set(runs, tmp_path / "runs.nc")
-    answer = failuretwin("diagnose", "runs.nc", "--plot", "page", folder=tmp_path)
+    answer = failuretwin("diagnose", "runs.nc", "--report", "page", folder=tmp_path)
     assert answer.returncode == 0, answer.stderr
     page = (tmp_path / "page" / "index.html").read_text("utf-8")
     (step,) = re.findall(r"^what to do: (.*)$", answer.stdout, re.M)
@@ -323,3 +323,16 @@ def test_output_may_be_cut_off_by_the_next_command(simulated):
     finally:
         os.close(write)
     assert "Traceback" not in answer.stderr
+
+
+@pytest.mark.parametrize(
+    ("verb", "old", "new"),
+    [("simulate", "--imperfections", "--calibration"), ("diagnose", "--plot", "--report")],
+)
+def test_old_names_of_options_work_and_are_not_shown(failuretwin, verb, old, new):
+    shown = failuretwin(verb, "--help").stdout
+    assert new in shown
+    assert old not in shown
+    refused = failuretwin(verb, "--out", "runs.txt", old, "nothing/there", "nothing.nc")
+    assert refused.returncode == 2
+    assert "No such option" not in refused.stderr

@@ -240,7 +240,7 @@ def test_every_letter_that_latex_reads_as_a_command_is_escaped():
 
 
 def test_a_picture_of_the_reliability(evaluate, folder):
-    assert evaluate("ours.jsonl", "--plot", "deep/pictures").returncode == 0
+    assert evaluate("ours.jsonl", "--report", "deep/pictures").returncode == 0
     (picture,) = (folder / "deep" / "pictures").iterdir()
     assert picture.name == "reliability.png"
     assert picture.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")

@@ -41,7 +41,7 @@ def test_the_checked_guess_leads_to_a_verdict_and_a_page(failuretwin, log):
     failuretwin("diagnose", "log.csv", "--columns", "map.toml", folder=log)
 
     result = failuretwin(
-        "diagnose", "log.csv", "--columns", "map.toml", "--plot", "report", folder=log
+        "diagnose", "log.csv", "--columns", "map.toml", "--report", "report", folder=log
     )
 
     assert result.returncode == 0, result.stderr

@@ -28,7 +28,7 @@ def told(answer):
 def recording(failuretwin, tmp_path_factory):
     """An emulated robot of which motor 3 sticks from 12 to 25 s, as a file."""
     path = tmp_path_factory.mktemp("live") / "robot.mcap"
-    answer = failuretwin("emulate", "--to", path, "--duration", 45, *FAULT)
+    answer = failuretwin("emulate", "--to", path, "--seconds", 45, *FAULT)
     assert answer.returncode == 0, answer.stderr
     states = [text for _, text in told(answer)]
     assert states == ["healthy", "motor_3:stuck", "healthy"]
@@ -60,7 +60,7 @@ def test_a_written_life_goes_on_after_its_last_fault(failuretwin, tmp_path):
 def test_an_emulated_robot_is_watched_and_recorded(failuretwin, tmp_path):
     path = tmp_path / "live.mcap"
     answer = failuretwin(
-        *("watch", "emulated", "--speed", 0, "--duration", 45, "--record", path), *FAULT
+        *("watch", "emulated", "--speed", 0, "--seconds", 45, "--record", path), *FAULT
     )
     assert answer.returncode == 0, answer.stderr
     check_found(told(answer))
@@ -70,7 +70,7 @@ def test_an_emulated_robot_is_watched_and_recorded(failuretwin, tmp_path):
 
 def test_an_emulated_robot_has_a_fault_of_a_size_that_begins_at_a_time(failuretwin):
     fault = ("--fault", "motor_2:steady_state_error=0.1@20")
-    answer = failuretwin("watch", "emulated", "--speed", 0, "--duration", 40, *fault)
+    answer = failuretwin("watch", "emulated", "--speed", 0, "--seconds", 40, *fault)
     assert answer.returncode == 0, answer.stderr
     assert "last answer: motor 2 misses its targets by about 5.9 deg" in answer.stdout
 
@@ -94,7 +94,7 @@ def test_a_robot_on_a_ros_network_is_watched(roscore):
     )
     try:
         answer = subprocess.run(
-            [*command, "watch", "ros1", "--duration", "14"],
+            [*command, "watch", "ros1", "--seconds", "14"],
             env=environment,
             capture_output=True,
             text=True,
@@ -139,7 +139,7 @@ def test_without_a_master_the_user_is_told_to_start_one(failuretwin, monkeypatch
         (("emulate", "--to", "a.mcap", "--fault", "motor_3:stuck@soon"), "is not of the form"),
         (("emulate", "--to", "no/such/folder.mcap"), "cannot be written"),
         (("watch", "emulated", "--record", "live.bag"), "Give a name that ends in .mcap"),
-        (("watch", ".", "--fault", "motor_3:stuck@5"), "--fault and --imperfections are of an"),
+        (("watch", ".", "--fault", "motor_3:stuck@5"), "--fault is of an"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_line(failuretwin, tmp_path, arguments, said):

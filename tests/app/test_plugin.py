@@ -68,7 +68,7 @@ def test_it_is_diagnosed_in_48_of_60_runs(tmp_path):
 
 def test_the_command_line_knows_it(failuretwin, folder):
     """By the path of its file, by its name, and in worker processes."""
-    states = ("--hypotheses", "healthy,motor_2:bent_shaft", "--imperfections", "armpi_fpv")
+    states = ("--hypotheses", "healthy,motor_2:bent_shaft", "--calibration", "armpi_fpv")
     command = ("simulate", "--runs-per-class", 34, *states, "--plugin")
     made = [
         failuretwin(*command, folder / "bent_shaft.py", "--out", folder / "one.zarr"),

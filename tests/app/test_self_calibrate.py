@@ -62,7 +62,9 @@ def test_runs_are_judged_together_and_the_robot_is_kept(runs, armpi, tmp_path):
 
 def test_the_page_tells_what_was_learned_of_the_robot(runs, armpi, tmp_path):
     """Sentences, every offset beside such robots, every run; the motor that is off stands out."""
-    diagnose(runs, "--self-calibrate", "--plot", tmp_path / "page", "--out", tmp_path / "own.toml")
+    diagnose(
+        runs, "--self-calibrate", "--report", tmp_path / "page", "--out", tmp_path / "own.toml"
+    )
     page = (tmp_path / "page" / "index.html").read_text()
     section = page[page.index("What the runs taught") : page.index("<h2>Runs</h2>")]
     rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in section.split("<tr>")]

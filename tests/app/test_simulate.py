@@ -13,7 +13,7 @@ import pytest
 from failuretwin.data_knowledge.store import load_run_set
 from waiting import WAIT_S
 
-COMMAND = ("simulate", "--runs-per-class", 40, "--imperfections", "armpi_fpv", "--out")
+COMMAND = ("simulate", "--runs-per-class", 40, "--calibration", "armpi_fpv", "--out")
 
 
 def remarks(stderr):

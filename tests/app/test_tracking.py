@@ -22,7 +22,7 @@ def healthy(failuretwin, tmp_path_factory):
     path = tmp_path_factory.mktemp("healthy") / "healthy.nc"
     answer = failuretwin(
         *("simulate", "--out", path, "--hypotheses", "healthy", "--runs-per-class", RUNS),
-        *("--imperfections", "armpi_fpv"),
+        *("--calibration", "armpi_fpv"),
     )
     assert answer.returncode == 0, answer.stderr
     save_run_set(load_run_set(path).drop_vars("position"), path)
@@ -159,7 +159,7 @@ def test_a_fault_is_told_and_not_learned(track, calibration, failuretwin, tmp_pa
     path = tmp_path / "stuck.nc"
     failuretwin(
         *("simulate", "--out", path, "--hypotheses", "motor_1:stuck", "--runs-per-class", 27),
-        *("--imperfections", "armpi_fpv"),
+        *("--calibration", "armpi_fpv"),
     )
     answer = track(path)
     assert "27 runs learned" in answer.stdout

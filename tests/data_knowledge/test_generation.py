@@ -244,7 +244,7 @@ def test_mode_that_cannot_be_simulated_names_those_that_can(plan_of, armpi):
 def test_torque_loss_is_refused_where_nothing_gives_way(plan_of, armpi, imperfections, motor):
     """Motor 1 turns about the vertical, so no weight pulls at it."""
     fault = f"motor_{motor}:torque_loss"
-    with pytest.raises(InputError, match=f"'{fault}' would not show.*--imperfections"):
+    with pytest.raises(InputError, match=f"'{fault}' would not show.*--calibration"):
         plan_of(imperfections, hypotheses=parse(fault, armpi))
 
 

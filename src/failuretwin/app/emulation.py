@@ -92,13 +92,16 @@ def number_of(value: str, what: str) -> float:
     return number
 
 
-def emulation_of(robot: Robot, live: LiveOptions, seed: int) -> Emulation:
+def emulation_of(
+    robot: Robot, live: LiveOptions, seed: int, calibration: str | None = None
+) -> Emulation:
     """Return what an emulated arm is, with faults of sizes that are asked for.
 
     Args:
         robot: The robot, as it is without faults.
-        live: Its imperfections and faults.
+        live: Its faults.
         seed: Seed of all chance.
+        calibration: Its healthy behaviour; None: what is known of it.
 
     Raises:
         InputError: If a fault or the imperfections cannot be read.
@@ -106,7 +109,7 @@ def emulation_of(robot: Robot, live: LiveOptions, seed: int) -> Emulation:
     from failuretwin.connection.emulated_arm import Emulation
 
     own = "none" if robot.imperfections_file is None else robot.name
-    known = load_calibration(live.imperfections or own, robot)
+    known = load_calibration(calibration or own, robot)
     asked = emulated_faults(live.faults, robot)
     return Emulation(
         known.robot, known.imperfections, asked.schedule, seed, asked.modes, asked.start

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from rich.console import Console
@@ -38,6 +38,9 @@ from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.calibration_fit import MISFIT
 from failuretwin.inference.explanation import percent
 
+if TYPE_CHECKING:
+    from failuretwin.connection.emulated_arm import Emulation
+
 EMULATED, ROS1, ROS2, ROSBRIDGE = "emulated", "ros1", "ros2", "rosbridge"
 NETWORKS = (ROS1, ROS2)
 """Networks on which an emulated robot may speak."""
@@ -52,12 +55,12 @@ OWN_CLASS = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(:.*)?")
 
 
 def emulated_robot(
-    robot: Robot, live: LiveOptions, seed: int, pace: Pace, duration_s: float, zero_s: float = 0.0
+    emulation: Emulation, pace: Pace, duration_s: float, zero_s: float = 0.0
 ) -> Source:
     """Return an emulated robot; it works for `duration_s` and its clock starts at `zero_s` [s]."""
     from failuretwin.connection.emulated_arm import emulated
 
-    return emulated(emulation_of(robot, live, seed), pace, duration_s, zero_s)
+    return emulated(emulation, pace, duration_s, zero_s)
 
 
 def topics_of(path: Path | None) -> RosTopics:
@@ -79,12 +82,13 @@ def connect(
     """
     topics, pace = topics_of(live.topics), Pace(live.speed)
     if text == EMULATED:
-        source = emulated_robot(robot, live, seed, pace, live.duration or math.inf)
+        emulation = emulation_of(robot, live, seed)
+        source = emulated_robot(emulation, pace, live.seconds or math.inf)
         return stack.enter_context(source), []
-    if live.faults or live.imperfections:
+    if live.faults:
         raise InputError(
-            f"--fault and --imperfections are of an emulated robot, but the source is {text!r}. "
-            f"Leave them out, or watch {EMULATED!r}."
+            f"--fault is of an emulated robot, but the source is {text!r}. Leave it out, or watch "
+            f"{EMULATED!r}."
         )
     if text == ROS1:
         return _ros1(robot, topics, stack, commands)

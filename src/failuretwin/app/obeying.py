@@ -20,19 +20,26 @@ POLL_S = 0.01
 """Longest wait for the arm before commands are heard again [s]."""
 
 
-def obey_commands(robot: Robot, live: LiveOptions, seed: int, tell: Callable[[str], None]) -> None:
+def obey_commands(
+    robot: Robot,
+    live: LiveOptions,
+    calibration: str | None,
+    seed: int,
+    tell: Callable[[str], None],
+) -> None:
     """Publish readings and do what the topic of commands says, until interrupted.
 
     Args:
         robot: The robot.
         live: Topics, faults, pace and length.
+        calibration: Its healthy behaviour; None: what is known of it.
         seed: Seed of all chance.
         tell: Called with what happens.
     """
-    emulation = emulation_of(robot, live, seed)
+    emulation = emulation_of(robot, live, seed, calibration)
     topics = topics_of(live.topics)
     arm = CommandedArm(emulation, Pace(live.speed))
-    length = live.duration or math.inf
+    length = live.seconds or math.inf
     with Ros1Robot(robot, topics) as sink, Ros1Source(robot, topics) as ears:
         tell("an emulated robot obeys; stop with Ctrl-C")
         try:

@@ -56,5 +56,5 @@ def _at_work(robot: Robot, live: LiveOptions, seed: int) -> Commander:
     """Return an emulated arm that somebody works with; its faults may have sizes."""
     from failuretwin.connection.operated_arm import OperatedArm, Shifts
 
-    shifts = Shifts(duration_s=live.duration or math.inf)
+    shifts = Shifts(duration_s=live.seconds or math.inf)
     return OperatedArm(emulation_of(robot, live, seed), shifts, Pace(live.speed))

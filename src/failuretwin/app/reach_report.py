@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from failuretwin.app.emulation import number_of
 from failuretwin.app.plots import clean, new_figure
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.store import replacing
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.data_knowledge.store import filling, replacing
 from failuretwin.decision.acting.reach import MotorReach, Reach
 from failuretwin.digital_model.robot import Robot
 
@@ -20,22 +22,18 @@ NEVER = 0.85
 
 
 def held_of(text: str, robot: Robot) -> tuple[str, float]:
-    """Read MOTOR=DEGREES; of a motor that slides, MOTOR=METRES.
+    """Return motor and angle [rad], or position [m], of ``MOTOR:stuck=SIZE``.
 
     Raises:
-        InputError: If it is not of that form.
+        InputError: If it is not of that form or names no motor of the robot.
     """
-    name, _, angle = text.partition("=")
-    try:
-        value = float(angle)
-    except ValueError:
+    name, _, size = text.partition("=")
+    fault = Hypothesis.parse(name, robot.motor_names).faults
+    if len(fault) != 1 or fault[0].mode != "stuck" or not size:
         raise InputError(
-            f"--held is {text!r}, expected MOTOR=DEGREES, such as motor_3=-20."
-        ) from None
-    if name not in robot.motor_names:
-        raise InputError(f"--held names {name!r}. Expected one of {', '.join(robot.motor_names)}.")
-    slides = robot.slides[robot.motor_names.index(name)]
-    return name, value if slides else float(np.deg2rad(value))
+            f"--fault is {text!r}, expected MOTOR:stuck=SIZE, such as motor_3:stuck=-0.35."
+        )
+    return fault[0].motor, number_of(size, f"--fault {text!r}: size")
 
 
 def by_motor_lines(motors: Sequence[MotorReach]) -> list[str]:
@@ -79,7 +77,7 @@ def write_json(records: Sequence[dict[str, Any]], path: Path) -> None:
         partial.write_text("".join(json.dumps(record) + "\n" for record in records))
 
 
-def save_map(maps: Sequence[Reach], path: Path) -> None:
+def save_map(maps: Sequence[Reach], folder: Path) -> None:
     """Draw each map from above and from the side: filled what can be reached, hollow what cannot.
 
     Raises:
@@ -103,5 +101,5 @@ def save_map(maps: Sequence[Reach], path: Path) -> None:
             panel.set_ylabel(name_up)
             panel.set_aspect("equal", adjustable="datalim")
         above.set_title(f"{found.motor} at {np.rad2deg(found.angle):.0f} deg: {found.share:.0%}")
-    with replacing(path) as partial:
-        figure.savefig(partial, format="png", dpi=130)
+    with filling(folder) as partial:
+        figure.savefig(partial / "reach.png", dpi=130)

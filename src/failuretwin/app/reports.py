@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 MAX_EXPLAINED = 3
-"""So few runs are explained in full on the screen; for more there are --plot and --json."""
+"""So few runs are explained in full on the screen; for more there are --report and --json."""
 
 
 def print_diagnoses(diagnoses: Sequence[Diagnosis]) -> None:

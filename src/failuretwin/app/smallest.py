@@ -14,7 +14,7 @@ from failuretwin.app.plots import clean, new_figure
 from failuretwin.app.tables import Table, figures_table
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import as_floats
-from failuretwin.data_knowledge.store import replacing
+from failuretwin.data_knowledge.store import filling
 from failuretwin.decision.test_motions.motions import Motions, holds_motions, read_motions
 from failuretwin.decision.test_motions.session import Checking
 from failuretwin.digital_model.robot import Robot
@@ -24,8 +24,16 @@ from failuretwin.inference.isolability import IsolabilityReport
 
 MOST_RUNS = 3
 """Runs of a log that are looked at, spread evenly."""
+RANDOM_S = 20.0
+"""Time of random movements where no motions are given [s]."""
 NARROWEST_IN = 5.0
 """The narrowest picture on which its title fits [in]."""
+
+
+def random_motions(asking: Checking, seconds: float, most: int = 1000) -> Motions:
+    """Return random movements within the usual ranges that take so long at most [s]."""
+    designer = replace(asking, usual=True).designer
+    return Motions.of(asking.known.robot, designer.random(asking.home, seconds, most))
 
 
 def of_motions(asking: Checking, motions: Motions) -> IsolabilityReport:
@@ -34,12 +42,16 @@ def of_motions(asking: Checking, motions: Motions) -> IsolabilityReport:
     return asking.isolability(command, time)
 
 
-def smallest_of(asking: Checking, path: Path) -> IsolabilityReport:
+def smallest_of(asking: Checking, path: Path | None) -> IsolabilityReport:
     """Return what the motions of a file can tell apart: designed ones, or those of a log.
+
+    Without a file: the usual random movements.
 
     Raises:
         InputError: If it cannot be read, or holds no movement.
     """
+    if path is None:
+        return of_motions(asking, random_motions(asking, RANDOM_S))
     if holds_motions(path, asking.known.robot):
         return of_motions(asking, read_motions(path, asking.known.robot))
     from failuretwin.data_knowledge.read import read_runs
@@ -53,12 +65,8 @@ def smallest_of(asking: Checking, path: Path) -> IsolabilityReport:
 
 def smallest_beside_random(asking: Checking, motions: Motions) -> list[str | Table]:
     """Return the smallest faults that motions show, beside those of random movements."""
-    usual = replace(asking, usual=True).designer
-    random = usual.random(asking.home, motions.duration_s, len(motions.orders))
-    found = [
-        of_motions(asking, motions),
-        of_motions(asking, Motions.of(asking.known.robot, random)),
-    ]
+    random = random_motions(asking, motions.duration_s, len(motions.orders))
+    found = [of_motions(asking, motions), of_motions(asking, random)]
     robot = asking.known.robot
     rows = [
         [plain_name(Hypothesis.parse(name)), *(_said(each, name, robot) for each in found)]
@@ -105,8 +113,8 @@ def smallest_record(found: IsolabilityReport) -> Sequence[dict[str, Any]]:
     ]
 
 
-def save_picture(found: IsolabilityReport, robot: Robot, path: Path) -> None:
-    """Draw the smallest sizes, a panel a mode, as a PNG file.
+def save_picture(found: IsolabilityReport, robot: Robot, folder: Path) -> None:
+    """Draw the smallest sizes, a panel a mode, as `isolability.png`.
 
     Raises:
         OutputError: If it cannot be written.
@@ -135,5 +143,5 @@ def save_picture(found: IsolabilityReport, robot: Robot, path: Path) -> None:
         "smallest fault shown: blue, told from healthy; red, from all others; pale: not even",
         fontsize=8,
     )
-    with replacing(path) as partial:
-        figure.savefig(partial, format="png", dpi=130)
+    with filling(folder) as partial:
+        figure.savefig(partial / "isolability.png", dpi=130)

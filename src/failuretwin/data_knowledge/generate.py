@@ -164,7 +164,7 @@ class Plan:
             raise InputError(
                 f"'{fault}' would not show: with imperfections {self.imperfections.name!r}, "
                 f"{fault.motor} does not give way under load. Choose imperfections in which it "
-                "sags (--imperfections), or another motor."
+                "sags (--calibration), or another motor."
             )
 
     @property

@@ -24,6 +24,7 @@ from failuretwin.app.commands.options import (
     gathered,
     plugin_option,
     refuse_unused,
+    report_option,
 )
 
 if TYPE_CHECKING:
@@ -133,12 +134,7 @@ MOTIONS = ("written", "motions", "keep", "speed_share", "floor", "radius")
     help="So many further movements at most, if it is still open then what is wrong.",
 )
 @click.option("--json", "json_file", type=PATH, metavar="FILE", help="Write an object a line.")
-@click.option(
-    "--plot",
-    type=PATH,
-    metavar="DIR",
-    help="Write index.html: the state of the robot, which motor, how surely, what to do.",
-)
+@report_option("Write index.html: the state of the robot, which motor, how surely, what to do.")
 @arm_options
 @motion_options
 @safety_options
@@ -153,7 +149,7 @@ def check(
     keep: Path | None,
     further: int,
     json_file: Path | None,
-    plot: Path | None,
+    report: Path | None,
     arm: ArmOptions,
     motion: MotionOptions,
     safety: SafetyOptions,
@@ -165,43 +161,43 @@ def check(
 
     Movements are chosen to tell most; each passes the gate of `act`. See docs/asking.md.
     """
-    from failuretwin.app import check_report as report
+    from failuretwin.app import check_report as said
     from failuretwin.app.tables import show
     from failuretwin.app.terminal import tell
     from failuretwin.decision.test_motions.motions import write_motions
 
     _refuse_what_does_nothing(logs, written, motions, keep)
-    before = report.kept_checks(keep) if keep is not None and keep.exists() else []
-    _check_outputs(keep, json_file, plot)
+    before = said.kept_checks(keep) if keep is not None and keep.exists() else []
+    _check_outputs(keep, json_file, report)
     asking = motion.checking(safety, calibration, robot, seed)
     model = asking.known.robot
     if logs:
-        _check_logs(asking.of_logs(logs), model, json_file, plot)
+        _check_logs(asking.of_logs(logs), model, json_file, report)
         return
     planned = asking.motions(seconds, keep if before else motions)
     if written is not None:
         write_motions(planned, model, written)
-        show(*report.motion_lines(planned, model), f"written to {written}; nothing was moved")
+        show(*said.motion_lines(planned, model), f"written to {written}; nothing was moved")
         return
     if not arm.moves:
         show("nothing moves without --move; these are the motions")
-        show(*report.motion_lines(planned, model))
+        show(*said.motion_lines(planned, model))
         return
     with ExitStack() as stack:
         commander = arm.commander(asking.known, seed, stack)
         result = asking.health_check(planned, further).work(commander, tell)
     time, command = planned.reference()
     result = asking.shown(result, command, time)
-    record = report.check_record(result, model, planned.duration_s)
-    show(*report.check_lines(result, model, planned.duration_s))
+    record = said.check_record(result, model, planned.duration_s)
+    show(*said.check_lines(result, model, planned.duration_s))
     if keep is not None:
-        report.keep_check(keep, planned, [*before, record])
-        show(*(report.changes(before[-1], record) if before else [f"kept in {keep}"]))
+        said.keep_check(keep, planned, [*before, record])
+        show(*(said.changes(before[-1], record) if before else [f"kept in {keep}"]))
     if json_file is not None:
-        report.write_records([record], json_file)
-    if plot is not None:
-        report.write_check_page([result], model, plot)
-    show(*report.closing_lines(result, model))
+        said.write_records([record], json_file)
+    if report is not None:
+        said.write_check_page([result], model, report)
+    show(*said.closing_lines(result, model))
 
 
 def _refuse_what_does_nothing(
@@ -212,7 +208,7 @@ def _refuse_what_does_nothing(
         why = "with --log nothing is moved and nothing is kept"
         refuse_unused(why, *DESIGN, *ARM, *MOTIONS)
     if written is not None:
-        refuse_unused("with --write nothing is moved", *ARM, "keep", "json_file", "plot")
+        refuse_unused("with --write nothing is moved", *ARM, "keep", "json_file", "report")
     if motions is not None:
         refuse_unused(f"{motions} says which motions are made", *DESIGN)
     if keep is not None and keep.exists():
@@ -220,31 +216,31 @@ def _refuse_what_does_nothing(
         refuse_unused(why, "motions", *DESIGN)
 
 
-def _check_outputs(keep: Path | None, json_file: Path | None, plot: Path | None) -> None:
+def _check_outputs(keep: Path | None, json_file: Path | None, report: Path | None) -> None:
     """Raise OutputError unless all that is to be written can be, before anything moves."""
     from failuretwin.data_knowledge.store import check_fillable, check_writable
 
     for path in (keep, json_file):
         if path is not None:
             check_writable(path)
-    if plot is not None:
-        check_fillable(plot)
+    if report is not None:
+        check_fillable(report)
 
 
 def _check_logs(
-    results: Sequence[CheckResult], model: Robot, json_file: Path | None, plot: Path | None
+    results: Sequence[CheckResult], model: Robot, json_file: Path | None, report: Path | None
 ) -> None:
     """Say what logs of checks say that were recorded elsewhere."""
-    from failuretwin.app import check_report as report
+    from failuretwin.app import check_report as said
     from failuretwin.app.tables import show
 
     for result in results:
-        lines = report.check_lines(result, model, 0.0)
-        show(result.diagnosis.run, *lines, *report.closing_lines(result, model), "")
+        lines = said.check_lines(result, model, 0.0)
+        show(result.diagnosis.run, *lines, *said.closing_lines(result, model), "")
     if json_file is not None:
-        report.write_records([report.check_record(r, model, 0.0) for r in results], json_file)
-    if plot is not None:
-        report.write_check_page(results, model, plot)
+        said.write_records([said.check_record(r, model, 0.0) for r in results], json_file)
+    if report is not None:
+        said.write_check_page(results, model, report)
 
 
 @click.command()
@@ -282,13 +278,12 @@ def design(
 
 
 @click.command()
-@click.argument("name", metavar="ROBOT")
 @click.option(
     "--motions",
     type=PATH,
-    required=True,
     metavar="FILE",
-    help="Motions that `design` or `check` wrote (.json, .csv, .mcap, .bag), or a log or run set.",
+    help="Motions that `design` or `check` wrote (.json, .csv, .mcap, .bag), or a log or run set. "
+    "Default: the usual random movements.",
 )
 @click.option(
     "--hypotheses",
@@ -296,31 +291,30 @@ def design(
     metavar="H,...",
     help="What is laid beside each other. Default: the paper's nine classes.",
 )
-@click.option("--plot", type=PATH, metavar="FILE.png", help="Draw the smallest sizes.")
+@report_option("Draw the smallest sizes there, isolability.png.")
 @click.option("--json", "json_file", type=PATH, metavar="FILE", help="Write the table.")
 @calibration_option
 @plugin_option
+@common_options
 def isolability(
-    name: str,
-    motions: Path,
+    motions: Path | None,
     hypotheses: str | None,
-    plot: Path | None,
+    report: Path | None,
     json_file: Path | None,
     calibration: Path | None,
+    robot: str,
+    seed: int,
 ) -> None:
-    """Say the smallest fault of each motor and mode that motions of ROBOT can show.
-
-    ROBOT is a bundled robot, or the TOML profile of another.
-    """
+    """Say the smallest fault of each motor and mode that motions of a robot can show."""
     from failuretwin.app.check_report import write_records
     from failuretwin.app.reports import group_lines
     from failuretwin.app.smallest import save_picture, size_table, smallest_of, smallest_record
     from failuretwin.app.tables import show
 
-    asking = MotionOptions(hypotheses).checking(SafetyOptions(), calibration, name, 0)
+    asking = MotionOptions(hypotheses).checking(SafetyOptions(), calibration, robot, seed)
     found = smallest_of(asking, motions)
     show(size_table(found, asking.known.robot), *group_lines(found, asking.known.robot))
     if json_file is not None:
         write_records(smallest_record(found), json_file)
-    if plot is not None:
-        save_picture(found, asking.known.robot, plot)
+    if report is not None:
+        save_picture(found, asking.known.robot, report)

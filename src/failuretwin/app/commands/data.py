@@ -13,6 +13,7 @@ from failuretwin.app.commands.options import (
     F,
     HypothesesOption,
     LogOptions,
+    RenamedOption,
     common_options,
     plugin_option,
     reading_options,
@@ -82,7 +83,9 @@ def import_(
     help="What to simulate, such as healthy,motor_2:stuck. Default: the paper's nine classes.",
 )
 @click.option(
+    "--calibration",
     "--imperfections",
+    cls=RenamedOption,
     default="none",
     metavar="none|NAME|FILE",
     help="What the robot does that its twin does not: nothing, what is known of the robot of that "
@@ -127,7 +130,7 @@ def simulate(
     out: Path,
     runs_per_class: int,
     hypotheses: str | None,
-    imperfections: str,
+    calibration: str,
     engine: str,
     sensors: str | None,
     faults: Path | None,
@@ -152,7 +155,7 @@ def simulate(
     from failuretwin.failure_behavior.registry import MODES, load_modes
 
     check_destination(out)
-    known = load_calibration(imperfections, load_robot(robot))
+    known = load_calibration(calibration, load_robot(robot))
     names = known.robot.motor_names
     plan = Plan(
         robot=known.robot,

@@ -15,6 +15,7 @@ from failuretwin.app.commands.options import (
     common_options,
     plugin_option,
     reading_options,
+    report_option,
 )
 
 if TYPE_CHECKING:
@@ -97,11 +98,8 @@ if TYPE_CHECKING:
 )
 @click.option("--json", "json_file", type=PATH, help="Write an object a line, a line a run.")
 @click.option("--csv", "csv_file", type=PATH, help="Write a table, a row a run.")
-@click.option(
-    "--plot",
-    type=PATH,
-    metavar="DIR",
-    help="Write index.html: the state of the robot, what to do, and pictures of some runs.",
+@report_option(
+    "Write index.html: the state of the robot, what to do, and pictures of some runs.", "--plot"
 )
 @reading_options
 @plugin_option
@@ -121,7 +119,7 @@ def diagnose(
     sensing: str | None,
     json_file: Path | None,
     csv_file: Path | None,
-    plot: Path | None,
+    report: Path | None,
     reading: LogOptions,
     robot: str,
     seed: int,
@@ -196,8 +194,8 @@ def diagnose(
     course = None if independent or not together else course_of(diagnoses, bayes)
     state = robot_state(diagnoses, model, course, _taught(learned) if together else None)
     _write_files(diagnoses, course, json_file, csv_file)
-    if plot is not None:
-        _write_page(runs, diagnoses, known.twin, state, learned, plot)
+    if report is not None:
+        _write_page(runs, diagnoses, known.twin, state, learned, report)
     _keep(tracked, runs, out)
     reports.print_diagnoses(diagnoses)
     if method == "bayes" and sensing_of(runs, sensing) == TOOL_ALONE:

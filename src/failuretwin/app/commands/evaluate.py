@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from failuretwin.app.commands.options import PATH, common_options, plugin_option
+from failuretwin.app.commands.options import PATH, common_options, plugin_option, report_option
 
 
 @click.command()
@@ -30,7 +30,7 @@ from failuretwin.app.commands.options import PATH, common_options, plugin_option
     help="Compare with other results of the same runs.",
 )
 @click.option("--latex", type=PATH, metavar="FILE", help="Write the scores as LaTeX tables.")
-@click.option("--plot", type=PATH, metavar="DIR", help="Write a picture of the reliability.")
+@report_option("Write a picture of the reliability.")
 @plugin_option
 @common_options
 def evaluate(
@@ -39,7 +39,7 @@ def evaluate(
     published_labels: bool,
     against: Path | None,
     latex: Path | None,
-    plot: Path | None,
+    report: Path | None,
     robot: str,
     seed: int,
 ) -> None:
@@ -67,8 +67,8 @@ def evaluate(
         comparison = evaluation.compare(first, second, truths, np.random.default_rng(seed))
     if latex is not None:
         write_latex(scores, comparison, latex)
-    if plot is not None:
-        write_reliability(scores, plot)
+    if report is not None:
+        write_reliability(scores, report)
     print_evaluation(scores, truth is not None)
     if comparison is not None:
         print_comparison(comparison)

@@ -15,6 +15,7 @@ from failuretwin.app.commands.options import (
     common_options,
     plugin_option,
     reading_options,
+    report_option,
 )
 from failuretwin.app.terminal import tell
 
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     "predicted. Default: each session is left out once, and the result learns from all.",
 )
 @click.option("--name", help="What results call the calibration. Default: the file's name.")
-@click.option("--report", type=PATH, metavar="DIR", help="Write a page with tables and pictures.")
+@report_option("Write a page with tables and pictures.")
 @click.option(
     "--pool",
     is_flag=True,

@@ -118,7 +118,7 @@ def watch(
     limit = "" if "goals" in sensing else _limit(known.imperfections, motors, budget)
     tell(_rests_on(known.imperfections, when) + limit)
     # An emulated robot ends by itself, a log when it is over.
-    length = live.duration if live.duration and source != "emulated" else math.inf
+    length = live.seconds if live.seconds and source != "emulated" else math.inf
     with ExitStack() as stack:
         link: Source
         prober = None
@@ -191,7 +191,7 @@ the last fault has begun or been repaired [s]."""
     metavar="ros1|ros2|FILE.mcap",
     help="Publish as a ROS 1 node, or on ROS 2 over Zenoh, until interrupted, or write a recording "
     "at once: one minute, or until 20 s after the last fault has begun or been repaired, unless "
-    "--duration says otherwise.",
+    "--seconds says otherwise.",
 )
 @click.option(
     "--obey",
@@ -200,12 +200,18 @@ the last fault has begun or been repaired [s]."""
     "moving at random.",
 )
 @live_options
+@click.option(
+    "--calibration",
+    metavar="none|NAME|FILE",
+    help="What the robot does that its twin does not. Default: what is known of it.",
+)
 @plugin_option
 @common_options
 def emulate(
     target: str,
     obey: bool,
     live: LiveOptions,
+    calibration: str | None,
     robot: str,
     seed: int,
 ) -> None:
@@ -214,12 +220,12 @@ def emulate(
     Needs no robot. Watch it with `failuretwin watch ros1`.
     """
     if obey:
-        _obey(target, live, robot, seed)
+        _obey(target, live, calibration, robot, seed)
     else:
-        _play(target, live, robot, seed)
+        _play(target, live, calibration, robot, seed)
 
 
-def _obey(target: str, live: LiveOptions, robot: str, seed: int) -> None:
+def _obey(target: str, live: LiveOptions, calibration: str | None, robot: str, seed: int) -> None:
     """Play a robot that does what it is told."""
     from failuretwin.core.errors import InputError
 
@@ -228,14 +234,14 @@ def _obey(target: str, live: LiveOptions, robot: str, seed: int) -> None:
     from failuretwin.app.obeying import obey_commands
     from failuretwin.digital_model.robot import load_robot
 
-    obey_commands(load_robot(robot), live, seed, tell)
+    obey_commands(load_robot(robot), live, calibration, seed, tell)
 
 
-def _play(target: str, live: LiveOptions, robot: str, seed: int) -> None:
+def _play(target: str, live: LiveOptions, calibration: str | None, robot: str, seed: int) -> None:
     """Play a robot that moves at random."""
     from contextlib import ExitStack
 
-    from failuretwin.app.emulation import emulated_faults
+    from failuretwin.app.emulation import emulated_faults, emulation_of
     from failuretwin.app.live import NETWORKS, emulated_robot, robot_sink
     from failuretwin.connection.links.base import AS_FAST_AS_POSSIBLE, Pace
     from failuretwin.core.errors import InputError
@@ -246,9 +252,9 @@ def _play(target: str, live: LiveOptions, robot: str, seed: int) -> None:
     zero, on_ros = time.time(), target.partition("://")[0] in NETWORKS
     if not on_ros and Path(target).suffix != ".mcap":
         raise InputError(f"--to is {target!r}, expected ros1, ros2 or a file that ends in .mcap.")
-    length = live.duration or (math.inf if on_ros else _file_length(schedule))
+    length = live.seconds or (math.inf if on_ros else _file_length(schedule))
     pace = Pace(live.speed if on_ros else AS_FAST_AS_POSSIBLE)
-    source = emulated_robot(model, live, seed, pace, length, zero)
+    source = emulated_robot(emulation_of(model, live, seed, calibration), pace, length, zero)
     with ExitStack() as stack:
         sink = robot_sink(target, model, live, stack)
         stack.enter_context(source)

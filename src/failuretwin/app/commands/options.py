@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, fields
 from functools import wraps
 from pathlib import Path
@@ -78,6 +79,23 @@ calibration_option = click.option(
     metavar="FILE",
     help="What `calibrate` learned of this robot. Default: the calibration its profile names.",
 )
+
+
+class RenamedOption(click.Option):
+    """An option whose last name is an old one: it works, and the help leaves it out."""
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Return the name of the option and its help."""
+        shown = copy(self)
+        shown.opts = self.opts[:1]
+        return click.Option.get_help_record(shown, ctx)
+
+
+def report_option(text: str, *old_names: str) -> Callable[[F], F]:
+    """Return the option `--report DIR`."""
+    return click.option(
+        "--report", *old_names, cls=RenamedOption, type=PATH, metavar="DIR", help=text
+    )
 
 
 class HypothesesOption(click.Option):
@@ -162,9 +180,8 @@ class LiveOptions:
 
     topics: Path | None
     faults: tuple[str, ...]
-    imperfections: str | None
     speed: float
-    duration: float | None
+    seconds: float | None
 
 
 live_options = gathered(
@@ -187,18 +204,13 @@ live_options = gathered(
         "several times.",
     ),
     click.option(
-        "--imperfections",
-        metavar="none|NAME|FILE",
-        help="What an emulated robot does that its twin does not. Default: what is known of it.",
-    ),
-    click.option(
         "--speed",
         type=click.FloatRange(min=0.0),
         default=1.0,
         help="How fast the time of logs and emulated robots passes; 0: as fast as possible.",
     ),
     click.option(
-        "--duration",
+        "--seconds",
         type=click.FloatRange(min=0.0, min_open=True),
         metavar="SECONDS",
         help="Stop after this time: by the clock of an emulated robot, else by ours. Default: with "

@@ -6,30 +6,31 @@ from pathlib import Path
 
 import click
 
-from failuretwin.app.commands.options import PATH, common_options
+from failuretwin.app.commands.options import PATH, common_options, report_option
 from failuretwin.app.terminal import tell
 
 
 @click.command()
 @click.argument("task", metavar="[TASK.csv]", type=PATH, required=False)
 @click.option(
-    "--held",
-    metavar="MOTOR=DEGREES",
-    help="The motor that is held, and where. Default: every motor in turn, all over its travel.",
+    "--fault",
+    metavar="MOTOR:stuck=SIZE",
+    help="The motor that is stuck, and where [rad, m for one that slides]. Default: every motor "
+    "in turn, all over its travel.",
 )
 @click.option("--floor", type=float, metavar="METRES", help="Height of the floor. Default: base.")
 @click.option(
     "--radius", type=click.FloatRange(min=0.0), metavar="METRES", help="Radius of the links."
 )
-@click.option("--plot", type=PATH, metavar="FILE.png", help="Draw a map of the workspace.")
+@report_option("Draw a map of the workspace there, reach.png.")
 @click.option("--json", "json_file", type=PATH, metavar="FILE", help="Write all points.")
 @common_options
 def reach(
     task: Path | None,
-    held: str | None,
+    fault: str | None,
     floor: float | None,
     radius: float | None,
-    plot: Path | None,
+    report: Path | None,
     json_file: Path | None,
     robot: str,
     seed: int,
@@ -54,16 +55,16 @@ def reach(
     model = load_robot(robot)
     gate = SafetyGate(model, SafetyLimits(floor_m=floor, radius_m=radius))
     points = workspace(model, seed=seed) if task is None else read_task(task)
-    if held is None:
+    if fault is None:
         motors = reach_by_motor(gate, points, seed)
         lines, records = by_motor_lines(motors), [motor.record() for motor in motors]
         maps = [reach_of(gate, points, (m.motor, m.best_angle), seed) for m in motors]
     else:
-        maps = [reach_of(gate, points, held_of(held, model), seed)]
+        maps = [reach_of(gate, points, held_of(fault, model), seed)]
         lines, records = map_lines(maps[0], per_point=task is not None), [maps[0].record()]
     for line in lines:
         tell(line)
     if json_file is not None:
         write_json(records, json_file)
-    if plot is not None:
-        save_map(maps, plot)
+    if report is not None:
+        save_map(maps, report)
