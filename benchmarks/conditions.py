@@ -26,7 +26,7 @@ import failuretwin as ft
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.decision.scoring_rules import calibrated_error, equal_edges, reliability
+from failuretwin.decision.scoring_rules import calibrated_error, reliability
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import calibrated
 from failuretwin.digital_model.nonidealities import Imperfections
@@ -296,8 +296,8 @@ class Score:
         """Return what is told of the condition."""
         told = [d for d in self.found if d.diagnosis is not None]
         sure = np.array([d.probability for d in told])
-        error = reliability(sure, right(told), equal_edges()).error
-        chance = float(np.mean(calibrated_error(sure, equal_edges(), np.random.default_rng(0))))
+        error = reliability(sure, right(told)).error
+        chance = float(np.mean(calibrated_error(sure, np.random.default_rng(0))))
         healthy = [d for d in self.found if d.truth == "healthy"]
         false = np.mean([d.diagnosis not in (None, "healthy") for d in healthy])
         cover = " ".join(f"{_percent(self.held[q], self.asked[q]):>5s}" for q in QUANTITIES)

@@ -25,7 +25,6 @@ from failuretwin.core.types import FloatArray
 from failuretwin.decision.scoring_rules import (
     calibrated_error,
     check_ranks,
-    equal_edges,
     rank_of_truth,
     reliability,
 )
@@ -172,9 +171,9 @@ def report(found: list[Outcome], rng: np.random.Generator) -> None:
     print(f"{len(found)} runs, {len(found) - len(told)} without a verdict")
     correct = share(int(right.sum()), len(right))
     print(f"right {correct}, log score {np.mean(nats):.4f} nats a run")
-    bins = reliability(sure, right, equal_edges())
+    bins = reliability(sure, right)
     error = bins.error
-    chance = calibrated_error(sure, equal_edges(), rng)
+    chance = calibrated_error(sure, rng)
     print(f"calibration error {error:.4f} (a perfect one shows {np.mean(chance):.4f} by chance)")
     for count, hits, mean in zip(bins.count, bins.right, bins.confidence, strict=True):
         if count:
@@ -190,7 +189,7 @@ def report(found: list[Outcome], rng: np.random.Generator) -> None:
             check = check_ranks(rank_of_truth(draws[known], truth[known], rng), DRAWS, rng)
             held = share(inside, len(cases))
             print(f"{mode}, {what}: 90 % intervals hold the truth in {held}")
-            print(f"  ranks: chi2 p = {check.chi2_p:.3f}, band p = {check.band_p:.3f}")
+            print(f"  ranks: chi2 p = {check.chi2_p:.3f}, Kolmogorov-Smirnov p = {check.ks_p:.3f}")
             print(f"  share of each bin over its due: {np.round(check.count / check.expected, 2)}")
 
 

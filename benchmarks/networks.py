@@ -20,7 +20,6 @@ from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.decision.learned.networks import NETWORKS
 from failuretwin.decision.learned.storage import load_network, save_network
 from failuretwin.decision.scoring_rules import (
-    equal_edges,
     log_score,
     log_score_gain,
     mcnemar,
@@ -55,7 +54,7 @@ def judged(diagnoses: Sequence[Diagnosis]) -> tuple[float, float, float]:
     right = np.array([d.diagnosis == d.truth for d in diagnoses])
     stated = np.array([min(max(d.posterior.values()), 1.0) for d in diagnoses])
     nats = nats_of(diagnoses)
-    error = reliability(stated, right, equal_edges()).error
+    error = reliability(stated, right).error
     return float(right.mean()), float(nats.mean()), float(error)
 
 

@@ -10,7 +10,7 @@ from scipy import stats
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.decision.proportions import Share
-from failuretwin.decision.scoring_rules import calibrated_error, equal_edges, log_score, reliability
+from failuretwin.decision.scoring_rules import calibrated_error, log_score, reliability
 
 
 def share(count: int, total: int) -> str:
@@ -41,8 +41,8 @@ def calibration(found: Sequence[Diagnosis], rng: np.random.Generator) -> str:
     """Return the calibration error of those with a verdict, and what chance alone shows."""
     told = [d for d in found if d.diagnosis is not None]
     sure = np.array([d.probability for d in told])
-    bins = reliability(sure, right(told), equal_edges())
-    chance = calibrated_error(sure, equal_edges(), rng)
+    bins = reliability(sure, right(told))
+    chance = calibrated_error(sure, rng)
     return (
         f"calibration error {bins.error:.4f} (a perfect one shows {np.mean(chance):.4f} by "
         f"chance, {np.quantile(chance, 0.95):.4f} at most in 95 %)"

@@ -1,7 +1,6 @@
-"""How good diagnoses are where the truth is known, and which of two methods is better.
+"""Scores of diagnoses whose truth is known, and comparison of two methods.
 
-`evaluate` and `compare` take diagnoses as they come from a diagnoser or a file and return frozen
-values; nothing is printed.
+`evaluate` and `compare` take diagnoses or a results file and return frozen values.
 """
 
 from __future__ import annotations
@@ -28,16 +27,16 @@ if TYPE_CHECKING:
 
 Given = Results | Iterable[Diagnosis | Record] | str | Path
 
-# What was true of the runs, where a run set or a log knows it.
+# Truth of the runs.
 
 
 @dataclass(frozen=True)
 class RunTruth:
-    """The truth of one run; NaN where it is not known or does not apply.
+    """Truth of one run; NaN where unknown or not applicable.
 
     Attributes:
         fault: True hypothesis.
-        onset: When the fault began [s]; 0: before the run.
+        onset: Start of the fault [s]; 0: before the run.
         magnitude: Size of the fault in the unit of its mode.
     """
 
@@ -48,7 +47,7 @@ class RunTruth:
 
 @dataclass(frozen=True)
 class Truths:
-    """The truth of the runs of a run set, by their names; `name` is what errors call the set."""
+    """Truth of each run by its name; `name` identifies the run set in errors."""
 
     name: str
     by_run: Mapping[str, RunTruth]
@@ -58,7 +57,7 @@ class Truths:
         """Return the truth of every run of a run set.
 
         Raises:
-            InputError: If it knows no truth.
+            InputError: If the run set has no truth.
         """
         faults = truth_of(runs)
         if faults is None:
@@ -68,39 +67,35 @@ class Truths:
             )
         unknown = np.full(len(faults), np.nan)
         columns = (runs[n].values if n in runs else unknown for n in ("onset", "magnitude"))
-        values = zip(faults, *(map(float, column) for column in columns), strict=True)
-        truths = (RunTruth(*value) for value in values)
+        truths = map(RunTruth, faults, *(map(float, column) for column in columns))
         return cls(name, dict(zip(map(str, runs["run"].values), truths, strict=True)))
 
     def __getitem__(self, run: str) -> RunTruth:
-        if run not in self.by_run:
-            raise InputError(f"{self.name}: holds no run {run!r} of the results. {self._why(run)}")
-        return self.by_run[run]
-
-    def _why(self, run: str) -> str:
+        if run in self.by_run:
+            return self.by_run[run]
+        why = "Expected the runs that were diagnosed."
         name, numbered, _ = run.rpartition("#")
         if numbered and name in self.by_run:
-            return (
-                f"It holds {name!r}; diagnose numbers runs of the same name, so it was given an "
-                "input twice, or several whose runs are called alike. Diagnose and evaluate each "
+            why = (
+                f"It holds {name!r}; diagnose numbers runs of the same name, so an input was given "
+                "twice, or several inputs have a run of this name. Diagnose and evaluate each "
                 "input once, by itself."
             )
-        return "Expected the runs that were diagnosed."
+        raise InputError(f"{self.name}: holds no run {run!r} of the results. {why}")
 
 
-# Diagnoses beside what was true.
+# Diagnoses with their truth.
 
 
 @dataclass(frozen=True)
 class Judged:
-    """Diagnoses of the runs whose truth is known, beside it.
+    """Diagnoses of the runs whose truth is known.
 
     Attributes:
-        diagnoses: One a run.
-        truth: What is right for each: its truth, or `unknown` where that means it.
-        as_unknown: How many runs are judged as `unknown`, by their truth.
-        protocol: How much real data the method has seen; letters joined by a slash where they
-            differ.
+        diagnoses: One per run.
+        truth: Correct answer for each run; see `judged_truth`.
+        as_unknown: Number of runs whose correct answer is `unknown`, by true fault.
+        protocol: Protocol letters of all diagnoses, joined by a slash.
     """
 
     diagnoses: tuple[Diagnosis | Record, ...]
@@ -110,7 +105,7 @@ class Judged:
 
     @classmethod
     def of(cls, results: Given, truths: Truths | None = None) -> Judged:
-        """Judge diagnoses by these truths, or by those that they name themselves.
+        """Judge diagnoses by `truths`; None: by the truth that they carry.
 
         Raises:
             InputError: If the truth of a run is not among `truths`.
@@ -128,12 +123,12 @@ class Judged:
 
     @property
     def verdicts(self) -> list[str | None]:
-        """Verdict on each run; None where there is none."""
+        """Verdict on each run; None: no verdict."""
         return [d.diagnosis for d in self.diagnoses]
 
     @property
     def right(self) -> BoolArray:
-        """Whether each run is diagnosed right, (run,)."""
+        """Whether each run is diagnosed correctly, (run,)."""
         pairs = zip(self.verdicts, self.truth, strict=True)
         return np.array([verdict == true for verdict, true in pairs], dtype=np.bool_)
 
@@ -144,19 +139,19 @@ class Judged:
 
     @cached_property
     def scores(self) -> proportions.Scores:
-        """Right, wrong and the log score; of one run at least."""
+        """Accuracy and log score; needs at least one run."""
         return proportions.score(self.truth, self.verdicts, self.posteriors)
 
 
 def as_results(given: Given, name: str = "the results") -> Results:
-    """Return diagnoses with a name; those that have one keep it, a path is read."""
+    """Return diagnoses as `Results`; a path is read."""
     if isinstance(given, str | Path):
         return read_results(Path(given))
     return given if isinstance(given, Results) else Results(name, tuple(given))
 
 
 def score_line(judged: Judged) -> str:
-    """Return the accuracy with its protocol, number of runs and interval; empty if unknown."""
+    """Return accuracy, interval, protocol and log score in one line; empty if there is no truth."""
     if not judged.diagnoses:
         return ""
     scores = judged.scores
@@ -168,37 +163,35 @@ def score_line(judged: Judged) -> str:
     )
 
 
-def _log_score_text(surprise: scoring_rules.LogScore) -> str:
-    """Return the log score in words; says so where a truth was ruled out altogether."""
-    text = f"{surprise.mean:.3f} nats a run"
-    if not surprise.impossible:
+def _log_score_text(scores: scoring_rules.LogScore) -> str:
+    text = f"{scores.mean:.3f} nats a run"
+    if not scores.impossible:
         return text
-    rest = surprise.nats.size - surprise.impossible
+    rest = scores.nats.size - scores.impossible
     if not rest:
         return f"{text} (the truth was given no probability in any run)"
     return (
-        f"{text} (of {surprise.impossible} runs the truth was given no probability; the other "
-        f"{rest}: {surprise.mean_of_rest:.3f})"
+        f"{text} (of {scores.impossible} runs the truth was given no probability; the other "
+        f"{rest}: {scores.mean_of_rest:.3f})"
     )
 
 
 def as_unknown_line(judged: Judged) -> str:
-    """Return which truths are judged as `unknown`, in words; empty if none is."""
-    found = judged.as_unknown
-    if not found:
+    """Return which truths are judged as `unknown`; empty if none is."""
+    if not judged.as_unknown:
         return ""
-    truths = [f"{truth} ({counted(count, 'run')})" for truth, count in found.items()]
+    truths = [f"{truth} ({counted(count, 'run')})" for truth, count in judged.as_unknown.items()]
     return f"judged as unknown, since not among the hypotheses: {', '.join(truths)}"
 
 
-# All scores of one method.
+# Scores of one method.
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibration of the verdict's probability, in bins of equal width and of about equal counts.
+    """Reliability of the verdict's probability, in equal and in adaptive bins.
 
-    By chance alone, a perfectly calibrated method would show these errors in `equal`, (draw,).
+    `by_chance` holds the errors of a perfectly calibrated method in equal bins, (draw,).
     """
 
     equal: scoring_rules.Reliability
@@ -211,11 +204,11 @@ class Evaluation:
     """Scores of diagnoses whose truth is known.
 
     Attributes:
-        judged: The diagnoses beside their truth.
+        judged: Diagnoses with their truth.
         alarms: False alarms and missed detections.
         brier: Mean Brier score, 0 to 2.
-        calibration: Over runs with a verdict; None if there are none.
-        coverage: Of 90 % intervals, by fault mode; empty where the true values are not known.
+        calibration: Of runs with a verdict; None if there are none.
+        coverage: Coverage of 90 % intervals by fault mode; empty where true values are unknown.
     """
 
     judged: Judged
@@ -226,12 +219,12 @@ class Evaluation:
 
     @property
     def scores(self) -> proportions.Scores:
-        """Right, wrong and the log score."""
+        """Accuracy and log score."""
         return self.judged.scores
 
     @property
     def runs_and_protocol(self) -> str:
-        """What was judged, in words."""
+        """Number of runs and protocol, as text."""
         return f"{counted(self.scores.runs, 'run')}, protocol {self.judged.protocol}"
 
 
@@ -243,14 +236,13 @@ def evaluate(
     """Return all scores of the diagnoses whose truth is known.
 
     Args:
-        results: Diagnoses, as a diagnoser returns them or `read_results` reads them, or the path
-            of such a file.
-        truth: Run set that knows the truth, or where it is; None: what the diagnoses say. Without
-            it nothing is known of the coverage of intervals.
-        rng: Source of chance, for the calibration error that chance alone would show; None: seed 0.
+        results: Diagnoses, results, or the path of a results file.
+        truth: Run set with the truth, or its path; None: the truth in the diagnoses, without
+            coverage of intervals.
+        rng: Random generator for the calibration error by chance; None: seed 0.
 
     Raises:
-        InputError: If no truth is known, a run is not in `truth`, or is given twice.
+        InputError: If no truth is known, or a run is missing from `truth` or given twice.
     """
     given, truths = as_results(results), _truths(truth)
     judged = Judged.of(given, truths)
@@ -273,28 +265,25 @@ def _no_truth(name: str) -> InputError:
 
 
 def _truths(given: RunsLike | Truths | None) -> Truths | None:
-    if given is None or isinstance(given, Truths):
-        return given
-    return Truths.of(as_runs(given))
+    return given if given is None or isinstance(given, Truths) else Truths.of(as_runs(given))
 
 
 def _calibration(judged: Judged, rng: np.random.Generator) -> Calibration | None:
-    pairs = zip(judged.verdicts, judged.posteriors, strict=True)
     decided = np.array([verdict is not None for verdict in judged.verdicts])
     if not decided.any():
         return None
-    chance = np.array([posterior[verdict] for verdict, posterior in pairs if verdict is not None])
-    stated, right = np.minimum(chance, 1.0), judged.right[decided]  # sums may round above 1
-    equal = scoring_rules.equal_edges()
+    pairs = zip(judged.verdicts, judged.posteriors, strict=True)
+    stated = np.array([posterior[verdict] for verdict, posterior in pairs if verdict is not None])
+    stated, right = np.minimum(stated, 1.0), judged.right[decided]  # sums may round above 1
     return Calibration(
-        equal=scoring_rules.reliability(stated, right, equal),
+        equal=scoring_rules.reliability(stated, right),
         adaptive=scoring_rules.reliability(stated, right, scoring_rules.adaptive_edges(stated)),
-        by_chance=scoring_rules.calibrated_error(stated, equal, rng),
+        by_chance=scoring_rules.calibrated_error(stated, rng),
     )
 
 
 def _intervals(judged: Judged, truths: Truths) -> Iterator[proportions.IntervalCase]:
-    """Yield the intervals of runs whose fault was found, with the values that they should hold."""
+    """Yield the intervals of correctly diagnosed runs with their true values."""
     for diagnosis, right in zip(judged.diagnoses, judged.truth, strict=True):
         if diagnosis.diagnosis != right:
             continue
@@ -308,18 +297,19 @@ def _intervals(judged: Judged, truths: Truths) -> Iterator[proportions.IntervalC
                 yield proportions.IntervalCase(mode, quantity, *interval, true)
 
 
-# Two methods on the same runs: which is better?
+# Two methods on the same runs.
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What two methods, by name and protocol, say of the same runs.
+    """Comparison of two methods on the same runs.
 
     Attributes:
-        split: Which runs they got right.
-        gain: Nats a run that the second saves.
-        as_unknown: Runs that the first and the second judge as `unknown`, since the truth is not
-            among their own hypotheses.
+        first: Name and protocol of the first method.
+        second: Name and protocol of the second method.
+        split: Runs that either method got right.
+        gain: Log score saved by the second method [nats per run].
+        as_unknown: Number of runs that the first and the second judge as `unknown`.
     """
 
     first: str
@@ -341,13 +331,13 @@ def compare(
     truth: RunsLike | Truths | None = None,
     rng: np.random.Generator | None = None,
 ) -> Comparison:
-    """Compare two methods run by run, matched by run name, each by its own hypotheses.
+    """Compare two methods run by run, matched by run name; each is judged by its own hypotheses.
 
     Args:
-        first: Diagnoses, with the truth of those runs that are to count.
-        second: Others of the same runs; where they lack the truth, that of the first counts.
-        truth: Run set that knows the truth; None: what the diagnoses say.
-        rng: Source of chance, for the bootstrap; None: seed 0.
+        first: Diagnoses; without `truth`, their own truth counts.
+        second: Diagnoses of the same runs.
+        truth: Run set with the truth; None: the truth in the diagnoses.
+        rng: Random generator for the bootstrap; None: seed 0.
 
     Raises:
         InputError: If the runs or their truths differ, or no truth is known.
@@ -355,11 +345,11 @@ def compare(
     one, other = as_results(first, "the first results"), as_results(second, "the second results")
     matched = _matched(one, other)
     truths = _truths(truth) or _own_truth(one, other.name, matched)
-    counted = [d for d in one.diagnoses if truth is not None or d.truth]
-    ours, theirs = (Judged.of(ds, truths) for ds in (counted, [matched[d.run] for d in counted]))
+    scored = [d for d in one.diagnoses if d.run in truths.by_run or truth is not None]
+    ours, theirs = (Judged.of(ds, truths) for ds in (scored, [matched[d.run] for d in scored]))
     return Comparison(
-        first=_named(one),
-        second=_named(other),
+        first=f"{one.name} (protocol {Judged.of(one).protocol})",
+        second=f"{other.name} (protocol {Judged.of(other).protocol})",
         split=scoring_rules.mcnemar(ours.right, theirs.right),
         gain=scoring_rules.log_score_gain(
             ours.scores.log_scores.nats,
@@ -370,12 +360,8 @@ def compare(
     )
 
 
-def _named(results: Results) -> str:
-    return f"{results.name} (protocol {Judged.of(results).protocol})"
-
-
 def _matched(first: Results, second: Results) -> dict[str, Diagnosis | Record]:
-    """Return the second diagnoses by run name, which must be those of the first."""
+    """Return the second diagnoses by run name; both must have the same runs."""
     ours, theirs = ({d.run: d for d in results.diagnoses} for results in (first, second))
     for has, lacks, missing in (
         (first, second, [run for run in ours if run not in theirs]),
@@ -390,15 +376,15 @@ def _matched(first: Results, second: Results) -> dict[str, Diagnosis | Record]:
 
 
 def _own_truth(first: Results, second: str, matched: Mapping[str, Diagnosis | Record]) -> Truths:
-    """Return what the first diagnoses say was true, which the second must not gainsay."""
+    """Return the truth in the first diagnoses; the second must not contradict it."""
     known = {d.run: RunTruth(d.truth) for d in first.diagnoses if d.truth}
     if not known:
         raise _no_truth(first.name)
     for run, true in known.items():
-        said = matched[run].truth
-        if said and said != true.fault:
+        other = matched[run].truth
+        if other and other != true.fault:
             raise InputError(
-                f"{second}: run {run!r} is {said} there, but {true.fault} in {first.name}. Give "
+                f"{second}: run {run!r} is {other} there, but {true.fault} in {first.name}. Give "
                 "the truth of both with --truth RUNS."
             )
     return Truths(first.name, known)

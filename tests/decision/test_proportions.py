@@ -1,12 +1,25 @@
+"""Shares, judged against scikit-learn and scipy."""
+
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import binomtest, norm
 from sklearn.metrics import confusion_matrix, f1_score, precision_recall_fscore_support
 
-from failuretwin.decision.proportions import NO_VERDICT, judged_truth, score, wilson_interval
+from failuretwin.decision.proportions import (
+    NO_VERDICT,
+    Coverage,
+    IntervalCase,
+    Share,
+    count_alarms,
+    coverage_by_mode,
+    judged_truth,
+    score,
+    wilson_interval,
+)
 
 TRUTH = ["a", "a", "a", "b", "b", "c"]
 SAID = ["a", "a", "b", "b", "a", "a"]
@@ -107,3 +120,60 @@ def test_truth_that_no_hypothesis_stands_for_counts_as_wrong():
 )
 def test_unknown_means_every_fault_that_is_not_named(truth, hypotheses, right):
     assert judged_truth(truth, hypotheses) == right
+
+
+@given(trials=st.integers(1, 4000), share=st.floats(0, 1))
+def test_wilson_interval_is_that_of_scipy(trials, share):
+    successes = round(share * trials)
+    expected = binomtest(successes, trials).proportion_ci(method="wilson")
+    np.testing.assert_allclose(wilson_interval(successes, trials), expected, rtol=1e-9, atol=1e-12)
+    assert Share(successes, trials).interval == wilson_interval(successes, trials)
+    assert Share(successes, trials).value == successes / trials
+
+
+def test_a_share_of_nothing_is_not_known():
+    assert wilson_interval(0, 0) == Share(0, 0).interval == (0.0, 1.0)
+    assert np.isnan(Share(0, 0).value)
+
+
+def test_any_other_verdict_on_a_healthy_run_is_a_false_alarm():
+    alarms = count_alarms(["healthy"] * 5, ["healthy", "motor_1:stuck", "unknown", None, "healthy"])
+    assert alarms.false_alarms == Share(2, 5)
+    assert alarms.healthy_abstained == 1
+    assert alarms.missed == Share(0, 0)
+
+
+def test_a_fault_is_missed_where_no_alarm_is_raised_whatever_its_name():
+    said = ["motor_1:stuck", "motor_2:stuck", "unknown", "healthy", None, None]
+    alarms = count_alarms(["motor_1:stuck"] * 5 + ["unknown"], said)
+    assert alarms.missed == Share(3, 6)
+    assert alarms.faulty_abstained == 2
+    assert alarms.false_alarms == Share(0, 0)
+
+
+def test_truths_are_counted_on_either_side():
+    cases = [
+        IntervalCase("stuck", "onset", 1.0, 2.0, truth) for truth in (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
+    ]
+    cases.append(IntervalCase("drift", "onset", 0.0, 0.0, 0.0))
+    assert coverage_by_mode(cases) == [
+        Coverage("stuck", "onset", Share(3, 6), below=1, above=2, points=0),
+        Coverage("drift", "onset", Share(1, 1), below=0, above=0, points=1),
+    ]
+
+
+def test_intervals_of_an_exact_posterior_cover_what_they_say():
+    """Also where runs were chosen by what the data say, as a diagnosis chooses them."""
+    rng = np.random.default_rng(0)
+    truth = rng.normal(size=20_000)
+    mean = (truth + rng.normal(size=20_000)) / 2
+    half = norm.ppf(0.95) * np.sqrt(0.5)
+    chosen = mean > 0.3
+    cases = [
+        IntervalCase("stuck", "magnitude", m - half, m + half, t)
+        for m, t in zip(mean[chosen], truth[chosen], strict=True)
+    ]
+    (coverage,) = coverage_by_mode(cases)
+    low, high = coverage.inside.interval
+    assert low < 0.9 < high
+    assert high - low < 0.02
