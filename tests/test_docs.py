@@ -108,7 +108,7 @@ def _parts(node: ast.ClassDef) -> Iterator[str]:
 
 def glossary_rows() -> list[list[str]]:
     lines = (ROOT / "docs" / "glossary.md").read_text("utf-8").splitlines()
-    rows = [line for line in lines if line.startswith("| ") and not line.startswith("| symbol")]
+    rows = [line for line in lines if line.startswith("| ") and not line.startswith("| term")]
     return [[cell.strip() for cell in row.split("|")[1:-1]] for row in rows]
 
 
@@ -174,11 +174,12 @@ def test_links_on_the_page_lead_somewhere(page):
 
 
 @pytest.mark.parametrize("page", [p for p in DOCS if p.name not in SHOWN], ids=named)
-def test_a_page_opens_with_what_when_and_code(page):
-    before_first_heading = page.read_text("utf-8").partition("\n## ")[0]
-    assert FENCE.search(before_first_heading)
-    assert "**What:**" in before_first_heading
-    assert re.search(r"\*\*(When|When to use|Start here):\*\*", before_first_heading)
+def test_a_page_opens_with_its_subject_and_code(page):
+    title, text = page.read_text("utf-8").split("\n", 1)
+    opening = text.partition("\n## ")[0]
+    assert title.startswith("# ")
+    assert FENCE.search(opening)
+    assert sentences(FENCE.split(opening)[0])
 
 
 def test_the_index_links_every_page():
@@ -189,13 +190,12 @@ def test_the_index_links_every_page():
     assert "docs/index.md" in LINK.findall((ROOT / "README.md").read_text("utf-8"))
 
 
-def test_every_row_of_the_glossary_has_a_name_and_a_section():
+def test_every_row_of_the_glossary_links_its_page():
     rows = glossary_rows()
-    assert len(rows) > 40
-    for row in rows:
-        assert len(row) == 6, row
-        assert NAME.search(row[2]), row
-        assert LINK.search(row[5]), row
+    assert len(rows) > 30
+    assert [row for row in rows if len(row) != 3 or not LINK.search(row[2])] == []
+    terms = [row[0].lower() for row in rows]
+    assert terms == sorted(terms)
 
 
 def test_sections_named_by_docstrings_exist():
@@ -236,19 +236,22 @@ def test_the_reference_has_every_public_name_once():
 
 
 def sentences(text: str) -> list[str]:
-    """Return the sentences of a page, without code, tables and addresses of links."""
-    text = re.sub(r"\]\([^)]*\)", "]", FENCE.sub("\n\n", text))
+    """Return the sentences of a page, without code, equations, tables and addresses of links."""
+    text = re.sub(r"^    .*$", "", FENCE.sub("\n\n", text), flags=re.MULTILINE)
+    text = re.sub(r"\]\([^)]*\)", "]", text)
     parts = re.split(r"\n\s*\n|\n(?=[-|#]|\d\. )", text)
     prose = [" ".join(part.split()) for part in parts if not part.startswith("|")]
     return [s for part in prose for s in re.split(r"(?<=[.!?:])\s+", part) if s]
 
 
 @pytest.mark.parametrize(
-    "page", [p for p in DOCS if p.parent != ROOT / "docs"] + [ROOT / "CONTRIBUTING.md"], ids=named
+    "page",
+    [p for p in (*DOCS, ROOT / "README.md", ROOT / "CONTRIBUTING.md") if p.name not in SHOWN],
+    ids=named,
 )
 def test_sentences_are_short(page):
     text = page.read_text("utf-8")
-    assert len(sentences(text)) > 3
+    assert len(sentences(text)) > 2
     assert [s for s in sentences(text) if len(s.split()) >= 30] == []
 
 

@@ -77,8 +77,8 @@ def test_every_mode_has_its_unit():
     assert {name: mode.unit for name, mode in MODES.items()} == UNITS
 
 
-def test_the_page_of_results_names_every_unit():
-    page = (Path(__file__).parents[2] / "docs" / "results.md").read_text()
+def test_the_page_on_diagnosis_names_every_unit():
+    page = (Path(__file__).parents[2] / "docs" / "diagnose.md").read_text()
     rows = re.findall(r"^\| `(\w+)` \| [^|]+ \| `([^`|]+)` \|$", page, re.MULTILINE)
     assert dict(rows) == UNITS
 

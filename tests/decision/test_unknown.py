@@ -100,7 +100,7 @@ def test_modes_without_a_law_are_unknown(twin, armpi, foreign, monkeypatch):
 
 
 def test_known_faults_stay_known(diagnoser, imperfect, diagnoses):
-    """Offering `unknown` turns hardly any right diagnosis: 1.7 % of 900 (docs/diagnosis.md)."""
+    """Offering `unknown` turns hardly any right diagnosis: 1.7 % of 900 (docs/inference.md)."""
     right = np.flatnonzero([d.diagnosis == d.truth for d in diagnoses])
     found = diagnoser.diagnose(imperfect.isel(run=right))
     assert np.mean([d.diagnosis == d.truth for d in found]) >= 0.96

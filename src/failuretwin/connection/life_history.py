@@ -4,7 +4,7 @@
 ``CAL.history.npz`` the state from which the next command goes on, digit for digit. The state says
 how much of the lines counts, so that a writer that is killed between the two does no harm.
 
-Section: docs/calibration_tracking.md#the-history-file
+Section: docs/self_calibration.md#follow-the-life-of-a-robot
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 What a kind of arm is like is the prior; the runs say together how this robot differs from it, each
 weighed by how surely it is known what is wrong in it. What is learned is an ordinary calibration.
 
-Section: docs/self_calibration.md
+Section: docs/inference.md#folders
 """
 
 from __future__ import annotations

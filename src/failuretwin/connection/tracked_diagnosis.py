@@ -1,6 +1,6 @@
 """Diagnosis that learns as it goes: runs are judged in their order, each by those before it.
 
-Section: docs/calibration_tracking.md
+Section: docs/inference.md#lives
 """
 
 from __future__ import annotations

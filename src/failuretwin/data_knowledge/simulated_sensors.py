@@ -2,7 +2,7 @@
 
     y seen = y(q(t)) + b + n,    b ~ N(bias, doubt^2) of each run,    n ~ N(0, noise^2) of a reading
 
-Section: docs/sensors.md#simulated-sensors
+Section: docs/sensors.md
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from failuretwin.digital_model.servo import first_order_lag
 from failuretwin.digital_model.twin import Drive, uniform_step
 
 STEP_S = 0.005
-"""Default step [s]; see docs/engines.md for its error."""
+"""Default step [s]; see docs/generation.md#servo-engine-and-physics-engine for its error."""
 RUNS_AT_ONCE = 64
 SAMPLES_AT_ONCE = 250
 """Bounds what is in memory: states and controls of 64 runs at two steps each take about 10 MB."""

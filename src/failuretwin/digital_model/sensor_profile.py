@@ -1,6 +1,6 @@
 """What a profile or a calibration says of a sensor: mount, noise, bias.
 
-Section: docs/sensors.md#what-the-profile-says
+Section: docs/sensors.md#sensors-in-the-profile
 """
 
 from __future__ import annotations

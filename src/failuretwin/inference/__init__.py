@@ -5,7 +5,7 @@
 
 with movements m, the first one m0 that a fault affects, its size z, and L_m the log density of
 what was seen of a movement. Read the modules in this order; each states its term, and links its
-section of docs/diagnosis.md or docs/shared_unknowns.md (words and symbols: docs/glossary.md):
+section of docs/inference.md (words: docs/glossary.md):
 
     readings, log_quality    which samples were measured, and what is wrong with them
     evidence, settings       e_m, where the tool settled; transient samples on the way

@@ -5,7 +5,7 @@
 with the faults of each run summed over inside, and f the probability that a calibration is of
 another robot or of other weeks. Of one that it is not of, the kind of arm says more.
 
-Section: docs/set_up.md#another-robot-of-the-same-make
+Section: docs/inference.md#set-ups
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ found before all else.
 
 for movements that start late by d with probability r.
 
-Section: docs/set_up.md#clocks
+Section: docs/inference.md#set-ups
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@
 with outcomes a of a movement, and the losses l(a) that lead there. The fault mode `lost_commands`,
 a motor that loses far more, is weighed in `missed_movements`.
 
-Section: docs/diagnosis.md#lost-commands-a-hidden-markov-chain
+Section: docs/inference.md#outcomes
 """
 
 from __future__ import annotations

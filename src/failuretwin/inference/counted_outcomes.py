@@ -2,7 +2,7 @@
 
 Sums over outcomes weighted by their probability leave out those that are all but impossible.
 
-Section: docs/shared_unknowns.md
+Section: docs/inference.md#shared-unknowns
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     runs -> Evidence -> RunLikelihood -> compute_posterior -> Diagnosis of each run
 
-Section: docs/diagnosis.md#posterior-estimates-and-abstention
+Section: docs/inference.md#posterior
 """
 
 from __future__ import annotations

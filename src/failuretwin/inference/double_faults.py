@@ -2,7 +2,7 @@
 
     p(run | h) = sum over both change points and both sizes of p(m1, z1) p(m2, z2) prod exp L_m
 
-Section: docs/diagnosis.md#two-faults-at-once
+Section: docs/inference.md#hypotheses
 """
 
 from __future__ import annotations

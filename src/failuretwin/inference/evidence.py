@@ -5,7 +5,7 @@ here and in everything that follows.
 
     e_m = median of the readings of the last 0.6 s at rest after movement m
 
-Section: docs/diagnosis.md#settled-evidence-where-the-tool-rests
+Section: docs/inference.md#moments
 """
 
 from __future__ import annotations

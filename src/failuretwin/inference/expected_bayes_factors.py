@@ -5,7 +5,7 @@
 The truth of each run is made again without scatter, losses and glitches, seen where the run was
 seen, and laid beside the best member of every hypothesis, in units of the declared scatter.
 
-Section: docs/isolability.md#how-it-is-computed
+Section: docs/isolability.md#method
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Those that are healthy and those of the faulty motor, each outcome with its probability w. What is
 left of them, rho = L^-1 (r - G theta), is what theta and scatter are judged by.
 
-Section: docs/shared_unknowns.md
+Section: docs/inference.md#shared-unknowns
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Diagnoses in plain words: the verdict, what speaks for it, what else it may be, what to do.
 
-Section: docs/diagnosis.md#posterior-estimates-and-abstention
+Section: docs/inference.md#posterior
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ likelihood of a state is its posterior over its prior:
 forward-backward gives p(s_i | all runs), Viterbi the course that is told. Each run keeps its own
 size and onset: that these stay too is not used.
 
-Section: docs/self_calibration.md#faults-that-persist
+Section: docs/inference.md#folders
 """
 
 from __future__ import annotations

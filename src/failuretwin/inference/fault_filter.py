@@ -12,7 +12,7 @@ with L the likelihood of movement m over that of a healthy robot, lambda and rho
 a fault and of a repair since the movement before, all divided by their sum. A movement that was not
 seen has L = 1.
 
-Section: docs/streaming.md#the-filter-all-movements-so-far
+Section: docs/inference.md#streams
 """
 
 from __future__ import annotations

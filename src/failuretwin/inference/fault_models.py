@@ -5,7 +5,7 @@ nodes where the movements point, and to give each its prior.
 
     phi(z) = where it settles + settled_offset(z)    weights of z: prior mass nearest to it
 
-Section: docs/diagnosis.md#fault-models-where-each-fault-puts-its-motor
+Section: docs/inference.md#hypotheses
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ the ranges are wide, and crowd where movements point, as narrowly as those say.
 with F the prior's distribution function: exact for the prior, and the trapezoidal rule for what is
 integrated.
 
-Section: docs/diagnosis.md#fault-models-where-each-fault-puts-its-motor
+Section: docs/inference.md#hypotheses
 """
 
 from __future__ import annotations

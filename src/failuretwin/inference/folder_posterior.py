@@ -2,7 +2,7 @@
 
 Every run is judged with what all others say (`RunsTogether`), some times over.
 
-Section: docs/self_calibration.md
+Section: docs/inference.md#folders
 """
 
 from __future__ import annotations

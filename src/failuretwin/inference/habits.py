@@ -2,7 +2,7 @@
 
 By expectation and maximisation with pseudo-counts, beside the theta that runs share.
 
-Section: docs/self_calibration.md#scatter-and-loss-rates
+Section: docs/inference.md#folders
 """
 
 from __future__ import annotations

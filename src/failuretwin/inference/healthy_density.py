@@ -14,7 +14,7 @@ is drawn: w = nu / chi2_nu; the last i is a blip, which no calibration knows), a
 j, at which the motor already stood there, says of where it stands off its target, with precision
 L_j.
 
-Section: docs/streaming.md#the-healthy-robot-in-the-filter
+Section: docs/inference.md#streams
 """
 
 from __future__ import annotations

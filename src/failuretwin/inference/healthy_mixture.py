@@ -9,7 +9,7 @@ divided by their sum, with n candidates and e the probability that the robot has
 robot that its calibration does not fit is judged by what arms of its kind are like, and a misfit
 that lasts does not add up to a fault.
 
-Section: docs/streaming.md#whose-calibration-it-is
+Section: docs/inference.md#streams
 """
 
 from __future__ import annotations

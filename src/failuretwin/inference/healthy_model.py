@@ -5,7 +5,7 @@
 with bias b, compliance c, load torque g, friction f, direction d, residual r_m [m] and its
 covariance S [m2]. The base is the target, or where a lost command has left the motor.
 
-Section: docs/diagnosis.md#healthy-model-where-a-healthy-arm-settles
+Section: docs/inference.md#healthy-robot
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Two faults are told apart if the one that is true is expected to be 3 nats ahead at typical size; a
 size is found from the one on at which it is 5 nats ahead.
 
-Section: docs/isolability.md#how-it-is-computed
+Section: docs/isolability.md#method
 """
 
 from __future__ import annotations

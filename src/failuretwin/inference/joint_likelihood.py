@@ -11,7 +11,7 @@ Where the tool is close to the axis the circle is small, and the nearest angle m
 it. If the motor explains the position where it should be too, and the parabola denies that, the
 parabola of where it should be counts.
 
-Section: docs/diagnosis.md#joint-likelihood-what-a-movement-says-of-one-motor
+Section: docs/inference.md#likelihood
 """
 
 from __future__ import annotations

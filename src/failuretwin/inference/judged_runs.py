@@ -1,6 +1,6 @@
 """What runs say that are judged together: of their hypotheses, of scatter and of lost commands.
 
-Section: docs/self_calibration.md#scatter-and-loss-rates
+Section: docs/inference.md#folders
 """
 
 from __future__ import annotations

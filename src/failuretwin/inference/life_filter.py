@@ -9,7 +9,7 @@ that a start that was judged wrongly is put right. A run that leaves the window 
 The latest runs are compared with what is behind and with what that was a while ago: what changes
 faster than by wear is a fault, whatever each run by itself looks like, and is not learned.
 
-Section: docs/calibration_tracking.md#state-evidence-and-filter
+Section: docs/inference.md#lives
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@
 
 Nothing of the arm is computed anew for another theta, so that many can be tried.
 
-Section: docs/shared_unknowns.md
+Section: docs/inference.md#shared-unknowns
 """
 
 from __future__ import annotations

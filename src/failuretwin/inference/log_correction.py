@@ -5,7 +5,7 @@
 with commands u and tool positions s as the log has them. Corrections form a group, so that
 two mistakes at once are one correction. Nothing of the robot changes.
 
-Section: docs/set_up.md
+Section: docs/inference.md#set-ups
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What is wrong with a log itself, before anyone asks what is wrong with the robot.
 
-Section: docs/diagnosis.md#readings-which-samples-count
+Section: docs/inference.md#moments
 """
 
 from __future__ import annotations

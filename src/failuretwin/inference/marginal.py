@@ -8,7 +8,7 @@ and the angle phi of each; what a node says of a movement comes from the joint l
 motor. Sums over m0 and the nodes are exact. Where readings on the way count, each L_m is the sum of
 the settled and the transient log likelihood.
 
-Section: docs/diagnosis.md#marginal-likelihood-change-point-and-size
+Section: docs/inference.md#change-points
 """
 
 from __future__ import annotations

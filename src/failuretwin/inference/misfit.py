@@ -5,7 +5,7 @@
 with the log density of a movement as it is explained, of a healthy arm at its best, and of a tool
 that may be anywhere.
 
-Section: docs/set_up.md#the-posterior-over-set-ups
+Section: docs/inference.md#set-ups
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ chain is summed exactly, for every movement with which the fault may have begun.
 
     state(m) = sum over places of state(m-1) p(stays, arrives or stops on the way) exp L_m(place)
 
-Section: docs/diagnosis.md#missed-movements-lost-commands-and-sticking-now-and-then
+Section: docs/inference.md#hypotheses
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ each; with N(0, I) as the prior of either,
 less what it takes to say which runs are whose: log n where one robot follows the other, n log 2
 where they come in any order.
 
-Section: docs/self_calibration.md#runs-of-two-robots
+Section: docs/inference.md#folders
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@
 with the start delay tau, and the variance v of a reading: what is left of the scatter of both ends,
 noise, and what straight lines between knots leave out.
 
-Section: docs/diagnosis.md#transient-likelihood-readings-on-the-way
+Section: docs/inference.md#readings-on-the-way
 """
 
 from __future__ import annotations

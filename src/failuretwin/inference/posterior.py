@@ -2,7 +2,7 @@
 
     p(h | run) = p(h) p(run | h) / sum over h' of p(h') p(run | h')
 
-Section: docs/diagnosis.md#posterior-estimates-and-abstention
+Section: docs/inference.md#posterior
 """
 
 from __future__ import annotations

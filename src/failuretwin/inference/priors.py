@@ -2,7 +2,7 @@
 
 The odds of each mode and its sizes stand in its class.
 
-Section: docs/diagnosis.md#priors-odds-onset-sizes
+Section: docs/inference.md#priors
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ A joint that slides does move the tool along a line. A path is taken for drawn o
 straight from corner to corner all along, which that of a slide that gathers speed is not;
 once drawn out, the steady part of its way counts as a line.
 
-Section: docs/diagnosis.md#readings-which-samples-count
+Section: docs/inference.md#moments
 """
 
 from __future__ import annotations

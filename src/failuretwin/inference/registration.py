@@ -6,7 +6,7 @@
 The weighted problem has a closed form (Kabsch), so that no frame is too far
 off; the weights take off poses that lost a command.
 
-Section: docs/registration.md#how-the-fit-works
+Section: docs/inference.md#calibration-and-geometry
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ rounded in the log alone is weighed by how the arm scatters about them,
 
 with s the scatter of each motor, at even odds.
 
-Section: docs/set_up.md#rounding
+Section: docs/inference.md#set-ups
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 L_m(healthy), L_m(phi) of each motor, and the same of the readings on the way, (run, movement) each,
 every part worked out once, when it is asked for.
 
-Section: docs/diagnosis.md#density-of-a-settled-position
+Section: docs/inference.md#likelihood
 """
 
 from __future__ import annotations

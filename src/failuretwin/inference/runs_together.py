@@ -11,7 +11,7 @@ with m_-i, V_-i the moments of the cavity. A run whose hypothesis is open sends 
 what is faulty teaches little. Scatter and loss rates are learned beside it, by expectation and
 maximisation with pseudo-counts.
 
-Section: docs/self_calibration.md#the-model-population-runs-offsets
+Section: docs/inference.md#folders
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Score and information of the logarithms of each motor's scatter, and of the degrees of freedom that
 they have in common.
 
-Section: docs/shared_unknowns.md
+Section: docs/inference.md#shared-unknowns
 """
 
 from __future__ import annotations

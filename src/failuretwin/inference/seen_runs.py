@@ -2,7 +2,7 @@
 
     p(h | run) = sum over w of p(w | runs) p(h | run, w)
 
-Section: docs/set_up.md
+Section: docs/inference.md#set-ups
 """
 
 from __future__ import annotations

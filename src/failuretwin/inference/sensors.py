@@ -6,7 +6,7 @@ with w = sn / noise for each channel, sn the noise of a settled tool position [m
 channel is as noisy as that, and a length. Of the tool's position w is 1. On the way w stands for
 what a reading may be off by there.
 
-Section: docs/sensors.md#one-residual-whatever-the-sensor
+Section: docs/sensors.md#one-residual-for-all-sensors
 """
 
 from __future__ import annotations

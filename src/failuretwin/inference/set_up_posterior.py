@@ -2,7 +2,7 @@
 
     p(w | runs) ~ p(w) p(runs | w)
 
-Section: docs/set_up.md#the-posterior-over-set-ups
+Section: docs/inference.md#set-ups
 """
 
 from __future__ import annotations

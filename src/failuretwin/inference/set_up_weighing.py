@@ -6,7 +6,7 @@ The sum over hypotheses inside and the product over runs outside tell a set-up, 
 share, from faults, which some have. What explains the runs as well as a healthy model says it
 should is not looked behind: a log that fits costs nothing.
 
-Section: docs/set_up.md
+Section: docs/inference.md#set-ups
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Every mistake is stated by the correction that undoes it, with what to say of it and what to do.
 
-Section: docs/set_up.md
+Section: docs/inference.md#set-ups
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Lengths and angles by which runs are read: those of the arm and of its sensor.
 
-Section: docs/diagnosis.md#settled-evidence-where-the-tool-rests
+Section: docs/inference.md#moments
 """
 
 from __future__ import annotations

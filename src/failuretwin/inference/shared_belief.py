@@ -8,7 +8,7 @@
 A site is what one run says, a normal factor of theta. Robots that fit their kind ill are a wide
 component beside the usual one: a tail that is common to all runs of a robot.
 
-Section: docs/self_calibration.md#what-is-believed-before-heavy-tails
+Section: docs/inference.md#shared-unknowns
 """
 
 from __future__ import annotations

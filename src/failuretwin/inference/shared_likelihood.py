@@ -10,7 +10,7 @@ faulty motor takes away. With weights w of outcomes and states, u = (nu + d)/(nu
 
 A motor with an active fault says nothing of its own offsets.
 
-Section: docs/shared_unknowns.md
+Section: docs/inference.md#shared-unknowns
 """
 
 from __future__ import annotations

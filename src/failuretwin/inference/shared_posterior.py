@@ -7,7 +7,7 @@ say, and set-ups that are off by group. Integrals are Laplace's, at the best the
 hypothesis. Set-ups are weighed in full only where they could change a verdict; a run that nothing
 explains is registered first, from coarse to fine.
 
-Section: docs/shared_unknowns.md
+Section: docs/inference.md#shared-unknowns
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ and bias b, compliance c and friction f of each motor beside those of the health
 derivative of the expected position at x by theta, J its derivative by the angles, g the load
 torques and d the directions of travel.
 
-Section: docs/shared_unknowns.md
+Section: docs/inference.md#shared-unknowns
 """
 
 from __future__ import annotations

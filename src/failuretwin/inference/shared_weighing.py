@@ -4,7 +4,7 @@ Expanded about some registration, each hypothesis is searched for its best theta
 nothing explains is registered first, from coarse to fine: what a wrong frame leaves must not look
 like outliers.
 
-Section: docs/shared_unknowns.md
+Section: docs/inference.md#shared-unknowns
 """
 
 from __future__ import annotations

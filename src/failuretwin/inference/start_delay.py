@@ -2,7 +2,7 @@
 
     p(tau) = (1 - r) N(tau; lag, 0.018^2 s^2) + r U(tau; lag + late starts)
 
-Section: docs/diagnosis.md#late-starts
+Section: docs/inference.md#outcomes
 """
 
 from __future__ import annotations

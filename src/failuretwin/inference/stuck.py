@@ -8,7 +8,7 @@ the motor keeps its angle and the others behave as healthy ones.
 
 (0.95 and 0.05 where the onset is known).
 
-Section: docs/diagnosis.md#fault-models-where-each-fault-puts-its-motor
+Section: docs/inference.md#hypotheses
 """
 
 from __future__ import annotations

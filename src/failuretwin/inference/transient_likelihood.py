@@ -6,7 +6,7 @@ Movements begin and end at the settled poses that explain them best under the fa
 What became of one whose end was not seen is judged by its way and by where the next one began. The
 start delay tau is shared by all motors, and summed over; a tool may stray as no fault explains.
 
-Section: docs/diagnosis.md#transient-likelihood-readings-on-the-way
+Section: docs/inference.md#readings-on-the-way
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ with motors that are off by linear functions of unknown amounts is found by a Ka
 
 with x the angles of both motors and P the 2 x 2 lever of both in units of the others' scatter.
 
-Section: docs/diagnosis.md#unknown-faults
+Section: docs/inference.md#hypotheses
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ the best counts alone: many poor explanations are no good one.
 
     log p(run | unknown) = max over explanations of log odds + log p(run | explanation)
 
-Section: docs/diagnosis.md#unknown-faults
+Section: docs/inference.md#hypotheses
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ OFF_ODDS = 1.0
 """The same of one motor or two being off anyhow."""
 LEFT_OUT = 0.5
 """Factor on the odds of a fault that the set leaves out. All three were chosen on simulated runs,
-for no more than 2 % of the known runs lost (docs/diagnosis.md)."""
+for no more than 2 % of the known runs lost (docs/accuracy.md)."""
 
 
 def unknown_likelihood(

@@ -1,6 +1,6 @@
 """How fast and how far healthy motors may change: what tells wear from a fault that grows.
 
-Section: docs/calibration_tracking.md#what-is-no-wear
+Section: docs/inference.md#lives
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ A mistake is undone on commands or tool positions and the healthy prediction ask
 of the list that brings the tool near is told. Simple ones come first, since a frame turned anyhow
 can explain few poses by chance.
 
-Section: docs/registration.md#a-log-that-is-nowhere-near
+Section: docs/inference.md#set-ups
 """
 
 from __future__ import annotations

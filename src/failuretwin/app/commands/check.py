@@ -159,7 +159,7 @@ def check(
 ) -> None:
     """Move an arm for 20 or 60 s and say whether it is healthy, or which motor is not.
 
-    Movements are chosen to tell most; each passes the gate of `act`. See docs/asking.md.
+    Movements are chosen to tell most; each passes the gate of `act`. See docs/check.md.
     """
     from failuretwin.app import check_report as said
     from failuretwin.app.tables import show

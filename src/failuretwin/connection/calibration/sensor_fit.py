@@ -6,7 +6,7 @@ with q where healthy motors settle, their scatter dq and the noise n of a readin
 movement weighed by a Student t. Noise is how readings scatter about their mean at rest. How the
 sensor is turned on its mount, w, is asked only where the profile says that it is in doubt.
 
-Section: docs/sensors.md#calibration-of-sensors
+Section: docs/sensors.md#sensors-in-the-profile
 """
 
 from __future__ import annotations

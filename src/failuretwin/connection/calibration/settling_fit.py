@@ -4,7 +4,7 @@ The inference of a folder of runs, `RunsTogether`, with every run known to be he
 asked is theta, the scatter, its tails and what became of each command. The prior is what arms of
 the class are like.
 
-Section: docs/calibration.md#settling-model-and-priors
+Section: docs/inference.md#calibration-and-geometry
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ Tool positions tell 4 n + 3 numbers of n joints that turn. What is one number in
 out: the first axis and its zero are part of P, the last zero is part of p_tool, and a line does not
 move as the zero of the joint before it would have it, nor slide along the first axis.
 
-Section: docs/registration.md#what-is-fitted
+Section: docs/inference.md#calibration-and-geometry
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """From healthy logs to a profile that knows its frames: search, fit, see what poses cannot tell.
 
-Section: docs/registration.md
+Section: docs/another_arm.md#fit-the-frame-and-the-geometry
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ of a pose at the squared distance d = |r|^2 / sigma^2,
 
 in units of what was believed before.
 
-Section: docs/registration.md#how-the-fit-works
+Section: docs/inference.md#calibration-and-geometry
 """
 
 from __future__ import annotations

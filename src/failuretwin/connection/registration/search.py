@@ -4,7 +4,7 @@ For every set of senses the frame has a closed form; zeros are tried joint by jo
 senses bring the poses together. The best few are then fitted. Sets of senses that fit equally well
 are one arm seen in two ways: what decides is told with them.
 
-Section: docs/registration.md#how-the-fit-works
+Section: docs/inference.md#calibration-and-geometry
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What the latest movements of arms say of them: the posterior that a belief is taken from.
 
-Section: docs/acting.md#belief
+Section: docs/acting.md#how-it-works
 """
 
 from __future__ import annotations

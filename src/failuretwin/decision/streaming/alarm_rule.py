@@ -11,7 +11,7 @@ robots leave of the bound. A robot that does worse
 is found out by its own life: what was suspected and passed by itself is counted, and where that is
 more than the bound allows, A is raised as much.
 
-Section: docs/streaming.md#the-alarm-rule-a-budget-of-false-alarms
+Section: docs/inference.md#streams
 """
 
 from __future__ import annotations

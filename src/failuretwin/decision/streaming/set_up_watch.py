@@ -3,7 +3,7 @@
 The stream is cut into runs of five movements. The first of them and the latest are weighed by
 `SeenRuns.set_ups`, now and then at first, and before any motor is blamed.
 
-Section: docs/streaming.md#wrong-set-ups-are-no-motors
+Section: docs/inference.md#set-ups
 """
 
 from __future__ import annotations

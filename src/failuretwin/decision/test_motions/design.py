@@ -6,7 +6,7 @@ Poses are drawn anywhere within the limits of the joints, off the floor and the 
 best are drawn around again. A way must be safe as the arm would follow it healthy, as it settles,
 and with any one motor left where it stood at first.
 
-Section: docs/asking.md#how-movements-are-chosen
+Section: docs/check.md#choice-of-movements
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     green: P(healthy) >= 0.95;    red: P(motor k), the sum over its modes, >= 0.95;    else open
 
-Section: docs/asking.md#what-a-check-says
+Section: docs/check.md#result-of-a-check
 """
 
 from __future__ import annotations

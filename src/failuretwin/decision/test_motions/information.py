@@ -7,7 +7,7 @@ D_ij is the distance of Bhattacharyya of where the tool comes to rest if member 
 with heavy tails d^2 counts as (nu + c) log(1 + d^2/(nu + c + 2)). Movements add up, so a whole set
 has a closed form: the estimate of Kolchinsky and Tracey (2017) by pairwise distances.
 
-Section: docs/asking.md#what-a-movement-is-expected-to-tell
+Section: docs/check.md#choice-of-movements
 """
 
 from __future__ import annotations

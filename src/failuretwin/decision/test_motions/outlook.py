@@ -6,7 +6,7 @@ A member is a hypothesis with one size of its fault. An error drawn anew for eac
 scatter, s_k^2 + size^2; a motor that is held stands at its angle and scatters as it gives; a
 movement that may be missed counts by its first two moments.
 
-Section: docs/asking.md#what-a-movement-is-expected-to-tell
+Section: docs/check.md#choice-of-movements
 """
 
 from __future__ import annotations

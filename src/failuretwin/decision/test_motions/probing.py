@@ -4,7 +4,7 @@ A probe is a movement chosen by what the watch believes, then the way back to wh
 told to be. It is made only while a fault is suspected and not yet named, after nobody has commanded
 the arm for a while, and so often at most; it takes the way that every order of `act` takes.
 
-Section: docs/asking.md#asking-while-watching
+Section: docs/live.md#probe-movements
 """
 
 from __future__ import annotations
