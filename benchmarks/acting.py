@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from acting_world import ERROR_RAD, MODES, ONSET, TrueFault, World
 
-from failuretwin.connection.links.commander import Order
+from failuretwin.connection.links.base import Order
 from failuretwin.core.hypothesis import Fault, Hypothesis, single_faults
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.decision.acting.actor import Actor

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from failuretwin.connection.links.commander import Order
+from failuretwin.connection.links.base import Order
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.digital_model.nonidealities import Imperfections, vary

@@ -22,8 +22,9 @@ from failuretwin import DigitalTwin, load_robot
 from failuretwin.app.shadow import Shadow
 from failuretwin.connection.emulated_arm import FIRST_COMMAND_S, Emulation
 from failuretwin.connection.links.base import CommandSent, Reading
-from failuretwin.connection.links.ros1 import Ros1Robot, Ros1Source
-from failuretwin.connection.links.ros_messages import RosTopics
+from failuretwin.connection.links.networks import open_transport
+from failuretwin.connection.links.ros_link import RosSource, robot_sink
+from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.monitor import monitor
@@ -65,7 +66,8 @@ def watch_state(robot: Robot, state: str, speed: float, seconds: float, seed: in
     if state != "healthy":
         command += ["--fault", f"{state}@{ONSET_S}"]
     twin, commands, sure_since = DigitalTwin(robot), KeptCommands(), np.nan
-    with Ros1Source(robot, RosTopics()) as source:
+    with open_transport("ros1") as transport:
+        source = RosSource(robot, RosTopics(), transport)
         child = subprocess.Popen(command, stdout=subprocess.DEVNULL)
         shadow = Shadow(
             source,
@@ -105,7 +107,9 @@ def latency(robot: Robot, samples: int = 300) -> list[float]:
     twin, topics = DigitalTwin(robot), RosTopics()
     rng = np.random.default_rng(0)
     taken = []
-    with Ros1Source(robot, topics) as source, Ros1Robot(robot, topics) as sink:
+    with open_transport("ros1") as transport:
+        source = RosSource(robot, topics, transport)
+        sink = robot_sink(robot, topics, transport)
         shadow = Shadow(
             source,
             monitor(twin),

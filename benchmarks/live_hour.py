@@ -20,7 +20,7 @@ from kept_commands import KeptCommands
 from failuretwin import DigitalTwin, load_robot
 from failuretwin.app.shadow import Shadow
 from failuretwin.connection.emulated_arm import Emulation, emulated
-from failuretwin.connection.links.base import Pace
+from failuretwin.connection.links.replay import Pace
 from failuretwin.core.alarm import RAISED, SUSPECTED
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.decision.streaming.monitor import monitor

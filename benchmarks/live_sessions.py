@@ -16,18 +16,21 @@ import numpy as np
 
 from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
 from failuretwin.app.shadow import Shadow
-from failuretwin.connection.links.base import (
+from failuretwin.connection.links.base import CommandSent, Event, Reading
+from failuretwin.connection.links.networks import open_transport
+from failuretwin.connection.links.replay import (
     AS_FAST_AS_POSSIBLE,
-    CommandSent,
-    Event,
     Pace,
     PacedSource,
-    Reading,
+    replay,
+    session_events,
 )
-from failuretwin.connection.links.recording import replay, session_events
-from failuretwin.connection.links.ros1 import Ros1Robot, Ros1Source
-from failuretwin.connection.links.ros_messages import Outgoing, RosTopics, RosWriter
+from failuretwin.connection.links.ros_codec import RosCodec
+from failuretwin.connection.links.ros_link import RosSource, robot_sink
+from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.ros_writer import RosWriter
 from failuretwin.core.types import FloatArray
+from failuretwin.data_knowledge.bag_messages import NS_PER_S
 from failuretwin.data_knowledge.raw_sessions import (
     RawSession,
     read_session,
@@ -47,40 +50,27 @@ QUIET_S = 3.0
 def write_bag(path: Path, events: list[Event], robot: Robot) -> None:
     """Write events as a ROS 1 bag of the authors' messages."""
     from rosbags.rosbag1 import Writer
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    from failuretwin.data_knowledge.bag_file import MONITORING_DEFINITION
-
-    store = get_typestore(Stores.ROS1_NOETIC)
-    type_ = "cm/msg/msg_cm"
-    store.register(get_types_from_msg(MONITORING_DEFINITION, type_))
-    said = RosWriter(robot, RosTopics())
+    codec, writer, topics = RosCodec(1), RosWriter(robot, RosTopics()), RosTopics()
+    definition, md5 = codec.definition(topics.command_type)
+    type_ = codec.full_name(topics.command_type)
     with Writer(path) as bag:
-        topics = {
-            name: bag.add_connection(f"/{name}", type_, typestore=store) for name, _ in said.topics
+        connections = {
+            name: bag.add_connection(f"/{name}", type_, msgdef=definition, md5sum=md5)
+            for name, _ in writer.topics
         }
         for event in events:
-            sent = said.reading(event) if isinstance(event, Reading) else said.command(event)
-            for message in sent:
-                stamp = message.content["header"]["stamp"]
-                raw = store.serialize_ros1(_message(store, type_, message), type_)
-                bag.write(topics[message.topic], stamp["secs"] * 10**9 + stamp["nsecs"], raw)
-
-
-def _message(store: object, type_: str, message: Outgoing) -> object:
-    types = store.types  # type: ignore[attr-defined]
-    content = message.content
-    stamp = content["header"]["stamp"]
-    time = types["builtin_interfaces/msg/Time"](sec=stamp["secs"], nanosec=stamp["nsecs"])
-    header = types["std_msgs/msg/Header"](seq=0, stamp=time, frame_id="")
-    values = {name: np.array(content[name]) for name in ("position", "temperature", "voltage")}
-    return types[type_](header=header, name=content["name"], **values)
+            for message in writer.messages(event):
+                stamp = round(event.time * NS_PER_S)
+                bag.write(connections[message.topic], stamp, codec.encode(message))
 
 
 def through_ros(events: PacedSource, robot: Robot) -> list[Event]:
     """Return what comes back of events that are published on a real ROS network."""
     topics, back = RosTopics(), []
-    with Ros1Source(robot, topics) as source, Ros1Robot(robot, topics) as sink:
+    with open_transport("ros1") as transport:
+        source = RosSource(robot, topics, transport)
+        sink = robot_sink(robot, topics, transport)
         while source.poll(0.2) is None:  # until the two know each other
             sink.put(CommandSent(0.0, np.zeros(len(robot.motors)), np.ones(len(robot.motors))))
             sink.put(Reading(1.0, np.full(3, np.nan), np.zeros(len(robot.motors))))

@@ -16,13 +16,14 @@ if TYPE_CHECKING:
     from failuretwin.connection.calibration.result import Calibration, save_calibration
     from failuretwin.connection.links.base import (
         Answer,
+        Commander,
         CommandSent,
         LinkCounts,
+        Order,
         Reading,
         Sink,
         Source,
     )
-    from failuretwin.connection.links.commander import Commander, Order
     from failuretwin.connection.population import Population
     from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
     from failuretwin.core.errors import InputError
@@ -64,7 +65,7 @@ _HOME = {
     "Calibration": "connection.calibration.result",
     "CheckResult": "decision.test_motions.health_check",
     "CommandSent": "connection.links.base",
-    "Commander": "connection.links.commander",
+    "Commander": "connection.links.base",
     "Diagnoser": "inference.diagnoser",
     "Diagnosis": "core.hypothesis",
     "DigitalTwin": "digital_model.twin",
@@ -76,7 +77,7 @@ _HOME = {
     "IsolabilityReport": "inference.isolability",
     "LinkCounts": "connection.links.base",
     "OnsetPrior": "inference.priors",
-    "Order": "connection.links.commander",
+    "Order": "connection.links.base",
     "Plan": "data_knowledge.generate",
     "Population": "connection.population",
     "Priors": "inference.priors",

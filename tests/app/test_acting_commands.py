@@ -43,7 +43,7 @@ def test_act_reaches_what_a_stuck_motor_leaves(failuretwin, task, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--on", "ros2"], "expected emulated, ros1 or rosbridge"),
+        (["--on", "ros3"], "expected emulated, ros1, ros2[://HOST[:PORT]], rosbridge"),
         (["--on", "rosbridge://"], "is no address"),
         (["--on", "ros1", "--fault", "motor_1:stuck"], "is of an emulated arm"),
         (["--fault", "motor_9:stuck"], "motor_9"),

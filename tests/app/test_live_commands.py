@@ -135,7 +135,7 @@ def test_without_a_master_the_user_is_told_to_start_one(failuretwin, monkeypatch
         (("watch", "emulated", "--topics", "missing.toml"), "missing.toml: cannot be read"),
         (("emulate", "--robot", "ur5e"), "cm/msg_cm holds servo counts"),
         (("watch", "ros1", "--robot", "ur5e"), "file for --topics"),
-        (("emulate", "--to", "robot.bag"), "expected ros1, ros2 or a file that ends in .mcap"),
+        (("emulate", "--to", "robot.bag"), "rosbridge://HOST[:PORT] or a file that ends in .mcap"),
         (("emulate", "--to", "a.mcap", "--fault", "motor_3:stuck@soon"), "is not of the form"),
         (("emulate", "--to", "no/such/folder.mcap"), "cannot be written"),
         (("watch", "emulated", "--record", "live.bag"), "Give a name that ends in .mcap"),

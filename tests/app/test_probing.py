@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from failuretwin.app.shadow import Shadow
-from failuretwin.connection.links.base import OK, Answer, CommandSent, LinkCounts, Reading
-from failuretwin.connection.links.commander import Order
-from failuretwin.connection.links.ros_messages import RosTopics, RosWriter
+from failuretwin.connection.links.base import OK, Answer, CommandSent, LinkCounts, Order, Reading
+from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.ros_writer import RosWriter
 from failuretwin.core.alarm import ALL_CLEAR, CLEAR, RAISED, SUSPECTED, Alarm
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
@@ -327,22 +327,24 @@ def arm_on_rosbridge(server, arm, robot, over):
             done += 1
         event = arm.poll(0.0)
         while isinstance(event, CommandSent):
-            for message in writer.command(event):
-                server.publish(message.topic, message.content)
+            message = writer.command(event)
+            server.publish(message.topic, message.content)
             event = arm.poll(0.0)
-        for message in writer.reading(event):
+        for message in writer.messages(event):
             server.publish(message.topic, message.content)
 
 
 def test_an_arm_is_asked_over_rosbridge_and_is_back(known):
     pytest.importorskip("roslibpy")
-    from failuretwin.connection.links import rosbridge
+    from failuretwin.connection.links.networks import open_transport
+    from failuretwin.connection.links.ros_link import RosCommander
 
     arm, server, over = Arm(known, program(3)), FakeRosbridge(free_port()), Event()
-    ros = rosbridge.connect("127.0.0.1", server.port)
+    address = f"rosbridge://127.0.0.1:{server.port}"
     robot = Thread(target=arm_on_rosbridge, args=(server, arm, known.robot, over))
     try:
-        with rosbridge.RosbridgeCommander(known.robot, STANDARD, ros) as link:
+        with open_transport(address) as transport:
+            link = RosCommander(known.robot, STANDARD, transport)
             wait_for(lambda: server.has_subscriber("/arm/command"))
             wait_for(lambda: server.has_subscriber("/joint_states"))
             robot.start()
@@ -356,7 +358,6 @@ def test_an_arm_is_asked_over_rosbridge_and_is_back(known):
     finally:
         over.set()
         robot.join()
-        rosbridge.disconnect(ros)
         server.stop()
     assert watched.said[-1] == "asked by 1 movement, the arm is back where it was"
     np.testing.assert_allclose(arm.sent[-1].target, program(3)[-1][1].target, atol=1e-6)
@@ -372,7 +373,7 @@ def test_an_emulated_arm_is_watched_that_may_be_asked(failuretwin):
     assert "last answer: healthy" in answer.stdout
 
 
-@pytest.mark.parametrize("source", [".", "ros2", "ros2://here:1", "recorded.mcap"])
+@pytest.mark.parametrize("source", [".", "recorded.mcap"])
 def test_sources_that_only_listen_are_refused(failuretwin, tmp_path, source):
     (tmp_path / "recorded.mcap").touch()
     answer = failuretwin("watch", source, "--probe", 2, folder=tmp_path)

@@ -13,8 +13,8 @@ from failuretwin.app.live import watch_until_end
 from failuretwin.app.live_view import View
 from failuretwin.app.shadow import Changes, Shadow
 from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, LinkCounts, Reading
-from failuretwin.connection.links.live_events import SampledCommands
-from failuretwin.connection.links.ros_messages import RosTopics
+from failuretwin.connection.links.ros_reader import SampledCommands
+from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.core.alarm import ALL_CLEAR, CLEAR, RAISED, SUSPECTED, Alarm, Episode
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.decision.streaming.monitor import FaultMonitor

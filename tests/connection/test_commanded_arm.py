@@ -8,9 +8,9 @@ import pytest
 from failuretwin import Fault
 from failuretwin.connection.commanded_arm import PACED_SLICE_S, CommandedArm
 from failuretwin.connection.emulated_arm import Emulation
-from failuretwin.connection.links import base
-from failuretwin.connection.links.base import CommandSent, Pace, Reading
-from failuretwin.connection.links.commander import Order
+from failuretwin.connection.links import replay
+from failuretwin.connection.links.base import CommandSent, Order, Reading
+from failuretwin.connection.links.replay import Pace
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from failuretwin.failure_behavior.injection import ScheduledFault
@@ -70,7 +70,7 @@ class Clock:
 def test_by_a_clock_an_order_begins_at_once(armpi, monkeypatch):
     """The time of a slice does not pass before it is due, however long polls may wait."""
     clock = Clock()
-    monkeypatch.setattr(base, "time", clock)
+    monkeypatch.setattr(replay, "time", clock)
     arm = CommandedArm(Emulation(armpi, PLAIN), Pace(1.0))
     while clock.now < 0.4:
         arm.poll(0.01)

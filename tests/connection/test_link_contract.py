@@ -13,22 +13,22 @@ from numpy.testing import assert_allclose
 
 from bag_writers import MONITORING, MONITORING_TEXT, entry, write_bag
 from failuretwin.connection.emulated_arm import Emulation, emulated
-from failuretwin.connection.links import base as pace
-from failuretwin.connection.links import ros2
-from failuretwin.connection.links.base import CommandSent, Pace, Reading
-from failuretwin.connection.links.recording import replay
-from failuretwin.connection.links.ros1 import Ros1Source
-from failuretwin.connection.links.ros2 import Ros2Source
-from failuretwin.connection.links.ros2_messages import Ros2Types
-from failuretwin.connection.links.ros_messages import RosTopics
-from failuretwin.connection.links.rosbridge import RosbridgeSource, connect, disconnect
+from failuretwin.connection.links import replay as pace
+from failuretwin.connection.links.base import CommandSent, Reading
+from failuretwin.connection.links.replay import Pace, replay
+from failuretwin.connection.links.ros1 import Ros1Transport, message_class
+from failuretwin.connection.links.ros2 import Ros2Transport
+from failuretwin.connection.links.ros_codec import Outgoing, RosCodec
+from failuretwin.connection.links.ros_link import RosSource
+from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.rosbridge import RosbridgeTransport
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from fake_rosbridge import FakeRosbridge
 from little_logs import LOG_COLUMNS
 from ros_peer import RosPeer
 from roscores import free_port
 from waiting import WAIT_S, wait_for
-from zenoh_router import zenoh_router
+from zenoh_router import client_of, zenoh_router
 
 pytest.importorskip("rosbags")
 pytestmark = [
@@ -87,7 +87,8 @@ def stamp(t):
 def ros1_link(robot, log, core):
     peer = RosPeer(core.environment)
     try:
-        with Ros1Source(robot, RosTopics()) as source:
+        with Ros1Transport() as transport:
+            source = RosSource(robot, RosTopics(), transport)
             for topic in ("position_monitoring", "condition_monitoring"):
                 # The definition is the authors'; the package name is one we have never heard of.
                 told = peer.ask(
@@ -109,39 +110,39 @@ def ros1_link(robot, log, core):
 @contextmanager
 def rosbridge_link(robot, log):
     server = FakeRosbridge(free_port())
-    ros = connect("127.0.0.1", server.port)
     try:
-        with RosbridgeSource(robot, RosTopics(), ros) as source:
+        with RosbridgeTransport("127.0.0.1", server.port) as transport:
+            source = RosSource(robot, RosTopics(), transport)
             wait_for(lambda: server.has_subscriber("condition_monitoring"))
             for topic, t, fields in messages_of(log):
                 header = {"seq": 0, "stamp": stamp(t), "frame_id": ""}
                 server.publish(topic, {"header": header, **fields})
             yield source
     finally:
-        disconnect(ros)
         server.stop()
 
 
 @contextmanager
 def ros2_link(robot, log):
-    pytest.importorskip("zenoh")
+    zenoh = pytest.importorskip("zenoh")
     port = free_port()
-    with zenoh_router(port):
-        ours, theirs = (ros2.connect("127.0.0.1", port) for _ in range(2))
-        with Ros2Source(robot, RosTopics(), ours) as source:
-            types, sent = Ros2Types(), {}
-            for topic in ("position_monitoring", "condition_monitoring"):
-                # As rmw_zenoh of ROS 2 Humble names it, under a package we have never heard of.
-                key = f"0/{topic}/some_package::msg::dds_::Monitoring_/TypeHashNotSupported"
-                sent[topic] = theirs.declare_publisher(key)
-                matched = sent[topic]
-                wait_for(lambda matched=matched: matched.matching_status.matching)
-            for topic, t, fields in messages_of(log):
-                content = {"header": {"stamp": stamp(t), "frame_id": ""}, **fields}
-                sent[topic].put(types.to_bytes("some_package/Monitoring", content))
-            yield source
-        theirs.close()
-        ours.close()
+    with (
+        zenoh_router(port),
+        zenoh.open(client_of(port)) as theirs,
+        Ros2Transport("127.0.0.1", port) as transport,
+    ):
+        source = RosSource(robot, RosTopics(), transport)
+        codec, publishers = RosCodec(2), {}
+        for topic in ("position_monitoring", "condition_monitoring"):
+            # As rmw_zenoh of ROS 2 Humble names it, under a package we have never heard of.
+            key = f"0/{topic}/some_package::msg::dds_::Monitoring_/TypeHashNotSupported"
+            publishers[topic] = publisher = theirs.declare_publisher(key)
+            wait_for(lambda publisher=publisher: publisher.matching_status.matching)
+        for topic, t, fields in messages_of(log):
+            content = {"header": {"stamp": stamp(t), "frame_id": ""}, **fields}
+            message = Outgoing(topic, "some_package/Monitoring", content)
+            publishers[topic].put(codec.encode(message))
+        yield source
 
 
 LINKS = ["session", "ros1 bag", "ros2 bag", "mcap", "ros1", "ros2", "rosbridge"]
@@ -221,9 +222,7 @@ def test_logs_end_and_networks_do_not(armpi, little_log, tmp_path):
     fetch(source, 63)
     assert source.poll(0.1) is None
     assert source.ended
-    assert not Ros1Source.ended
-    assert not Ros2Source.ended
-    assert not RosbridgeSource.ended
+    assert not RosSource.ended
 
 
 def test_a_replay_keeps_its_pace(monkeypatch, armpi, little_log, tmp_path):
@@ -253,12 +252,10 @@ def test_an_event_that_is_not_due_is_waited_for_no_longer_than_asked(monkeypatch
 def test_the_ros_message_of_the_authors_has_the_right_md5(roscore):
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    from failuretwin.connection.links.ros1_import import message_class
-
     store = get_typestore(Stores.ROS1_NOETIC)
     store.register(get_types_from_msg(MONITORING_TEXT, MONITORING))
     _, md5 = store.generate_msgdef(MONITORING)
-    ours = message_class("cm/msg_cm")
+    ours = message_class(RosCodec(1), "cm/msg_cm")
     assert ours._type == "cm/msg_cm"
     assert ours._md5sum == md5
     peer = RosPeer(roscore.environment)
@@ -271,14 +268,14 @@ def test_the_ros_message_of_the_authors_has_the_right_md5(roscore):
 
 def test_what_a_rosbridge_link_asks_for(armpi):
     server = FakeRosbridge(free_port())
-    ros = connect("127.0.0.1", server.port)
     topics = RosTopics(
         command="/arm/command",
         command_type="trajectory_msgs/JointTrajectory",
         tool="/tool",
         tool_type="geometry_msgs/PoseStamped",
     )
-    with RosbridgeSource(armpi, topics, ros) as source:
+    with RosbridgeTransport("127.0.0.1", server.port) as transport:
+        source = RosSource(armpi, topics, transport)
         wait_for(lambda: server.has_subscriber("/tool"))
         pose = {"position": {"x": 0.1, "y": 0.2, "z": 0.3}, "orientation": {}}
         header = {"stamp": {"sec": 7, "nanosec": 500_000_000}, "frame_id": ""}
@@ -290,5 +287,4 @@ def test_what_a_rosbridge_link_asks_for(armpi):
     assert_allclose(event.tool, [0.1, 0.2, 0.3])
     assert server.types["/arm/command"] == "trajectory_msgs/JointTrajectory"
     assert server.types["/tool"] == "geometry_msgs/PoseStamped"
-    disconnect(ros)
     server.stop()

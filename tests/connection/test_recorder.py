@@ -9,9 +9,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from failuretwin.connection.emulated_arm import EmulatedArm, Emulation
-from failuretwin.connection.links import recording as recorder
-from failuretwin.connection.links.base import OK, Answer, CommandSent, Pace, Reading
-from failuretwin.connection.links.recording import Recorder, replay
+from failuretwin.connection.links import recorder
+from failuretwin.connection.links.base import OK, Answer, CommandSent, Reading
+from failuretwin.connection.links.recorder import Recorder
+from failuretwin.connection.links.replay import Pace, replay
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.data_knowledge.bag_file import read_messages

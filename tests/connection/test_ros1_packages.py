@@ -21,7 +21,7 @@ def test_of_debians_modules_only_those_of_ros_are_seen():
         pytest.skip("this is Debian's own interpreter, which sees them all")
     code = """
 import importlib.util
-from failuretwin.connection.links.ros1_import import load_rospy
+from failuretwin.connection.links.ros1 import load_rospy
 rospy = load_rospy()
 import numpy
 print(rospy.__file__)
@@ -37,7 +37,7 @@ print(*(importlib.util.find_spec(name) is None for name in ("apt", "gi", "catkin
 def test_without_ros_the_user_is_told_what_to_install():
     code = """
 import sys
-from failuretwin.connection.links import ros1_import as packages
+from failuretwin.connection.links import ros1 as packages
 sys.modules["rospy"] = None
 packages.DEBIAN_FOLDER = "/nowhere"
 try:

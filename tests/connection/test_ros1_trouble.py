@@ -8,10 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from failuretwin.connection.links import ros_messages as bulletin
+from failuretwin.connection.links import ros_writer
 from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, EventQueue, Reading
-from failuretwin.connection.links.ros1 import Ros1Diagnostics, Ros1Robot, Ros1Source
-from failuretwin.connection.links.ros_messages import RosTopics
+from failuretwin.connection.links.ros1 import Ros1Transport
+from failuretwin.connection.links.ros_link import RosSource, diagnostics_sink, robot_sink
+from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.core.alarm import ALL_CLEAR, RAISED, Alarm, Episode
 from failuretwin.core.hypothesis import Diagnosis
 from little_logs import LOG_COLUMNS
@@ -51,7 +52,9 @@ def point(topic="/tool_point", x=0.1, t=100):
 
 def test_a_master_that_is_killed_and_restarted_is_no_trouble(armpi, roscore):
     posterior = {"healthy": 1.0}
-    with Ros1Source(armpi, STANDARD) as source, Ros1Diagnostics(armpi, STANDARD) as sink:
+    with Ros1Transport() as transport:
+        source = RosSource(armpi, STANDARD, transport)
+        sink = diagnostics_sink(armpi, STANDARD, transport)
         roscore.kill()
         wait_for(lambda: sink.trouble != "")
         roscore.start()
@@ -77,7 +80,8 @@ def test_a_master_that_is_killed_and_restarted_is_no_trouble(armpi, roscore):
 
 
 def test_a_robot_comes_back_with_its_topics(armpi, roscore):
-    with Ros1Robot(armpi, STANDARD) as sink:
+    with Ros1Transport() as transport:
+        sink = robot_sink(armpi, STANDARD, transport)
         roscore.kill()
         wait_for(lambda: sink.trouble != "")
         roscore.start()
@@ -90,7 +94,8 @@ def test_messages_that_make_no_sense_are_counted_and_left_out(armpi, peer):
     header = {"seq": 0, "stamp": stamp, "frame_id": ""}
     names = list(LOG_COLUMNS)
     good = {"name": ["joint1", "joint2", "joint3", "joint4"], "velocity": [], "effort": []}
-    with Ros1Source(armpi, STANDARD) as source:
+    with Ros1Transport() as transport:
+        source = RosSource(armpi, STANDARD, transport)
         for topic, type_ in (
             ("/tool_point", "std_msgs/Header"),
             ("/joint_states", "sensor_msgs/JointState"),
@@ -128,7 +133,9 @@ NO_SPEEDS = {"velocities": [], "accelerations": [], "effort": []}
 
 
 def test_ten_times_the_rate_is_taken(armpi, roscore):
-    with Ros1Source(armpi, STANDARD) as source, Ros1Robot(armpi, STANDARD) as sink:
+    with Ros1Transport() as transport:
+        source = RosSource(armpi, STANDARD, transport)
+        sink = robot_sink(armpi, STANDARD, transport)
         wait_until_connected(source, sink)
         begin = time.monotonic()
         for k in range(300):
@@ -145,7 +152,9 @@ def test_ten_times_the_rate_is_taken(armpi, roscore):
 def test_a_consumer_that_sleeps_loses_readings_but_no_command(armpi, roscore):
     queue = EventQueue(capacity=50)
     topics = RosTopics()
-    with Ros1Source(armpi, topics, queue) as source, Ros1Robot(armpi, topics) as sink:
+    with Ros1Transport() as transport:
+        source = RosSource(armpi, topics, transport, queue)
+        sink = robot_sink(armpi, topics, transport)
         wait_until_connected(source, sink)
         sink.put(CommandSent(1.0, np.full(4, 0.1), np.ones(4)))
         for k in range(300):
@@ -172,7 +181,9 @@ def wait_until_connected(source, sink):
 
 
 def test_commands_as_trajectories_keep_each_motors_own_duration(armpi, roscore):
-    with Ros1Source(armpi, STANDARD) as source, Ros1Robot(armpi, STANDARD) as sink:
+    with Ros1Transport() as transport:
+        source = RosSource(armpi, STANDARD, transport)
+        sink = robot_sink(armpi, STANDARD, transport)
         wait_until_connected(source, sink)
         target = np.array([0.4, -0.2, 0.3, 0.1])
         sink.put(CommandSent(50.0, target, np.array([0.6, 0.8, 1.0, 0.6])))
@@ -195,12 +206,13 @@ def test_diagnostics_come_every_second_and_at_once_when_it_gets_worse(monkeypatc
     )
     raised = Alarm(RAISED, "motor_2:stuck", Episode(1, "motor_2:stuck", 1002.5))
     now = [1000.0]
-    monkeypatch.setattr(bulletin, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(ros_writer, "time", SimpleNamespace(monotonic=lambda: now[0]))
 
     def levels():
         return [[s["level"] for s in m["statuses"]] for m in peer.ask(op="heard", **topic)]
 
-    with Ros1Diagnostics(armpi, STANDARD) as sink:
+    with Ros1Transport() as transport:
+        sink = diagnostics_sink(armpi, STANDARD, transport)
         peer.ask(op="listen", type="diagnostic_msgs/DiagnosticArray", **topic)
 
         def put(state, diagnosis):

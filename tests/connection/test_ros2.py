@@ -9,22 +9,17 @@ import numpy as np
 import pytest
 
 from failuretwin.connection.links.base import OK, Answer, CommandSent, Reading
-from failuretwin.connection.links.ros2 import (
-    Ros2Diagnostics,
-    Ros2Robot,
-    Ros2Source,
-    connect,
-    domain_id,
-)
-from failuretwin.connection.links.ros2_messages import Ros2Types
-from failuretwin.connection.links.ros_messages import RosTopics
+from failuretwin.connection.links.ros2 import Ros2Transport, domain_id
+from failuretwin.connection.links.ros_codec import RosCodec
+from failuretwin.connection.links.ros_link import RosSource, diagnostics_sink, robot_sink
+from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from roscores import free_port
 from waiting import WAIT_S, wait_for
-from zenoh_router import zenoh_router
+from zenoh_router import client_of, zenoh_router
 
-pytest.importorskip("zenoh")
+zenoh = pytest.importorskip("zenoh")
 pytest.importorskip("rosbags")
 
 STANDARD = RosTopics(
@@ -45,59 +40,49 @@ def port():
 
 
 @pytest.fixture
-def session(port):
-    with connect("127.0.0.1", port) as found:
-        yield found
+def transport(port):
+    with Ros2Transport("127.0.0.1", port) as opened:
+        yield opened
 
 
-def fetch(source, kind):
-    until = time.monotonic() + WAIT_S
-    while time.monotonic() < until:
-        event = source.poll(0.2)
-        if isinstance(event, kind) and (kind is CommandSent or np.isfinite(event.tool).all()):
-            return event
-    raise AssertionError(f"no {kind.__name__} came")
-
-
-def test_what_a_robot_says_is_heard(armpi, port, session):
-    with (
-        connect("127.0.0.1", port) as other,
-        Ros2Source(armpi, STANDARD, session) as source,
-        Ros2Robot(armpi, STANDARD, other) as robot,
-    ):
+def test_what_a_robot_says_is_heard(armpi, port, transport):
+    with Ros2Transport("127.0.0.1", port) as other:
+        source, robot = RosSource(armpi, STANDARD, transport), robot_sink(armpi, STANDARD, other)
         target = np.array([0.1, -0.2, 0.3, 0.4])
-        sent = CommandSent(1000.5, target, np.full(4, 0.8))
-        read = Reading(1000.25, np.array([0.1, 0.2, 0.3]), target)
-        wait_for(
-            lambda: all(p.matching_status.matching for p in robot._publishers._publishers.values())
-        )
-        robot.put(sent)
-        robot.put(read)
-        command, reading = fetch(source, CommandSent), fetch(source, Reading)
-        assert (command.time, reading.time) == (1000.5, 1000.25)
+        for _, topic, _ in STANDARD.subscribed:
+            other.check_listener(topic)
+        robot.put(CommandSent(1000.5, target, np.full(4, 0.8)))
+        robot.put(Reading(1000.25, np.array([0.1, 0.2, 0.3]), target))
+        heard = [source.poll(WAIT_S) for _ in range(3)]
+        (command,) = [event for event in heard if isinstance(event, CommandSent)]
+        (tool,) = [e.tool for e in heard if isinstance(e, Reading) and e.position is None]
+        (angle,) = [e.position for e in heard if isinstance(e, Reading) and e.position is not None]
+        assert sorted(event.time for event in heard) == [1000.25, 1000.25, 1000.5]
         np.testing.assert_allclose(command.target, target)
         np.testing.assert_allclose(command.duration, 0.8)
-        np.testing.assert_allclose(reading.tool, read.tool)
+        np.testing.assert_allclose(tool, [0.1, 0.2, 0.3])
+        np.testing.assert_allclose(angle, target)
         assert (source.counts.garbage, robot.trouble) == (0, "")
 
 
-def test_the_diagnosis_has_all_that_ros_2_asks_of_a_message(armpi, port, session):
+def test_the_diagnosis_has_all_that_ros_2_asks_of_a_message(armpi, port, transport):
     """The key, the hash (REP 2011: that of Jazzy), the attachment and the tokens of its node."""
     heard, alive = [], []
     hash_ = "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
-    with connect("127.0.0.1", port) as other:
+    with zenoh.open(client_of(port)) as other:
         other.declare_subscriber("0/diagnostics/**", heard.append)
-        with Ros2Diagnostics(armpi, STANDARD, session) as sink:
-            wait_for(lambda: sink._publishers._publishers["/diagnostics"].matching_status.matching)
-            alive = [str(r.ok.key_expr) for r in other.liveliness().get("@ros2_lv/0/**")]
-            sink.put(Answer(1000.5, OK, HEALTHY))
-            wait_for(lambda: bool(heard))
+        sink = diagnostics_sink(armpi, STANDARD, transport)
+        transport.check_listener("/diagnostics")
+        alive = [str(r.ok.key_expr) for r in other.liveliness().get("@ros2_lv/0/**")]
+        sink.put(Answer(1000.5, OK, HEALTHY))
+        wait_for(lambda: bool(heard))
     key = f"diagnostic_msgs::msg::dds_::DiagnosticArray_/{hash_}"
     assert str(heard[0].key_expr) == f"0/diagnostics/{key}"
     number, sent_ns, size = struct.unpack("<qqB", bytes(heard[0].attachment)[:17])
     assert (number, size, len(bytes(heard[0].attachment))) == (1, 16, 33)
     assert abs(sent_ns / 1e9 - time.time()) < 60.0
-    own = f"@ros2_lv/0/{session.zid()}/0"
+    (session,) = {token.split("/")[2] for token in alive}
+    own = f"@ros2_lv/0/{session}/0"
     assert sorted(alive) == [
         f"{own}/0/NN/%/%/failuretwin",
         f"{own}/1/MP/%/%/failuretwin/%diagnostics/{key}/::,10:,:,:,,",
@@ -113,33 +98,32 @@ def test_the_diagnosis_has_all_that_ros_2_asks_of_a_message(armpi, port, session
 def test_the_hash_of_a_type_is_that_of_ros_2():
     """As `ros2 topic info -v` of Jazzy prints it for std_msgs/msg/String."""
     known = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
-    assert Ros2Types().hash_of("std_msgs/String") == known
+    assert RosCodec(2).hash_of("std_msgs/String") == known
 
 
 def test_a_router_that_comes_back_is_no_trouble(armpi):
     port = free_port()
     with zenoh_router(port):
-        session = connect("127.0.0.1", port)
-        source = Ros2Source(armpi, STANDARD, session)
-        sink = Ros2Diagnostics(armpi, STANDARD, session)
+        transport = Ros2Transport("127.0.0.1", port)
+        source = RosSource(armpi, STANDARD, transport)
+        sink = diagnostics_sink(armpi, STANDARD, transport)
         assert (source.counts.reconnects, sink.trouble) == (0, "")
     wait_for(lambda: bool(sink.trouble))
     assert source.counts.reconnects == 0
     with zenoh_router(port):
         wait_for(lambda: source.counts.reconnects == 1)
         assert sink.trouble == ""
-        with connect("127.0.0.1", port) as other, Ros2Robot(armpi, STANDARD, other) as robot:
-            point = robot._publishers._publishers["/tool_point"]
-            wait_for(lambda: point.matching_status.matching)
+        with Ros2Transport("127.0.0.1", port) as other:
+            robot = robot_sink(armpi, STANDARD, other)
+            other.check_listener("/tool_point")
             robot.put(Reading(7.0, np.array([0.1, 0.2, 0.3])))
-            assert fetch(source, Reading).time == 7.0
-        for part in (source, sink):
-            part.__exit__(None, None, None)
-        session.close()
+            assert source.poll(WAIT_S).time == 7.0
+        transport.close()
 
 
-def test_nonsense_is_counted(armpi, port, session):
-    with connect("127.0.0.1", port) as other, Ros2Source(armpi, STANDARD, session) as source:
+def test_nonsense_is_counted(armpi, port, transport):
+    with zenoh.open(client_of(port)) as other:
+        source = RosSource(armpi, STANDARD, transport)
         key = "0/tool_point/geometry_msgs::msg::dds_::PointStamped_/RIHS01_any"
         publisher = other.declare_publisher(key)
         wait_for(lambda: publisher.matching_status.matching)
@@ -149,7 +133,7 @@ def test_nonsense_is_counted(armpi, port, session):
 
 def test_without_a_router_the_user_is_told_to_start_one():
     with pytest.raises(InputError, match="rmw_zenohd"):
-        connect("127.0.0.1", free_port())
+        Ros2Transport("127.0.0.1", free_port())
 
 
 @pytest.mark.parametrize("text", ["233", "-1", "home"])

@@ -8,10 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from failuretwin.connection.links import ros_messages as bulletin
-from failuretwin.connection.links import rosbridge
+from failuretwin.connection.links import ros_writer, rosbridge
 from failuretwin.connection.links.base import OK, Answer
-from failuretwin.connection.links.ros_messages import RosTopics
+from failuretwin.connection.links.ros_link import RosSource, diagnostics_sink
+from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from fake_rosbridge import FakeRosbridge
@@ -30,10 +30,9 @@ def server():
 
 
 @pytest.fixture
-def ros(server):
-    connection = rosbridge.connect("127.0.0.1", server.port)
-    yield connection
-    rosbridge.disconnect(connection)
+def transport(server):
+    with rosbridge.RosbridgeTransport("127.0.0.1", server.port) as opened:
+        yield opened
 
 
 def point(t):
@@ -45,9 +44,9 @@ def answer():
     return Answer(9.5, OK, Diagnosis("live", {"healthy": 1.0}, verdict="healthy"))
 
 
-def test_a_server_that_goes_and_comes_back_is_no_trouble(armpi, server, ros):
-    source = rosbridge.RosbridgeSource(armpi, TOPICS, ros)
-    with source, rosbridge.RosbridgeDiagnostics(armpi, TOPICS, ros) as sink:
+def test_a_server_that_goes_and_comes_back_is_no_trouble(armpi, server, transport):
+    sink = diagnostics_sink(armpi, TOPICS, transport)
+    with RosSource(armpi, TOPICS, transport) as source:
         wait_for(lambda: server.has_subscriber("/tool"))
         server.publish("/tool", point(1))
         assert source.poll(WAIT_S).time == 1.0
@@ -61,14 +60,13 @@ def test_a_server_that_goes_and_comes_back_is_no_trouble(armpi, server, ros):
         assert source.poll(WAIT_S).time == 2.0
         assert source.counts.reconnects == 1
         server.published.clear()
-        sink.put(answer())
-        wait_for(lambda: server.published)
+        wait_for(lambda: sink.put(answer()) or server.published)
 
 
-def test_diagnostics_by_rosbridge(monkeypatch, armpi, server, ros):
+def test_diagnostics_by_rosbridge(monkeypatch, armpi, server, transport):
     now = [0.0]
-    monkeypatch.setattr(bulletin, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    with rosbridge.RosbridgeDiagnostics(armpi, TOPICS, ros) as sink:
+    monkeypatch.setattr(ros_writer, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    with diagnostics_sink(armpi, TOPICS, transport) as sink:
         sink.put(answer())
         sink.put(answer())  # within the same second
         now[0] = 1.5
@@ -84,8 +82,8 @@ def test_diagnostics_by_rosbridge(monkeypatch, armpi, server, ros):
     ]
 
 
-def test_bytes_that_are_no_protocol_do_no_harm(armpi, server, ros):
-    with rosbridge.RosbridgeSource(armpi, TOPICS, ros) as source:
+def test_bytes_that_are_no_protocol_do_no_harm(armpi, server, transport):
+    with RosSource(armpi, TOPICS, transport) as source:
         wait_for(lambda: server.has_subscriber("/tool"))
         server.send_raw("/tool", "{not json")
         server.publish("/tool", {"header": 5, "point": None})
@@ -100,12 +98,12 @@ def test_bytes_that_are_no_protocol_do_no_harm(armpi, server, ros):
 def test_without_a_server_the_user_is_told(monkeypatch):
     monkeypatch.setattr(rosbridge, "CONNECT_S", 0.5)
     with pytest.raises(InputError, match="no rosbridge server answers"):
-        rosbridge.connect("127.0.0.1", free_port())
+        rosbridge.RosbridgeTransport("127.0.0.1", free_port())
 
 
-def test_what_a_server_refuses_is_told(armpi, server, ros):
+def test_what_a_server_refuses_is_told(armpi, server, transport):
     """A topic that it refuses stays silent; without its own words nobody would know why."""
-    with rosbridge.RosbridgeSource(armpi, TOPICS, ros) as source:
+    with RosSource(armpi, TOPICS, transport) as source:
         wait_for(lambda: server.has_subscriber("/tool"))
         said = {"op": "status", "level": "error", "msg": "subscribe: no permission for /tool"}
         server.send_raw("/tool", json.dumps(said))

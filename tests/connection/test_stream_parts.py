@@ -17,14 +17,13 @@ from failuretwin.connection.links.base import (
     Answer,
     CommandSent,
     EventQueue,
-    Pace,
     Reading,
     Sink,
     Source,
     source_from_text,
 )
-from failuretwin.connection.links.live_events import ReorderBuffer
-from failuretwin.connection.links.ros_messages import RosTopics, load_topics
+from failuretwin.connection.links.replay import Pace
+from failuretwin.connection.links.ros_topics import RosTopics, load_topics
 from failuretwin.connection.links.statuses import (
     LEVEL_ERROR,
     LEVEL_OK,
@@ -34,7 +33,7 @@ from failuretwin.connection.links.statuses import (
     Status,
     statuses,
 )
-from failuretwin.connection.links.stream_clock import StreamClock
+from failuretwin.connection.links.stream_time import ReorderBuffer, StreamClock
 from failuretwin.core.alarm import ALL_CLEAR, CLEAR, RAISED, SUSPECTED, Alarm, Episode
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
@@ -260,7 +259,7 @@ def test_readings_wait_for_set_points_unless_the_user_says_otherwise():
         ('tool_type = "sensor_msgs/JointState"\ntool = "/t"', "cannot be the tool"),
         ("commands_late_s = 100.0", r"expected 0 to 60"),
         ('command_type = "std_msgs/String"', "cannot be the command"),
-        ('command = "has space"', "is no name of a topic"),
+        ('command = "has space"', "is not a topic name"),
     ],
 )
 def test_topics_that_make_no_sense_are_refused(tmp_path, text, match):

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from failuretwin.app.emulation import emulated_faults, number_of
-from failuretwin.app.live import EMULATED, ROS1, ROSBRIDGE, address_of, topics_of
-from failuretwin.connection.links.commander import Commander
+from failuretwin.app.live import EMULATED, topics_of
+from failuretwin.connection.links.base import Commander
+from failuretwin.connection.links.networks import NETWORKS, is_network, open_transport
+from failuretwin.connection.links.ros_link import RosCommander
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
@@ -26,7 +28,7 @@ from failuretwin.digital_model.calibrated_robot import (
 )
 from failuretwin.inference.healthy_model import HealthyModel
 
-PLACES = f"{EMULATED}, {ROS1} or {ROSBRIDGE}://HOST[:PORT]"
+PLACES = f"{EMULATED}, {NETWORKS}"
 
 # The arm.
 
@@ -62,7 +64,7 @@ def is_real(place: str) -> bool:
     Raises:
         InputError: If it is none of `PLACES`.
     """
-    if place != EMULATED and place != ROS1 and not place.startswith(f"{ROSBRIDGE}://"):
+    if place != EMULATED and not is_network(place):
         raise InputError(f"--on is {place!r}, expected {PLACES}.")
     return place != EMULATED
 
@@ -87,15 +89,8 @@ def commander_of(
             f"--fault is of an emulated arm, but --on is {place!r}. Leave it out, or act on "
             f"{EMULATED!r}."
         )
-    if place == ROS1:
-        from failuretwin.connection.links.ros1 import Ros1Commander
-
-        return stack.enter_context(Ros1Commander(known.robot, topics_of(topics)))
-    from failuretwin.connection.links import rosbridge
-
-    ros = rosbridge.connect(*address_of(place))
-    stack.callback(rosbridge.disconnect, ros)
-    return stack.enter_context(rosbridge.RosbridgeCommander(known.robot, topics_of(topics), ros))
+    transport = stack.enter_context(open_transport(place))
+    return RosCommander(known.robot, topics_of(topics), transport)
 
 
 # What is told.

@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.live import Live
@@ -21,15 +20,16 @@ from failuretwin.app.emulation import emulation_of
 from failuretwin.app.live_view import View
 from failuretwin.app.shadow import SILENCE_S, Changes, Shadow
 from failuretwin.app.terminal import tell
-from failuretwin.connection.links.base import (
-    Event,
-    LinkCounts,
-    Pace,
-    Sink,
-    Source,
-    source_from_text,
+from failuretwin.connection.links.base import Event, LinkCounts, Sink, Source, source_from_text
+from failuretwin.connection.links.networks import NETWORKS, is_network, open_transport
+from failuretwin.connection.links.replay import Pace
+from failuretwin.connection.links.ros_link import (
+    RosCommander,
+    RosSource,
+    diagnostics_sink,
+    robot_sink,
 )
-from failuretwin.connection.links.ros_messages import RosTopics, load_topics
+from failuretwin.connection.links.ros_topics import RosTopics, load_topics
 from failuretwin.core.errors import InputError, counted
 from failuretwin.data_knowledge.bag_messages import BagTopics
 from failuretwin.decision.streaming.monitor import FaultMonitor, Fit
@@ -41,14 +41,10 @@ from failuretwin.inference.explanation import percent
 if TYPE_CHECKING:
     from failuretwin.connection.emulated_arm import Emulation
 
-EMULATED, ROS1, ROS2, ROSBRIDGE = "emulated", "ros1", "ros2", "rosbridge"
-NETWORKS = (ROS1, ROS2)
-"""Networks on which an emulated robot may speak."""
-ROSBRIDGE_PORT = 9090
-"""Where rosbridge servers listen unless told otherwise."""
+EMULATED = "emulated"
 SOURCES = (
-    f"{EMULATED}, {ROS1}, {ROS2}[://HOST[:PORT]], {ROSBRIDGE}://HOST[:PORT], a log (raw session, "
-    "bag, .mcap), or a source of your own, MODULE:CLASS"
+    f"{EMULATED}, {NETWORKS}, a log (raw session, bag, .mcap), or a source of your own, "
+    "MODULE:CLASS"
 )
 OWN_CLASS = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(:.*)?")
 """How the class of a source of one's own is named, see `source_from_text`."""
@@ -74,7 +70,7 @@ def connect(
     """Return what a SOURCE on the command line stands for, and where its network publishes.
 
     The text is one of `SOURCES`; the stack closes everything in the end. With `commands` a source
-    on ROS 1 or rosbridge takes orders too: it is a `Commander`.
+    on a network takes orders too: it is a `Commander`.
 
     Raises:
         InputError: If it does not exist, cannot be reached, is none of these, or is told what only
@@ -90,13 +86,11 @@ def connect(
             f"--fault is of an emulated robot, but the source is {text!r}. Leave it out, or watch "
             f"{EMULATED!r}."
         )
-    if text == ROS1:
-        return _ros1(robot, topics, stack, commands)
-    if text == ROS2 or text.startswith(f"{ROS2}://"):
-        return _ros2(text, robot, topics, stack)
-    if text.startswith(f"{ROSBRIDGE}://"):
-        return _rosbridge(text, robot, topics, stack, commands)
-    from failuretwin.connection.links.recording import replay
+    if is_network(text):
+        transport = stack.enter_context(open_transport(text))
+        link = (RosCommander if commands else RosSource)(robot, topics, transport)
+        return link, [diagnostics_sink(robot, topics, transport)]
+    from failuretwin.connection.links.replay import replay
 
     path = Path(text)
     if OWN_CLASS.fullmatch(text) and not path.exists():
@@ -114,27 +108,7 @@ def missing(text: str) -> InputError:
     return InputError(f"source {text!r} does not exist. Expected {SOURCES}.")
 
 
-def _ros1(
-    robot: Robot, topics: RosTopics, stack: ExitStack, commands: bool
-) -> tuple[Source, list[Sink]]:
-    from failuretwin.connection.links.ros1 import Ros1Commander, Ros1Diagnostics, Ros1Source
-
-    source = stack.enter_context((Ros1Commander if commands else Ros1Source)(robot, topics))
-    return source, [stack.enter_context(Ros1Diagnostics(robot, topics))]
-
-
-def _ros2(
-    text: str, robot: Robot, topics: RosTopics, stack: ExitStack
-) -> tuple[Source, list[Sink]]:
-    from failuretwin.connection.links import ros2
-
-    session = ros2_session(text)
-    stack.callback(session.close)
-    source = stack.enter_context(ros2.Ros2Source(robot, topics, session))
-    return source, [stack.enter_context(ros2.Ros2Diagnostics(robot, topics, session))]
-
-
-def robot_sink(target: str, robot: Robot, live: LiveOptions, stack: ExitStack) -> Sink:
+def emulated_sink(target: str, robot: Robot, live: LiveOptions, stack: ExitStack) -> Sink:
     """Return where an emulated robot speaks: a network, or a recording.
 
     The stack closes it in the end.
@@ -142,60 +116,12 @@ def robot_sink(target: str, robot: Robot, live: LiveOptions, stack: ExitStack) -
     Raises:
         InputError: If it cannot be reached or written.
     """
-    if target == ROS1:
-        from failuretwin.connection.links.ros1 import Ros1Robot
-
-        return stack.enter_context(Ros1Robot(robot, topics_of(live.topics)))
-    if target.partition("://")[0] == ROS2:
-        from failuretwin.connection.links.ros2 import Ros2Robot
-
-        session = ros2_session(target)
-        stack.callback(session.close)
-        return stack.enter_context(Ros2Robot(robot, topics_of(live.topics), session))
-    from failuretwin.connection.links.recording import Recorder
+    if is_network(target):
+        transport = stack.enter_context(open_transport(target))
+        return robot_sink(robot, topics_of(live.topics), transport)
+    from failuretwin.connection.links.recorder import Recorder
 
     return stack.enter_context(Recorder(Path(target), robot))
-
-
-def ros2_session(text: str) -> Any:
-    """Return a session with the router that ``ros2`` or ``ros2://HOST[:PORT]`` stands for.
-
-    Raises:
-        InputError: If it is no such address, or no router answers there.
-    """
-    from failuretwin.connection.links import ros2
-
-    return ros2.connect() if text == ROS2 else ros2.connect(*address_of(text, ros2.ROUTER_PORT))
-
-
-def address_of(text: str, usual_port: int = ROSBRIDGE_PORT) -> tuple[str, int]:
-    """Return host and port of a server, such as ``rosbridge://HOST[:PORT]``.
-
-    Raises:
-        InputError: If it is no such address.
-    """
-    try:
-        address = urlsplit(text)
-        host, port = address.hostname, address.port or usual_port
-    except ValueError:
-        host, port = None, 0
-    if not host:
-        kind = text.partition("://")[0]
-        raise InputError(f"{text!r} is no address. Expected {kind}://HOST[:PORT].")
-    return host, port
-
-
-def _rosbridge(
-    text: str, robot: Robot, topics: RosTopics, stack: ExitStack, commands: bool
-) -> tuple[Source, list[Sink]]:
-    from failuretwin.connection.links import rosbridge
-
-    ros = rosbridge.connect(*address_of(text))
-    stack.callback(rosbridge.disconnect, ros)
-    link = rosbridge.RosbridgeCommander if commands else rosbridge.RosbridgeSource
-    source = stack.enter_context(link(robot, topics, ros))
-    sink = stack.enter_context(rosbridge.RosbridgeDiagnostics(robot, topics, ros))
-    return source, [sink]
 
 
 # Watching until the source ends or the user has seen enough.

@@ -11,9 +11,10 @@ from failuretwin.app.commands.options import LiveOptions
 from failuretwin.app.emulation import emulation_of
 from failuretwin.app.live import topics_of
 from failuretwin.connection.commanded_arm import CommandedArm
-from failuretwin.connection.links.base import CommandSent, Pace, Reading
-from failuretwin.connection.links.commander import Order
-from failuretwin.connection.links.ros1 import Ros1Robot, Ros1Source
+from failuretwin.connection.links.base import CommandSent, Order, Reading
+from failuretwin.connection.links.networks import open_transport
+from failuretwin.connection.links.replay import Pace
+from failuretwin.connection.links.ros_link import RosSource, robot_sink
 from failuretwin.digital_model.robot import Robot
 
 POLL_S = 0.01
@@ -21,6 +22,7 @@ POLL_S = 0.01
 
 
 def obey_commands(
+    network: str,
     robot: Robot,
     live: LiveOptions,
     calibration: str | None,
@@ -30,6 +32,7 @@ def obey_commands(
     """Publish readings and do what the topic of commands says, until interrupted.
 
     Args:
+        network: Where to publish and listen, such as ``ros1``.
         robot: The robot.
         live: Topics, faults, pace and length.
         calibration: Its healthy behaviour; None: what is known of it.
@@ -40,7 +43,9 @@ def obey_commands(
     topics = topics_of(live.topics)
     arm = CommandedArm(emulation, Pace(live.speed))
     length = live.seconds or math.inf
-    with Ros1Robot(robot, topics) as sink, Ros1Source(robot, topics) as ears:
+    with open_transport(network) as transport:
+        sink = robot_sink(robot, topics, transport)
+        ears = RosSource(robot, topics, transport)
         tell("an emulated robot obeys; stop with Ctrl-C")
         try:
             now, zero = 0.0, time.time()

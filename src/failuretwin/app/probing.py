@@ -12,14 +12,12 @@ from failuretwin.app.emulation import emulation_of
 from failuretwin.app.live import (
     EMULATED,
     OWN_CLASS,
-    ROS1,
-    ROS2,
-    ROSBRIDGE,
     connect,
     missing,
 )
-from failuretwin.connection.links.base import Pace, Sink
-from failuretwin.connection.links.commander import Commander
+from failuretwin.connection.links.base import Commander, Sink
+from failuretwin.connection.links.networks import NETWORKS, is_network
+from failuretwin.connection.links.replay import Pace
 from failuretwin.core.errors import InputError
 from failuretwin.digital_model.robot import Robot
 
@@ -35,9 +33,8 @@ def commanded(
     if text == EMULATED:
         return stack.enter_context(_at_work(robot, live, seed)), []
     own = OWN_CLASS.fullmatch(text) and not Path(text).exists()
-    if not own and text != ROS1 and not text.startswith(f"{ROSBRIDGE}://"):
-        listens = text == ROS2 or text.startswith(f"{ROS2}://") or Path(text).exists()
-        raise _listens(text) if listens else missing(text)
+    if not own and not is_network(text):
+        raise _listens(text) if Path(text).exists() else missing(text)
     link, sinks = connect(text, robot, live, seed, stack, commands=True)
     if not (hasattr(link, "send") and hasattr(link, "standing")):
         raise _listens(text)
@@ -47,8 +44,7 @@ def commanded(
 def _listens(text: str) -> InputError:
     return InputError(
         f"source {text!r} can only be listened to, but --probe orders movements. Expected "
-        f"{EMULATED}, {ROS1}, {ROSBRIDGE}://HOST[:PORT], or MODULE:CLASS of a Commander; or leave "
-        "--probe out."
+        f"{EMULATED}, {NETWORKS}, or MODULE:CLASS of a Commander; or leave --probe out."
     )
 
 

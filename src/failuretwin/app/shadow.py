@@ -21,9 +21,8 @@ from failuretwin.connection.links.base import (
     Sink,
     Source,
 )
-from failuretwin.connection.links.live_events import LiveReference, ReorderBuffer
 from failuretwin.connection.links.statuses import statuses
-from failuretwin.connection.links.stream_clock import StreamClock
+from failuretwin.connection.links.stream_time import LiveReference, ReorderBuffer, StreamClock
 from failuretwin.core.alarm import RAISED, SUSPECTED, Alarm, Episode
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray

@@ -14,15 +14,8 @@ from typing import Self
 import numpy as np
 
 from failuretwin.connection.emulated_arm import MEMORY_S, STEP_S, EmulatedArm, Emulation
-from failuretwin.connection.links.base import (
-    AS_FAST_AS_POSSIBLE,
-    CommandSent,
-    Event,
-    LinkCounts,
-    Pace,
-    Reading,
-)
-from failuretwin.connection.links.commander import Order
+from failuretwin.connection.links.base import CommandSent, Event, LinkCounts, Order, Reading
+from failuretwin.connection.links.replay import AS_FAST_AS_POSSIBLE, Pace
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.disturbances import Disturbances, sense, stack

@@ -14,7 +14,8 @@ from itertools import takewhile
 
 import numpy as np
 
-from failuretwin.connection.links.base import CommandSent, Event, Pace, PacedSource, Reading
+from failuretwin.connection.links.base import CommandSent, Event, Reading
+from failuretwin.connection.links.replay import Pace, PacedSource
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model.disturbances import (

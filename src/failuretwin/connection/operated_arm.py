@@ -12,8 +12,8 @@ import numpy as np
 
 from failuretwin.connection.commanded_arm import CommandedArm
 from failuretwin.connection.emulated_arm import FIRST_COMMAND_S, STEP_S, Emulation
-from failuretwin.connection.links.base import Event, Pace
-from failuretwin.connection.links.commander import Order
+from failuretwin.connection.links.base import Event, Order
+from failuretwin.connection.links.replay import Pace
 from failuretwin.failure_behavior.random_movements import RandomMovements
 
 OPERATOR = 1

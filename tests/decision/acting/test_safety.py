@@ -7,7 +7,7 @@ import pytest
 from small_world import SmallWorld, believed, carry_out, task_of
 
 from failuretwin import InputError, load_robot
-from failuretwin.connection.links.commander import Order
+from failuretwin.connection.links.base import Order
 from failuretwin.decision.acting.belief import LatchedBelief
 from failuretwin.decision.acting.believed_arm import BelievedArm
 from failuretwin.decision.acting.planner import Planner, Standing

@@ -12,8 +12,7 @@ from small_world import task_of
 from failuretwin import Fault
 from failuretwin.connection.commanded_arm import CommandedArm
 from failuretwin.connection.emulated_arm import Emulation
-from failuretwin.connection.links.base import CommandSent, LinkCounts, Reading
-from failuretwin.connection.links.commander import Order
+from failuretwin.connection.links.base import CommandSent, LinkCounts, Order, Reading
 from failuretwin.core.errors import InputError
 from failuretwin.decision.acting import work as work_module
 from failuretwin.decision.acting.actor import Actor

@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from failuretwin.app.shadow import Shadow
-from failuretwin.connection.links.base import AS_FAST_AS_POSSIBLE, Pace, PacedSource
-from failuretwin.connection.links.recording import session_events
+from failuretwin.connection.links.replay import (
+    AS_FAST_AS_POSSIBLE,
+    Pace,
+    PacedSource,
+    session_events,
+)
 from failuretwin.data_knowledge.raw_sessions import read_session
 from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.decision.streaming.trouble import FrozenSensorDetector, TwoPlaces, UntoldMotion

@@ -8,7 +8,7 @@ import pytest
 import failuretwin as ft
 from failuretwin.connection.commanded_arm import CommandedArm
 from failuretwin.connection.emulated_arm import Emulation
-from failuretwin.connection.links.commander import Order
+from failuretwin.connection.links.base import Order
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
 from failuretwin.decision.acting.believed_arm import Seen
 from failuretwin.decision.acting.judging import Judge, settled_evidence_of

@@ -117,7 +117,7 @@ def act(
 
 @click.command()
 @click.option(
-    "--on", "place", default="ros1", metavar="ros1|rosbridge://HOST[:PORT]", help="The arm."
+    "--on", "place", default="ros1", metavar="ros1|ros2|rosbridge://HOST[:PORT]", help="The arm."
 )
 @click.option("--topics", type=PATH, metavar="FILE.toml", help="Names and types of ROS topics.")
 @common_options
@@ -130,13 +130,15 @@ def stop(place: str, topics: Path | None, robot: str, seed: int) -> None:
 
     from failuretwin.app.acting import commander_of
     from failuretwin.app.live import EMULATED
-    from failuretwin.connection.links.commander import Order
+    from failuretwin.connection.links.base import Order
     from failuretwin.core.errors import InputError
     from failuretwin.decision.acting.work import where_it_stands
     from failuretwin.digital_model.calibrated_robot import load_calibration
 
     if place == EMULATED:
-        raise InputError("an emulated arm ends with its process. Name ros1 or rosbridge://HOST.")
+        raise InputError(
+            "an emulated arm ends with its process. Name ros1, ros2 or rosbridge://HOST."
+        )
     known = load_calibration("none", robot)
     with ExitStack() as stack:
         arm = commander_of(place, known, (), seed, topics, stack)

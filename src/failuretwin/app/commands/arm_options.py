@@ -12,7 +12,7 @@ import click
 from failuretwin.app.commands.options import PATH, gathered
 
 if TYPE_CHECKING:
-    from failuretwin.connection.links.commander import Commander
+    from failuretwin.connection.links.base import Commander
     from failuretwin.decision.acting.safety import SafetyGate
     from failuretwin.decision.test_motions.probing import ProbeRules
     from failuretwin.digital_model.calibrated_robot import CalibratedRobot
@@ -55,7 +55,7 @@ arm_options = gathered(
         "--on",
         "place",
         default="emulated",
-        metavar="emulated|ros1|rosbridge://HOST[:PORT]",
+        metavar="emulated|ros1|ros2|rosbridge://HOST[:PORT]",
         help="The arm.",
     ),
     click.option(

@@ -101,7 +101,7 @@ def watch(
     from failuretwin.app.probing import commanded
     from failuretwin.app.shadow import Shadow
     from failuretwin.app.tables import console
-    from failuretwin.connection.links.recording import Recorder
+    from failuretwin.connection.links.recorder import Recorder
     from failuretwin.connection.links.statuses import statuses
     from failuretwin.decision.streaming.monitor import monitor
     from failuretwin.decision.test_motions.probing import Prober
@@ -227,14 +227,15 @@ def emulate(
 
 def _obey(target: str, live: LiveOptions, calibration: str | None, robot: str, seed: int) -> None:
     """Play a robot that does what it is told."""
+    from failuretwin.connection.links.networks import is_network
     from failuretwin.core.errors import InputError
 
-    if target != "ros1":
+    if not is_network(target):
         raise InputError(f"--obey needs a network to obey, but --to is {target!r}.")
     from failuretwin.app.obeying import obey_commands
     from failuretwin.digital_model.robot import load_robot
 
-    obey_commands(load_robot(robot), live, calibration, seed, tell)
+    obey_commands(target, load_robot(robot), live, calibration, seed, tell)
 
 
 def _play(target: str, live: LiveOptions, calibration: str | None, robot: str, seed: int) -> None:
@@ -242,26 +243,27 @@ def _play(target: str, live: LiveOptions, calibration: str | None, robot: str, s
     from contextlib import ExitStack
 
     from failuretwin.app.emulation import emulated_faults, emulation_of
-    from failuretwin.app.live import NETWORKS, emulated_robot, robot_sink
-    from failuretwin.connection.links.base import AS_FAST_AS_POSSIBLE, Pace
+    from failuretwin.app.live import emulated_robot, emulated_sink
+    from failuretwin.connection.links.networks import NETWORKS, is_network
+    from failuretwin.connection.links.replay import AS_FAST_AS_POSSIBLE, Pace
     from failuretwin.core.errors import InputError
     from failuretwin.digital_model.robot import load_robot
 
     model = load_robot(robot)
     schedule = emulated_faults(live.faults, model).schedule
-    zero, on_ros = time.time(), target.partition("://")[0] in NETWORKS
-    if not on_ros and Path(target).suffix != ".mcap":
-        raise InputError(f"--to is {target!r}, expected ros1, ros2 or a file that ends in .mcap.")
-    length = live.seconds or (math.inf if on_ros else _file_length(schedule))
-    pace = Pace(live.speed if on_ros else AS_FAST_AS_POSSIBLE)
+    zero, on_network = time.time(), is_network(target)
+    if not on_network and Path(target).suffix != ".mcap":
+        raise InputError(f"--to is {target!r}, expected {NETWORKS} or a file that ends in .mcap.")
+    length = live.seconds or (math.inf if on_network else _file_length(schedule))
+    pace = Pace(live.speed if on_network else AS_FAST_AS_POSSIBLE)
     source = emulated_robot(emulation_of(model, live, seed, calibration), pace, length, zero)
     with ExitStack() as stack:
-        sink = robot_sink(target, model, live, stack)
+        sink = emulated_sink(target, model, live, stack)
         stack.enter_context(source)
         _pass_on(source, sink, schedule, zero, model)
     if sink.trouble:
         raise InputError(sink.trouble)
-    if source.ended and not on_ros:
+    if source.ended and not on_network:
         tell(f"{length:g} s written to {target}")
 
 

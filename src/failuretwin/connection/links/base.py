@@ -1,10 +1,8 @@
-"""What passes along a link: readings and commands one way, answers the other."""
+"""Readings, commands and answers, and the protocols of the links that carry them."""
 
 from __future__ import annotations
 
-import time
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from threading import Condition
@@ -22,15 +20,15 @@ OK, STALE = "OK", "STALE"
 
 @dataclass(frozen=True)
 class Reading:
-    """What the sensors say at one time.
+    """Sensor values at one time.
 
     Attributes:
-        time: By the robot's clock [s].
+        time: Time by the robot's clock [s].
         tool: Tool position in the base frame, (axis,) [m]; NaN where there is none.
-        position: Angles of the motors in the log's sense, (motor,) [rad], NaN where one is
-            missing; None where the robot does not tell.
-        goal: Goals that the motors report to have received, (motor,) [rad], NaN where one is
-            missing; None where the robot does not tell.
+        position: Motor angles in the log's sense, (motor,) [rad], NaN where one is missing; None
+            if the robot does not report them.
+        goal: Goals that the motors report as received, (motor,) [rad], NaN where one is missing;
+            None if the robot does not report them.
     """
 
     time: float
@@ -41,12 +39,12 @@ class Reading:
 
 @dataclass(frozen=True)
 class CommandSent:
-    """A command: every motor shall ramp to its target, all starting together, and stay there.
+    """A command: all motors start together, ramp to their targets and hold them.
 
     Attributes:
-        time: By the robot's clock [s].
-        target: Where to go, (motor,) [rad].
-        duration: Time to get there, (motor,) [s].
+        time: Time by the robot's clock [s].
+        target: Target angles, (motor,) [rad].
+        duration: Ramp durations, (motor,) [s].
     """
 
     time: float
@@ -58,14 +56,27 @@ Event = Reading | CommandSent
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What is believed at one time.
+class Order:
+    """A movement to be made: all motors start together and ramp to their targets.
 
     Attributes:
-        time: By the robot's clock [s].
-        state: ``OK``, or ``STALE`` where data have stopped; then nothing is known of the present.
-        diagnosis: The diagnosis as it stands, or stood when data stopped; None: there was none yet.
-        alarm: Whether to call somebody.
+        target: Target angles in the sense of commands, (motor,) [rad].
+        duration: Ramp durations, (motor,) [s].
+    """
+
+    target: FloatArray
+    duration: FloatArray
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Diagnosis and alarm at one time.
+
+    Attributes:
+        time: Time by the robot's clock [s].
+        state: ``OK``, or ``STALE`` if data have stopped; then the present state is unknown.
+        diagnosis: Current diagnosis, or the last one before data stopped; None before the first.
+        alarm: State of the alarm.
     """
 
     time: float
@@ -79,14 +90,14 @@ Item = Reading | CommandSent | Answer
 
 @dataclass(frozen=True)
 class LinkCounts:
-    """What a link has seen since it was opened.
+    """Counters of a link since it was opened.
 
     Attributes:
         received: Readings and commands.
-        garbage: Messages that made no sense and were left out.
-        dropped: Readings and commands given up because they were not fetched in time.
-        reconnects: How often the far side went away and came back.
-        last_garbage: What was wrong with the last message that made no sense.
+        garbage: Invalid messages, which were left out.
+        dropped: Readings and commands dropped because they were not fetched in time.
+        reconnects: Times that the far side went away and came back.
+        last_garbage: Error of the last invalid message.
     """
 
     received: int = 0
@@ -97,13 +108,13 @@ class LinkCounts:
 
 
 class Source(Protocol):
-    """Where readings and commands come from; implement this to watch a robot of your own.
+    """Source of readings and commands; implement it to watch a robot of your own.
 
-    It is opened by its constructor and used in one ``with`` statement, by one thread, which calls
-    `poll` again and again and looks at `ended` and `counts` in between. A source that listens in a
-    thread of its own puts what it hears into an `EventQueue`. Times are by the robot's clock, and
-    need not be in order. `failuretwin watch MODULE:CLASS` watches such a class; it is called with
-    the robot, and with the text after a second colon if there is one, such as an address::
+    The constructor opens the source. One thread uses it in one ``with`` statement: it calls `poll`
+    repeatedly and reads `ended` and `counts` in between. A source with a thread of its own can put
+    what it hears into an `EventQueue`. Times are by the robot's clock and need not be in order.
+    `failuretwin watch MODULE:CLASS` watches such a class. The class is called with the robot, and
+    with the text after a second colon if there is one, such as an address::
 
         class Replayed:
             name, ended, counts = "ten readings at rest", False, LinkCounts()
@@ -125,28 +136,21 @@ class Source(Protocol):
 
     @property
     def name(self) -> str:
-        """What to call it, such as its file or address."""
+        """Name for messages to the user, such as a file or an address."""
         ...
 
     @property
     def ended(self) -> bool:
-        """Whether nothing can ever come any more; a robot that is silent has not ended."""
+        """Whether the source is finished; a robot that is silent has not ended."""
         ...
 
     @property
     def counts(self) -> LinkCounts:
-        """What it has seen so far."""
+        """Counters since the source was opened."""
         ...
 
     def poll(self, timeout_s: float) -> Event | None:
-        """Return the next event, waiting for it if need be.
-
-        Args:
-            timeout_s: Longest time to wait [s].
-
-        Returns:
-            The event; None if none came in time or the source has ended.
-        """
+        """Return the next event; None if none comes within `timeout_s` [s] or the source ended."""
         ...
 
     def __enter__(self) -> Self: ...
@@ -154,12 +158,29 @@ class Source(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
 
-class Sink(Protocol):
-    """Where items go: a recording, a network, a log of your own.
+class Commander(Source, Protocol):
+    """A source that also takes orders; implement it to act on a robot of your own.
 
-    Used in one ``with`` statement. `put` is called by one thread with every reading, command and
-    answer in the order of the stream, and must not wait: an answer comes with every reading. After
-    it `trouble` is looked at, and told to the user whenever it changes::
+    An order that is sent comes back as a `CommandSent` if other programs on the network can hear
+    it. The safety gate has checked every order before it is sent.
+    """
+
+    @property
+    def standing(self) -> FloatArray | None:
+        """Last target of the motors, (motor,) [rad]; None if it is not known."""
+        ...
+
+    def send(self, order: Order) -> None:
+        """Send an order to the motors; returns at once."""
+        ...
+
+
+class Sink(Protocol):
+    """Consumer of items: a recording, a network, a log of your own.
+
+    Used in one ``with`` statement. One thread calls `put` with every reading, command and answer
+    in the order of the stream. `put` must not block: an answer comes with every reading. After
+    each call `trouble` is read, and the user is told when it changes::
 
         class Printed:
             name, trouble = "printed", ""
@@ -177,16 +198,16 @@ class Sink(Protocol):
 
     @property
     def name(self) -> str:
-        """What to call it, such as its file or address."""
+        """Name for messages to the user, such as a file or an address."""
         ...
 
     @property
     def trouble(self) -> str:
-        """What keeps items from arriving just now; empty if nothing does."""
+        """Reason why items do not arrive at present; empty if they do."""
         ...
 
     def put(self, item: Item) -> None:
-        """Take an item. A far side that is gone makes trouble, but no error."""
+        """Take an item. If the far side is gone, set `trouble` and raise nothing."""
         ...
 
     def __enter__(self) -> Self: ...
@@ -194,20 +215,24 @@ class Sink(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
 
-# The queue between a link's own thread and a consumer that may be slow.
+# Queue between the thread of a link and a consumer that may be slow.
 
 CAPACITY = 1000
-"""Events that wait at most: 100 s of a robot that reads at 10 Hz."""
+"""Maximum number of waiting events: 100 s of a robot that is read at 10 Hz."""
 
 
 class EventQueue:
-    """Holds a limited number of events and counts those that it had to give up.
+    """Bounded queue of events.
 
-    When it is full the oldest reading goes: a lost reading costs little, a lost command would make
-    a healthy robot look faulty.
+    A full queue drops its oldest reading: a lost reading costs little, but a lost command would
+    make a healthy robot look faulty.
 
     Args:
-        capacity: Events that it can hold.
+        capacity: Maximum number of events.
+
+    Attributes:
+        received: Number of events put in.
+        dropped: Number of events dropped.
     """
 
     def __init__(self, capacity: int = CAPACITY) -> None:
@@ -218,10 +243,12 @@ class EventQueue:
         self.received = 0
 
     def put(self, event: Event) -> None:
-        """Add an event; never waits."""
+        """Add an event; never blocks."""
         with self._filled:
             if len(self._events) >= self._capacity:
-                self._drop_one()
+                readings = (i for i, kept in enumerate(self._events) if isinstance(kept, Reading))
+                del self._events[next(readings, 0)]
+                self.dropped += 1
             self._events.append(event)
             self.received += 1
             self._filled.notify()
@@ -234,126 +261,26 @@ class EventQueue:
             return self._events.popleft() if self._events else None
 
     def __len__(self) -> int:
-        """Return how many events wait."""
+        """Return the number of waiting events."""
         return len(self._events)
 
-    def _drop_one(self) -> None:
-        readings = (i for i, event in enumerate(self._events) if isinstance(event, Reading))
-        del self._events[next(readings, 0)]
-        self.dropped += 1
 
-
-# The pace at which recorded and emulated time passes.
-
-AS_FAST_AS_POSSIBLE = 0.0
-"""The speed at which nothing is waited for."""
-
-
-@dataclass
-class Pace:
-    """Waits until events are due.
-
-    Attributes:
-        speed: Seconds of the robot's time in each of ours; 0: as fast as possible.
-
-    Raises:
-        InputError: If the speed is negative or not finite.
-    """
-
-    speed: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.speed < float("inf"):
-            raise InputError(
-                f"speed is {self.speed:g}, expected a factor above 0, such as 1 (as recorded) or "
-                "10; 0 means as fast as possible."
-            )
-        self._zero: tuple[float, float] | None = None
-
-    def due(self, event_time: float, timeout_s: float) -> bool:
-        """Wait for an event and return whether it is due by now.
-
-        Args:
-            event_time: When it happens by the robot's clock [s]; the first one is due at once.
-            timeout_s: Longest time to wait [s].
-        """
-        if self.speed == AS_FAST_AS_POSSIBLE:
-            return True
-        now = time.monotonic()
-        if self._zero is None:
-            self._zero = event_time, now
-        first, began = self._zero
-        left = began + (event_time - first) / self.speed - now
-        if left > 0.0:
-            time.sleep(min(left, timeout_s))
-        return left <= timeout_s
-
-
-# Sources whose events are known or made here: replayed logs and the emulated robot.
-
-
-class PacedSource:
-    """Gives events when they are due. Nothing is dropped: a slow consumer gets them later.
-
-    Args:
-        name: What to call it.
-        events: Events in the order of their times.
-        pace: How fast time passes.
-    """
-
-    def __init__(self, name: str, events: Iterator[Event], pace: Pace) -> None:
-        self.name = name
-        self._events = events
-        self._pace = pace
-        self._next: Event | None = None
-        self._ended = False
-        self._received = 0
-
-    @property
-    def ended(self) -> bool:
-        """Whether all events have been given."""
-        return self._ended
-
-    @property
-    def counts(self) -> LinkCounts:
-        """How many events have been given."""
-        return LinkCounts(received=self._received)
-
-    def poll(self, timeout_s: float) -> Event | None:
-        """Return the next event; None if it is not due within `timeout_s` [s] or there is none."""
-        if self._next is None and not self._ended:
-            self._next = next(self._events, None)
-            self._ended = self._next is None
-        event = self._next
-        if event is None or not self._pace.due(event.time, timeout_s):
-            return None
-        self._next = None
-        self._received += 1
-        return event
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Nothing to be closed."""
-
-
-# Sources of other people, by their names.
+# Sources that users have written.
 
 SOURCE_PARTS = ("name", "ended", "counts", "poll", "__enter__", "__exit__")
-"""What `Source` asks for."""
+"""Members of `Source`."""
 
 
 def source_from_text(text: str, robot: Robot) -> Source:
-    """Return the source of a class that the user names.
+    """Return an instance of a source class that the user names.
 
     Args:
         text: ``module:Class``, or ``module:Class:ADDRESS`` for a class that takes an address; the
-            module is imported from where Python finds modules.
-        robot: The robot, given to the class before the address.
+            module must be on Python's path.
+        robot: The robot, the first argument of the class.
 
     Raises:
-        InputError: If there is no such class, or what it makes is no source.
+        InputError: If there is no such class, or its instance is not a source.
     """
     module, _, rest = text.partition(":")
     name, *address = rest.split(":", 1)

@@ -1,9 +1,9 @@
-"""A robot on ROS 2 without a ROS installation: Zenoh, by the conventions of rmw_zenoh.
+"""Transport to ROS 2 over Zenoh, by the conventions of rmw_zenoh, without a ROS installation.
 
-    topic     <domain>/<topic>/<type, mangled as DDS does>/<hash of the type>
-    payload   the message as CDR
-    attached  sequence number and time of sending [ns], 8 bytes each, then 16 and 16 bytes of a gid
-    alive     @ros2_lv/<domain>/<session>/<node>/<entity>/NN or MP/%/%/<name of the node>/...
+    topic       <domain>/<topic>/<type, mangled as DDS does>/<hash of the type>
+    payload     the message as CDR
+    attachment  sequence number, time of sending [ns] (8 bytes each), 16, and 16 bytes of a gid
+    liveliness  @ros2_lv/<domain>/<session>/<node>/<entity>/NN or MP/%/%/<name of the node>/...
 
 Discovery and messages pass through the router, `rmw_zenohd`, to which sessions connect as clients.
 
@@ -17,38 +17,27 @@ import os
 import struct
 import time
 import uuid
-from functools import partial
 from typing import Any
 
-from failuretwin.connection.links.base import EventQueue
-from failuretwin.connection.links.live_events import NetworkSource
-from failuretwin.connection.links.network_sinks import DiagnosticsSink, RobotSink
-from failuretwin.connection.links.ros2_messages import Ros2Types
-from failuretwin.connection.links.ros_messages import (
-    DIAGNOSTICS_TYPE,
-    DiagnosticsPublisher,
-    Outgoing,
-    RosTopics,
-    RosWriter,
-)
+from failuretwin.connection.links.ros_codec import Outgoing, RosCodec
+from failuretwin.connection.links.ros_link import Take, Transport, wait_for_listener
 from failuretwin.core.errors import InputError, needs_extra
-from failuretwin.data_knowledge.bag_messages import NS_PER_S, Role
-from failuretwin.digital_model.robot import Robot
+from failuretwin.data_knowledge.bag_messages import NS_PER_S
 
 ROUTER_PORT = 7447
-"""Where the router of rmw_zenoh listens unless told otherwise."""
+"""Default port of the router of rmw_zenoh."""
 LARGEST_DOMAIN = 232
-"""Domains of ROS 2 count from 0 to this."""
+"""Largest domain number of ROS 2."""
 NODE = "failuretwin"
 QOS = "::,10:,:,:,,"
 """Quality of service as rmw_zenoh writes it: reliable, volatile, the last ten messages."""
 
 
 def domain_id() -> int:
-    """Return the domain that ``ROS_DOMAIN_ID`` names; 0 unless it does.
+    """Return the domain in ``ROS_DOMAIN_ID``; default 0.
 
     Raises:
-        InputError: If it names none.
+        InputError: If it is not a domain number.
     """
     text = os.environ.get("ROS_DOMAIN_ID", "0") or "0"
     if not (text.isdecimal() and int(text) <= LARGEST_DOMAIN):
@@ -58,8 +47,8 @@ def domain_id() -> int:
     return int(text)
 
 
-def connect(host: str = "localhost", port: int = ROUTER_PORT) -> Any:
-    """Return a session with a router, a `zenoh.Session`.
+def _open_session(host: str, port: int) -> Any:
+    """Return a `zenoh.Session` with a router.
 
     Raises:
         InputError: If zenoh is missing or no router answers.
@@ -83,144 +72,98 @@ def connect(host: str = "localhost", port: int = ROUTER_PORT) -> Any:
         ) from error
 
 
+class Ros2Transport(Transport):
+    """Session with a Zenoh router; a node of ROS 2 once it publishes.
+
+    Types are known by the key of a message. Those of ROS have their own fields, all others the
+    fields of the authors' message, because Zenoh sends no definitions along.
+
+    Args:
+        host: Host of the router.
+        port: Its port.
+
+    Raises:
+        InputError: If an extra is missing, ``ROS_DOMAIN_ID`` is invalid, or no router answers.
+    """
+
+    def __init__(self, host: str = "localhost", port: int = ROUTER_PORT) -> None:
+        self._domain = domain_id()
+        self.name = f"ROS 2, domain {self._domain}"
+        self._session = _open_session(host, port)
+        self._codec = RosCodec(2)
+        self._gid, self._sent = uuid.uuid4().bytes, 0
+        self._publishers: dict[str, Any] = {}
+        self._declared: list[Any] = []
+        self._gone, self._reconnects = False, 0
+
+    @property
+    def trouble(self) -> str:
+        """Whether the router is gone."""
+        return "the Zenoh router is gone" if self._router_gone() else ""
+
+    @property
+    def reconnects(self) -> int:
+        """Number of times that the router was seen to go away and come back."""
+        gone = self._router_gone()
+        self._reconnects += self._gone and not gone
+        self._gone = gone
+        return self._reconnects
+
+    def subscribe(self, topic: str, type_: str, take: Take) -> None:
+        """Call `take` with every message of a topic, whatever its type and hash."""
+
+        def receive(sample: Any) -> None:
+            name = _unmangled(str(sample.key_expr).split("/")[-2])
+            take(lambda: self._codec.decode(name, bytes(sample.payload)))
+
+        key = f"{self._domain}/{topic.lstrip('~/')}/*/*"
+        self._declared.append(self._session.declare_subscriber(key, receive))
+
+    def advertise(self, topic: str, type_: str) -> None:
+        """Declare a publisher, and the liveliness tokens by which ROS 2 knows it."""
+        name, hash_ = topic.lstrip("~/"), self._codec.hash_of(type_)
+        key = f"{self._domain}/{name}/{_mangled(type_)}/{hash_}"
+        self._publishers[topic] = self._session.declare_publisher(key)
+        alive = f"@ros2_lv/{self._domain}/{self._session.zid()}/0"
+        number = len(self._publishers)
+        known = f"%{name.replace('/', '%')}/{_mangled(type_)}/{hash_}/{QOS}"
+        tokens = [f"{alive}/{number}/MP/%/%/{NODE}/{known}"]
+        if number == 1:
+            tokens.append(f"{alive}/0/NN/%/%/{NODE}")
+        self._declared += map(self._session.liveliness().declare_token, tokens)
+
+    def publish(self, message: Outgoing) -> None:
+        """Publish a message with the attachment that rmw_zenoh expects."""
+        self._sent += 1
+        now_ns = round(time.time() * NS_PER_S)
+        attached = struct.pack("<qqB", self._sent, now_ns, len(self._gid)) + self._gid
+        self._publishers[message.topic].put(self._codec.encode(message), attachment=attached)
+
+    def check_listener(self, topic: str) -> None:
+        """Wait for a listener in another session; raises InputError if there is none in time."""
+        import zenoh
+
+        key, remote = self._publishers[topic].key_expr, zenoh.Locality.REMOTE
+        with self._session.declare_publisher(key, allowed_destination=remote) as probe:
+            wait_for_listener(topic, lambda: probe.matching_status.matching)
+
+    def close(self) -> None:
+        """End all subscriptions and publishers, and the session."""
+        for declared in (*self._publishers.values(), *self._declared):
+            declared.undeclare()
+        self._session.close()
+
+    def _router_gone(self) -> bool:
+        return self._session.is_closed() or not self._session.info.routers_zid()
+
+
 def _mangled(type_: str) -> str:
     """Return the name of a type in a key, such as ``std_msgs::msg::dds_::String_``."""
     package, _, name = type_.replace("/msg/", "/").partition("/")
     return f"{package}::msg::dds_::{name}_"
 
 
-def _plain(mangled: str) -> str:
-    """Return what `_mangled` was given, by its ROS 2 name."""
+def _unmangled(mangled: str) -> str:
+    """Return the ROS 2 name of a type in a key, such as ``std_msgs/msg/String``."""
     package, _, name = mangled.partition("::msg::dds_::")
     return f"{package}/msg/{name.removesuffix('_')}"
-
-
-def _topic_key(topic: str, type_: str, hash_: str) -> str:
-    """Return the key of a topic; a name without a slash in front is taken as one with it."""
-    return f"{domain_id()}/{topic.lstrip('~/')}/{type_}/{hash_}"
-
-
-class Ros2Source(NetworkSource):
-    """Listens to the topics of a robot; a router that goes away and comes back is no trouble.
-
-    Types are known by the key that a message comes under, and those of ROS by their name.
-
-    Args:
-        robot: The robot.
-        topics: Its topics.
-        session: The session, see `connect`.
-        queue: Where events wait to be fetched; None: a queue of its own.
-
-    Raises:
-        InputError: If rosbags is missing, or the robot does not fit the topics.
-    """
-
-    def __init__(
-        self, robot: Robot, topics: RosTopics, session: Any, queue: EventQueue | None = None
-    ) -> None:
-        super().__init__(robot, topics, queue)
-        self._types, self._session = Ros2Types(), session
-        names = [name for _, name, _ in topics.subscribed]
-        self.name = f"ROS 2, domain {domain_id()}: {', '.join(names)}"
-        self._gone, self._reconnects = False, 0
-        self._subscribers = [
-            session.declare_subscriber(_topic_key(name, "*", "*"), partial(self._take, role))
-            for role, name, _ in topics.subscribed
-        ]
-
-    @property
-    def reconnects(self) -> int:
-        """How often the router was seen to go away and come back."""
-        gone = _router_gone(self._session)
-        self._reconnects += self._gone and not gone
-        self._gone = gone
-        return self._reconnects
-
-    def close(self) -> None:
-        """Stop listening."""
-        for subscriber in self._subscribers:
-            subscriber.undeclare()
-
-    def _take(self, role: Role, sample: Any) -> None:
-        type_ = _plain(str(sample.key_expr).split("/")[-2])
-        self.take(role, lambda: self._types.from_bytes(type_, bytes(sample.payload)))
-
-
-def _router_gone(session: Any) -> bool:
-    return session.is_closed() or not session.info.routers_zid()
-
-
-class _Publishers:
-    """Publishers that ROS 2 sees as those of a node.
-
-    Args:
-        session: The session.
-        topics: Name and type of each topic.
-    """
-
-    def __init__(self, session: Any, topics: list[tuple[str, str]]) -> None:
-        self._session, self._types = session, Ros2Types()
-        self._gid, self._sent = uuid.uuid4().bytes, 0
-        alive = f"@ros2_lv/{domain_id()}/{session.zid()}/0"
-        declare = session.liveliness().declare_token
-        self._tokens = [declare(f"{alive}/0/NN/%/%/{NODE}")]
-        self._publishers = {}
-        for number, (name, type_) in enumerate(topics, start=1):
-            known = _mangled(type_), self._types.hash_of(type_)
-            self._publishers[name] = session.declare_publisher(_topic_key(name, *known))
-            topic = f"/{name.lstrip('~/')}".replace("/", "%")
-            said = "/".join((topic, *known, QOS))
-            self._tokens.append(declare(f"{alive}/{number}/MP/%/%/{NODE}/{said}"))
-
-    @property
-    def trouble(self) -> str:
-        """What keeps messages from arriving."""
-        return "the Zenoh router is gone" if _router_gone(self._session) else ""
-
-    def send(self, message: Outgoing) -> None:
-        """Publish a message on its topic."""
-        self._sent += 1
-        now_ns = round(time.time() * NS_PER_S)
-        attached = struct.pack("<qqB", self._sent, now_ns, len(self._gid)) + self._gid
-        data = self._types.to_bytes(message.type, message.content)
-        self._publishers[message.topic].put(data, attachment=attached)
-
-    def close(self) -> None:
-        """Stop publishing."""
-        for declared in (*self._publishers.values(), *self._tokens):
-            declared.undeclare()
-
-
-class Ros2Robot(RobotSink):
-    """Plays a robot on ROS 2; see `RobotSink`.
-
-    Args:
-        robot: The robot.
-        topics: Its topics.
-        session: The session, see `connect`.
-
-    Raises:
-        InputError: If rosbags is missing, or a type cannot be published.
-    """
-
-    def __init__(self, robot: Robot, topics: RosTopics, session: Any) -> None:
-        writer = RosWriter(robot, topics)
-        super().__init__("ROS 2", writer, _Publishers(session, writer.topics))
-
-
-class Ros2Diagnostics(DiagnosticsSink):
-    """Publishes answers as diagnostics on ROS 2.
-
-    Args:
-        robot: The robot.
-        topics: Names the topic.
-        session: The session, see `connect`.
-
-    Raises:
-        InputError: If rosbags is missing.
-    """
-
-    def __init__(self, robot: Robot, topics: RosTopics, session: Any) -> None:
-        bulletin = DiagnosticsPublisher(robot, topics)
-        publishers = _Publishers(session, [(topics.diagnostics, DIAGNOSTICS_TYPE)])
-        super().__init__("ROS 2 diagnostics", bulletin, publishers)

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from failuretwin.connection.links.commander import Order
+from failuretwin.connection.links.base import Order
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.decision.acting.believed_arm import BelievedArm
 from failuretwin.decision.acting.safety import SafetyGate

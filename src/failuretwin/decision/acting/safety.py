@@ -16,7 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from failuretwin.connection.links.commander import Order
+from failuretwin.connection.links.base import Order
 from failuretwin.core.errors import FailureTwinError, InputError
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.clearance import Clearance

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from failuretwin.connection.links.commander import Commander
+from failuretwin.connection.links.base import Commander
 from failuretwin.core.errors import unknown_name
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.actor import Actor

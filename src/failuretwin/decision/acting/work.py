@@ -9,8 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from failuretwin.connection.links.base import CommandSent, Event, Reading
-from failuretwin.connection.links.commander import Commander, Order
+from failuretwin.connection.links.base import Commander, CommandSent, Event, Order, Reading
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.belief import Belief

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from failuretwin.connection.links.commander import Order
+from failuretwin.connection.links.base import Order
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.rest import QUIET_S

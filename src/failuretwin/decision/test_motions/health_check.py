@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from failuretwin.connection.links.commander import Commander, Order
+from failuretwin.connection.links.base import Commander, Order
 from failuretwin.core.hypothesis import HEALTHY, Diagnosis, Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.belief import Belief, NoBelief

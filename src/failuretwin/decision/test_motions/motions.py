@@ -16,8 +16,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from failuretwin.connection.links.base import CommandSent
-from failuretwin.connection.links.commander import Order
+from failuretwin.connection.links.base import CommandSent, Order
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.bags import read_targets
@@ -265,7 +264,7 @@ def write_motions(motions: Motions, robot: Robot, path: Path) -> None:
 
 
 def _write_commands(motions: Motions, robot: Robot, path: Path) -> None:
-    from failuretwin.connection.links.recording import Recorder, write_bag
+    from failuretwin.connection.links.recorder import Recorder, write_bag
 
     commands = [
         CommandSent(begin, order.target, order.duration)

@@ -16,9 +16,8 @@ from typing import Self
 
 import numpy as np
 
-from failuretwin.connection.links.base import OK, Answer, CommandSent, Event, Item
-from failuretwin.connection.links.commander import Commander, Order
-from failuretwin.connection.links.stream_clock import StreamClock
+from failuretwin.connection.links.base import OK, Answer, Commander, CommandSent, Event, Item, Order
+from failuretwin.connection.links.stream_time import StreamClock
 from failuretwin.core.alarm import CLEAR, RAISED
 from failuretwin.core.errors import InputError, counted
 from failuretwin.core.types import FloatArray

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from failuretwin.connection.links.commander import Commander
+from failuretwin.connection.links.base import Commander
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits

@@ -1,0 +1,182 @@
+"""Sources whose events are known in advance or made here: recorded logs and emulated robots."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from failuretwin.connection.links.base import CommandSent, Event, LinkCounts, Reading
+from failuretwin.connection.links.ros_reader import SampledCommands, goal_reading, motor_reading
+from failuretwin.core.errors import InputError
+from failuretwin.core.runs import GOAL_VARIABLE
+from failuretwin.core.types import FloatArray
+from failuretwin.data_knowledge.bags import BagTopics, is_bag, read_bag
+from failuretwin.data_knowledge.raw_sessions import RawSession, find_sessions, read_session
+from failuretwin.data_knowledge.timed_log import Samples, Targets, TimedLog
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.twin import DigitalTwin
+
+AS_FAST_AS_POSSIBLE = 0.0
+"""Speed at which events are given without waiting."""
+
+
+@dataclass
+class Pace:
+    """Clock that waits until events are due.
+
+    Attributes:
+        speed: Seconds of the robot's time per second of ours; 0: as fast as possible.
+
+    Raises:
+        InputError: If the speed is negative or not finite.
+    """
+
+    speed: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.speed < float("inf"):
+            raise InputError(
+                f"speed is {self.speed:g}, expected a factor above 0, such as 1 (as recorded) or "
+                "10; 0 means as fast as possible."
+            )
+        self._zero: tuple[float, float] | None = None
+
+    def due(self, event_time: float, timeout_s: float) -> bool:
+        """Wait for an event and return whether it is due.
+
+        Args:
+            event_time: Time of the event by the robot's clock [s]; the first one is due at once.
+            timeout_s: Longest time to wait [s].
+        """
+        if self.speed == AS_FAST_AS_POSSIBLE:
+            return True
+        now = time.monotonic()
+        if self._zero is None:
+            self._zero = event_time, now
+        first, start = self._zero
+        left = start + (event_time - first) / self.speed - now
+        if left > 0.0:
+            time.sleep(min(left, timeout_s))
+        return left <= timeout_s
+
+
+class PacedSource:
+    """Source that gives events when they are due and drops none.
+
+    Args:
+        name: Its name.
+        events: Events in the order of their times.
+        pace: Clock of the events.
+    """
+
+    def __init__(self, name: str, events: Iterator[Event], pace: Pace) -> None:
+        self.name = name
+        self.ended = False
+        self._events = events
+        self._pace = pace
+        self._next: Event | None = None
+        self._received = 0
+
+    @property
+    def counts(self) -> LinkCounts:
+        """Number of events given so far."""
+        return LinkCounts(received=self._received)
+
+    def poll(self, timeout_s: float) -> Event | None:
+        """Return the next event; None if it is not due within `timeout_s` [s] or there is none."""
+        if self._next is None and not self.ended:
+            self._next = next(self._events, None)
+            self.ended = self._next is None
+        event = self._next
+        if event is None or not self._pace.due(event.time, timeout_s):
+            return None
+        self._next = None
+        self._received += 1
+        return event
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Do nothing: there is nothing to close."""
+
+
+def replay(path: Path, robot: Robot, pace: Pace, topics: BagTopics | None = None) -> PacedSource:
+    """Return a log as a source.
+
+    Args:
+        path: Folder of one raw session, ROS 1 bag, ROS 2 bag or MCAP file.
+        robot: The robot of the log.
+        pace: Clock of the events.
+        topics: Roles of a bag's topics, for bags whose types do not settle them.
+
+    Raises:
+        InputError: If it does not exist, cannot be read, or holds several sessions.
+    """
+    if not path.exists():
+        raise InputError(f"{path}: does not exist. Expected a raw session or a bag.")
+    if is_bag(path):
+        (log,) = read_bag(path, robot, topics)
+        return PacedSource(path.name, log_events(log, robot), pace)
+    folders = find_sessions(path) if path.is_dir() else []
+    if len(folders) != 1:
+        raise InputError(
+            f"{path}: expected one raw session or a bag (.bag, .mcap, a folder of ROS 2), found "
+            f"{len(folders)} sessions. Name one of them."
+        )
+    session = read_session(folders[0], robot)
+    return PacedSource(session.name, session_events(session, robot), pace)
+
+
+def session_events(session: RawSession, robot: Robot) -> Iterator[Event]:
+    """Yield the commands and readings of a raw session in the order of their stamps."""
+    units = robot.servo_units
+    counts = session.reading_counts
+    angle = np.where(units.valid(counts), units.to_rad(counts), np.nan)
+    target = units.to_rad(session.target_counts)
+    commands = [
+        CommandSent(float(time), target[i], session.ramp_s[i])
+        for i, time in enumerate(session.command_time)
+    ]
+    return _in_order([*commands, *_motor_readings(session.reading_time, angle, robot)])
+
+
+def log_events(log: TimedLog, robot: Robot) -> Iterator[Event]:
+    """Yield the commands and readings of a log in the order of their times."""
+    goals = log.sensors.get(GOAL_VARIABLE)
+    events: list[Event] = list(_commands(log.command))
+    if log.tool is not None:
+        events += map(Reading, log.tool.time.tolist(), log.tool.value)
+    elif log.position is not None:
+        events += _motor_readings(log.position.time, log.position.value, robot)
+    else:
+        raise InputError(f"{log.name}: holds neither a tool path nor motor readings.")
+    if goals is not None:
+        events += map(goal_reading, goals.time.tolist(), goals.value)
+    return _in_order(events)
+
+
+def _motor_readings(time: FloatArray, angle: FloatArray, robot: Robot) -> list[Reading]:
+    twin = DigitalTwin(robot)
+    return [motor_reading(float(t), row, twin) for t, row in zip(time, angle, strict=True)]
+
+
+def _commands(command: Samples | Targets) -> Iterator[CommandSent]:
+    if isinstance(command, Targets):
+        yield from map(CommandSent, command.time.tolist(), command.target, command.duration)
+        return
+    samples = SampledCommands()
+    for stamp, value in zip(command.time.tolist(), command.value, strict=True):
+        sent = samples.add(stamp, value) if np.isfinite(value).all() else None
+        if sent is not None:
+            yield sent
+
+
+def _in_order(events: list[Event]) -> Iterator[Event]:
+    """Yield events in the order of their times, a command before a reading of the same time."""
+    return iter(sorted(events, key=lambda event: (event.time, isinstance(event, Reading))))

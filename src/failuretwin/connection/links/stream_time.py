@@ -1,0 +1,227 @@
+"""Stream time: the robot's clock without jumps, events in order, and the reference they draw."""
+
+from __future__ import annotations
+
+import heapq
+from bisect import insort
+from dataclasses import dataclass
+from itertools import count
+from time import time as wall_clock
+
+import numpy as np
+
+from failuretwin.connection.links.base import CommandSent, Event
+from failuretwin.core.types import FloatArray
+
+LEAP_S = 60.0
+"""A stamp this far ahead of the newest one is a clock that was set, not a silence [s]."""
+BACK_S = 5.0
+"""A stamp this far behind the newest one is a clock that was set, not a late message [s]."""
+SET_BACK_S, SET_BACK_READINGS = 0.5, 3
+"""Number of consecutive readings, each this far behind an earlier one [s], that show a clock that
+was set back; a single one is a late message."""
+SET_EVENTS = 10
+"""Number of consecutive events with equal jumps that show a clock that was set; fewer are invalid
+stamps."""
+
+
+class StreamClock:
+    """Converts stamps to a time that starts at zero and never jumps.
+
+    After a jump of the stamps our own clock bridges the gap: permanently if the following stamps
+    continue from there, for a single event if its stamp is invalid.
+
+    Attributes:
+        jumps: Number of times that the robot's clock was set.
+        senseless: Number of events with invalid stamps.
+    """
+
+    def __init__(self) -> None:
+        self.jumps = self.senseless = 0
+        self._offset: float | None = None
+        self._newest = 0.0
+        self._seen_s = 0.0
+        self._last_reading = -np.inf
+        self._behind = 0
+        self._leap, self._leaps = np.nan, 0
+
+    def to_stream_time(self, stamp: float, now_s: float, reading: bool = False) -> float:
+        """Return the stream time of an event [s].
+
+        Args:
+            stamp: Its stamp by the robot's clock [s].
+            now_s: Our own monotonic clock [s].
+            reading: Whether it is a reading; commands may be late.
+        """
+        if self._offset is None:
+            self._offset, self._seen_s = -stamp, now_s
+        time = stamp + self._offset
+        leaps = not -BACK_S <= time - self._newest <= LEAP_S
+        if leaps:
+            was_set = self._keeps_leaping(self.at(now_s) - stamp)
+        else:
+            self._leaps = 0
+            was_set = reading and self._is_set_back(stamp)
+        if leaps or was_set:
+            time = self.at(now_s)
+        if was_set:
+            self.jumps += 1
+            self._last_reading, self._behind = stamp if reading else -np.inf, 0
+            self._offset = time - stamp
+        if time >= self._newest:
+            self._newest, self._seen_s = time, now_s
+        return time
+
+    def _keeps_leaping(self, offset: float) -> bool:
+        """Return whether `SET_EVENTS` events have jumped alike.
+
+        Args:
+            offset: Stream time by our own clock minus the stamp [s].
+        """
+        alike = abs(offset - self._leap) <= BACK_S
+        self._leaps, self._leap = self._leaps + 1 if alike else 1, offset
+        self.senseless += 1
+        if self._leaps < SET_EVENTS:
+            return False
+        self.senseless -= self._leaps
+        self._leaps = 0
+        return True
+
+    def _is_set_back(self, stamp: float) -> bool:
+        """Return whether `SET_BACK_READINGS` readings have been behind an earlier one."""
+        if stamp < self._last_reading - SET_BACK_S:
+            self._behind += 1
+        else:
+            self._last_reading, self._behind = max(stamp, self._last_reading), 0
+        return self._behind >= SET_BACK_READINGS
+
+    def at(self, now_s: float) -> float:
+        """Return the stream time [s] at a time of our own clock [s]; 0 before the first event."""
+        if self._offset is None:
+            return self._newest
+        return self._newest + max(0.0, now_s - self._seen_s)
+
+    def stamp(self, time: float) -> float:
+        """Return the robot's clock at a stream time, both [s]; ours before the first event."""
+        return wall_clock() if self._offset is None else time - self._offset
+
+
+HELD_BACK = 10_000
+"""Maximum number of events held back; beyond it the oldest are released at once."""
+
+
+class ReorderBuffer:
+    """Buffer that puts late events into the order of their times.
+
+    Args:
+        hold_s: Time that events are held back [s]; 0: only those of the future.
+    """
+
+    def __init__(self, hold_s: float = 0.0) -> None:
+        self._hold_s = hold_s
+        self._waiting: list[tuple[float, bool, int, Event]] = []
+        self._number = count()
+
+    def add(self, event: Event) -> None:
+        """Add an event; a command goes before a reading of the same time."""
+        entry = (event.time, not isinstance(event, CommandSent), next(self._number), event)
+        heapq.heappush(self._waiting, entry)
+
+    def ready(self, now: float) -> list[Event]:
+        """Return the events that are released at a stream time [s]."""
+        events, until = [], now - self._hold_s
+        while self._waiting and (self._waiting[0][0] <= until or len(self._waiting) > HELD_BACK):
+            events.append(heapq.heappop(self._waiting)[-1])
+        return events
+
+
+Corner = tuple[float, FloatArray]
+"""Time [s] and angles (motor,) [rad]."""
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """Straight lines of all motors from one pose to another.
+
+    Attributes:
+        start: Common start [s].
+        origin: Angles at the start, (motor,) [rad].
+        target: Angles at the end, (motor,) [rad].
+        duration: Durations, (motor,) [s].
+    """
+
+    start: float
+    origin: FloatArray
+    target: FloatArray
+    duration: FloatArray
+
+    def at(self, time: float) -> FloatArray:
+        """Return the angles at a time [s], (motor,) [rad]."""
+        since = np.full_like(self.duration, time - self.start)
+        share = np.divide(since, self.duration, out=np.ones_like(since), where=self.duration > 0.0)
+        return np.asarray(self.origin + np.clip(share, 0.0, 1.0) * (self.target - self.origin))
+
+
+class LiveReference:
+    """Reference of the motors while commands keep coming, as corners of straight lines.
+
+    A command that comes while another runs starts from the present reference. It replaces pending
+    commands of the same time or later.
+
+    Attributes:
+        late_s: Longest delay of a command after the time at which it should have started [s].
+    """
+
+    def __init__(self) -> None:
+        self.late_s = 0.0
+        self._ramp: Ramp | None = None
+        self._pending: list[CommandSent] = []
+        self._known_until = -np.inf
+
+    def start_at(self, pose: FloatArray) -> None:
+        """Set the pose before the first command, (motor,) [rad]; no effect later."""
+        if self._ramp is None:
+            self._ramp = Ramp(-np.inf, pose, pose, np.zeros_like(pose))
+
+    def add(self, command: CommandSent) -> None:
+        """Add a command; its time may be in the future or a little in the past."""
+        self._pending = [other for other in self._pending if other.time < command.time]
+        insort(self._pending, command, key=lambda other: other.time)
+
+    def corners_to(self, time: float) -> list[Corner]:
+        """Return the corners since the last call, up to a time [s], and the reference then.
+
+        Nothing is returned before the first command or pose.
+        """
+        corners: list[Corner] = []
+        while self._pending and self._pending[0].time <= time:
+            self._begin(self._pending.pop(0), corners)
+        self._add_ends(time, corners)
+        if self._ramp is not None and time > self._known_until:
+            corners.append((time, self._ramp.at(time)))
+        self._known_until = max(self._known_until, time)
+        return corners
+
+    def _begin(self, command: CommandSent, corners: list[Corner]) -> None:
+        # Corners that were returned cannot be changed: a command that comes late starts late.
+        start = max(command.time, self._known_until)
+        self._add_ends(start, corners)
+        if self._ramp is None:
+            origin = command.target
+        else:
+            origin = self._ramp.at(start)
+            if start > self._known_until:
+                corners.append((start, origin))
+                self._known_until = start
+        late = start - command.time
+        self.late_s = max(self.late_s, late)
+        self._ramp = Ramp(start, origin, command.target, np.maximum(command.duration - late, 0.0))
+
+    def _add_ends(self, time: float, corners: list[Corner]) -> None:
+        """Add the ends of the motors' ramps before a time [s]."""
+        if self._ramp is None:
+            return
+        for end in np.unique(self._ramp.start + self._ramp.duration).tolist():
+            if self._known_until < end < time:
+                corners.append((end, self._ramp.at(end)))
+                self._known_until = end
