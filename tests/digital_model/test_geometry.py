@@ -1,11 +1,15 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from failuretwin.core.errors import InputError
+from failuretwin.digital_model.geometry import JointCorrection, SensorFrame
 from failuretwin.digital_model.physics_model import TOOL, arm_spec
-from failuretwin.digital_model.robot import load_robot
+from failuretwin.digital_model.robot import _assembled, load_robot
+from failuretwin.digital_model.twin import DigitalTwin
 
 ARM = """<robot name="arm"><link name="base"/>
 <joint name="turn" type="revolute"><parent link="base"/><child link="upper"/>
@@ -18,6 +22,8 @@ ARM = """<robot name="arm"><link name="base"/>
 <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
 </robot>"""
 """A link of 0.3 m that turns about z, and one that lifts: up is positive."""
+
+SLIDE = '"lift" type="prismatic"'
 
 PROFILE = """name = "arm"
 urdf = "arm.urdf"
@@ -96,3 +102,40 @@ def test_the_physics_engine_has_the_same_tool_point(robot):
 def test_a_joint_that_is_not_there_is_refused(robot):
     with pytest.raises(InputError, match="unknown joint 'lifd'"):
         robot("", '[geometry]\n[[geometry.joints]]\njoint = "lifd"')
+
+
+MOUNT = SensorFrame((0.1, -0.2, 0.3, 0.4, 0.5, 0.6), 1.05)
+
+
+@pytest.mark.parametrize(("name", "frame"), [("armpi_fpv", None), ("so101", MOUNT)])
+def test_geometry_columns_equal_differences_of_corrected_robots(name, frame):
+    check_geometry_columns(load_robot(name).seen_from(frame))
+
+
+def test_geometry_columns_of_an_arm_with_a_slide(robot, monkeypatch):
+    monkeypatch.setitem(globals(), "ARM", ARM.replace('"lift" type="revolute"', SLIDE))
+    arm = robot(TURNED)
+    assert arm.slides.tolist() == [False, True]
+    check_geometry_columns(arm)
+
+
+def check_geometry_columns(robot):
+    angles = np.random.default_rng(0).uniform(-0.5, 0.5, (2, 3, len(robot.motors)))
+    columns = DigitalTwin(robot).geometry_columns(angles)
+    for k, motor in enumerate(robot.motors):
+        for place in range(6):
+            ahead, behind = (
+                DigitalTwin(corrected(robot, motor.joint, place, step)).path(angles)
+                for step in (1e-5, -1e-5)
+            )
+            expected = (ahead - behind) / 2e-5
+            np.testing.assert_allclose(columns[..., 6 * k + place], expected, atol=1e-9)
+
+
+def corrected(robot, joint, place, step):
+    values = np.zeros(6)
+    values[place] = step
+    correction = JointCorrection(joint, xyz=tuple(values[:3]), rpy=tuple(values[3:]))
+    geometry = replace(robot.profile.geometry, joints=(correction,))
+    made = _assembled(replace(robot.profile, geometry=geometry), robot.source)
+    return made.seen_from(robot.frame)

@@ -18,6 +18,7 @@ import numpy as np
 
 from failuretwin.core.config import AtLeastZero, Bounded, Bounds
 from failuretwin.core.types import FloatArray
+from failuretwin.digital_model.frames import ChainFrames
 from failuretwin.digital_model.kinematics import SerialChain, rotation_to_z
 from failuretwin.digital_model.urdf import Triple, Urdf, UrdfJoint, transform
 
@@ -132,6 +133,38 @@ def seen_chain(chain: SerialChain, base_xyz_rpy: Pose, scale: float = 1.0) -> Se
     x, y, z, roll, pitch, yaw = base_xyz_rpy
     first = replace(first, T_pj=transform((x, y, z), (roll, pitch, yaw)) @ first.T_pj)
     return SerialChain((first, *others), _scaled(chain.T_jt, scale))
+
+
+def geometry_columns(chain: SerialChain, q: FloatArray, scale: float = 1.0) -> FloatArray:
+    """Return the derivative of the tool position by small corrections of every joint's frame.
+
+        dp/dxyz_j = scale R_j,    dp/drpy_j[k] = R_j[:, k] x (p - p_j)
+
+    R_j and p_j are the rotation and origin of joint j's URDF frame before the joint moves, p is
+    the tool position. To first order `JointCorrection(xyz=..., rpy=...)` has this effect.
+
+    Args:
+        chain: The chain as the sensor sees it; see `seen_chain`.
+        q: Joint values in chain order, (..., joint) [rad or m].
+        scale: Length that the sensor reports for a metre.
+
+    Returns:
+        (..., 3, 6 * joint): x, y, z [m/m] and roll, pitch, yaw [m/rad] of the first joint, then of
+        the next.
+    """
+    frames = ChainFrames(chain).frames(q)
+    before = np.stack([joint.T_pj for joint in chain.joints])
+    before = np.concatenate(
+        [np.broadcast_to(before[0], (*q.shape[:-1], 1, 4, 4)), frames[..., :-1, :, :] @ before[1:]],
+        axis=-3,
+    )
+    to_urdf = np.stack([rotation_to_z(joint.axis).T for joint in chain.joints])
+    R = before[..., :3, :3] @ to_urdf
+    tool = (frames[..., -1, :, :] @ chain.T_jt)[..., None, :3, 3]
+    arm = (tool - before[..., :3, 3])[..., None, :]  # (..., joint, 1, 3)
+    turned = np.swapaxes(np.cross(np.swapaxes(R, -1, -2), arm), -1, -2)
+    columns = np.concatenate([scale * R, turned], axis=-1)  # (..., joint, 3, 6)
+    return np.moveaxis(columns, -3, -2).reshape(*q.shape[:-1], 3, 6 * q.shape[-1])
 
 
 def _scaled(T: FloatArray, scale: float) -> FloatArray:

@@ -97,6 +97,7 @@ class Joint:
         name: Name in the URDF.
         prismatic: True if it slides [m], False if it turns [rad].
         T_pj: Pose of the joint frame (at zero) in the frame of the joint before it, (4, 4).
+        axis: Axis of the joint in the frame that the URDF gives it; z of the joint frame here.
         low: Lower limit [rad or m]; -inf when unlimited.
         high: Upper limit [rad or m]; inf when unlimited.
     """
@@ -106,6 +107,7 @@ class Joint:
     T_pj: FloatArray
     low: float = -np.inf
     high: float = np.inf
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)

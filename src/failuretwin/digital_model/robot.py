@@ -180,9 +180,16 @@ class Robot:
         geometry = self.profile.geometry
         chain = seen_chain(self.loads.chain, self.profile.base_xyz_rpy, geometry.sensor_scale)
         if frame is not None:
-            scale = 1.0 if self.slides.any() else frame.scale
-            chain = seen_chain(chain, frame.xyz_rpy, scale)
+            chain = seen_chain(chain, frame.xyz_rpy, self._scale_in(frame))
         return replace(self, chain=chain, frame=frame)
+
+    @property
+    def sensor_scale(self) -> float:
+        """Length that the sensor reports for a metre of the arm [-]."""
+        return self.profile.geometry.sensor_scale * self._scale_in(self.frame)
+
+    def _scale_in(self, frame: SensorFrame | None) -> float:
+        return 1.0 if frame is None or self.slides.any() else frame.scale
 
     @property
     def folder(self) -> Path:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model import servo
+from failuretwin.digital_model.geometry import geometry_columns
 from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.settling import hold, sag
 
@@ -64,6 +65,19 @@ class DigitalTwin:
         """Return `path` and its derivative by the angles, (..., axis, motor) [m/rad]."""
         point, jacobian = self.robot.chain.position_and_jacobian(self._sensor_pose(position))
         return point, jacobian if self._turned is None else jacobian * self._turned
+
+    def geometry_columns(self, position: ArrayLike) -> FloatArray:
+        """Return the derivative of `path` by small corrections of every joint's frame.
+
+        Args:
+            position: Motor angles in the log's sense, (..., motor) [rad].
+
+        Returns:
+            (..., axis, 6 * motor): x, y, z [m/m] and roll, pitch, yaw [m/rad] of the first motor's
+            joint, then of the next; see `failuretwin.digital_model.geometry.geometry_columns`.
+        """
+        robot = self.robot
+        return geometry_columns(robot.chain, self._sensor_pose(position), robot.sensor_scale)
 
     def _sensor_pose(self, position: ArrayLike) -> FloatArray:
         position = np.asarray(position, dtype=np.float64)

@@ -214,7 +214,7 @@ class Urdf:
                 turn = np.eye(4)
                 turn[:3, :3] = rotation_to_z(joint.axis)
                 slides, T_pj = joint.type == "prismatic", _snap(T @ turn)
-                joints.append(Joint(joint.name, slides, T_pj, joint.low, joint.high))
+                joints.append(Joint(joint.name, slides, T_pj, joint.low, joint.high, joint.axis))
                 T = turn.T
         return SerialChain(tuple(joints), _snap(T))
 
