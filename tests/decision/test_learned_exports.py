@@ -74,6 +74,7 @@ def test_a_stored_network_answers_the_same(armpi, trained, runs, network, tmp_pa
 
 @ALL
 def test_onnx_runtime_agrees(trained, runs, network, tmp_path):
+    pytest.importorskip("onnxscript")
     path = tmp_path / "network.onnx"
     export_onnx(trained[network], path)
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])

@@ -1,9 +1,6 @@
-"""A trained network in a file: our own, an ONNX graph, or Python that needs numpy alone.
+"""Trained networks in files: our own format, ONNX, and Python that needs numpy alone.
 
-Our own is an npz archive of plain arrays, read without pickle, so that loading a file of a stranger
-runs nothing; the configuration is JSON in an array of bytes. Both exports are made of one recording
-of what the network does, operator by operator, in the terms of ONNX: nothing but `onnx` is needed
-to write the graph, and the Python file has the same operators in numpy.
+Our own format is an npz archive of plain arrays and a JSON configuration, read without pickle.
 """
 
 from __future__ import annotations
@@ -12,8 +9,8 @@ import base64
 import json
 import platform
 import textwrap
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+import warnings
+from dataclasses import asdict
 from importlib.resources import files
 from io import BytesIO
 from pathlib import Path
@@ -22,8 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import fx, nn
-from torch.fx.passes.shape_prop import ShapeProp
+from torch import Tensor, nn
 
 from failuretwin import __version__
 from failuretwin.core.config import fingerprint, from_table
@@ -42,7 +38,7 @@ from failuretwin.decision.learned.feature_encoder import (
     expectation_of,
 )
 from failuretwin.decision.learned.log_pool import PoolWeights
-from failuretwin.decision.learned.networks import Standard, build_network
+from failuretwin.decision.learned.networks import STRIDES, Standard, build_network
 from failuretwin.digital_model.kinematics import GRAVITY
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from failuretwin.digital_model.robot import Robot, load_robot
@@ -50,19 +46,19 @@ from failuretwin.digital_model.robot import Robot, load_robot
 FORMAT = 1
 SUFFIX = ".npz"
 _WEIGHT = "weight/"
-_NOT_STORED = ("encoder", "network")
-"""Arguments of the estimator that have a place of their own in the file."""
+_NOT_ARGUMENTS = ("encoder", "network")
+"""Arguments of the estimator with their own place in the file."""
 Arrays = dict[str, NDArray[Any]]
 
 
 def check_network_file(path: Path) -> None:
-    """Raise InputError unless a network can be written under this name."""
+    """Raise InputError unless the name ends in .npz."""
     if path.suffix != SUFFIX:
         raise InputError(f"{path}: a network file ends in {SUFFIX}.")
 
 
 def save_network(diagnoser: LearnedDiagnoser, path: str | Path) -> None:
-    """Write a trained network; a file of that name is replaced at the end, all at once.
+    """Write a trained network; an existing file is replaced atomically.
 
     Raises:
         InputError: If the suffix is not .npz.
@@ -97,7 +93,7 @@ def _configuration(diagnoser: LearnedDiagnoser) -> dict[str, Any]:
             "arm_sha256": arm_fingerprint(encoder.robot),
             "expected": encoder.expected and asdict(encoder.expected),
         },
-        "arguments": {key: v for key, v in arguments.items() if key not in _NOT_STORED},
+        "arguments": {key: v for key, v in arguments.items() if key not in _NOT_ARGUMENTS},
         "features_in": int(diagnoser.n_features_in_),
         "movements": diagnoser.movements_,
         "weights": diagnoser.weights_ and asdict(diagnoser.weights_),
@@ -113,15 +109,15 @@ def _configuration(diagnoser: LearnedDiagnoser) -> dict[str, Any]:
 
 
 def arm_fingerprint(robot: Robot) -> str:
-    """Return a hash of all of a robot that features depend on."""
+    """Return a hash of the parts of a robot that features depend on."""
     return fingerprint([robot.chain, robot.loads, robot.sense, robot.sensor_sense])
 
 
 def load_network(path: str | Path, robot: Robot | None = None) -> LearnedDiagnoser:
-    """Read a trained network for its robot; None: the bundled one of the name in the file.
+    """Read a trained network; a robot of None is the bundled one named in the file.
 
     Raises:
-        InputError: If the file cannot be read, is no network, or is one for another robot.
+        InputError: If the file is not a network, or a network for another robot.
     """
     path = Path(path)
     with reading(path, "a network", "Expected a file that `failuretwin train` wrote."):
@@ -143,7 +139,7 @@ def _restored(
     encoder = _restored_encoder(configuration["encoder"], robot, path)
     _check_numbers(arrays, float(configuration["temperature"]))
     arguments = configuration["arguments"]
-    known = set(LearnedDiagnoser().get_params(deep=False)) - set(_NOT_STORED)
+    known = set(LearnedDiagnoser().get_params(deep=False)) - set(_NOT_ARGUMENTS)
     if set(arguments) != known:
         raise KeyError(f"arguments {sorted(set(arguments) ^ known)}")
     diagnoser = LearnedDiagnoser(configuration["network"], encoder, **arguments)
@@ -163,7 +159,7 @@ def _restored(
 
 
 def _check_numbers(arrays: Arrays, temperature: float) -> None:
-    """Raise ValueError unless the numbers of a network can be reckoned with."""
+    """Raise ValueError unless all numbers of a network are valid."""
     numbers = [value for value in arrays.values() if np.issubdtype(value.dtype, np.floating)]
     if not all(np.isfinite(value).all() for value in numbers):
         raise ValueError("a weight is not finite")
@@ -189,190 +185,97 @@ def _restored_encoder(
     return FeatureEncoder(table["features"], robot, expected)
 
 
-# What a network does, recorded operator by operator.
+# Exports.
 
 OPSET = 18
-"""Operator set of the graph; any runtime since 2023 knows it."""
-IR_VERSION = 9
-INPUT, OUTPUT = "features", "probabilities"
-Attributes = Mapping[str, Any]
-_RESHAPES = ("unflatten", "flatten", "unsqueeze")
-_REDUCTIONS = {"mean": "ReduceMean", "amax": "ReduceMax"}
-_PLAIN = {"relu": "Relu", "add": "Add", "cat": "Concat"}
+"""ONNX operator set; known to every runtime since 2023."""
 
 
-_Operator = tuple[str, Sequence[str], Sequence[str], Attributes]
-"""An operator of ONNX: its kind, names of what it takes and makes, and attributes."""
+class _Classifier(nn.Module):
+    """A trained network from features (run, point, channel) to probabilities (run, class)."""
 
+    def __init__(self, diagnoser: LearnedDiagnoser) -> None:
+        super().__init__()
+        self.network, self.temperature = diagnoser.network_, diagnoser.temperature_
+        self.mean, self.spread = (torch.from_numpy(a) for a in vars(diagnoser.standard_).values())
 
-@dataclass
-class _Recording:
-    """Operators in their order, and the constants that they take."""
-
-    weights: Arrays
-    operators: list[_Operator] = field(default_factory=list)
-    constants: Arrays = field(default_factory=dict)
-
-    def add(
-        self, kind: str, *inputs: str, how: Attributes | None = None, outputs: int = 1
-    ) -> list[str]:
-        """Add an operator; return the names of its outputs."""
-        names = [f"{kind}_{len(self.operators)}_{i}" for i in range(outputs)]
-        self.operators.append((kind, inputs, names, how or {}))
-        return names
-
-    def constant(self, values: Any) -> str:
-        """Add a constant; return its name."""
-        name = f"constant_{len(self.constants)}"
-        self.constants[name] = np.asarray(values)
-        return name
-
-    def layer(self, module: nn.Module, name: str, x: str) -> list[str]:
-        """Add a layer."""
-        if isinstance(module, nn.Dropout):
-            return [x]
-        if isinstance(module, nn.LSTM):
-            return self._lstm(name, x)
-        own = [f"{name}.{kind}" for kind, _ in module.named_parameters()]
-        self.constants |= {weight: self.weights[weight] for weight in own}
-        if isinstance(module, nn.Linear):
-            return self.add("Gemm", x, *own, how={"transB": 1})
-        assert isinstance(module, nn.Conv1d)
-        side = int(module.padding[0])
-        return self.add("Conv", x, *own, how={"pads": [side] * 2, "strides": list(module.stride)})
-
-    def _lstm(self, name: str, x: str) -> list[str]:
-        """Add an LSTM layer; in ONNX its steps come first, (point, run, channel)."""
-        kinds = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
-        into, back, *biases = (_gates(self.weights[f"{name}.{kind}_l0"]) for kind in kinds)
-        weights = [self.constant(a[None]) for a in (into, back, np.concatenate(biases))]
-        (x,) = self.add("Transpose", x, how={"perm": [1, 0, 2]})
-        (x,) = self.add("LSTM", x, *weights, how={"hidden_size": back.shape[1]})
-        (x,) = self.add("Squeeze", x, self.constant([1]))
-        return self.add("Transpose", x, how={"perm": [1, 0, 2]})
-
-    def function(self, node: fx.Node, *inputs: str) -> list[str]:
-        """Add what torch does beside layers."""
-        name = node.target if isinstance(node.target, str) else node.target.__name__
-        dim: Any = node.kwargs.get("dim")
-        rest: Any = node.args[1:]
-        axis = {} if dim is None else {"axis": dim}
-        if name in _RESHAPES:
-            shape = node.meta["tensor_meta"].shape
-            return self.add("Reshape", *inputs, self.constant([-1, *shape[1:]]))
-        if name == "split":
-            return self.add("Split", *inputs, self.constant(*rest), how=axis, outputs=len(*rest))
-        if name == "select":
-            return self.add("Gather", *inputs, self.constant(node.kwargs["index"]), how=axis)
-        if name == "repeat":
-            return self.add("Tile", *inputs, self.constant(rest))
-        if name == "permute":
-            return self.add("Transpose", *inputs, how={"perm": list(rest)})
-        if name in _REDUCTIONS:
-            return self.add(_REDUCTIONS[name], *inputs, self.constant([dim]), how={"keepdims": 0})
-        return self.add(_PLAIN[name], *inputs, how=axis)
-
-
-def _gates(weight: NDArray[Any]) -> NDArray[Any]:
-    """Return gates in the order of ONNX (input, output, forget, cell) from PyTorch's."""
-    i, f, g, o = np.split(weight, 4)
-    return np.concatenate([i, o, f, g])
-
-
-def _record(diagnoser: LearnedDiagnoser) -> _Recording:
-    """Return what a diagnoser does from features to probabilities."""
-    standard, network = diagnoser.standard_, diagnoser.network_.eval()
-    traced = fx.symbolic_trace(network)
-    ShapeProp(traced).propagate(torch.zeros(1, POINTS, len(standard.mean)))
-    made = _Recording(_weights(diagnoser))
-    (x,) = made.add("Sub", INPUT, made.constant(standard.mean))
-    x, *_ = made.add("Div", x, made.constant(standard.spread))
-    names: dict[fx.Node, list[str]] = {}
-    for node in traced.graph.nodes:
-        inputs = [names[before][0] for before in node.all_input_nodes]
-        if node.op == "placeholder":
-            names[node] = [x]
-        elif node.op == "call_module":
-            names[node] = made.layer(traced.get_submodule(node.target), node.target, *inputs)
-        elif node.name.startswith("getitem"):
-            names[node] = [names[node.args[0]][node.args[1]]]
-        elif node.op != "output":
-            names[node] = made.function(node, *inputs)
-        else:
-            (x,) = inputs
-    (x,) = made.add("Div", x, made.constant(np.float32(diagnoser.temperature_)))
-    made.operators.append(("Softmax", [x], [OUTPUT], {"axis": 1}))
-    return made
+    def forward(self, features: Tensor) -> Tensor:
+        """Return probabilities (run, class)."""
+        scores = self.network((features - self.mean) / self.spread)
+        return torch.softmax(scores / self.temperature, dim=1)
 
 
 def export_onnx(diagnoser: LearnedDiagnoser, path: Path) -> None:
     """Write a trained network as an ONNX file.
 
-    Its input `features` is (run, 100, channel) as the encoder makes them, its output
-    `probabilities` (run, class); the metadata hold the names of the classes.
+    Its input is `features` (run, 100, channel), its output `probabilities` (run, class); the
+    metadata entry `classes` lists the classes.
 
     Raises:
-        InputError: If onnx is missing.
-        OutputError: If it cannot be written.
+        InputError: If onnxscript is missing.
+        OutputError: If the file cannot be written.
     """
-    with needs_extra("ONNX files need onnx", "learn"):
-        import onnx
-        from onnx import TensorProto, helper, numpy_helper
-    made = _record(diagnoser)
-    channels, classes = len(diagnoser.standard_.mean), len(diagnoser.classes_)
-    model = helper.make_model(
-        helper.make_graph(
-            [helper.make_node(kind, x, y, **how) for kind, x, y, how in made.operators],
-            "diagnosis",
-            [helper.make_tensor_value_info(INPUT, TensorProto.FLOAT, ["run", POINTS, channels])],
-            [helper.make_tensor_value_info(OUTPUT, TensorProto.FLOAT, ["run", classes])],
-            [numpy_helper.from_array(array, name) for name, array in made.constants.items()],
-        ),
-        opset_imports=[helper.make_opsetid("", OPSET)],
-        ir_version=IR_VERSION,
-        producer_name="failuretwin",
-    )
-    helper.set_model_props(model, {"classes": ",".join(map(str, diagnoser.classes_))})
-    onnx.checker.check_model(model, full_check=True)
+    with needs_extra("ONNX files need onnxscript", "learn"):
+        import onnxscript  # noqa: F401
+    features = torch.zeros(2, POINTS, len(diagnoser.standard_.mean))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # from inside the exporter
+        program = torch.onnx.export(
+            _Classifier(diagnoser).eval(),
+            (features,),
+            input_names=["features"],
+            output_names=["probabilities"],
+            opset_version=OPSET,
+            dynamo=True,
+            dynamic_shapes=({0: torch.export.Dim("run")},),
+            verbose=False,
+        )
+    assert program is not None
+    program.model.metadata_props["classes"] = ",".join(map(str, diagnoser.classes_))
     with replacing(path) as partial:
-        partial.write_bytes(model.SerializeToString())
+        partial.write_bytes(program.model_proto.SerializeToString())
 
 
 def export_numpy(diagnoser: LearnedDiagnoser, path: Path) -> None:
-    """Write a trained network as one Python file that needs numpy alone, for the robot's computer.
+    """Write a trained network as one Python file that needs numpy alone.
 
     Raises:
         InputError: If the name is not that of a Python module, or the network has no encoder.
-        OutputError: If it cannot be written.
+        OutputError: If the file cannot be written.
     """
     if path.suffix != ".py" or not path.stem.isidentifier():
         raise InputError(f"{path}: cannot be imported. Expected a name such as diagnoser.py.")
     if diagnoser.encoder is None:
-        raise InputError("this network has no encoder, so it could not read runs by itself.")
-    made = _record(diagnoser)
+        raise InputError("this network has no encoder, so it cannot read runs.")
+    shape = network_shape(diagnoser.encoder, len(diagnoser.standard_.mean), 0)
     settings = {
         "classes": [str(name) for name in diagnoser.classes_],
         "features": diagnoser.encoder.features,
+        "network": diagnoser.network,
         "points": POINTS,
-        "operators": made.operators,
+        "strides": STRIDES,
+        "motors": shape.motors,
+        "shared": shape.shared,
+        "temperature": float(diagnoser.temperature_),
     }
     buffer = BytesIO()
-    arrays = {**_feature_constants(diagnoser.encoder), **made.constants}
+    arrays = _feature_constants(diagnoser.encoder) | vars(diagnoser.standard_) | _weights(diagnoser)
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
     packed = textwrap.fill(base64.b64encode(buffer.getvalue()).decode("ascii"), 96)
-    template = (files("failuretwin.decision.learned") / "standalone.py.txt").read_text("utf-8")
-    text = (
-        template.replace("@MODULE@", path.stem)
-        .replace("@VERSION@", __version__)
-        .replace("@SETTINGS@", json.dumps(settings))
-        .replace("@WEIGHTS@", packed)
-    )
+    text = (files("failuretwin.decision.learned") / "standalone.py.txt").read_text("utf-8")
+    for mark, value in {
+        "@MODULE@": path.stem,
+        "@VERSION@": __version__,
+        "@SETTINGS@": json.dumps(settings),
+        "@WEIGHTS@": packed,
+    }.items():
+        text = text.replace(mark, value)
     with replacing(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
 
 def _feature_constants(encoder: FeatureEncoder) -> Arrays:
-    """Return all that the features of a run depend on beside the run."""
+    """Return the constants of the robot and its healthy behavior that features depend on."""
     robot = encoder.robot
     expected = encoder.expected or expectation_of(robot, NO_IMPERFECTIONS)
     settling = expected.settling
