@@ -30,7 +30,7 @@ CONTRACT = {
     "protocol",
     "method",
 }
-BEYOND_IT = {"explanation", "evidence"}
+BEYOND_IT = {"state", "explanation", "evidence"}
 """What a result may say on top of the contract."""
 ANSI = "\x1b"
 MANY = ("stuck", "drift", "encoder_bias", "encoder_scale", "torque_loss")

@@ -91,7 +91,7 @@ def test_size_and_onset_stay_where_both_agree():
     (diagnosis,) = other.diagnose(None)
     assert (diagnosis.diagnosis, diagnosis.magnitude) == ("motor_2:stuck", None)
     assert sum(diagnosis.posterior.values()) == pytest.approx(1.0)
-    assert diagnosis.verdict.startswith("motor 2 stuck, 90 % sure")
+    assert diagnosis.verdict.startswith("cannot tell yet; most probable: motor 2 stuck, 90 %")
 
 
 def test_no_verdict_of_the_model_is_none_of_both():

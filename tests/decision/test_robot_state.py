@@ -9,8 +9,16 @@ import pytest
 
 from failuretwin import load_robot
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import Diagnosis, Hypothesis, MovementEvidence
-from failuretwin.decision.robot_state import FAULTY, OPEN, WELL, robot_state, state_of
+from failuretwin.core.hypothesis import (
+    FAULTY_STATE,
+    HEALTHY_STATE,
+    OPEN_STATE,
+    Diagnosis,
+    Hypothesis,
+    MovementEvidence,
+    state_of,
+)
+from failuretwin.decision.robot_state import robot_state
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.failure_behavior.repair import ADVICE, advice_for
 from failuretwin.inference.advice import (
@@ -37,16 +45,21 @@ def test_runs_that_agree_are_never_surer_together_than_the_surest():
     chances = (0.97, 0.99, 0.96)
     runs = [run(f"{i}", motor_2__stuck=p) for i, p in enumerate(chances)]
     found = robot_state(runs, ROBOT)
-    assert (found.state.kind, found.state.motors) == (FAULTY, ("motor_2",))
+    assert (found.state.kind, found.state.motors) == (FAULTY_STATE, ("motor_2",))
     assert found.state.probability == pytest.approx(np.mean(chances))
     assert found.step == MODES["stuck"].advice
     assert [row.faulty for row in found.motors] == [0, 3, 0, 0]
-    assert [row.kind for row in found.motors] == [WELL, FAULTY, WELL, WELL]
+    assert [row.kind for row in found.motors] == [
+        HEALTHY_STATE,
+        FAULTY_STATE,
+        HEALTHY_STATE,
+        HEALTHY_STATE,
+    ]
 
 
 def test_runs_that_are_unsure_stay_so_however_many_they_are():
     found = robot_state([run(f"{i}", motor_2__stuck=0.87) for i in range(50)], ROBOT)
-    assert found.state.kind == OPEN
+    assert found.state.kind == OPEN_STATE
     assert found.sureness == "likely, but not sure (87 %)"
     assert found.step.startswith("Record again, with motor 2 moving")
     assert "Replace" not in found.step
@@ -64,17 +77,17 @@ def test_runs_that_were_weighed_together_are_not_told_to_be():
 def test_a_zero_that_may_be_a_fault_of_every_run_is_no_healthy_robot():
     odd = "bias of motor_2: +4.1 deviations off: a zero that is off, or a fault that every run has"
     found = robot_state([run("a"), run("b")], ROBOT, learned=("most was learned from a", odd))
-    assert found.state.kind == OPEN
+    assert found.state.kind == OPEN_STATE
     assert found.headline == "Cannot tell yet; healthy, but for a zero that may be a fault"
     assert "+4.1 deviations off" in found.remark
     assert found.step.startswith("Look at the zero mark")
-    assert robot_state([run("a")], ROBOT, learned=("most was learned",)).state.kind == WELL
+    assert robot_state([run("a")], ROBOT, learned=("most was learned",)).state.kind == HEALTHY_STATE
 
 
 def test_a_fault_that_began_is_told_by_the_runs_since_then():
     runs = [run("a"), run("b"), run("c", motor_1__stuck=0.98), run("d", motor_1__stuck=0.99)]
     found = robot_state(runs, ROBOT)
-    assert found.state.kind == FAULTY
+    assert found.state.kind == FAULTY_STATE
     assert found.state.probability == pytest.approx(0.985)
     assert "since run 3 of 4 (c)" in found.line
 
@@ -87,7 +100,7 @@ def test_one_run_of_several_alone_is_recorded_again():
 def test_runs_that_contradict_each_other_are_counted():
     runs = [run("a", motor_1__stuck=0.99), run("b"), run("c", motor_2__stuck=0.99), run("d")]
     found = robot_state(runs, ROBOT)
-    assert found.state.kind == OPEN
+    assert found.state.kind == OPEN_STATE
     assert found.state.probability is None
     for told in ("healthy in 2 runs", "motor 1 faulty in 1 run", "motor 2 faulty in 1 run"):
         assert told in found.line
@@ -98,7 +111,7 @@ def test_runs_without_a_verdict_say_nothing():
     blind = run("a", undecided="the log holds no readings")
     assert "no readings" in robot_state([blind], ROBOT).headline
     assert "Log again" in robot_state([blind], ROBOT).step
-    assert {row.kind for row in robot_state([blind], ROBOT).motors} == {OPEN}
+    assert {row.kind for row in robot_state([blind], ROBOT).motors} == {OPEN_STATE}
     found = robot_state([blind, run("b", motor_2__stuck=0.99)], ROBOT)
     assert found.state.probability == pytest.approx(0.99)
     with pytest.raises(InputError, match="one run at least"):
@@ -111,13 +124,13 @@ def test_runs_that_were_weighed_together_have_the_state_of_their_course():
     found = robot_state(runs, ROBOT, course)
     at = [str(h) for h in course.hypotheses].index("motor_2:stuck")
     assert found.state.probability == pytest.approx(course.posterior[-1, at])
-    assert found.state.kind == FAULTY
+    assert found.state.kind == FAULTY_STATE
     assert found.remark == "; ".join(course.verdict)
 
 
 def test_a_motor_is_sure_before_its_fault_is():
     posterior = {"healthy": 0.01, "motor_2:stuck": 0.6, "motor_2:drift": 0.39}
-    assert state_of(posterior, ROBOT.motor_names).kind == FAULTY
+    assert state_of(posterior) == FAULTY_STATE
     (step,) = next_steps(posterior)
     assert step.startswith("Which fault of motor 2 it is stays open: record again")
     assert "Replace" not in step
@@ -125,9 +138,9 @@ def test_a_motor_is_sure_before_its_fault_is():
 
 def test_unknown_faults_leave_no_motor_healthy():
     found = robot_state([Diagnosis("a", {"healthy": 0.02, "unknown": 0.98})], ROBOT)
-    assert found.state.kind == OPEN
+    assert found.state.kind == OPEN_STATE
     assert found.step == UNKNOWN_ADVICE
-    assert {row.kind for row in found.motors} == {OPEN}
+    assert {row.kind for row in found.motors} == {OPEN_STATE}
 
 
 # One movement alone: without it another would be the most probable.

@@ -10,8 +10,9 @@ import pytest
 
 from failuretwin import BayesDiagnoser, SetupPrior, load_robot
 from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import HEALTHY_STATE
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.decision.robot_state import WELL, robot_state
+from failuretwin.decision.robot_state import robot_state
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from failuretwin.failure_behavior.random_movements import RandomMovements
@@ -241,7 +242,7 @@ def test_a_zero_far_off_what_such_robots_do_is_told_of_one_run(twin, armpi, know
         assert re.match(r"motor 3 rests \+1[345] counts off", line)  # 0.06 rad is 14.3 counts
         assert line.endswith(FAULT_OF_EVERY_RUN)
     state = robot_state([found], armpi)
-    assert (state.state.kind == WELL) == (off_rad == 0.0)
+    assert (state.state.kind == HEALTHY_STATE) == (off_rad == 0.0)
     assert ("zero mark" in state.step) == (off_rad > 0.0)
 
 

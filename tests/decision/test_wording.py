@@ -152,7 +152,8 @@ def test_nothing_is_certain(chance, text):
 def test_what_else_it_may_be_is_told():
     others = [(single("stuck"), 0.3), (PAIR, 0.08), (UNKNOWN, 0.02)]
     assert told(HEALTHY, 0.6, others) == (
-        "healthy, 60 % sure (or motor 3 stuck 30 %, motor 1 stuck and motor 3 drifts 8 %)"
+        "cannot tell yet; most probable: healthy, 60 % "
+        "(or motor 3 stuck 30 %, motor 1 stuck and motor 3 drifts 8 %)"
     )
 
 

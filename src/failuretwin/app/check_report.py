@@ -39,7 +39,6 @@ def check_lines(result: CheckResult, robot: Robot, seconds: float) -> list[str |
     head = f"{result.light.upper()}: {diagnosis.verdict}"
     if result.light == OPEN and not diagnosis.undecided:
         names = [name for name, p in result.by_motor.items() if p >= LIKELY]
-        head = f"OPEN: cannot tell, because {diagnosis.verdict}"
         head += f". Ask {' and '.join(names)} further: --further 6" if names else ""
     made = counted(result.movements, "movement") + " seen at rest"
     made += f", {seconds:.0f} s planned" if seconds else ""

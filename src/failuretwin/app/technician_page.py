@@ -16,11 +16,11 @@ from failuretwin import __version__
 from failuretwin.app.arm_sketch import Mark, arm_sketch
 from failuretwin.app.plots import plain, plot_runs, render_page
 from failuretwin.app.tables import Table
-from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.hypothesis import FAULTY_STATE, HEALTHY_STATE, OPEN_STATE, Diagnosis
 from failuretwin.data_knowledge.store import filling
 from failuretwin.decision.evaluation import Judged, as_unknown_line, score_line
 from failuretwin.decision.proportions import judged_truth
-from failuretwin.decision.robot_state import FAULTY, OPEN, WELL, RobotState, state_of_run
+from failuretwin.decision.robot_state import RobotState, state_of_run
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -33,7 +33,11 @@ MOST_PICTURE_BYTES = 3_000_000
 """Size of all pictures together in the page [byte]."""
 MOST_ROWS = 2000
 """Runs that get a row."""
-SHOWN = {WELL: ("#2e7d4f", "✓"), FAULTY: ("#c8402f", "!"), OPEN: ("#8a6500", "?")}
+SHOWN = {
+    HEALTHY_STATE: ("#2e7d4f", "✓"),
+    FAULTY_STATE: ("#c8402f", "!"),
+    OPEN_STATE: ("#8a6500", "?"),
+}
 """Colour and sign of each state; shapes are in the template."""
 
 
@@ -92,7 +96,7 @@ def chosen_runs(diagnoses: Sequence[Diagnosis], robot: Robot, most: int) -> list
     groups: dict[tuple[bool, str, tuple[str, ...]], list[int]] = {}
     for i, diagnosis in enumerate(diagnoses):
         state = state_of_run(diagnosis, robot.motor_names)
-        motors = state.motors if state.kind == FAULTY else ()
+        motors = state.motors if state.kind == FAULTY_STATE else ()
         groups.setdefault((_truth_cell(diagnosis)[1], state.kind, motors), []).append(i)
     groups = {key: groups[key] for key in sorted(groups, key=lambda key: key[0])}
     for members in groups.values():
@@ -169,7 +173,7 @@ def write_page(
 
 def _marks(state: RobotState) -> dict[str, Mark]:
     """Return how the sketch marks the motors that the state names."""
-    if state.state.kind == WELL:
+    if state.state.kind == HEALTHY_STATE:
         return {}
     joints = {row.motor: row.joint for row in state.motors}
     return {motor: Mark(*SHOWN[state.state.kind], joints[motor]) for motor in state.state.motors}

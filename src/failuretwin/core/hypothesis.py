@@ -149,6 +149,34 @@ def _as_hypothesis(given: Hypothesis | str) -> Hypothesis:
     return given if isinstance(given, Hypothesis) else Hypothesis.parse(str(given).strip())
 
 
+# The state that a posterior tells.
+
+HEALTHY_STATE, FAULTY_STATE, OPEN_STATE = "healthy", "faulty", "cannot tell"
+SURE = 0.95
+"""Probability from which a robot is called healthy, or a motor faulty."""
+
+
+def motor_probabilities(posterior: Mapping[str, float]) -> dict[str, float]:
+    """Return the probability of a fault of each motor, the sum over the hypotheses with one."""
+    found: dict[str, float] = {}
+    for name, probability in posterior.items():
+        for fault in Hypothesis.parse(name).faults:
+            found[fault.motor] = found.get(fault.motor, 0.0) + probability
+    return found
+
+
+def state_of(posterior: Mapping[str, float]) -> str:
+    """Return `HEALTHY_STATE`, `FAULTY_STATE` or `OPEN_STATE`.
+
+    A motor is faulty from P(motor) = 0.95 on, even if its fault mode is still uncertain.
+    """
+    if posterior.get(str(HEALTHY), 0.0) >= SURE:
+        return HEALTHY_STATE
+    if any(p >= SURE for p in motor_probabilities(posterior).values()):
+        return FAULTY_STATE
+    return OPEN_STATE
+
+
 # The answer for one run: what, how sure, since when, how large.
 
 Interval = tuple[float, float]
@@ -221,6 +249,11 @@ class Diagnosis:
         return None if self.undecided else self.posterior[self.ranked[0]]
 
     @property
+    def state(self) -> str:
+        """``healthy``, ``faulty`` or ``cannot tell``; see `state_of`."""
+        return OPEN_STATE if self.undecided else state_of(self.posterior)
+
+    @property
     def runner_up(self) -> str | None:
         """The second most probable hypothesis; None where there is none."""
         return None if self.undecided or len(self.posterior) < 2 else self.ranked[1]
@@ -245,6 +278,7 @@ class Diagnosis:
         return {
             "run": self.run,
             "truth": self.truth,
+            "state": self.state,
             "diagnosis": self.diagnosis,
             "probability": self.probability,
             "posterior": dict(self.posterior),

@@ -18,13 +18,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from failuretwin.core.errors import InputError, counted
-from failuretwin.core.hypothesis import HEALTHY, UNKNOWN, Diagnosis, Hypothesis
+from failuretwin.core.hypothesis import (
+    FAULTY_STATE,
+    HEALTHY,
+    HEALTHY_STATE,
+    OPEN_STATE,
+    SURE,
+    UNKNOWN,
+    Diagnosis,
+    Hypothesis,
+    motor_probabilities,
+    state_of,
+)
 from failuretwin.digital_model.arm_classes import class_name
 from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.advice import (
     MOVEMENT,
-    SURE,
-    motor_probabilities,
     next_steps,
     rests_on_one_movement,
     sureness,
@@ -40,8 +49,6 @@ from failuretwin.inference.fault_course import FaultCourse
 from failuretwin.inference.posterior import log_prior
 from failuretwin.inference.set_ups import FAULT_OF_EVERY_RUN
 
-WELL, FAULTY, OPEN = "healthy", "faulty", "cannot tell"
-"""What a robot, a motor or a run may be."""
 SUSPECT = 0.05
 """Motors of an open state are named from this probability on."""
 RUN = "run"
@@ -64,7 +71,7 @@ class State:
     """What one run, or all of them together, say of the robot.
 
     Attributes:
-        kind: `WELL`, `FAULTY` or `OPEN`.
+        kind: `HEALTHY_STATE`, `FAULTY_STATE` or `OPEN_STATE`.
         motors: Those that are faulty, or may be, in chain order; none of a healthy robot.
         probability: Of what `kind` and `motors` say; None where nothing can be told.
     """
@@ -130,31 +137,28 @@ class RobotState:
         return f"{told}; {self.remark}" if self.remark else told
 
 
-def state_of(posterior: Mapping[str, float], order: Sequence[str]) -> State:
-    """Return the state that a posterior tells.
+def with_motors(posterior: Mapping[str, float], order: Sequence[str]) -> State:
+    """Return the state that a posterior tells, with its motors in chain order.
 
     Args:
         posterior: Probability of every hypothesis.
         order: Names of the motors in chain order.
     """
-    well = posterior.get(str(HEALTHY), 0.0)
-    by_motor = motor_probabilities(posterior)
-    named = tuple(motor for motor in order if by_motor.get(motor, 0.0) >= SURE)
-    if well >= SURE:
-        return State(WELL, (), well)
-    if named:
-        return State(FAULTY, named, min(by_motor[motor] for motor in named))
+    kind, by_motor = state_of(posterior), motor_probabilities(posterior)
+    if kind == HEALTHY_STATE:
+        return State(kind, (), posterior[str(HEALTHY)])
+    least = SURE if kind == FAULTY_STATE else SUSPECT
+    motors = tuple(motor for motor in order if by_motor.get(motor, 0.0) >= least)
+    if kind == FAULTY_STATE:
+        return State(kind, motors, min(by_motor[motor] for motor in motors))
     best = max(posterior, key=lambda name: posterior[name])
-    motors = tuple(motor for motor in order if by_motor.get(motor, 0.0) >= SUSPECT)
-    if not Hypothesis.parse(best).faults:
-        return State(OPEN, motors, posterior[best])
-    top = tuple(fault.motor for fault in Hypothesis.parse(best).faults)
-    return State(OPEN, motors, min(by_motor[motor] for motor in top))
+    probable = [by_motor[fault.motor] for fault in Hypothesis.parse(best).faults]
+    return State(kind, motors, min(probable, default=posterior[best]))
 
 
 def state_of_run(diagnosis: Diagnosis, order: Sequence[str]) -> State:
     """Return the state that one run tells; without a verdict nothing can be told."""
-    return State(OPEN) if diagnosis.undecided else state_of(diagnosis.posterior, order)
+    return State(OPEN_STATE) if diagnosis.undecided else with_motors(diagnosis.posterior, order)
 
 
 @dataclass(frozen=True)
@@ -224,17 +228,17 @@ def course_of(diagnoses: Sequence[Diagnosis], diagnoser: BayesDiagnoser) -> Faul
 def _with_zero(found: _Found, lines: Sequence[str]) -> _Found:
     """Return a healthy state with what was said of a zero that is off, or a fault of every run."""
     told = [line for line in lines if FAULT_OF_EVERY_RUN in line]
-    if found.state.kind != WELL or not told:
+    if found.state.kind != HEALTHY_STATE or not told:
         return found
     remark = "; ".join(filter(None, (found.remark, told[-1])))
     headline = "Cannot tell yet; healthy, but for a zero that may be a fault"
-    return replace(found, state=State(OPEN), headline=headline, step=ZERO_STEP, remark=remark)
+    return replace(found, state=State(OPEN_STATE), headline=headline, step=ZERO_STEP, remark=remark)
 
 
 def _nothing(diagnoses: Sequence[Diagnosis]) -> _Found:
     """Return what is said where no run allows a verdict."""
     reason = diagnoses[0].undecided
-    return _Found(State(OPEN), f"Cannot tell, because {reason}", undecided_step(reason))
+    return _Found(State(OPEN_STATE), f"Cannot tell, because {reason}", undecided_step(reason))
 
 
 def _of_course(course: FaultCourse, robot: Robot) -> _Found:
@@ -242,7 +246,7 @@ def _of_course(course: FaultCourse, robot: Robot) -> _Found:
     last = course.posterior[-1]
     posterior = {str(h): float(p) for h, p in zip(course.hypotheses, last, strict=True)}
     steps = " ".join(next_steps(posterior, class_name(robot)))
-    state = state_of(posterior, robot.motor_names)
+    state = with_motors(posterior, robot.motor_names)
     return _Found(state, _headline(state, posterior), steps, "; ".join(course.verdict), posterior)
 
 
@@ -257,21 +261,21 @@ def _one_by_one(
 
     Of runs that were not judged each alone it is not advised to weigh them together.
     """
-    faulty = [i for i in decided if states[i].kind == FAULTY]
+    faulty = [i for i in decided if states[i].kind == FAULTY_STATE]
     since = faulty[0] if faulty else 0
     used = [i for i in decided if i >= since]
     posterior = _pooled([diagnoses[i].posterior for i in used])
     named = {states[i].motors for i in faulty}
-    if len(named) > 1 or (faulty and any(states[i].kind == WELL for i in used)):
+    if len(named) > 1 or (faulty and any(states[i].kind == HEALTHY_STATE for i in used)):
         step = DIFFERENT_STEP.format(how=WEIGH if each_alone else ORDERED)
         return _different(states, decided, posterior, step)
-    state = state_of(posterior, robot.motor_names)
+    state = with_motors(posterior, robot.motor_names)
     alone = _alone(diagnoses, faulty, len(decided))
     remarks = [f"one {alone} alone shows it"] if alone else []
-    if any(states[i].kind == WELL for i in decided if i < since):
+    if any(states[i].kind == HEALTHY_STATE for i in decided if i < since):
         remarks.append(f"since run {since + 1} of {len(diagnoses)} ({diagnoses[since].run})")
     step = " ".join(next_steps(posterior, class_name(robot), alone))
-    if state.kind == OPEN and len(used) > 1 and each_alone:
+    if state.kind == OPEN_STATE and len(used) > 1 and each_alone:
         step = f"{step} {TOGETHER_STEP}"
     return _Found(state, _headline(state, posterior), step, "; ".join(remarks), posterior)
 
@@ -297,13 +301,15 @@ def _different(
     """Return what is said of runs that show different states."""
     counts = Counter(_short(states[i]) for i in decided)
     told = ", ".join(f"{name} in {counted(count, 'run')}" for name, count in counts.most_common())
-    motors = dict.fromkeys(m for i in decided if states[i].kind == FAULTY for m in states[i].motors)
+    motors = dict.fromkeys(
+        m for i in decided if states[i].kind == FAULTY_STATE for m in states[i].motors
+    )
     headline = "Different states in different runs"
-    return _Found(State(OPEN, tuple(motors)), headline, step, told, posterior)
+    return _Found(State(OPEN_STATE, tuple(motors)), headline, step, told, posterior)
 
 
 def _short(state: State) -> str:
-    if state.kind != FAULTY:
+    if state.kind != FAULTY_STATE:
         return state.kind
     return f"{' and '.join(map(_spoken, state.motors))} faulty"
 
@@ -312,9 +318,9 @@ def _headline(state: State, posterior: Mapping[str, float]) -> str:
     """Return a state in a few words."""
     best = max(posterior, key=lambda name: posterior[name])
     name = plain_name(Hypothesis.parse(best))
-    if state.kind == WELL:
+    if state.kind == HEALTHY_STATE:
         return "Healthy"
-    if state.kind == FAULTY:
+    if state.kind == FAULTY_STATE:
         told = name if posterior[best] >= SURE else " and ".join(map(_spoken, state.motors))
         return f"Faulty: {told}"
     return f"Cannot tell yet; most probable: {name}"
@@ -330,15 +336,15 @@ def _motor_states(
     rows = []
     for name, motor in zip(robot.motor_names, robot.motors, strict=True):
         chance = over_all.get(name, 0.0)
-        kind = WELL if chance + unknown < SUSPECT else OPEN
+        kind = HEALTHY_STATE if chance + unknown < SUSPECT else OPEN_STATE
         rows.append(
             MotorState(
                 name,
                 motor.joint,
                 motor.log_column,
                 found.state.kind if name in found.state.motors else kind,
-                sum(s.kind == FAULTY and name in s.motors for s in states),
-                sum(s.kind == OPEN and name in s.motors for s in states),
+                sum(s.kind == FAULTY_STATE and name in s.motors for s in states),
+                sum(s.kind == OPEN_STATE and name in s.motors for s in states),
                 max(each.get(name, 0.0) for each in by_run),
                 chance,
             )

@@ -11,12 +11,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from failuretwin.core.hypothesis import Diagnosis, Fault, Hypothesis
+from failuretwin.core.hypothesis import SURE, Diagnosis, Fault, Hypothesis, motor_probabilities
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.failure_behavior.repair import advice_for
 
-SURE = 0.95
-"""Probability from which a motor is named, or all is well."""
 IN_QUESTION = 0.02
 """Motors whose fault is as probable as this are to move in the next log."""
 MOST_NAMED = 2
@@ -43,15 +41,6 @@ WORDS = (
 def sureness(probability: float) -> str:
     """Return how sure a probability is, in words."""
     return next(words for least, words in WORDS if probability >= least)
-
-
-def motor_probabilities(posterior: Mapping[str, float]) -> dict[str, float]:
-    """Return the probability that something is wrong with each motor, by its name."""
-    found: dict[str, float] = {}
-    for name, probability in posterior.items():
-        for fault in Hypothesis.parse(name).faults:
-            found[fault.motor] = found.get(fault.motor, 0.0) + probability
-    return found
 
 
 def rests_on_one_movement(diagnosis: Diagnosis) -> bool:

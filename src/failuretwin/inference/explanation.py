@@ -13,6 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from failuretwin.core.hypothesis import (
+    OPEN_STATE,
+    SURE,
     Diagnosis,
     Fault,
     Hypothesis,
@@ -25,7 +27,6 @@ from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.advice import (
     MOVEMENT,
-    SURE,
     advice_lines,
     next_steps,
     rests_on_one_movement,
@@ -123,7 +124,11 @@ def verdict(diagnosis: Diagnosis, ranked: Sequence[Hypothesis]) -> str:
     text = plain_name(best)
     if not best.is_healthy:
         text += _size_and_onset(diagnosis, best)
-    text += f", {percent(diagnosis.posterior[str(best)])} sure"
+    probability = diagnosis.posterior[str(best)]
+    if diagnosis.state == OPEN_STATE and probability < SURE:
+        text = f"cannot tell yet; most probable: {text}, {percent(probability)}"
+    else:
+        text = f"{text}, {percent(probability)} sure"
     possible = possible_hypotheses(diagnosis, ranked)
     if len(possible) > 1:
         others = [f"{plain_name(h)} {percent(diagnosis.posterior[str(h)])}" for h in possible[1:3]]

@@ -13,7 +13,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from failuretwin.connection.links.base import Commander, Order
-from failuretwin.core.hypothesis import HEALTHY, Diagnosis, Hypothesis
+from failuretwin.core.hypothesis import (
+    FAULTY_STATE,
+    HEALTHY_STATE,
+    OPEN_STATE,
+    SURE,
+    Diagnosis,
+    Hypothesis,
+    motor_probabilities,
+)
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.belief import Belief, NoBelief
 from failuretwin.decision.acting.believed_arm import BelievedArm, Seen
@@ -25,7 +33,6 @@ from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.decision.test_motions.motions import Motions
 from failuretwin.failure_behavior.mode import Range, Signature
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.advice import SURE, motor_probabilities
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.isolability import IsolabilityReport
@@ -46,6 +53,8 @@ SMALLER = 2
 """Ranges that a check adds below those from what one settled position shows: forty movements of a
 minute show a sixth of that, and "healthy" must not be surer than they can make it."""
 GREEN, RED, OPEN = "green", "red", "open"
+LIGHTS = {HEALTHY_STATE: GREEN, FAULTY_STATE: RED, OPEN_STATE: OPEN}
+"""Light of each state of a diagnosis."""
 ROUNDS = 8
 """Steps in which movements that fit ill get less weight."""
 LOOSE_RAD = 0.1
@@ -166,11 +175,7 @@ class CheckResult:
     @property
     def light(self) -> str:
         """``green``, ``red`` or ``open``."""
-        if self.diagnosis.undecided:
-            return OPEN
-        if self.diagnosis.posterior.get(str(HEALTHY), 0.0) >= SURE:
-            return GREEN
-        return RED if self.motor else OPEN
+        return LIGHTS[self.diagnosis.state]
 
 
 def faults_at_rest(model: HealthyModel) -> tuple[Hypothesis, ...]:
