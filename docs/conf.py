@@ -1,4 +1,4 @@
-"""How Sphinx builds the site: `make docs`."""
+"""Configuration of Sphinx; `make docs` builds the site."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ myst_heading_anchors = 4
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented_params"
-autodoc_mock_imports = ["sklearn", "torch"]  # too large for pages that only name them
+autodoc_mock_imports = ["sklearn", "torch"]  # too large to install for the site
 autosummary_generate = False
 napoleon_numpy_docstring = False
 
 OUTSIDE = {"../CHANGELOG.md": "changelog.md", "../benchmarks/looks.md": "looks.md"}
-"""Pages of the site that show files outside of its folder."""
+"""Files outside of the folder, and the pages that include them."""
 
 
 def link_inside(app: Sphinx, page: str, source: list[str]) -> None:
-    """Point links to files outside of the folder at the pages that show them."""
+    """Redirect links to files outside of the folder to the pages that include them."""
     del app, page
     for outside, inside in OUTSIDE.items():
         source[0] = re.sub(rf"\]\({re.escape(outside)}", f"]({inside}", source[0])
 
 
 def setup(app: Sphinx) -> None:
-    """Tell Sphinx of it."""
+    """Register the hook with Sphinx."""
     app.connect("source-read", link_inside)

@@ -1,4 +1,4 @@
-"""Code of the pages, run as tests."""
+"""Run the code of the pages as tests."""
 
 from __future__ import annotations
 

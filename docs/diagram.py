@@ -1,4 +1,4 @@
-"""Which package imports which, drawn from the code: `python docs/diagram.py` writes the picture."""
+"""Draw which package imports which, from the code: `python docs/diagram.py`."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ PACKAGES = {
     "decision": "5  streams, networks, acting",
     "app": "commands, pages",
 }
-"""From left to right in the order of imports, and what is in them; numbers: the paper's modules."""
+"""Packages in import order and their contents; numbers: modules of the paper."""
 WIDTH, ROW, BOX = 640, 56, 40
 
 
 def imports() -> set[tuple[str, str]]:
-    """Return the pairs of packages of which the first imports from the second."""
+    """Return the pairs (importing package, imported package)."""
     found = set()
     for package in PACKAGES:
         for path in (PACKAGE / package).rglob("*.py"):
@@ -36,7 +36,7 @@ def imports() -> set[tuple[str, str]]:
 
 
 def picture(found: set[tuple[str, str]]) -> str:
-    """Return the picture: a box for each package, an arc from each to those it imports."""
+    """Return the SVG: one box per package, one arc per import."""
     rows = {name: ROW * number + ROW // 2 for number, name in enumerate(reversed(PACKAGES))}
     boxes = [_box(name, text, rows[name]) for name, text in PACKAGES.items()]
     arcs = [_arc(*pair, rows) for pair in sorted(found)]

@@ -1,12 +1,12 @@
-"""Pages whose code is run: what they show works, and prints what stands below it.
+"""Run the code blocks of a page and compare the printed output.
 
-    Save this as `FILE`:    the block that follows is written to FILE
-    ```python               is run; all blocks of a page share one namespace
-    ```sh                   is run, a `failuretwin` command in each line; one that ends with
-                            `# refused` must be refused, and its error counts as printed
-    ```text                 is what the block before it prints; `...` stands for anything
+    Save this as `FILE`:    writes the next block to FILE
+    ```python               runs; all blocks of a page share one namespace
+    ```sh                   runs one `failuretwin` command per line; a line that ends with
+                            `# refused` must fail, and its error counts as output
+    ```text                 expected output of the previous block; `...` matches anything
 
-`python docs/executed.py PAGE...` runs pages and writes into them what their code prints now.
+`python docs/executed.py PAGE...` runs pages and updates their expected output.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 from sybil import Document, Example, Region
 
 TESTS = Path(__file__).parents[1] / "tests"
-"""Where the warm command line is, for pages that are run outside of pytest."""
+"""Folder of the warm command line, for runs outside of pytest."""
 if TYPE_CHECKING:
     from warm_command import WarmCommand
 
@@ -44,7 +44,7 @@ PRINTED = "_printed_by_the_block_before"
 
 @cache
 def command_line() -> WarmCommand:
-    """Return a process that runs commands without waiting for imports."""
+    """Return a process that runs commands with all imports done."""
     sys.path.append(str(TESTS))
     from warm_command import WarmCommand
 
@@ -54,7 +54,7 @@ def command_line() -> WarmCommand:
 
 
 def blocks(document: Document) -> Iterator[Region]:
-    """Yield the blocks of a page that are run, written or compared."""
+    """Yield the blocks of a page to run, write or compare."""
     for found in BLOCK.finditer(document.text):
         language, code = found["language"], found["code"]
         evaluate = write if found["file"] else EVALUATORS.get(language)
@@ -64,12 +64,12 @@ def blocks(document: Document) -> Iterator[Region]:
 
 
 def write(example: Example) -> None:
-    """Write a block to the file that the line before it names."""
+    """Write a block to the file named in the line before it."""
     Path(example.region.lexemes["file"]).write_text(example.parsed, "utf-8")
 
 
 def run_python(example: Example) -> None:
-    """Run a block of Python and keep what it prints."""
+    """Run a block of Python and keep its output."""
     code = compile("\n" * example.line + example.parsed, example.path, "exec")
     with contextlib.redirect_stdout(io.StringIO()) as out:
         exec(code, example.namespace)
@@ -77,7 +77,7 @@ def run_python(example: Example) -> None:
 
 
 def run_commands(example: Example) -> None:
-    """Run `failuretwin` commands, one after the other, and keep what they print."""
+    """Run `failuretwin` commands one after the other and keep their output."""
     printed = ""
     for line in re.sub(r"\\\n\s*", "", example.parsed).splitlines():
         words = shlex.split(line, comments=True)
@@ -92,7 +92,7 @@ def run_commands(example: Example) -> None:
 
 
 def compare(example: Example) -> None:
-    """Compare a block with what the block before it printed."""
+    """Compare a block with the output of the previous block."""
     printed = example.namespace[PRINTED]
     checker, want = doctest.OutputChecker(), doctest.Example("", example.parsed)
     if not checker.check_output(want.want, printed, doctest.ELLIPSIS):
@@ -104,7 +104,7 @@ EVALUATORS = {"python": run_python, "sh": run_commands, "text": compare}
 
 @contextlib.contextmanager
 def in_a_folder_of_its_own() -> Iterator[None]:
-    """Run what follows in an empty folder, and forget modules and modes that it brought."""
+    """Work in an empty temporary folder; restore fault modes and modules afterwards."""
     from failuretwin.failure_behavior.registry import MODES
 
     home, modes, paths, modules = Path.cwd(), dict(MODES), list(sys.path), set(sys.modules)
@@ -124,18 +124,18 @@ def in_a_folder_of_its_own() -> Iterator[None]:
 
 
 def setup(namespace: dict[str, Any]) -> None:
-    """Enter the folder in which a page is run."""
+    """Enter the temporary folder of a page."""
     namespace["_folder"] = folder = contextlib.ExitStack()
     folder.enter_context(in_a_folder_of_its_own())
 
 
 def teardown(namespace: dict[str, Any]) -> None:
-    """Leave it."""
+    """Leave the temporary folder."""
     namespace["_folder"].close()
 
 
 def rewrite(page: Path) -> None:
-    """Run a page and write into it what its code prints; blocks with `...` that fit stay."""
+    """Run a page and update its expected output; matching blocks with `...` stay."""
     text = page.read_text("utf-8")
     document = Document(text, str(page))
     for region in blocks(document):

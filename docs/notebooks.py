@@ -1,4 +1,4 @@
-"""Notebooks, made of tutorials: `python docs/notebooks.py` writes them anew."""
+"""Generate notebooks from tutorials: `python docs/notebooks.py`."""
 
 from __future__ import annotations
 
@@ -18,10 +18,7 @@ LINK = re.compile(r"\]\((?!\w+://)([^)#]+)(#[^)]*)?\)")
 
 
 def notebook_of(page: str) -> Any:
-    """Return the notebook of a page: its text, its code, and files that it saves.
-
-    What the page prints is left out: whoever runs the notebook sees it.
-    """
+    """Return the notebook of a page: text, code and saved files, without printed output."""
     cells, at = [], 0
     for found in BLOCK.finditer(page):
         language, code = found.groups()
@@ -37,7 +34,7 @@ def notebook_of(page: str) -> Any:
             cells.append(new_code_cell(code.rstrip()))
     cells += _markdown(page[at:])
     for number, cell in enumerate(cells):
-        cell["id"] = f"cell-{number}"  # else they are drawn anew each time
+        cell["id"] = f"cell-{number}"  # else random
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
     return new_notebook(cells=cells, metadata={"kernelspec": kernel})
 
@@ -54,7 +51,7 @@ def _markdown(text: str) -> list[Any]:
 
 
 def text_of(name: str) -> str:
-    """Return the file that a tutorial makes."""
+    """Return the notebook file of a tutorial."""
     page = (HERE / "tutorials" / f"{name}.md").read_text("utf-8")
     return nbformat.writes(notebook_of(page)) + "\n"
 

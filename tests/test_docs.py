@@ -1,4 +1,4 @@
-"""Pages and README: every name, file and link in them exists, and snippets use the public names."""
+"""README and pages: names, files and links exist; snippets use public names; short sentences."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ DOCS = sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [*DOCS, ROOT / "README.md", ROOT / "CHANGELOG.md"]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 ENTRY_POINTS = {"failuretwin.modes"}
-"""Groups of entry points: dotted, but no module."""
-READERS_OWN = {
+"""Groups of entry points: dotted names that are not modules."""
+READER_FILES = {
     *("arm_diagnoser.py", "bent_shaft.py", "my_method.py", "my_methods.py", "my_robot.py"),
     *("arm.toml", "arm.urdf", "cal.toml", "costs.toml", "faults.toml", "map.toml", "MAP.toml"),
     *("mine.toml", "my_arm.toml", "my_robot.toml", "topics.toml", "CAL.toml", "FILE.py"),
 }
-"""Files in examples that the reader writes or gets."""
-STRANGERS = {"Dataset", "Guess"}
+"""Files in examples that belong to the reader."""
+FOREIGN_CLASSES = {"Dataset", "Guess"}
 """Classes of xarray and of the reader."""
-SHOWN = {"changelog.md", "looks.md"}
-"""Pages of the site that only show a file from elsewhere."""
+INCLUDED = {"changelog.md", "looks.md"}
+"""Pages that only include a file from elsewhere."""
 FOLDERS = ("benchmarks", "docs", "examples", "src", "tests")
 
 FENCE = re.compile(r"```([\w{}-]*)[^\n]*\n(.*?)```", re.DOTALL)
@@ -39,12 +39,12 @@ CLASS = re.compile(r"`(?:\w+\.)*?([A-Z][a-z]+\w*)(?:\.([a-z_]\w*))?\b[^`]*`")
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
-def named(page: Path) -> str:
+def page_name(page: Path) -> str:
     return page.relative_to(ROOT).as_posix()
 
 
 def snippets(page: Path) -> list[str]:
-    """Return the Python of a page, or of a script."""
+    """Return the Python blocks of a page, or a script."""
     text = page.read_text("utf-8")
     if page.suffix == ".py":
         return [text]
@@ -52,7 +52,7 @@ def snippets(page: Path) -> list[str]:
 
 
 def resolve(dotted: str) -> Any:
-    """Return the module, class, function or field of that name; raise if there is none."""
+    """Return the module, class, function or field of a dotted name, or raise."""
     parts = dotted.split(".")
     for count in range(len(parts), 0, -1):
         try:
@@ -67,7 +67,7 @@ def resolve(dotted: str) -> Any:
 
 
 def deep_imports(source: str) -> Iterator[str]:
-    """Yield the imports of anything but `failuretwin` itself and its public names."""
+    """Yield imports other than `failuretwin` itself and its public names."""
     public = set(failuretwin.__all__)
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -121,24 +121,24 @@ def glossary_rows() -> list[list[str]]:
         ("import failuretwin as ft\nfrom failuretwin import load_robot\nimport numpy", []),
     ],
 )
-def test_deep_imports_are_noticed(source, found):
+def test_deep_imports_are_detected(source, found):
     assert list(deep_imports(source)) == found
 
 
 @pytest.mark.parametrize("name", ["failuretwin.core.no_such_module", "failuretwin.core.runs.Nope"])
-def test_a_name_that_is_not_there_is_noticed(name):
+def test_missing_names_are_detected(name):
     with pytest.raises((AttributeError, ModuleNotFoundError)):
         resolve(name)
 
 
 @pytest.mark.parametrize(
-    "page", [p for p in (*PAGES, *EXAMPLES) if p.parent.name != "contributing"], ids=named
+    "page", [p for p in (*PAGES, *EXAMPLES) if p.parent.name != "contributing"], ids=page_name
 )
-def test_snippets_import_public_names_alone(page):
+def test_snippets_import_only_public_names(page):
     assert [name for code in snippets(page) for name in deep_imports(code)] == []
 
 
-@pytest.mark.parametrize("page", PAGES, ids=named)
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
 def test_names_on_the_page_exist(page):
     text = page.read_text("utf-8")
     for name in set(NAME.findall(text)) - ENTRY_POINTS:
@@ -146,24 +146,24 @@ def test_names_on_the_page_exist(page):
     assert set(PUBLIC.findall(text)) <= set(failuretwin.__all__)
 
 
-@pytest.mark.parametrize("page", [*DOCS, ROOT / "README.md"], ids=named)
+@pytest.mark.parametrize("page", [*DOCS, ROOT / "README.md"], ids=page_name)
 def test_classes_on_the_page_exist(page, classes):
     text = FENCE.sub("", page.read_text("utf-8"))
     for name, part in CLASS.findall(text):
-        assert name in {*classes, *STRANGERS}, name
+        assert name in {*classes, *FOREIGN_CLASSES}, name
         assert not part or part in classes[name], f"{name}.{part}"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=named)
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
 def test_files_on_the_page_exist(page):
     below = [path for name in FOLDERS for path in (ROOT / name).rglob("*")]
     files = [path.as_posix() for path in (*below, *ROOT.glob("*"))]
-    for name in set(FILE.findall(page.read_text("utf-8"))) - READERS_OWN:
+    for name in set(FILE.findall(page.read_text("utf-8"))) - READER_FILES:
         assert any(path.endswith(f"/{name}") for path in files), name
 
 
-@pytest.mark.parametrize("page", PAGES, ids=named)
-def test_links_on_the_page_lead_somewhere(page):
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_links_on_the_page_exist(page):
     for link in LINK.findall(FENCE.sub("", page.read_text("utf-8"))):
         path, _, anchor = link.partition("#")
         if "://" in path:
@@ -173,7 +173,7 @@ def test_links_on_the_page_lead_somewhere(page):
         assert not anchor or anchor in anchors(target), link
 
 
-@pytest.mark.parametrize("page", [p for p in DOCS if p.name not in SHOWN], ids=named)
+@pytest.mark.parametrize("page", [p for p in DOCS if p.name not in INCLUDED], ids=page_name)
 def test_a_page_opens_with_its_subject_and_code(page):
     title, text = page.read_text("utf-8").split("\n", 1)
     opening = text.partition("\n## ")[0]
@@ -185,7 +185,7 @@ def test_a_page_opens_with_its_subject_and_code(page):
 def test_the_index_links_every_page():
     docs = ROOT / "docs"
     index = (docs / "index.md").read_text("utf-8")
-    others = {page.relative_to(docs).as_posix() for page in DOCS} - {"index.md", *SHOWN}
+    others = {page.relative_to(docs).as_posix() for page in DOCS} - {"index.md", *INCLUDED}
     assert others <= {link.partition("#")[0] for link in LINK.findall(index)}
     assert "docs/index.md" in LINK.findall((ROOT / "README.md").read_text("utf-8"))
 
@@ -208,7 +208,7 @@ def test_sections_named_by_docstrings_exist():
         assert (ROOT / "docs" / page).exists()
 
 
-def test_the_first_snippet_of_the_readme_prints_what_stands_below_it(capsys):
+def test_the_first_snippet_of_the_readme_prints_its_output(capsys):
     text = (ROOT / "README.md").read_text("utf-8")
     code, printed = re.search(r"```python\n(.*?)```\n\n```\n(.*?)```", text, re.DOTALL).groups()
     exec(compile(code, "README.md", "exec"), {})
@@ -216,23 +216,23 @@ def test_the_first_snippet_of_the_readme_prints_what_stands_below_it(capsys):
 
 
 def code_of(pages: list[Path]) -> str:
-    """Return all Python of some pages and scripts."""
+    """Return all Python of the pages and scripts."""
     return "\n".join(code for page in pages for code in snippets(page))
 
 
 @pytest.mark.parametrize("name", [n for n in failuretwin.__all__ if n != "__version__"])
 def test_every_public_name_has_an_example(name):
-    pages = [page for page in PAGES if page.name not in SHOWN]
+    pages = [page for page in PAGES if page.name not in INCLUDED]
     assert re.search(rf"\bft\.{name}\b", code_of([*pages, *EXAMPLES]))
 
 
 def test_the_reference_has_every_public_name_once():
     pages = sorted((ROOT / "docs" / "reference").glob("api_*.md"))
     text = "\n".join(page.read_text("utf-8") for page in pages)
-    told = re.findall(r"auto(?:class|function|exception):: failuretwin\.(\w+)", text)
-    assert sorted(told) == sorted(set(failuretwin.__all__) - {"__version__"})
+    documented = re.findall(r"auto(?:class|function|exception):: failuretwin\.(\w+)", text)
+    assert sorted(documented) == sorted(set(failuretwin.__all__) - {"__version__"})
     overview = (ROOT / "docs" / "reference" / "api.md").read_text("utf-8")
-    assert sorted(re.findall(r"^   ([A-Za-z_]\w*)$", overview, re.MULTILINE)) == sorted(told)
+    assert sorted(re.findall(r"^   ([A-Za-z_]\w*)$", overview, re.MULTILINE)) == sorted(documented)
 
 
 def sentences(text: str) -> list[str]:
@@ -246,8 +246,8 @@ def sentences(text: str) -> list[str]:
 
 @pytest.mark.parametrize(
     "page",
-    [p for p in (*DOCS, ROOT / "README.md", ROOT / "CONTRIBUTING.md") if p.name not in SHOWN],
-    ids=named,
+    [p for p in (*DOCS, ROOT / "README.md", ROOT / "CONTRIBUTING.md") if p.name not in INCLUDED],
+    ids=page_name,
 )
 def test_sentences_are_short(page):
     text = page.read_text("utf-8")
@@ -255,5 +255,5 @@ def test_sentences_are_short(page):
     assert [s for s in sentences(text) if len(s.split()) >= 30] == []
 
 
-def test_a_long_sentence_is_noticed():
+def test_long_sentences_are_detected():
     assert max(len(s.split()) for s in sentences(f"Short. {'word ' * 40}end.\n")) == 41

@@ -1,4 +1,4 @@
-"""The site: pages that are run notice what is wrong, what is drawn from code is up to date."""
+"""The site: executed pages detect errors; generated files are up to date; the site builds."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ EACH_TUTORIAL = [
 
 
 def run(page):
-    """Run a page as a test would."""
+    """Run a page as its test does."""
     document = Document(page, "page.md")
     for region in executed.blocks(document):
         document.add(region)
@@ -35,7 +35,7 @@ def run(page):
     return document
 
 
-def test_a_page_prints_what_stands_below():
+def test_printed_output_is_compared():
     run("```python\nx = 2\nprint(x + 1)\n```\n\n```text\n3\n```\n")
     run("```python\nprint('a 0.123 b')\n```\n\n```text\na ... b\n```\n")
 
@@ -50,12 +50,12 @@ def test_a_page_prints_what_stands_below():
         "```sh\nls\n```\n",
     ],
 )
-def test_a_page_that_is_not_true_is_noticed(page):
+def test_wrong_output_and_failed_commands_are_detected(page):
     with pytest.raises(AssertionError):
         run(page)
 
 
-def test_a_page_writes_files_and_is_told_what_is_refused():
+def test_files_are_written_and_refused_commands_expected():
     run(
         "Save this as `wrong.csv`:\n\n```csv\na,b\n1,2\n```\n\n"
         "```sh\nfailuretwin diagnose wrong.csv   # refused\n```\n\n"
@@ -64,13 +64,13 @@ def test_a_page_writes_files_and_is_told_what_is_refused():
     assert not Path("wrong.csv").exists()
 
 
-def test_lines_of_an_error_are_those_of_the_page():
+def test_errors_have_the_line_number_of_the_page():
     with pytest.raises(ZeroDivisionError) as caught:
         run("# title\n\n```python\nx = 1\n1 / 0\n```\n")
     assert caught.traceback[-1].lineno + 1 == 5
 
 
-def test_pages_are_rewritten_where_they_are_not_true(tmp_path):
+def test_wrong_output_is_rewritten(tmp_path):
     page = tmp_path / "page.md"
     kept = "```python\nprint('a 1 b')\n```\n\n```text\na ...\n```\n"
     page.write_text(f"{kept}\n```python\nprint(3)\n```\n\n```text\n2\n```\n")
@@ -78,7 +78,7 @@ def test_pages_are_rewritten_where_they_are_not_true(tmp_path):
     assert page.read_text() == f"{kept}\n```python\nprint(3)\n```\n\n```text\n3\n```\n"
 
 
-def test_the_picture_of_the_packages_is_of_today():
+def test_the_picture_of_the_packages_is_up_to_date():
     found = diagram.imports()
     assert ("decision", "inference") in found
     assert ("inference", "decision") not in found
@@ -86,7 +86,7 @@ def test_the_picture_of_the_packages_is_of_today():
 
 
 @pytest.mark.parametrize("name", notebooks.TUTORIALS)
-def test_a_notebook_is_that_of_its_tutorial(name):
+def test_notebooks_match_their_tutorials(name):
     written = (notebooks.FOLDER / f"{name}.ipynb").read_text("utf-8")
     assert written == notebooks.text_of(name), "python docs/notebooks.py"
 
@@ -104,7 +104,7 @@ def test_a_notebook_runs(name, tmp_path, monkeypatch):
     assert any("sure" in out.get("text", "") for out in printed)
 
 
-def test_the_site_is_built_without_a_warning(tmp_path):
+def test_the_site_builds_without_warnings(tmp_path):
     words = ["-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", "docs", str(tmp_path)]
     done = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
