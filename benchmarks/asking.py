@@ -33,9 +33,9 @@ from acting_world import TrueFault, World, home_of
 
 from failuretwin.app.emulation import emulated_faults
 from failuretwin.app.shadow import Shadow
+from failuretwin.connection.commanded_arm import OperatedArm, Shifts
 from failuretwin.connection.emulated_arm import Emulation
 from failuretwin.connection.links.base import Order
-from failuretwin.connection.operated_arm import OperatedArm, Shifts
 from failuretwin.core.alarm import CLEAR, RAISED, SUSPECTED
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
 from failuretwin.core.types import FloatArray

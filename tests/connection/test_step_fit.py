@@ -80,7 +80,7 @@ def test_small_steps_do_not_say_the_speed_limit(tmp_path, armpi, sizes):
     limit = fit_file(tmp_path, armpi, np.random.default_rng(4), truth, sizes)["speed limit"]
     assert not limit.identified
     assert limit.low < 4.3 < limit.high
-    assert "the largest is 12 deg in 5 ms; it takes one of" in limit.note
+    assert "the largest is 12 deg in 5 ms; needed is one of" in limit.note
 
 
 def test_what_is_not_known_stays_at_the_profile(tmp_path, armpi):

@@ -50,7 +50,7 @@ def _listens(text: str) -> InputError:
 
 def _at_work(robot: Robot, live: LiveOptions, seed: int) -> Commander:
     """Return an emulated arm that somebody works with; its faults may have sizes."""
-    from failuretwin.connection.operated_arm import OperatedArm, Shifts
+    from failuretwin.connection.commanded_arm import OperatedArm, Shifts
 
     shifts = Shifts(duration_s=live.seconds or math.inf)
     return OperatedArm(emulation_of(robot, live, seed), shifts, Pace(live.speed))

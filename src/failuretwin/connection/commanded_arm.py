@@ -1,62 +1,50 @@
-"""The physics engine's arm, told from outside where to go: a `Commander` without a robot.
+"""Emulated arms that take orders: a `Commander` without a robot, and one that works in shifts.
 
-Time passes when it is polled, in slices, none before it is due. An order is carried out at once,
-unless the bus stalls: then readings stop, and what was ordered waits until it comes back. A motor
-that is told nothing new keeps the place that it has.
+Time passes in slices when the arm is polled. An order is carried out at once, unless the bus
+stalls: then readings stop, and the order waits until the bus answers. A motor whose target does not
+change keeps its place.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 
-from failuretwin.connection.emulated_arm import MEMORY_S, STEP_S, EmulatedArm, Emulation
+from failuretwin.connection.emulated_arm import (
+    FIRST_COMMAND_S,
+    MEMORY_S,
+    STEP_S,
+    EmulatedArm,
+    Emulation,
+)
 from failuretwin.connection.links.base import CommandSent, Event, LinkCounts, Order, Reading
 from failuretwin.connection.links.replay import AS_FAST_AS_POSSIBLE, Pace
+from failuretwin.connection.links.stream_time import Ramp
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.disturbances import Disturbances, sense, stack
+from failuretwin.failure_behavior.random_movements import RandomMovements
 
 SLICE_S, PACED_SLICE_S = 0.1, 0.05
-"""Time that passes at a time, as fast as possible and by a clock: so long an order may wait [s]."""
+"""Length of a slice, as fast as possible and by a clock; an order may wait this long [s]."""
 UNMOVED_RAD = 1e-9
-"""Commands nearer than this are the same [rad]."""
-
-
-@dataclass(frozen=True)
-class _Ramp:
-    """What the motors are told from a time on.
-
-    Attributes:
-        start_s: When it begins [s].
-        origin: Where they were told to be, (motor,) [rad].
-        aim: Where they go, bias, scatter and faults of their orders included, (motor,) [rad].
-        duration: Time to get there, (motor,) [s].
-    """
-
-    start_s: float
-    origin: FloatArray
-    aim: FloatArray
-    duration: FloatArray
-
-    def at(self, time: FloatArray) -> FloatArray:
-        """Return what the motors are told, (time, motor) [rad]."""
-        since = time[:, None] - self.start_s
-        share = np.clip(since / np.maximum(self.duration, STEP_S), 0.0, 1.0)
-        return np.asarray(self.origin + share * (self.aim - self.origin))
+"""Largest difference of targets that count as equal [rad]."""
+OPERATOR = 1
+"""Number of the operator's random stream, apart from the arm's own."""
 
 
 class CommandedArm(EmulatedArm):
-    """An emulated arm that does what it is told; the same seed gives the same arm and bad luck.
+    """Emulated arm that takes orders; the same seed gives the same arm and disturbances.
 
-    Bad luck is drawn for each slice of time, so it is another by a clock than as fast as possible.
+    Disturbances are drawn per slice, so they differ by a clock and as fast as possible.
 
     Args:
-        emulation: What to emulate.
-        pace: How fast its time passes; None: as fast as possible.
+        emulation: Settings of the arm.
+        pace: Clock of its time; None: as fast as possible.
 
     Raises:
         InputError: If mujoco is missing.
@@ -73,26 +61,26 @@ class CommandedArm(EmulatedArm):
         self._given = 0
         self._waiting: list[Order] = []
         self._ordered = self._commanded
-        self._ramp = _Ramp(0.0, self._told[-1], self._told[-1], np.full(len(self._commanded), 1.0))
+        self._ramp = Ramp(0.0, self._told[-1], self._told[-1], np.zeros(len(self._commanded)))
         self._silent = (np.inf, np.inf)
 
     @property
     def counts(self) -> LinkCounts:
-        """How many events have been given."""
+        """Number of events given so far."""
         return LinkCounts(received=self._given)
 
     @property
     def standing(self) -> FloatArray:
-        """What the motors were told last, (motor,) [rad]."""
+        """Last target of the motors, (motor,) [rad]."""
         return self._ordered
 
     @property
     def angle(self) -> FloatArray:
-        """Where the motors really stand, (motor,) [rad]; nobody but a judge may look."""
+        """True angles of the motors, (motor,) [rad]; for judging results only."""
         return self._arm.angle
 
     def send(self, order: Order) -> None:
-        """Take an order; it begins with the next slice, or when the bus comes back."""
+        """Take an order; it begins with the next slice, or when the bus answers again."""
         self._waiting.append(order)
         self._ordered = order.target
 
@@ -111,7 +99,7 @@ class CommandedArm(EmulatedArm):
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Nothing to be closed."""
+        """Do nothing: there is nothing to close."""
 
     def _pass(self) -> None:
         """Let one slice of time pass."""
@@ -130,7 +118,7 @@ class CommandedArm(EmulatedArm):
         return np.asarray(self._self.lag)[None]
 
     def _begin(self, order: Order, now: float) -> None:
-        """Carry out an order; from here on its luck decides."""
+        """Begin an order, with its disturbances and faults."""
         drawn = self._draw()
         movement = Movements(
             self._commanded[None],
@@ -140,13 +128,11 @@ class CommandedArm(EmulatedArm):
         )
         faults = self._injection(now, now + 1.0)
         faulty, lost = faults.on_movements(movement, drawn.lost[None, 1:])
-        here = self._ramp.at(np.array([now]))[0]
+        here = self._ramp.at(now)
         aim = faulty.target[0, 0] + self._self.bias + drawn.scatter[2]
         stays = lost[0, 0] | (np.abs(order.target - self._commanded) < UNMOVED_RAD)
         duration = faulty.ramp_duration[0, 0] * (1.0 - self._self.shortening)
-        self._ramp = _Ramp(
-            now + float(self._self.delay), here, np.where(stays, here, aim), duration
-        )
+        self._ramp = Ramp(now + float(self._self.delay), here, np.where(stays, here, aim), duration)
         self._commanded = np.where(lost[0, 0], self._commanded, order.target)
         self._queue.append(CommandSent(now, order.target, order.duration))
         late, period = float(drawn.late[1]), self._imperfections.schedule.period_s
@@ -156,15 +142,78 @@ class CommandedArm(EmulatedArm):
 
     def _read(self, position: FloatArray, time: FloatArray, drawn: Disturbances) -> None:
         """Put the readings of a slice into the queue."""
-        local = time - time[0]
+        local, zero = time - time[0], np.zeros((1, 1))
         chance = stack([self._with_readings(drawn, time)])
-        chance = replace(chance, stalled=np.array([False]), late=np.zeros((1, 1)),
-                         gap_start=np.zeros((1, 1)))  # fmt: skip
-        measured, angle = sense(
-            self._twin, self._imperfections.readings, position[None], local,
-            np.zeros((1, 1)), chance,
-        )  # fmt: skip
+        chance = replace(chance, stalled=np.array([False]), late=zero, gap_start=zero)
+        readings = self._imperfections.readings
+        measured, angle = sense(self._twin, readings, position[None], local, zero, chance)
         seen = np.isfinite(angle[0]).any(axis=1) & (local > 0.0)
         seen &= ~((time >= self._silent[0]) & (time < self._silent[1]))
         for k in np.flatnonzero(seen):
             self._queue.append(Reading(float(time[k]), measured[0, k], angle[0, k]))
+
+
+# Work in shifts.
+
+
+@dataclass(frozen=True)
+class Shifts:
+    """Working hours of an arm.
+
+    Attributes:
+        movements: Movements of a shift.
+        break_s: Time from the last of them to the next shift [s].
+        duration_s: Time after which the arm ends [s].
+    """
+
+    movements: int = 12
+    break_s: float = 30.0
+    duration_s: float = math.inf
+
+
+class OperatedArm(CommandedArm):
+    """Commanded arm that also moves at random, in shifts; the same seed gives the same life.
+
+    In the breaks it is free for the orders of others, which the operator does not notice.
+
+    Args:
+        emulation: Settings of the arm.
+        shifts: Its working hours; None: the default.
+        pace: Clock of its time; None: as fast as possible.
+
+    Raises:
+        InputError: If mujoco is missing.
+    """
+
+    def __init__(
+        self, emulation: Emulation, shifts: Shifts | None = None, pace: Pace | None = None
+    ) -> None:
+        super().__init__(emulation, pace)
+        self.name = f"emulated {emulation.robot.name}, at work in shifts"
+        self._shifts = shifts or Shifts()
+        self._chance = np.random.default_rng([emulation.seed, OPERATOR])
+        self._next_s, self._made = FIRST_COMMAND_S, 0
+
+    def poll(self, timeout_s: float) -> Event | None:
+        """Return the next event; None if it is not due in time, or the arm has ended."""
+        if not self._queue and self._index * STEP_S >= self._shifts.duration_s:
+            self.ended = True
+            return None
+        return super().poll(timeout_s)
+
+    def _pass(self) -> None:
+        if self._index * STEP_S >= self._next_s:
+            self._work()
+        super()._pass()
+
+    def _work(self) -> None:
+        """Order the next movement of a shift, once the one before has begun."""
+        schedule, robot = self._imperfections.schedule, self._emulation.robot
+        self._next_s = self._index * STEP_S + float(self._chance.uniform(*schedule.period_s))
+        if self._waiting:
+            return
+        drawn = RandomMovements(count=1).draw(robot, schedule, self._chance, self._ordered)
+        self.send(Order(drawn.target[0, 0], drawn.ramp_duration[0, 0]))
+        self._made += 1
+        if self._made % self._shifts.movements == 0:
+            self._next_s += self._shifts.break_s

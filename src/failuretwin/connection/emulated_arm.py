@@ -1,8 +1,7 @@
-"""The physics engine's arm at work without end: random movements, faults that come and go.
+"""Emulated arm: the physics engine's arm with random movements and scheduled faults, without end.
 
-A leg is what happens from one command to the next. All chance of the next one is drawn before the
-readings of this one are made, because a bus that stalls swallows readings before it delays a
-command.
+A leg is the time from one command to the next. The disturbances of the next leg are drawn before
+the readings of this one are made, because a stalled bus loses readings before it delays a command.
 """
 
 from __future__ import annotations
@@ -42,20 +41,20 @@ STEP_S = 0.01
 FIRST_COMMAND_S = 1.0
 """Time at rest before the first command [s]."""
 MEMORY_S = 6.0
-"""How long lags and play remember what they were told [s]; longer than any movement."""
+"""Length of past reference that lag and play depend on [s]; longer than any movement."""
 
 
 @dataclass(frozen=True)
 class Emulation:
-    """What to emulate.
+    """Settings of an emulated arm.
 
     Attributes:
         robot: The robot.
-        imperfections: What it does that its twin does not.
-        schedule: Faults that come and go.
-        seed: Seed of all chance.
+        imperfections: Its deviations from the twin.
+        schedule: Faults with their start and end.
+        seed: Seed of all random draws.
         modes: Fault modes with their distributions, by id.
-        start: Where the motors are told to stand at first [rad]; empty: at zero.
+        start: First targets of the motors [rad]; empty: zero.
     """
 
     robot: Robot
@@ -71,11 +70,11 @@ class _Leg:
     """One movement and the time until the next.
 
     Attributes:
-        time: Grid from where the arm stands to the next command, (time,) [s].
-        movement: The movement as commanded, one of one run.
-        chance: Bad luck of this one run with one movement.
-        late: How late it starts [s].
-        faults: The faults that are there, or were not long ago.
+        time: Grid from the present to the next command, (time,) [s].
+        movement: The movement as commanded, as one run with one movement.
+        chance: Disturbances of this run.
+        late: Delay of its start [s].
+        faults: The faults that act, or acted within `MEMORY_S`.
     """
 
     time: FloatArray
@@ -86,10 +85,10 @@ class _Leg:
 
 
 class EmulatedArm:
-    """An arm that moves at random for ever; the same seed gives the same life, whatever fails.
+    """Arm that moves at random without end; the same seed gives the same life, whatever fails.
 
     Args:
-        emulation: What to emulate.
+        emulation: Its settings.
 
     Raises:
         InputError: If mujoco is missing.
@@ -118,13 +117,13 @@ class EmulatedArm:
         self._arm = LiveArm(engine, self._told[0], STEP_S, float(self._self.payload))
 
     def events(self) -> Iterator[Event]:
-        """Give readings and commands in the order of their times, without end."""
+        """Yield readings and commands in the order of their times, without end."""
         while True:
             leg = self._next_leg()
             yield from sorted(self._live_through(leg), key=lambda event: event.time)
 
     def _draw(self) -> Disturbances:
-        """Draw the bad luck of a movement; it is the second of two, as the first is never late."""
+        """Draw the disturbances of two movements. The second is used: the first is never late."""
         timing = self._imperfections.timing
         longest = FIRST_COMMAND_S + self._imperfections.schedule.period_s[1] + timing.late_s[1]
         return draw_disturbances(self._imperfections, self._emulation.robot, 2, longest, self._rng)
@@ -169,7 +168,7 @@ class EmulatedArm:
         return stack([self._with_readings(chance, time)])
 
     def _with_readings(self, chance: Disturbances, time: FloatArray) -> Disturbances:
-        """Return the disturbances with the readings of this leg alone, on an even beat."""
+        """Return the disturbances with the readings of this leg, evenly spaced across legs."""
         readings = self._imperfections.readings
         if readings is None:
             return chance
@@ -183,7 +182,7 @@ class EmulatedArm:
         )
 
     def _injection(self, begin_s: float, end_s: float) -> Injection:
-        """Return the faults that are there at any time between two times [s]."""
+        """Return the faults that act between two times [s]."""
         robot, values = self._emulation.robot, []
         for scheduled in self._emulation.schedule:
             if scheduled.overlaps(begin_s, end_s):
@@ -202,7 +201,7 @@ class EmulatedArm:
     def _coming_and_going(
         self, scheduled: ScheduledFault, mode: Intermittent, begin_s: float, end_s: float
     ) -> FaultValue:
-        """Return a fault with its episodes between two times [s]; none after its repair."""
+        """Return an intermittent fault with its episodes between two times [s] up to its repair."""
         if scheduled not in self._episodes:
             rng = self._rng_of_faults.spawn(1)[0]
             share = float(rng.uniform(*mode.magnitude))
@@ -210,16 +209,16 @@ class EmulatedArm:
                 scheduled.start_s, share, mode.episode_s, rng
             )
         endless, repaired = self._episodes[scheduled], scheduled.end_s
-        there = endless.within(begin_s, min(end_s, repaired))
-        there = tuple((start, min(end, repaired)) for start, end in there)
-        course = Course(INTERMITTENT, scheduled.start_s, episodes=there)
+        episodes = endless.within(begin_s, min(end_s, repaired))
+        episodes = tuple((start, min(end, repaired)) for start, end in episodes)
+        course = Course(INTERMITTENT, scheduled.start_s, episodes=episodes)
         return FaultValue(scheduled.fault, endless.share, course)
 
     def _live_through(self, leg: _Leg) -> list[Event]:
         before = self._goal
         position = self._move(leg)
         local = leg.time - leg.time[0]
-        # A bus that stalls twice in a row comes back between; else it would be silent for minutes.
+        # The bus answers between two stalls in a row; otherwise it would be silent for minutes.
         start = leg.movement.start - leg.time[0] + leg.late
         readings = self._imperfections.readings
         measured, angle = sense(self._twin, readings, position[None], local, start, leg.chance)
@@ -238,7 +237,7 @@ class EmulatedArm:
         return [*events, command]
 
     def _move(self, leg: _Leg) -> FloatArray:
-        """Return the angles on the leg's grid, (time, motor) [rad], and stand at its end."""
+        """Move through a leg and return the angles on its grid, (time, motor) [rad]."""
         faulty, lost = leg.faults.on_movements(leg.movement, leg.chance.lost)
         told = actual_movements(faulty, replace(leg.chance, lost=lost)).reference(leg.time)[0]
         self._commanded = np.where(lost[0, 0], self._commanded, faulty.target[0, 0])
@@ -248,10 +247,10 @@ class EmulatedArm:
     def _follow(
         self, told: FloatArray, time: FloatArray, lag: FloatArray, faults: Injection
     ) -> FloatArray:
-        """Return the angles that follow from references (time, motor) [rad], and stand there.
+        """Follow a reference and return the angles on its grid, (time, motor) [rad].
 
         Args:
-            told: Where the motors are told to be, from where they stand on, (time, motor) [rad].
+            told: The reference from the present on, (time, motor) [rad].
             time: Grid, (time,) [s].
             lag: First-order lag, (1,) [s].
             faults: The faults that act.
@@ -272,19 +271,16 @@ class EmulatedArm:
         return np.concatenate([before[None], angles])
 
 
-# The emulated robot as a source, in this very process.
-
-
 def emulated(
     emulation: Emulation, pace: Pace, duration_s: float = math.inf, zero_s: float = 0.0
 ) -> PacedSource:
     """Return an emulated robot as a source.
 
     Args:
-        emulation: What to emulate.
-        pace: How fast its time passes.
-        duration_s: How long it works [s].
-        zero_s: What its clock says at the start [s].
+        emulation: Settings of the arm.
+        pace: Clock of the events.
+        duration_s: Time after which it ends [s].
+        zero_s: Its clock at the start [s].
 
     Raises:
         InputError: If mujoco is missing.

@@ -1,4 +1,4 @@
-"""Step tests of a robot: told as parameters, with what each cannot say, and joined to the rest."""
+"""Step tests of a robot: parameters of each motor, and the robot calibrated with them."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from failuretwin.data_knowledge.step_tests import StepTest, find_step_tests, rea
 from failuretwin.digital_model.calibrated_robot import CalibratedLoop, with_loops
 from failuretwin.digital_model.robot import Motor, Robot
 
-# What step tests show without any model: how far a motor overshoots and when it has settled.
+# Overshoot and settling time, read from the steps without a model.
 
 BAND_SHARE, BAND_COUNTS = 0.02, 2.0
-"""A motor has settled when it stays this near: 2 % of its travel, two counts at least."""
+"""A motor has settled when it stays within 2 % of its travel, or within two counts if more."""
 
 
 def overshoot(step: StepTest) -> float:
-    """Return how far a motor goes beyond the level where it settles, as a share of its travel."""
+    """Return the largest excess over the settled level, as a share of the travel."""
     beyond = (step.position[step.time > 0.0] - step.settled) / step.travel
     return max(0.0, float(beyond.max()))
 
 
 def settling_time(step: StepTest, rad_per_count: float) -> float:
-    """Return the time from the end of the commanded ramp until a motor stays where it settles [s].
+    """Return the time from the end of the commanded ramp until the motor has settled [s].
 
     Args:
         step: The step.
@@ -50,41 +50,42 @@ def settling_time(step: StepTest, rad_per_count: float) -> float:
 
 
 def mean_interval(values: Sequence[float], blur: Sequence[float]) -> tuple[float, float, float]:
-    """Return the mean and the ends of its 95 % interval.
+    """Return the mean and the limits of its 95 % interval.
 
     Args:
-        values: One value for each step.
+        values: One value per step.
         blur: Standard deviation of each by rounding.
     """
     mean, count = float(np.mean(values)), len(values)
-    known = float(np.sum(np.square(blur))) / count**2
-    if count == 1:
-        half = 1.96 * float(np.sqrt(known))
-        return mean, mean - half, mean + half
-    seen = float(np.var(values, ddof=1)) / count
-    factor = student.ppf(0.975, count - 1) if seen > known else 1.96
-    half = float(factor * np.sqrt(max(seen, known)))
+    variance, factor = float(np.sum(np.square(blur))) / count**2, 1.96
+    if count > 1:
+        observed = float(np.var(values, ddof=1)) / count
+        if observed > variance:
+            variance, factor = observed, float(student.ppf(0.975, count - 1))
+    half = factor * float(np.sqrt(variance))
     return mean, mean - half, mean + half
 
 
+# All parameters of each motor.
+
 NAMES = ("loop gain P", "loop gain I", "filter time", "speed limit", "dead time")
 UNITS = ("-", "1/s", "s", "rad/s", "s")
-WELL_ABOVE = 5.0
-"""A step of this many times speed limit / I is at the limit for most of its way."""
+LIMITED = 5.0
+"""A step of this many times speed limit / I runs at the limit for most of its way."""
 COARSE = 0.05
-"""Overshoots are told from rounding if a count is less than this share of the travel."""
+"""Largest share of a count in the travel at which overshoot can be told from rounding."""
 
 
 @dataclass(frozen=True)
 class StepFit:
-    """What step tests say of one motor.
+    """Parameters of one motor from its step tests.
 
     Attributes:
         motor: Its name.
-        steps: Number of steps that count.
+        steps: Number of steps used.
         loop: Best values of loop and speed limit.
-        parameters: Every figure with its 95 % interval.
-        residual: Root mean square of the readings about the fitted motion [rad].
+        parameters: All parameters with their 95 % intervals.
+        residual: Root mean square residual of the readings [rad].
     """
 
     motor: str
@@ -97,7 +98,7 @@ class StepFit:
 def fit_steps(
     steps: Sequence[StepTest], robot: Robot
 ) -> tuple[tuple[StepFit, ...], tuple[LeftOut, ...]]:
-    """Fit every motor that has sound steps.
+    """Fit every motor that has steps without flaw.
 
     Args:
         steps: Steps of any of the robot's motors.
@@ -106,11 +107,12 @@ def fit_steps(
     Returns:
         The fits in chain order and the steps left out, each with its reason.
     """
-    sound = [step for step in steps if not step.flaw]
+    of_motor = {motor.name: [s for s in steps if s.motor == motor.name and not s.flaw]
+                for motor in robot.motors}  # fmt: skip
     fits = tuple(
-        _fit_motor([step for step in sound if step.motor == motor.name], motor, robot)
+        _fit_motor(of_motor[motor.name], motor, robot)
         for motor in robot.motors
-        if any(step.motor == motor.name for step in sound)
+        if of_motor[motor.name]
     )
     flawed = (step for step in steps if step.flaw)
     return fits, tuple(LeftOut(s.source, s.number, s.motor, s.flaw) for s in flawed)
@@ -137,32 +139,33 @@ def _shared_parameter(k: int, fit: SharedFit, steps: list[StepTest], motor: str)
     deviation = float(fit.deviation[k])
     if NAMES[k] == "speed limit" and not sizes_differ(steps):
         deviation = float(PRIOR_DEVIATION[k])
-    ends = np.array([0.0, -Z_95, Z_95]) * deviation + fit.mode[k]
+    limits = np.array([0.0, -Z_95, Z_95]) * deviation + fit.mode[k]
     if k in (1, 2, 3):
-        ends = np.exp(ends)
+        limits = np.exp(limits)
     if NAMES[k] == "loop gain P":
-        ends = np.maximum(ends, 0.0)
+        limits = np.maximum(limits, 0.0)
     learned = deviation < LEARNED * float(PRIOR_DEVIATION[k])
     note = "" if learned else _note(k, fit, steps)
-    value, low, high = ends.tolist()
+    value, low, high = limits.tolist()
     return Parameter(NAMES[k], motor, UNITS[k], value, low, high, learned, note)
 
 
 def _note(k: int, fit: SharedFit, steps: list[StepTest]) -> str:
-    """Return why the steps do not say a shared parameter and which would."""
+    """Return why the steps do not determine a shared parameter, and which steps would."""
     gain, limit = np.exp(fit.mode[[1, 3]])
     largest = np.rad2deg(max(abs(step.travel) for step in steps))
-    large = np.rad2deg(WELL_ABOVE * limit / gain)
-    quick = 1e3 * min(step.duration for step in steps)
+    large = np.rad2deg(LIMITED * limit / gain)
+    shortest = 1e3 * min(step.duration for step in steps)
     if NAMES[k] == "speed limit":
         return (
-            f"no step is seen to run at it, the largest is {largest:.0f} deg in {quick:.0f} ms; it "
-            f"takes one of {large:.0f} deg or more in 5 ms beside a small one"
+            f"no step reaches it, the largest is {largest:.0f} deg in {shortest:.0f} ms; needed is "
+            f"one of {large:.0f} deg or more in 5 ms, and a small one"
         )
-    read = 1e3 * float(np.median(np.diff(steps[0].time)))
+    period = 1e3 * float(np.median(np.diff(steps[0].time)))
     return (
-        f"{len(steps)} steps read every {read:.0f} ms do not say; it takes more steps of different "
-        f"sizes up to {np.rad2deg(limit / gain):.0f} deg in 5 ms, there and back, or faster reading"
+        f"{len(steps)} steps read every {period:.0f} ms do not determine it; needed are more steps "
+        f"of different sizes up to {np.rad2deg(limit / gain):.0f} deg in 5 ms, there and back, or "
+        "faster reading"
     )
 
 
@@ -170,7 +173,7 @@ def _overshoot(steps: list[StepTest], motor: str, quantum: float) -> Parameter:
     blur = [quantum / abs(step.travel) for step in steps]
     mean, low, high = mean_interval([overshoot(step) for step in steps], blur)
     learned = min(blur) < COARSE
-    note = "" if learned else "a count is much of such small steps; it takes larger ones"
+    note = "" if learned else "a count is a large share of such small steps; larger ones are needed"
     return Parameter("overshoot", motor, "share", mean, max(low, 0.0), high, learned, note)
 
 
@@ -180,17 +183,17 @@ def _settling(steps: list[StepTest], motor: str, quantum: float) -> Parameter:
     return Parameter("settling time after the ramp", motor, "s", mean, max(low, 0.0), high)
 
 
-# Step tests among the logs of a calibration: sorted out, fitted, and joined to the result.
+# Step tests among the logs of a calibration.
 
 
 @dataclass(frozen=True)
 class LearnedLoops:
-    """What step tests say of a robot.
+    """Servo loops of a robot from step tests.
 
     Attributes:
-        robot: The robot with the loops found; as it was unless every motor was tested.
-        fits: What was learned of each motor.
-        left_out: Steps that did not count.
+        robot: The robot with the fitted loops; unchanged unless every motor was tested.
+        fits: Fit of each motor.
+        left_out: Steps that were not used.
     """
 
     robot: Robot
@@ -199,13 +202,11 @@ class LearnedLoops:
 
 
 def split_step_tests(logs: Sequence[Path], columns: Path | None) -> tuple[list[Path], list[Path]]:
-    """Return step tests, as files, and all other logs.
-
-    A folder that holds both kinds counts as both.
+    """Return step tests, as files, and all other logs; a folder with both kinds counts as both.
 
     Args:
         logs: Files and folders.
-        columns: Column map, by which other CSV files in a folder are logs; None: they are not.
+        columns: Column map by which other CSV files in a folder are logs; None: they are ignored.
 
     Raises:
         InputError: If there are step tests only.
@@ -220,7 +221,7 @@ def split_step_tests(logs: Sequence[Path], columns: Path | None) -> tuple[list[P
         raise InputError(
             f"{len(tests)} step tests and no other log. Step tests say how fast a motor follows, "
             "but each rests at two or three places only; where motors settle takes logs of the arm "
-            "moving about. Give a session of the healthy robot beside them."
+            "moving about. Give a session of the healthy robot in addition."
         )
     return list(dict.fromkeys(tests)), others
 
@@ -244,27 +245,27 @@ def learn_loops(tests: Sequence[Path], robot: Robot) -> LearnedLoops:
     steps = [step for test in tests for step in read_step_test(test, robot)]
     fits, left_out = fit_steps(steps, robot)
     if not fits:
-        told = "; ".join(f"{out.run}: step {out.movement} {out.reason}" for out in left_out[:3])
+        reasons = "; ".join(f"{out.run}: step {out.movement} {out.reason}" for out in left_out[:3])
         raise InputError(
-            f"none of {len(steps)} steps can be used ({told}). Give step tests of a healthy motor "
-            "in files named after its servo, such as test_motor_6.csv, or leave them out."
+            f"none of {len(steps)} steps can be used ({reasons}). Give step tests of a healthy "
+            "motor in files named after its servo, such as test_motor_6.csv, or leave them out."
         )
     loops = [fit.loop for fit in fits] if len(fits) == len(robot.motors) else []
     return LearnedLoops(with_loops(robot, loops), fits, left_out)
 
 
 def with_step_tests(found: Calibration, steps: LearnedLoops) -> Calibration:
-    """Return a calibration with what step tests say.
+    """Return a calibration with the parameters of step tests.
 
-    Loops join it only if every motor has one: delay and lag, which are those of the whole robot,
-    are on top of the loops and cannot be on top of two kinds.
+    The loops are used only if every motor has one: delay and lag are parameters of the whole robot
+    in addition to the loops, and cannot be added to fitted and published loops at once.
     """
     if not steps.fits:
         return found
     counts = ", ".join(f"{fit.steps} of {fit.motor}" for fit in steps.fits)
     tested = [fit.motor for fit in steps.fits]
     missing = [name for name in steps.robot.motor_names if name not in tested]
-    use = "delay, lag and ramp shortening are what is left on top of them"
+    use = "delay, lag and ramp shortening are added to them"
     if missing:
         use = f"not used by the twin, since {', '.join(missing)} had no step test"
     return replace(

@@ -1,4 +1,4 @@
-"""Answers as the statuses of the arm and of each motor: one rule for all who are told."""
+"""Status of the arm and of each motor in an answer, the same for screens, logs and networks."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ PERIOD_S = 1.0
 
 @dataclass(frozen=True)
 class Status:
-    """State of a motor or of the whole arm.
+    """Status of a motor or of the whole arm.
 
     Attributes:
         name: ``arm``, or the name of the motor.
         level: One of the four levels.
-        message: What is the matter, in words.
+        message: Description in words.
         values: Key-values: probability, mode, magnitude, onset, runner-up.
     """
 
@@ -40,8 +40,8 @@ class Status:
 def statuses(answer: Answer, motors: Sequence[str]) -> list[Status]:
     """Return the statuses of an answer: the arm first, then its motors.
 
-    The alarm decides the levels, whatever the probabilities are.
-    Without data everything is stale; what was known before is told with it.
+    The alarm decides the levels, whatever the probabilities are. Without data every status is
+    stale, with the last known state in its message.
 
     Args:
         answer: The answer.
@@ -54,16 +54,16 @@ def statuses(answer: Answer, motors: Sequence[str]) -> list[Status]:
         return [Status(name, LEVEL_STALE, text, {}) for name in names]
     alarm = answer.alarm
     if diagnosis.undecided:
-        found = [
+        current = [
             Status(name, max(LEVEL_WARN, _level(alarm, name)), diagnosis.verdict, {})
             for name in names
         ]
     else:
-        found = [_arm(diagnosis, alarm), *(_motor(diagnosis, alarm, motor) for motor in motors)]
+        current = [_arm(diagnosis, alarm), *(_motor(diagnosis, alarm, motor) for motor in motors)]
     if answer.state != STALE:
-        return found
-    told = "no data for a while; before that: "
-    return [Status(s.name, LEVEL_STALE, told + s.message, s.values) for s in found]
+        return current
+    before = "no data for a while; before that: "
+    return [Status(s.name, LEVEL_STALE, before + s.message, s.values) for s in current]
 
 
 def _arm(diagnosis: Diagnosis, alarm: Alarm) -> Status:
@@ -89,18 +89,18 @@ def _arm(diagnosis: Diagnosis, alarm: Alarm) -> Status:
 
 
 def _episode(alarm: Alarm) -> dict[str, str]:
-    """Return the last fault that an alarm told of."""
+    """Return the last episode of an alarm."""
     episode = alarm.episode
     if episode is None:
         return {}
-    told = {
+    values = {
         "episode": str(episode.number),
         "episode_cause": episode.cause,
         "raised_s": f"{episode.raised_s:.2f}",
     }
     if episode.cleared_s is not None:
-        told["cleared_s"] = f"{episode.cleared_s:.2f}"
-    return told
+        values["cleared_s"] = f"{episode.cleared_s:.2f}"
+    return values
 
 
 def _motor(diagnosis: Diagnosis, alarm: Alarm, motor: str) -> Status:
@@ -146,20 +146,20 @@ def _level(alarm: Alarm, name: str) -> int:
 
 
 class RateLimiter:
-    """Says when to report: every second, and at once when any status gets worse."""
+    """Timing of reports: every second, and at once when any status gets worse."""
 
     def __init__(self) -> None:
         self._levels: list[int] = []
         self._due_s = -np.inf
 
-    def due(self, found: Sequence[Status], now_s: float) -> bool:
-        """Return whether these statuses are to be reported now.
+    def due(self, current: Sequence[Status], now_s: float) -> bool:
+        """Return whether to report statuses now.
 
         Args:
-            found: The statuses.
+            current: The statuses.
             now_s: Our own monotonic clock [s].
         """
-        levels = [status.level for status in found]
+        levels = [status.level for status in current]
         worse = any(new > old for new, old in zip(levels, self._levels, strict=False))
         if not worse and now_s < self._due_s:
             return False

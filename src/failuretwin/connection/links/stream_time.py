@@ -135,6 +135,8 @@ class ReorderBuffer:
         return events
 
 
+SHORTEST_S = 1e-9
+"""Shortest duration of a ramp [s]; durations of 0 are jumps."""
 Corner = tuple[float, FloatArray]
 """Time [s] and angles (motor,) [rad]."""
 
@@ -155,11 +157,11 @@ class Ramp:
     target: FloatArray
     duration: FloatArray
 
-    def at(self, time: float) -> FloatArray:
-        """Return the angles at a time [s], (motor,) [rad]."""
-        since = np.full_like(self.duration, time - self.start)
-        share = np.divide(since, self.duration, out=np.ones_like(since), where=self.duration > 0.0)
-        return np.asarray(self.origin + np.clip(share, 0.0, 1.0) * (self.target - self.origin))
+    def at(self, time: float | FloatArray) -> FloatArray:
+        """Return the angles at times [s] of any shape, (..., motor) [rad]."""
+        since = np.asarray(time)[..., None] - self.start
+        share = np.clip(since / np.maximum(self.duration, SHORTEST_S), 0.0, 1.0)
+        return np.asarray(self.origin + share * (self.target - self.origin))
 
 
 class LiveReference:
