@@ -14,6 +14,7 @@ from click.testing import CliRunner
 from failuretwin.app.cli import cli
 from failuretwin.app.study import (
     FEATURES,
+    PAGE,
     PLAN_FILE,
     WORK,
     Exam,
@@ -26,7 +27,14 @@ from failuretwin.app.study import (
     run_study,
     stand_in_test_set,
 )
-from failuretwin.app.study_page import TABLE_2, TABLE_3, mean_confusion, ratio_spreads, spread_of
+from failuretwin.app.study_page import (
+    TABLE_2,
+    TABLE_3,
+    mean_confusion,
+    ratio_spreads,
+    spread_of,
+    write_study_page,
+)
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.store import save_run_set
@@ -45,7 +53,8 @@ def studied(armpi, exam, tmp_path_factory):
     """A tiny study, and how much of it was told as progress."""
     folder = tmp_path_factory.mktemp("study") / "out"
     told = []
-    run_study(TINY, armpi, exam, folder, told.append)
+    trainings = run_study(TINY, armpi, exam, folder, told.append)
+    write_study_page(trainings, TINY, armpi, exam, folder / PAGE)
     return folder, sum(told)
 
 
@@ -108,7 +117,7 @@ def test_published_ratios_fit_each_other():
 def test_everything_is_on_the_page(studied):
     folder, told = studied
     text = (folder / "index.html").read_text("utf-8")
-    assert told == len(list(TINY.jobs())) * TINY.iterations
+    assert told == len(TINY.jobs()) * TINY.iterations
     for words in ("Table II", "Table III", "61.56 ± 5.59", "0.89 ± 0.04", "NaN", "stands in"):
         assert words in text
     assert text.count("data:image/png;base64,") == 4

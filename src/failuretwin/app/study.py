@@ -1,7 +1,6 @@
-"""The paper's study from end to end: its plan, its trainings, each kept, and the page.
+"""The paper's study: simulate, train each network, keep every result, resume after interruption.
 
-The networks learn from runs of the published twin alone and are tested on real runs. A study that
-was cut short goes on with the trainings that have no result yet.
+Networks are trained on runs of the published twin alone and tested on real runs.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import json
 import multiprocessing
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
@@ -38,19 +37,19 @@ if TYPE_CHECKING:
 
 PLAN_FILE, WORK, PAGE = "study.json", "trainings", "index.html"
 
-# What the study does, to the letter of the paper; and a small version of it.
+# Plan of the study.
 
 FEATURES = ("original", "augmented")
 """The paper's two feature sets."""
 RATES = REPRODUCING_RATE, PRINTED_RATE = 1e-3, 1e-4
-"""Learning rates: the reading that reproduces the paper's Table II, and the one that it prints."""
+"""Learning rates: the one that reproduces the paper's Table II, and the one that it prints."""
 BATCH_RUNS = 32
 VALIDATION_SHARE = 0.1
 
 
 @dataclass(frozen=True)
 class Job:
-    """One training: repetition `repeat`, from 0, with a split and random weights of its own."""
+    """One training; each `repeat`, from 0, has its own split and initial weights."""
 
     features: str
     learning_rate: float
@@ -67,12 +66,12 @@ class StudyPlan:
     """Sizes of the study; the defaults are the paper's.
 
     Attributes:
-        seed: Seed of all chance.
+        seed: Random seed.
         runs_per_class: Simulated runs of each of the nine classes.
-        checkpoints: Iterations after which accuracies are taken, all of one training. The paper
+        checkpoints: Iterations at which accuracies are measured within one training. The paper
             calls them epochs; its figures fit iterations, of which an epoch has 101.
         repeats: Repetitions of each training.
-        stand_in_runs: Runs of each class by the physics engine where no real test set is given.
+        stand_in_runs: Runs per class of the stand-in test set by the physics engine.
     """
 
     seed: int = 0
@@ -81,12 +80,10 @@ class StudyPlan:
     repeats: int = 5
     stand_in_runs: int = 100
 
-    def jobs(self) -> Iterator[Job]:
-        """Give every training, those that tell most first."""
-        for repeat in range(self.repeats):
-            for rate in RATES:
-                for features in reversed(FEATURES):
-                    yield Job(features, rate, repeat)
+    def jobs(self) -> list[Job]:
+        """Return all trainings, the most informative ones first."""
+        kinds = [(rate, features) for rate in RATES for features in reversed(FEATURES)]
+        return [Job(f, rate, repeat) for repeat in range(self.repeats) for rate, f in kinds]
 
     @property
     def iterations(self) -> int:
@@ -95,16 +92,16 @@ class StudyPlan:
 
 
 def quick_plan(seed: int) -> StudyPlan:
-    """Return a study of about two minutes: all of its parts, figures that mean little."""
+    """Return a small study of about two minutes."""
     return StudyPlan(seed, 60, (50, 100, 150, 200, 250), 2, 20)
 
 
-# The runs as features: simulated by the published twin, and a test set beside them.
+# Test set and training data.
 
 
 @dataclass(frozen=True)
 class Exam:
-    """Runs that networks are tested on, from a log (`real`) or the physics engine."""
+    """Test set: recorded runs (`real`) or simulated ones, with a description of their source."""
 
     runs: xr.Dataset
     real: bool
@@ -117,11 +114,11 @@ def class_names(robot: Robot) -> list[str]:
 
 
 def given_test_set(path: Path, robot: Robot, published_labels: bool) -> Exam:
-    """Read a test set as the authors processed theirs: readings drawn out by straight lines.
+    """Read a test set with linearly interpolated readings, as the authors processed theirs.
 
     Raises:
-        InputError: If it cannot be read or its truth is not known or not one of the classes, or if
-            a stored run set, which has its labels, is to be labelled anew.
+        InputError: If it cannot be read, its truth is unknown or not one of the classes, or
+            `published_labels` is set for a run set.
     """
     if published_labels and path.suffix in SUFFIXES:
         raise InputError(
@@ -138,13 +135,12 @@ def given_test_set(path: Path, robot: Robot, published_labels: bool) -> Exam:
             f"{', '.join(class_names(robot))}."
         )
     simulated = str(runs.attrs.get("source", "")).startswith("simulated")
-    made = "simulated " if simulated else ""
-    source = f"{counted(runs.sizes['run'], made + 'run')} of {path}"
-    return Exam(runs, real=not simulated, source=source)
+    kind = "simulated run" if simulated else "run"
+    return Exam(runs, not simulated, f"{counted(runs.sizes['run'], kind)} of {path}")
 
 
 def stand_in_test_set(plan: StudyPlan, robot: Robot) -> Exam:
-    """Simulate a test set with the physics engine, for want of a real one."""
+    """Simulate a test set with the physics engine."""
     hypotheses = paper_hypotheses(robot.motor_names)
     runs = simulate(Plan(robot, hypotheses, plan.stand_in_runs, plan.seed + 1, engine="physics"))
     source = f"{runs.sizes['run']} runs of the physics engine, which stands in for a robot"
@@ -152,7 +148,7 @@ def stand_in_test_set(plan: StudyPlan, robot: Robot) -> Exam:
 
 
 def make_arrays(plan: StudyPlan, robot: Robot, test: Exam, folder: Path) -> None:
-    """Simulate the training data and write a file of arrays for each feature set into `folder`."""
+    """Simulate the training runs and write one file of arrays per feature set into `folder`."""
     names = class_names(robot)
     simulated = simulate(
         Plan(robot, paper_hypotheses(robot.motor_names), plan.runs_per_class, plan.seed)
@@ -163,29 +159,24 @@ def make_arrays(plan: StudyPlan, robot: Robot, test: Exam, folder: Path) -> None
         for name, runs in (("simulated", simulated), ("test", test.runs)):
             arrays[name] = encoder.encode(signals_of(runs))
             arrays[f"{name}_class"] = [names.index(fault) for fault in truth_of(runs) or []]
-        with replacing(_data_file(folder, features)) as new, new.open("wb") as file:
+        with replacing(folder / f"{features}.npz") as new, new.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
 
 
-def _data_file(folder: Path, features: str) -> Path:
-    return folder / f"{features}.npz"
+# Trainings, each in a process of its own.
 
-
-# The trainings, each a process of its own.
-
-LOOK_S = 0.5
-"""Time between two looks at how far the trainings are [s]."""
+POLL_S = 0.5
+"""Time between two progress updates [s]."""
 
 
 @dataclass(frozen=True)
 class Training:
-    """The result of one job.
+    """Result of one job.
 
     Attributes:
-        accuracies: Shares of runs that are right at each checkpoint of the plan, on those learned
-            from (`training`), simulated ones held out (`validation`) and the `test` set.
+        accuracies: Accuracy at each checkpoint on the `training`, `validation` and `test` runs.
         confusion: Counts on the test set at the last checkpoint, rows of (truth, diagnosis).
-        seconds: Time it took [s].
+        seconds: Duration [s].
     """
 
     job: Job
@@ -197,11 +188,11 @@ class Training:
 def run_all(
     plan: StudyPlan, folder: Path, classes: int, on_progress: Callable[[int], None]
 ) -> list[Training]:
-    """Do all trainings that have no result in `folder` yet; return the results of all.
+    """Run the trainings without a result in `folder`; return all results.
 
-    Progress counts iterations, those of earlier attempts included.
+    `on_progress` receives numbers of iterations, including those of earlier attempts.
     """
-    jobs = list(plan.jobs())
+    jobs = plan.jobs()
     missing = [job for job in jobs if not _file(folder, job).is_file()]
     on_progress((len(jobs) - len(missing)) * plan.iterations)
     if missing:
@@ -220,11 +211,11 @@ def _spread(
     at_a_time = 1 if torch.cuda.is_available() else min(len(jobs), cores())
     context = multiprocessing.get_context("spawn")
     done, reported = context.Value("q", 0), 0
-    with ProcessPoolExecutor(at_a_time, context, initializer=_begin, initargs=(done,)) as pool:
+    with ProcessPoolExecutor(at_a_time, context, initializer=_start, initargs=(done,)) as pool:
         running = {pool.submit(work, job) for job in jobs}
         try:
             while running:
-                finished, running = wait(running, LOOK_S, FIRST_COMPLETED)
+                finished, running = wait(running, POLL_S, FIRST_COMPLETED)
                 on_progress(done.value - reported)
                 reported = done.value
                 for future in finished:
@@ -236,19 +227,19 @@ def _spread(
             ) from error
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():  # they would go on with their jobs
+            for process in multiprocessing.active_children():
                 process.terminate()
             raise
 
 
 _done: Any = None
-"""Iterations that all processes have done; set in each of them."""
+"""Iterations done by all processes; set in each of them."""
 
 
-def _begin(done: Any) -> None:
+def _start(done: Any) -> None:
     global _done
     _done = done
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for whoever gives out the jobs
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles Ctrl-C
     import torch
 
     torch.set_num_threads(1)
@@ -261,57 +252,65 @@ def _count() -> None:
 
 
 def train(plan: StudyPlan, folder: Path, classes: int, job: Job) -> None:
-    """Do one training and write its result into `folder`."""
+    """Run one training and write its result into `folder`."""
     import torch
 
     from failuretwin.decision.learned import networks
 
-    begun = time.perf_counter()
-    with np.load(_data_file(folder, job.features), allow_pickle=False) as stored:
-        arrays = dict(stored)
-    simulated, truth = arrays["simulated"], arrays["simulated_class"]
+    start = time.perf_counter()
     rng = np.random.default_rng([plan.seed, job.repeat])
-    order = rng.permutation(len(simulated))
-    held_out = round(VALIDATION_SHARE * len(order))
-    validation, learning = order[:held_out], order[held_out:]
-    standard = networks.Standard.of(simulated[learning])
-    sets = {
-        "training": (standard(simulated[learning]), truth[learning]),
-        "validation": (standard(simulated[validation]), truth[validation]),
-        "test": (standard(arrays["test"]), arrays["test_class"]),
-    }
+    sets = _standardised_sets(folder / f"{job.features}.npz", rng)
+    channels = sets["test"][0].shape[2]
     torch.manual_seed(int(rng.integers(2**31)))
-    network = networks.build_network("lstm", networks.Shape(simulated.shape[2], classes))
+    network = networks.build_network("lstm", networks.Shape(channels, classes))
     batches = networks.shuffled_batches(*sets["training"], BATCH_RUNS, rng)
-    right: dict[str, tuple[float, ...]] = dict.fromkeys(sets, ())
+    accuracies: dict[str, tuple[float, ...]] = dict.fromkeys(sets, ())
     confusion = np.zeros((classes, classes), dtype=np.int64)
     pace = networks.Pace(plan.iterations, job.learning_rate)
     for iteration in networks.training(network, batches, pace):
         _count()
         if iteration in plan.checkpoints:
-            for name, (x, true) in sets.items():
-                said = networks.scores_of(network, x).argmax(axis=1)
-                right[name] += (float(np.mean(said == true)),)
+            for name, (features, truth) in sets.items():
+                diagnosis = networks.scores_of(network, features).argmax(axis=1)
+                accuracies[name] += (float(np.mean(diagnosis == truth)),)
             confusion[:] = 0  # of the test set, which is the last
-            np.add.at(confusion, (true, said), 1)
+            np.add.at(confusion, (truth, diagnosis), 1)
     counts = tuple(map(tuple, confusion.tolist()))
-    result = Training(job, right, counts, time.perf_counter() - begun)
+    result = Training(job, accuracies, counts, time.perf_counter() - start)
     with replacing(_file(folder, job)) as file:
         file.write_text(json.dumps(asdict(result), indent=1), encoding="utf-8")
+
+
+def _standardised_sets(path: Path, rng: np.random.Generator) -> dict[str, tuple[Any, Any]]:
+    """Return features and classes of the `training`, `validation` and `test` runs."""
+    from failuretwin.decision.learned.networks import Standard
+
+    with np.load(path, allow_pickle=False) as stored:
+        simulated, truth = stored["simulated"], stored["simulated_class"]
+        test = stored["test"], stored["test_class"]
+    order = rng.permutation(len(simulated))
+    held_out = round(VALIDATION_SHARE * len(order))
+    validation, learning = order[:held_out], order[held_out:]
+    standard = Standard.of(simulated[learning])
+    return {
+        "training": (standard(simulated[learning]), truth[learning]),
+        "validation": (standard(simulated[validation]), truth[validation]),
+        "test": (standard(test[0]), test[1]),
+    }
 
 
 def _file(folder: Path, job: Job) -> Path:
     return folder / f"{job.name}.json"
 
 
-# The study in one call: take up what is there, do what is missing, write the page.
+# The study in one call.
 
 
 def check_folder(folder: Path, resume: bool) -> None:
-    """Refuse a folder that this study must not write to.
+    """Check that the study may write to `folder`.
 
     Raises:
-        InputError: If it holds anything and is not to be resumed, or is to be and is no study.
+        InputError: If it is not empty and `resume` is off, or it holds no study to resume.
     """
     taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
     if taken and not resume:
@@ -320,15 +319,15 @@ def check_folder(folder: Path, resume: bool) -> None:
             "another folder."
         )
     names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
-    begun = names == [WORK]  # interrupted before it had a plan
-    if taken and not begun and not (folder / PLAN_FILE).is_file():
+    without_plan = names == [WORK]  # interrupted before the plan was written
+    if taken and not without_plan and not (folder / PLAN_FILE).is_file():
         raise InputError(f"{folder}: holds no study to resume ({PLAN_FILE} is missing).")
 
 
 def run_study(
     plan: StudyPlan, robot: Robot, test: Exam, folder: Path, on_progress: Callable[[int], None]
-) -> Path:
-    """Do the study in a folder that `check_folder` allowed; return its page.
+) -> list[Training]:
+    """Run what is missing of a study in a folder that `check_folder` accepted.
 
     Raises:
         InputError: If the folder holds a study with another plan, or an extra is missing.
@@ -338,27 +337,18 @@ def run_study(
     if stored.is_file():
         _check_same(json.loads(stored.read_text(encoding="utf-8")), manifest, folder)
     else:
-        _make(folder / WORK)
+        try:
+            (folder / WORK).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{folder}: cannot be made ({reason(error)}).") from error
         make_arrays(plan, robot, test, folder / WORK)
         with replacing(stored) as new:
             new.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
-    trainings = run_all(plan, folder / WORK, len(class_names(robot)), on_progress)
-    from failuretwin.app.study_page import write_study_page
-
-    page = folder / PAGE
-    write_study_page(trainings, plan, robot, test, page)
-    return page
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be made ({reason(error)}).") from error
+    return run_all(plan, folder / WORK, len(class_names(robot)), on_progress)
 
 
 def _manifest(plan: StudyPlan, robot: Robot, test: Exam) -> dict[str, Any]:
-    """Return what decides the study's figures."""
+    """Return everything that determines the figures of the study."""
     return {
         "seed": plan.seed,
         "runs_per_class": plan.runs_per_class,
@@ -372,7 +362,7 @@ def _manifest(plan: StudyPlan, robot: Robot, test: Exam) -> dict[str, Any]:
 
 
 def _digest(test: Exam) -> str:
-    """Return a hash of all that networks see of the test set, and of its truth."""
+    """Return a hash of the commands, readings and truth of the test set."""
     digest = hashlib.sha256(json.dumps([str(f) for f in test.runs["fault"].values]).encode())
     for name in ("command", "measured"):
         digest.update(test.runs[name].values.tobytes())

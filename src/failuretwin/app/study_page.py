@@ -34,12 +34,12 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-# What the paper reports, to stand beside our figures (arXiv 2411.01360, tables II and III).
+# Published figures (arXiv 2411.01360, tables II and III).
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Mean and standard deviation over repetitions; NaN where there is none."""
+    """Mean and standard deviation over repetitions; NaN where undefined."""
 
     mean: float
     deviation: float
@@ -70,15 +70,15 @@ TABLE_3 = {
 }
 """Precision, recall and F1 of each class on 90 real runs, in the order of the paper's rows."""
 
-# From the results of the trainings to the numbers of the paper's tables.
+# Statistics over repetitions.
 
 COLOURS = {"training": GREY, "validation": BLUE, "test": RED}
 SETS = tuple(COLOURS)
-"""What accuracies are taken on."""
+"""Sets of runs whose accuracy is measured."""
 
 
 def of_kind(trainings: Sequence[Training], features: str, rate: float) -> list[Training]:
-    """Return the repetitions of one kind of training."""
+    """Return the repetitions with these features and this learning rate."""
     return [t for t in trainings if (t.job.features, t.job.learning_rate) == (features, rate)]
 
 
@@ -98,7 +98,7 @@ def accuracies(repeats: Sequence[Training], name: str) -> list[Spread]:
 def ratio_spreads(repeats: Sequence[Training]) -> list[tuple[Spread, ...]]:
     """Return precision, recall and F1 of each class on the test set.
 
-    Precision and F1 are NaN in a repetition that never names the class, as in the paper.
+    Precision and F1 are NaN in a repetition that never predicts the class, as in the paper.
     """
     ratios = class_ratios(np.array([training.confusion for training in repeats]))
     ratios[np.isnan(ratios[..., 0]), 2] = np.nan  # (repeat, class, ratio)
@@ -106,24 +106,24 @@ def ratio_spreads(repeats: Sequence[Training]) -> list[tuple[Spread, ...]]:
 
 
 def mean_confusion(repeats: Sequence[Training]) -> FloatArray:
-    """Return the share of each truth that got each diagnosis on the test set, (truth, diagnosis).
+    """Return the row-normalised confusion matrix on the test set, (truth, diagnosis).
 
-    NaN in the row of a class that the test set lacks.
+    Rows of classes missing from the test set are NaN.
     """
     total = np.sum([training.confusion for training in repeats], axis=0).astype(np.float64)
     with np.errstate(invalid="ignore"):
         return total / total.sum(axis=1, keepdims=True)
 
 
-# Pictures of the study. Need the extra `plots`.
+# Figures.
 
 
 def training_figure(
     trainings: Sequence[Training], learning_rate: float, iterations: Sequence[int]
 ) -> Figure:
-    """Return accuracy by iterations, a panel for each feature set, with error bars of one sd.
+    """Return accuracy by iterations, one panel per feature set, error bars of one deviation.
 
-    The published accuracies are lines in the panel of augmented features.
+    Dotted lines show the published accuracies of augmented features.
     """
     figure = plots.new_figure(11.0, 4.2)
     panels = figure.subplots(1, len(FEATURES), sharey=True)
@@ -152,7 +152,7 @@ def training_figure(
 
 
 def path_figure(runs: xr.Dataset, run: int, twin: DigitalTwin) -> Figure:
-    """Return the simulated and the measured path of a run, and what lies between them."""
+    """Return the simulated and measured path of a run, and their difference."""
     time = as_floats(runs["time"].values)
     measured = as_floats(runs["measured"].values[run])
     simulated = twin.path(twin.respond(as_floats(runs["command"].values[run]), time))
@@ -175,7 +175,7 @@ def path_figure(runs: xr.Dataset, run: int, twin: DigitalTwin) -> Figure:
 
 
 def confusion_figure(shares: Mapping[str, FloatArray], classes: Sequence[str]) -> Figure:
-    """Return confusion matrices side by side, by title: shares as of `mean_confusion`."""
+    """Return confusion matrices of `mean_confusion` side by side, by title."""
     figure = plots.new_figure(6.0 * len(shares), 5.6)
     panels = figure.subplots(1, len(shares), sharey=True, squeeze=False)[0]
     for panel, (title, share) in zip(panels, shares.items(), strict=True):
@@ -199,7 +199,7 @@ def confusion_figure(shares: Mapping[str, FloatArray], classes: Sequence[str]) -
 def write_study_page(
     trainings: Sequence[Training], plan: StudyPlan, robot: Robot, test: Exam, path: Path
 ) -> None:
-    """Write tables and pictures of a finished study."""
+    """Write the page with tables and figures of a finished study."""
     names = class_names(robot)
     values = {
         "plan": plan,
@@ -219,7 +219,7 @@ def write_study_page(
 
 
 def _table_2(trainings: Sequence[Training], test: Exam) -> Table:
-    """Return a row for the paper and one for each kind of training."""
+    """Return one row for the paper and one per kind of training."""
     stand_in = "" if test.real else " (stand-in)"
     rows = [("the paper", *(percent(TABLE_2[name]) for name in SETS))]
     for features in reversed(FEATURES):
@@ -232,7 +232,7 @@ def _table_2(trainings: Sequence[Training], test: Exam) -> Table:
 
 
 def _progress(trainings: Sequence[Training], plan: StudyPlan) -> Table:
-    """Return accuracies at every checkpoint, a row for each kind of training and set."""
+    """Return accuracies at every checkpoint, one row per kind of training and set."""
     rows = [
         (
             f"{features} features, {rate:g}, {name}",
@@ -246,7 +246,7 @@ def _progress(trainings: Sequence[Training], plan: StudyPlan) -> Table:
 
 
 def _table_3(trainings: Sequence[Training], features: str, names: Sequence[str]) -> Table:
-    """Return ratios of each class at the reproducing rate beside those of the paper."""
+    """Return ratios of each class at the reproducing rate, with those of the paper."""
     ours = ratio_spreads(of_kind(trainings, features, REPRODUCING_RATE))
     rows = [
         (plots.plain(name), *map(text, ours[names.index(name)]), *map(text, published))
@@ -266,7 +266,7 @@ def text(value: Spread, scale: float = 1.0) -> str:
 
 
 def percent(value: Spread) -> str:
-    """Return an accuracy in per cent."""
+    """Return an accuracy in percent."""
     return text(value, 100.0)
 
 

@@ -251,6 +251,7 @@ def study(
     from failuretwin.app import study as paper
     from failuretwin.app.inputs import check_learning
     from failuretwin.app.plots import figure_class
+    from failuretwin.app.study_page import write_study_page
     from failuretwin.app.tables import progress_bar
     from failuretwin.core.errors import InputError
     from failuretwin.digital_model.robot import load_robot
@@ -267,9 +268,10 @@ def study(
         else paper.given_test_set(test_path, model, published_labels)
     )
     check_learning()
-    trainings = len(list(plan.jobs()))
-    tell(f"{trainings} trainings of {plan.iterations} iterations each")
-    total = trainings * plan.iterations
-    with progress_bar("training", total) as advance:
-        page = paper.run_study(plan, model, test, out, advance)
+    jobs = len(plan.jobs())
+    tell(f"{jobs} trainings of {plan.iterations} iterations each")
+    with progress_bar("training", jobs * plan.iterations) as advance:
+        trainings = paper.run_study(plan, model, test, out, advance)
+    page = out / paper.PAGE
+    write_study_page(trainings, plan, model, test, page)
     tell(f"written to {page}")
