@@ -6,6 +6,7 @@ import itertools
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from runpy import run_path
 
@@ -73,7 +74,7 @@ def share_waited(name: str, encoder: FeatureEncoder, data: TrainingData) -> tupl
             waits.append(time.perf_counter() - begun)
             yield chunk
 
-    with stream.chunks() as chunks:
+    with closing(stream.chunks()) as chunks:
         standard = Standard.of(next(chunks)[0])
         for _ in range(stream.uses):  # until as many chunks are in use as there ever are
             next(chunks)

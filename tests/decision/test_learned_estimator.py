@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -169,7 +170,7 @@ def test_every_run_is_used_as_often_as_asked(stream):
 
 def test_fresh_runs_come_from_other_processes_in_order(stream, encoder, monkeypatch):
     monkeypatch.setattr(stream_module, "CHUNK_RUNS", 48)
-    with stream.chunks() as chunks:
+    with closing(stream.chunks()) as chunks:
         streamed = list(itertools.islice(chunks, 2))
     for number, (features, classes) in enumerate(streamed):
         expected = stream.data.chunk(number, 48, encoder)
@@ -184,7 +185,7 @@ def test_a_mode_of_ones_own_is_learned_in_other_processes_too(
     with registered_from(code_on_the_page(), tmp_path, "shaft_to_learn"):
         states = parse_hypotheses(["healthy", "motor_2:bent_shaft"], armpi.motor_names)
         recipe = TrainingData(armpi, measured_armpi, 3, hypotheses=states)
-        with Stream(recipe, encoder, batch_runs=12).chunks() as chunks:
+        with closing(Stream(recipe, encoder, batch_runs=12).chunks()) as chunks:
             features, classes = next(chunks)
         expected, order = recipe.chunk(0, 24, encoder)
     np.testing.assert_array_equal(features, expected)

@@ -216,7 +216,7 @@ def features():
     signals = signals_of(runs)
     found = {
         "robust": robust_features(twin().robot, healthy("armpi_fpv", twin().robot), runs),
-        "original": original_features(twin(), signals),
+        "original": original_features(signals),
         "augmented": augmented_features(twin(), signals),
     }
     return {

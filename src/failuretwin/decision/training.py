@@ -1,22 +1,17 @@
-"""Training a network for a real robot: on the calibrated twin, without any recorded failure.
-
-It learns from runs as various as a real robot may make them, without end, which other processes
-make meanwhile.
-"""
+"""Training a network on the calibrated twin, without recorded failures."""
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field, replace
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from torch.utils.data import DataLoader, Dataset
 
 from failuretwin.core.errors import FailureTwinError
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
@@ -51,9 +46,9 @@ if TYPE_CHECKING:
 Range = tuple[float, float]
 
 COUNT_RAD = float(np.deg2rad(0.24))
-"""One count of the servos whose errors the ranges below were found on [rad]."""
+"""One servo count [rad]; the error ranges below are in counts of this servo."""
 RUNS_PER_CLASS = 10**9
-"""Runs of each class that a seed has room for: more than any training sees."""
+"""Runs of each class reserved per seed; more than any training uses."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +58,8 @@ class Variant:
     Attributes:
         error_counts: Range of steady-state errors [counts of 0.24 deg].
         onset_s: Range of the onset of stuck faults [s]; 0: before the run.
-        first_motor_deg: Range of the first motor's targets to both sides [deg]; None: as the
-            robot's profile says.
+        first_motor_deg: Largest target of the first motor, to both sides [deg]; None: as in the
+            robot's profile.
     """
 
     error_counts: Range
@@ -80,21 +75,21 @@ VARIANTS = (
     Variant((4.0, 12.0), (0.49, 0.49), 70.0),
     Variant((4.0, 20.0), (0.0, 2.0)),
 )
-"""Small errors are the hard ones, so they come most often; the paper's are 10 to 50 counts."""
+"""Small errors are the hardest, so they are the most frequent; the paper's are 10 to 50 counts."""
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """An endless supply of labelled runs, the same for the same seed.
+    """Endless labelled runs, reproducible by seed.
 
     Attributes:
         robot: The robot.
-        imperfections: Its healthy behaviour, with the variation to draw robots from.
-        seed: Seed of all chance.
+        imperfections: Its healthy behaviour, with the variation between robots.
+        seed: Random seed.
         variants: Kinds of runs, equally frequent.
-        engine: What moves the robot; see `Plan`.
-        hypotheses: The classes; none: the paper's.
-        modes: Fault modes by id; a variant says how large the paper's are and when they begin.
+        engine: Simulation engine; see `Plan`.
+        hypotheses: The classes; empty: the paper's.
+        modes: Fault modes by id; variants override magnitude and onset of the paper's modes.
     """
 
     robot: Robot
@@ -111,14 +106,14 @@ class TrainingData:
 
     @property
     def movements(self) -> tuple[int, int]:
-        """Fewest and most movements of a run."""
+        """Smallest and largest number of movements of a run."""
         count = RandomMovements().count
         return count, count
 
     def chunk(self, number: int, runs: int, encoder: FeatureEncoder) -> tuple[Floats, IntArray]:
-        """Return some runs as features, with their classes, in random order.
+        """Return features and classes of the runs of a chunk, in random order.
 
-        Each number of a chunk has runs of its own, and as many of one variant as of another.
+        Chunks of different numbers share no runs; variants are equally frequent in each.
         """
         made = [(at, encoder.encode(signals_of(table))) for at, table in self._made(number, runs)]
         order, features = (np.concatenate(parts) for parts in zip(*made, strict=True))
@@ -126,7 +121,7 @@ class TrainingData:
         return features[shuffled], self._classes(number, runs)[order[shuffled]]
 
     def run_set(self, number: int, runs: int) -> xr.Dataset:
-        """Return the runs of a chunk as a run set that knows their truth."""
+        """Return the runs of a chunk as a run set with their truth."""
         return concatenate([table.to_dataset() for _, table in self._made(number, runs)])
 
     def _classes(self, number: int, runs: int) -> IntArray:
@@ -134,7 +129,7 @@ class TrainingData:
         return rng.integers(0, len(self.hypotheses), runs)
 
     def _made(self, number: int, runs: int) -> Iterator[tuple[IntArray, RunTable]]:
-        """Give the runs of each variant, and their places among the classes of the chunk."""
+        """Yield the runs of each variant with their indices in the chunk."""
         classes = self._classes(number, runs)
         for kind, variant in enumerate(self.variants):
             places = np.arange(kind, runs, len(self.variants))
@@ -166,7 +161,7 @@ def _modes_of(variant: Variant) -> Mapping[str, FaultMode]:
 
 
 def _with_range(robot: Robot, degrees: float | None) -> Robot:
-    """Return the robot with another range of the first motor's targets."""
+    """Return the robot with another target range of the first motor."""
     if degrees is None:
         return robot
     first, *others = robot.motors
@@ -176,10 +171,9 @@ def _with_range(robot: Robot, degrees: float | None) -> Robot:
 
 
 def widened(imperfections: Imperfections, factor: float) -> Imperfections:
-    """Return imperfections whose robots differ `factor` times as much from each other.
+    """Return imperfections with `factor` times the variation between robots.
 
-    A calibration knows its figures well on the day of its logs; on another day, and with another
-    tool, they are a little different.
+    A calibration describes the day of its logs; other days and tools differ more than it states.
     """
     variation = imperfections.variation
     if variation is None:
@@ -191,30 +185,40 @@ def widened(imperfections: Imperfections, factor: float) -> Imperfections:
     return replace(imperfections, variation=replace(variation, **wider))
 
 
-# Training batches that never end, made by other processes while a network learns.
+# Endless training batches, simulated by other processes while a network learns.
 
 CHUNK_RUNS = 576
-"""Runs made at a time."""
+"""Runs simulated at a time."""
 AHEAD = 2
-"""Batchs made ahead for each process, so that none waits."""
+"""Chunks prepared in advance by each process."""
 
 
 def cores() -> int:
-    """Return how many processes this machine can run at a time."""
+    """Return the number of processes that this machine runs at a time."""
     return os.cpu_count() or 1
 
 
 @dataclass(frozen=True)
-class Stream:
-    """Batches of runs straight from the generator.
+class _Chunks(Dataset[Batch]):
+    """Chunks of simulated runs by number."""
 
-    They depend on `data` alone, not on how many processes make the runs.
+    data: TrainingData
+    encoder: FeatureEncoder
+    runs: int
+
+    def __getitem__(self, number: int) -> Batch:
+        return self.data.chunk(number, self.runs, self.encoder)
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Batches of simulated runs; they depend on `data` alone, not on the number of processes.
 
     Attributes:
-        data: What runs are made.
-        encoder: What networks see of them.
+        data: Source of the runs.
+        encoder: Turns runs into features.
         batch_runs: Runs in a batch.
-        uses: Batches that a run is part of before it is thrown away; 1: none is seen twice.
+        uses: Number of batches that each run is part of.
     """
 
     data: TrainingData
@@ -222,35 +226,33 @@ class Stream:
     batch_runs: int = 64
     uses: int = 6
 
-    @contextmanager
-    def chunks(self) -> Iterator[Iterator[Batch]]:
-        """Give chunks of fresh runs without end; leaving the block ends the processes.
+    def chunks(self) -> Generator[Batch]:
+        """Yield chunks of new runs without end, in order.
 
         Scripts must be guarded by ``if __name__ == "__main__":``.
+
+        Raises:
+            FailureTwinError: If one of the processes ends.
         """
-        workers = max(1, cores() - 1)
-        pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
+        loader: DataLoader[Batch] = DataLoader(
+            _Chunks(self.data, self.encoder, CHUNK_RUNS),
+            batch_size=None,
+            sampler=count(),
+            num_workers=max(1, cores() - 1),
+            prefetch_factor=AHEAD,
+            collate_fn=tuple,  # arrays, not tensors
+            multiprocessing_context="spawn",
+        )
         try:
-            yield self._in_order(pool, AHEAD * workers)
-        except BrokenProcessPool as error:
+            yield from loader
+        except RuntimeError as error:
             raise FailureTwinError(
-                "a process that makes runs has died. Look for what ended it, such as too little "
+                "a process that simulates runs has ended. Look for the cause, such as too little "
                 "memory, and start again."
             ) from error
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-
-    def _in_order(self, pool: ProcessPoolExecutor, ahead: int) -> Iterator[Batch]:
-        given: deque[Future[Batch]] = deque()
-        number = 0
-        while True:
-            while len(given) <= ahead:
-                given.append(pool.submit(self.data.chunk, number, CHUNK_RUNS, self.encoder))
-                number += 1
-            yield given.popleft().result()
 
     def batches(self, chunks: Iterator[Batch]) -> Iterator[Batch]:
-        """Give batches from chunks: each fresh chunk is shuffled with those still in use."""
+        """Yield shuffled batches of the last `uses` chunks."""
         rng = np.random.default_rng([self.data.seed, CHUNK_RUNS])
         in_use: deque[Batch] = deque(maxlen=self.uses)
         for chunk in chunks:
@@ -259,12 +261,12 @@ class Stream:
             yield from epoch(features, classes, self.batch_runs, rng)
 
 
-# Training itself, and how well the result does on another engine.
+# Training, and validation on another engine.
 
 WIDER = 2.0
-"""Robots in training differ this many times as much as the calibration leaves open."""
+"""Factor on the calibration's variation between robots in training."""
 VALIDATION_SEED = 1_000_003
-"""Added to the seed for runs of the other engine, so that none of their chance is shared."""
+"""Added to the seed for validation runs."""
 
 
 @dataclass(frozen=True)
@@ -273,11 +275,11 @@ class TrainingPlan:
 
     Attributes:
         network: Name of the network; see `NETWORKS`.
-        iterations: Batches of 64 runs to learn from; ten minutes on two cores.
-        seed: Seed of all chance.
-        validation_runs: Runs of the physics engine; half set temperature and
-            weights, half judge.
-        hypotheses: What the network tells apart; None: the paper's classes.
+        iterations: Batches of 64 runs; the default takes ten minutes on two cores.
+        seed: Random seed.
+        validation_runs: Runs of the physics engine: half to fit temperature and pool weights, half
+            to score the result.
+        hypotheses: Classes of the network; None: the paper's.
     """
 
     network: str = "cnn"
@@ -294,13 +296,16 @@ def train(
     *,
     with_bayes: bool = False,
 ) -> LearnedDiagnoser | HybridDiagnoser:
-    """Return a network trained on the twin, alone or together with the Bayesian diagnosis.
+    """Return a network trained on the twin, or its pool with the Bayesian diagnosis.
 
-    Other processes make the runs: guard scripts by ``if __name__ == "__main__":``. Keep a network
-    with `save_network`.
+    Other processes simulate the runs: guard scripts by ``if __name__ == "__main__":``. Save a
+    network with `save_network`.
 
-    Its healthy behaviour is that of some imperfections, such as a calibration; None: as its profile
-    says. The pool with the Bayesian diagnosis has fitted weights.
+    Args:
+        robot: Robot to train for.
+        imperfections: Healthy behaviour, such as a calibration; None: that of the robot's profile.
+        plan: How much to train.
+        with_bayes: Return the pool with fitted weights.
     """
     known = calibrated(robot, imperfections)
     network, _, _ = train_network(plan, known.robot, known.imperfections)
@@ -316,11 +321,11 @@ def train_network(
     imperfections: Imperfections,
     on_iteration: Callable[[int], None] = lambda done: None,
 ) -> tuple[LearnedDiagnoser, Scores, Scores]:
-    """Train a network on the twin with imperfections and calibrate its probabilities.
+    """Train a network on the twin and calibrate its probabilities.
 
-    Nothing is chosen on the way: the network of the last iteration is the result. After each batch
-    `on_iteration` is called with the number of those done. Returns the network, and the scores of
-    it and of its pool with the Bayesian diagnosis on runs that nothing was learned from.
+    The network of the last iteration is the result. `on_iteration` is called after each batch with
+    the number of batches so far. Returns the network, and the scores of the network and of its
+    pool with the Bayesian diagnosis on validation runs.
     """
     encoder = FeatureEncoder("robust", robot, expectation_of(robot, imperfections))
     hypotheses = plan.hypotheses or paper_hypotheses(robot.motor_names)
@@ -335,7 +340,7 @@ def train_network(
     )
     stream = Stream(data, encoder, network.batch_runs)
     classes = [str(hypothesis) for hypothesis in data.hypotheses]
-    with stream.chunks() as chunks:
+    with closing(stream.chunks()) as chunks:
         standard = Standard.of(next(chunks)[0])
         batches = stream.batches(chunks)
         network.fit_batches(batches, standard, classes, data.movements, on_iteration)
@@ -352,7 +357,7 @@ def train_network(
 
 
 def _calibrate(network: LearnedDiagnoser, bayes: BayesDiagnoser, runs: xr.Dataset) -> None:
-    """Set the temperature of a network, and its weights beside the Bayesian diagnosis."""
+    """Fit the temperature of a network and its weights in the pool with the Bayesian diagnosis."""
     network.calibrate(runs)
     classes = network.classes_.tolist()
     by_bayes = [[d.posterior[name] for name in classes] for d in bayes.diagnose(runs)]

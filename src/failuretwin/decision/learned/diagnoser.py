@@ -1,4 +1,4 @@
-"""A network as a diagnoser, and as an estimator in the sense of scikit-learn."""
+"""A network as a diagnoser and as a scikit-learn estimator."""
 
 from __future__ import annotations
 
@@ -53,24 +53,24 @@ Runs = Any
 
 @dataclass(eq=False, repr=False)
 class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
-    """A network that says how probable each class is.
+    """A network that returns the probability of each class.
 
-    Takes run sets where it has an encoder, and arrays of features anyway.
+    Takes arrays of features, and run sets if it has an encoder.
 
     Attributes:
         network: Name of the network; see `NETWORKS`.
-        encoder: Turns run sets into features; None: arrays only.
-        iterations: Batches to learn from in `fit`.
-        learning_rate: Of Adam, at its highest.
-        decay: Whether it falls to zero at the end along half a cosine.
+        encoder: Encodes run sets as features; None: arrays only.
+        iterations: Number of batches in `fit`.
+        learning_rate: Initial learning rate of Adam.
+        decay: Whether the rate falls to zero along half a cosine.
         batch_runs: Runs in a batch.
         random_state: Seed of weights, dropout and order.
-        classes_: The classes, sorted if they came from `fit`.
+        classes_: The classes; sorted after `fit`.
         network_: The trained network.
-        standard_: Mean and spread of each channel.
-        temperature_: What scores are divided by before they become probabilities.
-        movements_: Fewest and most movements of a run that it learned from; None: not known.
-        weights_: Its part in a pool with the Bayesian diagnosis; None: was never fitted.
+        standard_: Standardisation of each channel.
+        temperature_: Divisor of the logits before softmax.
+        movements_: Smallest and largest number of movements of the training runs; None: unknown.
+        weights_: Weights in the pool with the Bayesian diagnosis; None: never fitted.
     """
 
     network: str = "cnn"
@@ -87,10 +87,10 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return tags
 
     def fit(self, X: Runs, y: ArrayLike | None = None) -> LearnedDiagnoser:
-        """Learn from runs and the class of each; None: as the run set says.
+        """Train on runs and their classes; `y` of None: the truth in the run set.
 
         Raises:
-            InputError: If there is no class to learn from.
+            InputError: If there are fewer than two classes.
         """
         y = _truth(X, y)
         self.movements_ = None
@@ -122,10 +122,10 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         movements: tuple[int, int],
         on_iteration: Callable[[int], None] = lambda done: None,
     ) -> LearnedDiagnoser:
-        """Learn from batches that somebody else makes, such as a `Stream`: not standardised yet.
+        """Train on batches that are not standardised yet, such as those of a `Stream`.
 
-        `movements` are the fewest and most of a run; `on_iteration` is called after each batch with
-        the number of those done.
+        `movements` are the smallest and largest number of a run; `on_iteration` is called after
+        each batch with the number of batches so far.
         """
         seed = check_random_state(self.random_state).randint(2**31)
         self.n_features_in_, self.movements_ = POINTS, movements
@@ -159,12 +159,12 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         self.weights_: PoolWeights | None = None
 
     def calibrate(self, X: Runs, y: ArrayLike | None = None) -> LearnedDiagnoser:
-        """Set the temperature of the best mean log score on runs that were not learned from.
+        """Set the temperature with the best mean log score on held-out runs; no test set.
 
-        Never use a test set. The class of each run is `y`; None: as the run set says.
+        `y` are the classes of the runs; None: the truth in the run set.
 
         Raises:
-            InputError: If a class is not among those that the network knows.
+            InputError: If a class is not among those of the network.
         """
         scores = self.scores(X)
         number = {name: i for i, name in enumerate(self.classes_.tolist())}
@@ -180,7 +180,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return self
 
     def scores(self, X: Runs) -> FloatArray:
-        """Return the score of each class, (run, class), before the temperature."""
+        """Return the logits, (run, class), before the temperature."""
         check_is_fitted(self, "network_")
         features = validate_data(
             self, self._features(X), allow_nd=True, dtype=np.float32, reset=False
@@ -205,13 +205,13 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     def score(
         self, X: Runs, y: ArrayLike | None = None, sample_weight: ArrayLike | None = None
     ) -> float:
-        """Return the (weighted) share of runs that are right; y of None: as the run set says."""
+        """Return the (weighted) accuracy; `y` of None: the truth in the run set."""
         return float(super().score(X, _truth(X, y), sample_weight))
 
     def diagnose(self, runs: RunsLike) -> list[Diagnosis]:
-        """Return the diagnosis of each run of a run set, or of any logs by their path.
+        """Return the diagnosis of each run of a run set, or of logs by their path.
 
-        Reads `command` and `measured` alone; the truth, where there is any, is only passed on.
+        Uses `command` and `measured` alone; the truth is only copied to the results.
 
         Raises:
             InputError: If the run set is of another robot, or the network has no encoder.
@@ -232,8 +232,8 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     def _diagnosis(
         self, name: str, truth: str | None, chances: list[float], log: LogQuality, movements: int
     ) -> Diagnosis:
-        """Return the diagnosis of a run; a log too poor for a verdict gets none."""
-        if log.fatal:  # nothing is learnt, so no class is more probable than another
+        """Return the diagnosis of a run; no verdict if the log is too poor."""
+        if log.fatal:
             chances = [1.0 / len(chances)] * len(chances)
         protocol, method = self.about
         diagnosis = Diagnosis(
@@ -250,7 +250,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return worded(diagnosis, ranked, arm_class=kind)
 
     def _unfamiliar(self, movements: int) -> tuple[str, ...]:
-        """Return a remark on a run of more or fewer movements than the network learned from."""
+        """Return a remark if the number of movements differs from the training runs."""
         if self.movements_ is None or self.movements_[0] <= movements <= self.movements_[1]:
             return ()
         low, high = self.movements_
@@ -262,7 +262,7 @@ class LearnedDiagnoser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
     @property
     def about(self) -> tuple[str, str]:
-        """Protocol and method, as results name them."""
+        """Protocol and method, for results."""
         encoder = self._encoder()
         method = f"network {self.network}, {encoder.features} features"
         if encoder.expected is not None:
@@ -290,12 +290,12 @@ def _is_run_set(X: Runs) -> bool:
 
 
 def _truth(X: Runs, y: ArrayLike | None) -> ArrayLike | None:
-    """Return the class of each run: as told, else as the run set says."""
+    """Return the class of each run: `y`, else the truth in the run set."""
     return truth_of(X) if _is_run_set(X) and y is None else y
 
 
 def _points(features: Floats) -> Floats:
-    """Return (run, point, channel) of features that may be of one point each."""
+    """Return features as (run, point, channel)."""
     return features if features.ndim == 3 else features[:, None, :]
 
 
@@ -306,18 +306,18 @@ def movement_counts(runs: xr.Dataset) -> IntArray:
 
 
 def probabilities(scores: FloatArray, temperature: float) -> FloatArray:
-    """Return p_k ~ exp(score_k / temperature), (run, class)."""
+    """Return p_k ~ exp(logit_k / temperature), (run, class)."""
     return softmax(scores / temperature, axis=1)
 
 
 TEMPERATURES = (0.05, 20.0)
-"""Temperatures worth trying."""
+"""Range of temperatures."""
 
 
 def best_temperature(scores: FloatArray, truth: IntArray) -> float:
-    """Return the temperature of the best mean log score (Guo et al., ICML 2017).
+    """Return the temperature with the best mean log score (Guo et al., ICML 2017).
 
-    Takes scores (run, class) and the number of the true class, (run,).
+    Takes logits (run, class) and the true class index, (run,).
     """
     from scipy.optimize import minimize_scalar
 

@@ -1,10 +1,9 @@
-"""Features that carry over to a real robot: what each motor alone would have to be off by.
+"""Features of runs for networks: the paper's two sets, and residuals in motor space (`robust`).
 
-Every reading is compared with where a healthy arm would be: commands with the mean lag, sag and
-friction of the calibration. For each motor, the turn that brings the tool nearest to the reading
-(exact: a joint moves the tool on a circle) and what no turn of this motor explains tell which motor
-it is; both are compressed, so that a glitch is only a little larger than a fault. Points without a
-reading are zero and marked by a mask.
+The robust features compare each reading with the pose of a healthy arm: the command with the mean
+lag, sag and friction of the calibration. For each motor they hold the turn of this motor that
+brings the tool nearest to the reading (exact: a joint moves the tool on a circle) and the remaining
+distance, both compressed by asinh. Points without a reading are zero and marked by a mask.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from failuretwin.digital_model.twin import DigitalTwin
 if TYPE_CHECKING:
     import xarray as xr
 
-# What a network may look at: commands and tool paths as plain arrays, and nothing else.
+# Commands and tool paths as plain arrays.
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class Signals:
 
     @property
     def seen(self) -> BoolArray:
-        """Where there is a reading, (run, time)."""
+        """Whether there is a reading, (run, time)."""
         within = self.time <= self.duration[:, None] + 1e-9
         return np.asarray(np.isfinite(self.measured).all(axis=-1) & within)
 
@@ -67,35 +66,31 @@ def signals_of(runs: xr.Dataset | RunTable) -> Signals:
     return Signals(time, command, as_floats(runs.measured), as_floats(duration))
 
 
-# The paper's two feature sets: every tenth of 1000 samples, over the first ten seconds.
+# The paper's feature sets: every tenth of 1000 samples, over the first ten seconds.
 
 POINTS = 100
-"""Points of a run that a network sees."""
+"""Points of each run."""
 PERIOD_S = 0.1
-"""Time from one point to the next [s]: every tenth sample of the published 100 Hz."""
+"""Time between points [s]: every tenth sample of the published 100 Hz."""
 
 
-def original_features(twin: DigitalTwin, signals: Signals) -> FloatArray:
+def original_features(signals: Signals) -> FloatArray:
     """Return commands [rad] and measured tool position [m], (run, point, motor + axis)."""
-    del twin  # these features know nothing of the robot
     command, measured = _at_points(signals)
     return np.concatenate([command, measured], axis=-1)
 
 
 def augmented_features(twin: DigitalTwin, signals: Signals) -> FloatArray:
-    """Return desired tool position and what is measured beyond it, (run, point, 6) [m].
-
-    The desired position is the forward kinematics of the command, without any servo.
-    """
+    """Return the kinematics of the command and the residual, (run, point, 6) [m]."""
     command, measured = _at_points(signals)
     desired = twin.path(command)
     return np.concatenate([desired, measured - desired], axis=-1)
 
 
 def _at_points(signals: Signals) -> tuple[FloatArray, FloatArray]:
-    """Return commands (run, point, motor) and filled readings (run, point, axis).
+    """Return commands (run, point, motor) and interpolated readings (run, point, axis).
 
-    Where a run ends early, its last values are held.
+    After the end of a run, its last values are held.
     """
     stride = max(1, round(PERIOD_S / signals.step))
     index = np.minimum(stride * np.arange(POINTS), len(signals.time) - 1)
@@ -110,25 +105,25 @@ def _at_points(signals: Signals) -> tuple[FloatArray, FloatArray]:
 
 
 SHARED = ("x", "y", "z", "seen")
-"""Channels that belong to no motor; before them come turn, misfit, angle and command of each."""
+"""Channels that belong to no motor; turn, misfit, angle and command of each motor precede them."""
 
 TURN_RAD = 0.01
-"""Turns below this are shown in proportion, larger ones by their logarithm [rad]: 2.4 counts."""
+"""Turns are linear below this and logarithmic above [rad]: 2.4 counts."""
 DISTANCE_M = 0.002
-"""The same for distances [m]: what half a degree does at the length of the arm."""
+"""The same for distances [m]: half a degree at the length of the arm."""
 DAMPING_M = 0.003
-"""A tool this near to a joint's axis says half of nothing about the joint's turn [m]."""
+"""Distance of the tool from a joint axis at which the turn is halved [m]."""
 
 
 @dataclass(frozen=True)
 class Expectation:
-    """Where a healthy arm is expected to be: all of a calibration that features make use of.
+    """Expected healthy behaviour: the parts of a calibration that features depend on.
 
     Attributes:
         name: Name of the calibration.
-        protocol: How much real data it has seen.
-        lag_s: Mean time by which each motor runs behind its command, (motor,) [s].
-        settling: Where motors settle.
+        protocol: Protocol letter of the calibration.
+        lag_s: Mean lag of each motor behind its command, (motor,) [s].
+        settling: Settling errors of the motors.
     """
 
     name: str
@@ -138,7 +133,7 @@ class Expectation:
 
 
 def expectation_of(robot: Robot, imperfections: Imperfections) -> Expectation:
-    """Return what is expected of a healthy robot with some imperfections."""
+    """Return the expected healthy behaviour of a robot with these imperfections."""
     timing = imperfections.timing
     common = float(np.mean(timing.delay_s) + np.mean(timing.lag_s))
     # 1 / I: delay of the loop (P s + I) / (s (tau s + 1)^2 + P s + I) at low frequency.
@@ -149,7 +144,7 @@ def expectation_of(robot: Robot, imperfections: Imperfections) -> Expectation:
 
 @dataclass(frozen=True)
 class RobustFeatures:
-    """Turns a run into 100 points of residuals in motor space, beside an expected healthy arm."""
+    """Residuals in motor space against the expected healthy arm, at 100 points of a run."""
 
     robot: Robot
     expected: Expectation
@@ -163,7 +158,7 @@ class RobustFeatures:
             )
 
     def __call__(self, signals: Signals) -> FloatArray:
-        """Return the features, (run, point, channel), each of about unit size."""
+        """Return the features, (run, point, channel), of order one."""
         index, seen = _points(signals)
         run, known = np.arange(len(index))[:, None], seen[..., None]
         pose = self._healthy_pose(signals, index)
@@ -178,7 +173,7 @@ class RobustFeatures:
         return np.concatenate([per_motor.reshape(*pose.shape[:2], -1), off, known], axis=-1)
 
     def _healthy_pose(self, signals: Signals, index: IntArray) -> FloatArray:
-        """Return where a healthy arm would be at some samples, (run, point, motor) [rad]."""
+        """Return the pose of a healthy arm at samples `index`, (run, point, motor) [rad]."""
         command, lag = signals.command, np.asarray(self.expected.lag_s)
         place = np.maximum(index[..., None] - lag / signals.step, 0.0)
         low = place.astype(np.int64)
@@ -191,9 +186,9 @@ class RobustFeatures:
 
 
 def _points(signals: Signals) -> tuple[IntArray, FloatArray]:
-    """Return the sample of each point (run, point), and 1 where it is a reading, else 0.
+    """Return the sample index of each point and 1 where it is a reading, else 0; (run, point).
 
-    Points divide the length of a run evenly; of several readings in one the last counts.
+    Points divide a run evenly; the last of several readings within one point is used.
     """
     runs = len(signals.command)
     last = np.floor(signals.duration[:, None] / signals.step + 1e-6)  # sample of each run
@@ -202,7 +197,7 @@ def _points(signals: Signals) -> tuple[IntArray, FloatArray]:
     seen = np.zeros((runs, POINTS))
     run, sample = np.nonzero(signals.seen)
     point = np.minimum((share[run, sample] * POINTS).astype(np.int64), POINTS - 1)
-    index[run, point] = sample  # the last of several stays
+    index[run, point] = sample  # the last of several wins
     seen[run, point] = 1.0
     return index, seen
 
@@ -217,11 +212,10 @@ def _direction(command: FloatArray) -> FloatArray:
 
 
 def joint_frames(robot: Robot, pose: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return where the joints are and point to, and where the tool is, in the base frame.
+    """Return joint origins [m] and unit axes, (..., motor, 3), and tool points (..., 3) [m].
 
-    The pose, (..., motor) [rad], is that which the tool sensor's path belongs to; joints that slide
-    are not supported. Origins are (..., motor, 3) [m], unit axes (..., motor, 3) and tool points
-    (..., 3) [m].
+    All are in the base frame. `pose` (..., motor) [rad] is in the sense of the tool sensor; all
+    joints must be revolute.
     """
     lead = pose.shape[:-1]
     rotation = np.broadcast_to(np.eye(3), (*lead, 3, 3))
@@ -242,7 +236,7 @@ def joint_frames(robot: Robot, pose: FloatArray) -> tuple[FloatArray, FloatArray
 def _explained(
     origin: FloatArray, axis: FloatArray, tool: FloatArray, measured: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the turn of each joint that brings the tool nearest [rad], and what is left [m]."""
+    """Return the turn of each joint that brings the tool nearest [rad] and the rest [m]."""
     here, there = tool[..., None, :] - origin, measured[..., None, :] - origin
     along = np.sum(axis * (there - here), axis=-1)
     here = here - np.sum(axis * here, axis=-1, keepdims=True) * axis
@@ -259,7 +253,7 @@ def _compressed(values: FloatArray, scale: float) -> FloatArray:
     return np.arcsinh(values / scale) / 3.0
 
 
-# From runs to what a network sees, by one of the named feature sets.
+# Named feature sets.
 
 FEATURE_SETS = ("original", "augmented", "robust")
 Floats = NDArray[np.float32]
@@ -267,13 +261,12 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class FeatureEncoder:
-    """Turns runs into arrays for a network.
+    """Encodes runs as features for a network.
 
     Attributes:
-        features: One of `FEATURE_SETS`: the paper's two, and the one for real robots.
+        features: One of `FEATURE_SETS`.
         robot: The robot.
-        expected: Healthy behaviour that the robust features compare with; None: that of the
-            published twin. The paper's features know of none.
+        expected: Healthy behaviour for the robust features; None: that of the published twin.
     """
 
     features: str
@@ -286,16 +279,16 @@ class FeatureEncoder:
 
     @property
     def protocol(self) -> str:
-        """How much real data the features have seen."""
+        """Protocol letter of the features."""
         return "P0" if self.expected is None else self.expected.protocol
 
     def encode(self, signals: Signals) -> Floats:
-        """Return what a network sees, (run, point, channel)."""
+        """Return features (run, point, channel)."""
         if self.features == "robust":
             return self._robust(signals).astype(np.float32)
-        twin = DigitalTwin(self.robot)
-        make = original_features if self.features == "original" else augmented_features
-        return make(twin, signals).astype(np.float32)
+        if self.features == "original":
+            return original_features(signals).astype(np.float32)
+        return augmented_features(DigitalTwin(self.robot), signals).astype(np.float32)
 
     @cached_property
     def _robust(self) -> RobustFeatures:

@@ -1,4 +1,4 @@
-"""Model and network together, the paper's closing idea: a logarithmic opinion pool, or a gate."""
+"""Bayesian diagnosis combined with a network: logarithmic opinion pool, or gate."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ HEALTHY = "healthy"
 UNSIZED: dict[str, Any] = dict.fromkeys(
     ("onset_s", "onset_90", "magnitude", "magnitude_unit", "magnitude_90")
 )
-"""What is not known of a fault that only the network names."""
+"""Fields that are unknown for a fault that only the network names."""
 LEAST = 1e-300
-"""Probabilities that have underflowed count as this, so that a logarithm of them exists."""
+"""Lower bound of probabilities before their logarithm."""
 
 
 @dataclass(frozen=True)
 class PoolWeights:
-    """How much the log probability of each part counts; 1 and 0: the first part alone."""
+    """Weights of the log probabilities of both parts."""
 
     bayes: float
     network: float
@@ -41,7 +41,7 @@ def log_pool(bayes: FloatArray, network: FloatArray, weights: PoolWeights) -> Fl
 
 
 def gated(bayes: FloatArray, network: FloatArray, healthy: int) -> FloatArray:
-    """Return probabilities (run, class): of class `healthy` by Bayes, of others by the network."""
+    """Return P(healthy) by Bayes, shared among faults as the network does, (run, class)."""
     faults = np.maximum(network, LEAST)
     faults[:, healthy] = 0.0
     rest = 1.0 - bayes[:, [healthy]]
@@ -51,9 +51,9 @@ def gated(bayes: FloatArray, network: FloatArray, healthy: int) -> FloatArray:
 
 
 def fit_pool_weights(bayes: FloatArray, network: FloatArray, truth: IntArray) -> PoolWeights:
-    """Return the weights of the best mean log score of some runs.
+    """Return the weights with the best mean log score.
 
-    Takes the probabilities by either part, (run, class), and the number of the true class, (run,).
+    Takes the probabilities of both parts, (run, class), and the true class index, (run,).
     """
     from scipy.optimize import minimize
 
@@ -73,13 +73,13 @@ def _log(chances: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class HybridDiagnoser:
-    """Two diagnosers as one.
+    """Combination of the Bayesian diagnosis and a network.
 
     Attributes:
-        bayes: The model-based one; where it gives no verdict, there is none.
-        network: The learned one, of the same classes.
-        weights: Of the pool; None: gated.
-        arm_class: Kind of arm, which advice depends on; empty: not known.
+        bayes: Bayesian diagnoser; without its verdict the result has none.
+        network: Learned diagnoser with the same classes.
+        weights: Weights of the pool; None: gate.
+        arm_class: Kind of arm, for advice; empty: unknown.
     """
 
     bayes: Diagnoser
@@ -90,10 +90,10 @@ class HybridDiagnoser:
     def diagnose(self, runs: xr.Dataset) -> list[Diagnosis]:
         """Return the diagnosis of each run of a run set.
 
-        Onset and size are those of the Bayesian part, where both agree on the fault.
+        Onset and size are those of the Bayesian part, if both agree on the fault.
 
         Raises:
-            InputError: If the parts know different classes.
+            InputError: If the parts have different classes.
         """
         pairs = zip(self.bayes.diagnose(runs), self.network.diagnose(runs), strict=True)
         return [self._joined(first, second) for first, second in pairs]

@@ -1,7 +1,6 @@
-"""The networks: the paper's LSTM, a plain CNN, and one that treats all motors alike.
+"""The networks and their training loop: the paper's LSTM, a CNN, and a motor-wise CNN.
 
-Each takes standardised features (run, point, channel) and gives a score for each class
-(run, class), the logarithm of its probability up to a constant.
+Each maps standardised features (run, point, channel) to logits (run, class).
 """
 
 from __future__ import annotations
@@ -20,25 +19,25 @@ from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.decision.learned.feature_encoder import Floats
 
 HIDDEN = 100
-"""Units of both LSTM layers, as published (Table I of the paper)."""
+"""Units of both LSTM layers (Table I of the paper)."""
 DROPOUT = 0.1
-"""Share of units left out in training, as published."""
+"""Dropout rate (Table I of the paper)."""
 CNN_WIDTH = 96
 MOTORWISE_WIDTH = 64
 STRIDES = (1, 2, 2, 1)
-"""Points by which each convolution moves on: 100 points become 50, then 25."""
+"""Stride of each convolution: 100 points become 50, then 25."""
 KERNEL = 5
-"""Points that a convolution sees, half a second of a run of ten."""
+"""Kernel size of each convolution [points]."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """What a network takes and gives.
+    """Input and output sizes of a network.
 
     Attributes:
         channels: Channels of each point.
         classes: Number of classes.
-        motors: Motors whose channels come first, equally many each; 1: all channels are alike.
+        motors: Motors with equally many channels each, which come first.
         shared: Channels after those, which belong to no motor.
     """
 
@@ -49,7 +48,7 @@ class Shape:
 
 
 class PaperLstm(nn.Module):
-    """LSTM 100, dropout 0.1, LSTM 100, its last step, one dense layer: the paper's network."""
+    """The paper's network: LSTM 100, dropout 0.1, LSTM 100, last step, one dense layer."""
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
@@ -58,22 +57,22 @@ class PaperLstm(nn.Module):
         self.second = nn.LSTM(HIDDEN, HIDDEN, batch_first=True)
         self.dense = nn.Linear(HIDDEN, shape.classes)
         for layer in (self.first, self.second):
-            _begin_as_published(layer)
+            _initialise_as_published(layer)
         nn.init.xavier_uniform_(self.dense.weight)
         nn.init.zeros_(self.dense.bias)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return scores (run, class)."""
+        """Return logits (run, class)."""
         steps = self.first(x)[0]
         steps = self.second(self.dropout(steps))[0]
         return self.dense(steps.select(dim=1, index=-1))
 
 
-def _begin_as_published(layer: nn.LSTM) -> None:
-    """Draw weights as MATLAB's `lstmLayer` does, in which the paper's network was built.
+def _initialise_as_published(layer: nn.LSTM) -> None:
+    """Initialise weights like MATLAB's `lstmLayer`, with which the paper's network was built.
 
-    Its documented defaults: Glorot for what comes in, orthogonal for what comes back, biases of
-    zero but one for the forget gate. PyTorch's own draw learns more slowly here.
+    Glorot input weights, orthogonal recurrent weights, zero biases, forget-gate bias one. PyTorch's
+    default learns more slowly here.
     """
     weights = dict(layer.named_parameters())
     nn.init.xavier_uniform_(weights["weight_ih_l0"])
@@ -92,7 +91,7 @@ def _convolutions(channels: int, wide: int, *, bias: bool = True) -> nn.ModuleLi
 
 
 class Cnn(nn.Module):
-    """Four convolutions over time, mean and largest value of each channel, one hidden layer."""
+    """Four convolutions over time, mean and maximum over time, one hidden layer."""
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
@@ -103,7 +102,7 @@ class Cnn(nn.Module):
         self.dense = nn.Linear(wide, shape.classes)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return scores (run, class)."""
+        """Return logits (run, class)."""
         x = x.permute(0, 2, 1)
         for convolution in self.convolutions:
             x = torch.relu(convolution(x))
@@ -112,10 +111,9 @@ class Cnn(nn.Module):
 
 
 class MotorWise(nn.Module):
-    """The same convolutions look at every motor, each with an eye on the mean of all motors.
+    """CNN whose convolutions share their weights between motors.
 
-    What a stuck motor looks like is learned once, not for each motor anew; only the last layers,
-    which name the class, tell the motors apart.
+    Each motor also receives the mean over all motors; only the last layers are motor-specific.
     """
 
     def __init__(self, shape: Shape) -> None:
@@ -130,7 +128,7 @@ class MotorWise(nn.Module):
         self.dense = nn.Linear(2 * wide, shape.classes)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return scores (run, class)."""
+        """Return logits (run, class)."""
         motor, common = torch.split(x, [self.motors * self.each, self.shared], dim=2)
         motor = torch.unflatten(motor, 2, (self.motors, self.each))
         common = common.unsqueeze(2).repeat(1, 1, self.motors, 1)
@@ -151,7 +149,7 @@ NETWORKS: dict[str, type[PaperLstm] | type[Cnn] | type[MotorWise]] = {
 
 
 def build_network(name: str, shape: Shape) -> nn.Module:
-    """Return a new network with random weights (of torch's generator).
+    """Return a new network with random weights from torch's generator.
 
     Raises:
         InputError: If there is no such network.
@@ -161,23 +159,23 @@ def build_network(name: str, shape: Shape) -> nn.Module:
     return NETWORKS[name](shape)
 
 
-# The training loop: one for all networks, whether batches come from arrays or never end.
+# Training loop.
 
 Batch = tuple[Floats, IntArray]
 """Standardised features (run, point, channel) and classes (run,)."""
 
 EVALUATED_RUNS = 512
-"""Runs that go through a network at a time when nothing is learned."""
+"""Runs evaluated at a time."""
 
 
 @dataclass(frozen=True)
 class Pace:
-    """How a network learns. Adam, cross-entropy.
+    """Settings of Adam with cross-entropy loss.
 
     Attributes:
-        iterations: Batches to learn from.
-        learning_rate: Learning rate of Adam, at its highest.
-        decay: Whether the rate falls to zero at the end along half a cosine; else it stays.
+        iterations: Number of batches.
+        learning_rate: Initial learning rate.
+        decay: Whether the rate falls to zero along half a cosine.
     """
 
     iterations: int
@@ -191,14 +189,14 @@ class Pace:
 
 
 def device() -> torch.device:
-    """Return where networks are trained: a GPU where there is one."""
+    """Return the training device: a GPU if there is one."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def training(network: nn.Module, batches: Iterable[Batch], pace: Pace) -> Iterator[int]:
-    """Train a network in place and give the number of iterations after each, to look at it.
+    """Train a network in place; yield the number of iterations after each.
 
-    There must be as many batches as `pace` has iterations, or more.
+    Needs at least as many batches as `pace` has iterations.
     """
     where = device()
     network.to(where)
@@ -218,7 +216,7 @@ def training(network: nn.Module, batches: Iterable[Batch], pace: Pace) -> Iterat
 
 
 def scores_of(network: nn.Module, features: Floats) -> FloatArray:
-    """Return the scores of runs, (run, class), without learning anything."""
+    """Return the logits of runs, (run, class)."""
     where = next(network.parameters()).device
     network.eval()
     parts = []
@@ -232,7 +230,7 @@ def scores_of(network: nn.Module, features: Floats) -> FloatArray:
 def shuffled_batches(
     features: Floats, classes: IntArray, size: int, rng: np.random.Generator
 ) -> Iterator[Batch]:
-    """Give batches of arrays without end, in a new order each time through; see `epoch`."""
+    """Yield batches without end, in a new random order each epoch."""
     while True:
         yield from epoch(features, classes, min(size, len(features)), rng)
 
@@ -240,7 +238,7 @@ def shuffled_batches(
 def epoch(
     features: Floats, classes: IntArray, size: int, rng: np.random.Generator
 ) -> Iterator[Batch]:
-    """Give batches of arrays once through in random order; what is left at the end is left out."""
+    """Yield the full batches of one epoch in random order."""
     order = rng.permutation(len(features))
     for first in range(0, len(order) - size + 1, size):
         chosen = order[first : first + size]
@@ -249,11 +247,11 @@ def epoch(
 
 @dataclass(frozen=True)
 class Standard:
-    """Mean and spread of each channel, so that a network sees numbers of unit size.
+    """Standardisation of each channel to zero mean and unit variance.
 
     Attributes:
         mean: (channel,).
-        spread: Standard deviation, (channel,); 1 for a channel that never changes.
+        spread: Standard deviation, (channel,); 1 for a constant channel.
     """
 
     mean: NDArray[np.float32]
@@ -261,7 +259,7 @@ class Standard:
 
     @classmethod
     def of(cls, features: Floats) -> Standard:
-        """Return those of features (run, point, channel)."""
+        """Return the standardisation fitted to features (run, point, channel)."""
         flat = features.reshape(-1, features.shape[-1]).astype(np.float64)
         spread = flat.std(axis=0)
         spread[spread < 1e-12] = 1.0
