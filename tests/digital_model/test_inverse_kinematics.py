@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from failuretwin import DigitalTwin, InputError, load_robot
-from failuretwin.digital_model.frames import ChainFrames
 from failuretwin.digital_model.inverse_kinematics import (
     POINTER_M,
     InverseKinematics,
     feedback_factor,
+    tool_points,
     usable_limits,
 )
 from failuretwin.digital_model.kinematics import Joint, SerialChain, rotation_to_z
@@ -36,8 +36,7 @@ def test_a_joint_that_slides():
     along[:3, :3] = rotation_to_z([1.0, 0.0, 0.0])
     chain = SerialChain((Joint("turn", False, np.eye(4)), Joint("slide", True, along)), np.eye(4))
     q = np.array([[0.7, 0.3], [-2.0, -0.1]])
-    frames = ChainFrames(chain)
-    point, jacobian = frames.tool_points(q)
+    point, jacobian = tool_points(chain, q)
     expected, slope = chain.position_and_jacobian(q)
     np.testing.assert_allclose(point, expected, atol=1e-15)
     np.testing.assert_allclose(jacobian, slope, atol=1e-15)
@@ -110,13 +109,13 @@ def test_an_approach_direction_is_kept():
     kinematics, rng = InverseKinematics.of(robot), np.random.default_rng(3)
     # Six motors would do; the five that move the tool point hold some directions only.
     q = poses(robot, 8, 4)
-    frames = ChainFrames(robot.chain, POINTER_M).tool_points(q * robot.sensor_sense)[0]
+    frames = tool_points(robot.chain, q * robot.sensor_sense, POINTER_M)[0]
     axis = (frames[:, 3:] - frames[:, :3]) / POINTER_M
     found = kinematics.solve(frames[:, :3], kinematics.starts(40, rng), None, axis)
     score = found.miss_m + POINTER_M * found.miss_rad
     assert np.all(score.min(axis=1) < 2e-3)
     best = found.pose[np.arange(8), score.argmin(axis=1)]
-    seen = ChainFrames(robot.chain, POINTER_M).tool_points(best * robot.sensor_sense)[0]
+    seen = tool_points(robot.chain, best * robot.sensor_sense, POINTER_M)[0]
     cosine = np.sum((seen[:, 3:] - seen[:, :3]) / POINTER_M * axis, axis=1)
     assert np.all(np.arccos(np.clip(cosine, -1, 1)) < np.deg2rad(1.0))
 

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from failuretwin.core.types import FloatArray, IntArray
-from failuretwin.digital_model.frames import ChainFrames
+from failuretwin.digital_model.kinematics import SerialChain
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import poses_in_range
 
@@ -57,18 +57,14 @@ class Clearance:
         if radius_m is None:
             radius_m = RADIUS_OF_REACH * robot.reach
         if floor_m is None:
-            fixed = ChainFrames(robot.loads.chain).origins(np.zeros(len(robot.motors)))[1, 2]
+            fixed = joint_points(robot.loads.chain, np.zeros(len(robot.motors)))[1, 2]
             floor_m = min(0.0, float(fixed))
         return cls(robot, radius_m, floor_m)
 
     @cached_property
-    def _frames(self) -> ChainFrames:
-        return ChainFrames(self.robot.loads.chain)
-
-    @cached_property
     def pairs(self) -> IntArray:
         """Links that must keep apart, (pair, 2): 0 is the base, the last carries the tool."""
-        points = self._frames.origins(poses_in_range(self.robot))
+        points = joint_points(self.robot.loads.chain, poses_in_range(self.robot))
         length = np.linalg.norm(np.diff(points, axis=-2), axis=-1).max(axis=0)
         links = np.flatnonzero(length > SHORTEST_LINK)
         some = [(i, j) for a, i in enumerate(links) for j in links[a + 2 :]]
@@ -81,13 +77,13 @@ class Clearance:
     @cached_property
     def _first_moved(self) -> int:
         """Index of the first point that any joint moves."""
-        points = self._frames.origins(poses_in_range(self.robot))
+        points = joint_points(self.robot.loads.chain, poses_in_range(self.robot))
         moved = np.ptp(points, axis=0).max(axis=-1) > SHORTEST_LINK
         return int(np.argmax(moved))
 
     def points(self, pose: FloatArray) -> FloatArray:
         """Return base, joints and tool, (..., point, 3) [m], of poses in the log's sense."""
-        return self._frames.origins(pose * self.robot.sense)
+        return joint_points(self.robot.loads.chain, pose * self.robot.sense)
 
     def gap(self, pose: FloatArray) -> FloatArray:
         """Return the least gap between links, (...) [m]; below 0 they touch.
@@ -126,6 +122,16 @@ class Clearance:
         return segment_distance(
             points[..., a, :], points[..., a + 1, :], points[..., b, :], points[..., b + 1, :]
         )
+
+
+def joint_points(chain: SerialChain, q: FloatArray) -> FloatArray:
+    """Return base, joints and tool as points, (..., joint + 2, 3) [m], for q (..., joint)."""
+    rotation, origin = chain.frames(q)
+    base = np.zeros((*q.shape[:-1], 1, 3))
+    points = np.concatenate([base, origin], axis=-2)
+    slides = np.array([float(joint.prismatic) for joint in chain.joints])
+    points[..., 1:-1, :] += (slides * q)[..., None] * rotation[..., :-1, :, 2]
+    return points
 
 
 def segment_distance(

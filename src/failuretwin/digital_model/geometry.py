@@ -18,8 +18,7 @@ import numpy as np
 
 from failuretwin.core.config import AtLeastZero, Bounded, Bounds
 from failuretwin.core.types import FloatArray
-from failuretwin.digital_model.frames import ChainFrames
-from failuretwin.digital_model.kinematics import SerialChain, rotation_to_z
+from failuretwin.digital_model.kinematics import SerialChain, cross, rotation_to_z
 from failuretwin.digital_model.urdf import Triple, Urdf, UrdfJoint, transform
 
 NO_OFFSET = (0.0, 0.0, 0.0)
@@ -152,18 +151,15 @@ def geometry_columns(chain: SerialChain, q: FloatArray, scale: float = 1.0) -> F
         (..., 3, 6 * joint): x, y, z [m/m] and roll, pitch, yaw [m/rad] of the first joint, then of
         the next.
     """
-    frames = ChainFrames(chain).frames(q)
-    before = np.stack([joint.T_pj for joint in chain.joints])
-    before = np.concatenate(
-        [np.broadcast_to(before[0], (*q.shape[:-1], 1, 4, 4)), frames[..., :-1, :, :] @ before[1:]],
-        axis=-3,
-    )
-    to_urdf = np.stack([rotation_to_z(joint.axis).T for joint in chain.joints])
-    R = before[..., :3, :3] @ to_urdf
-    tool = (frames[..., -1, :, :] @ chain.T_jt)[..., None, :3, 3]
-    arm = (tool - before[..., :3, 3])[..., None, :]  # (..., joint, 1, 3)
-    turned = np.swapaxes(np.cross(np.swapaxes(R, -1, -2), arm), -1, -2)
-    columns = np.concatenate([scale * R, turned], axis=-1)  # (..., joint, 3, 6)
+    rotation, origin = chain.frames(q)
+    axes = rotation[..., :-1, :, :]
+    arm = origin[..., -1:, :] - origin[..., :-1, :]
+    columns = np.concatenate([scale * axes, cross(axes, arm[..., None], -2)], axis=-1)
+    for j, joint in enumerate(chain.joints):
+        if joint.axis != (0.0, 0.0, 1.0):
+            parts = columns[..., j, :, :].reshape(*q.shape[:-1], 3, 2, 3)
+            to_urdf = np.dot(parts, rotation_to_z(joint.axis).T)
+            columns[..., j, :, :] = to_urdf.reshape(*q.shape[:-1], 3, 6)
     return np.moveaxis(columns, -3, -2).reshape(*q.shape[:-1], 3, 6 * q.shape[-1])
 
 

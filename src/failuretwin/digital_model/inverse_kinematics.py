@@ -10,13 +10,12 @@ tried from many poses at once, for a single start misses poses at limits.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.digital_model.frames import ChainFrames
+from failuretwin.digital_model.kinematics import SerialChain, cross
 from failuretwin.digital_model.robot import Robot
 
 POINTER_M = 0.1
@@ -85,14 +84,6 @@ class InverseKinematics:
         low, high = usable_limits(robot)
         return cls(robot, low, high)
 
-    @cached_property
-    def _points(self) -> ChainFrames:
-        return ChainFrames(self.robot.chain)
-
-    @cached_property
-    def _pointers(self) -> ChainFrames:
-        return ChainFrames(self.robot.chain, POINTER_M)
-
     def starts(
         self, count: int, rng: np.random.Generator, first: FloatArray | None = None
     ) -> FloatArray:
@@ -110,16 +101,16 @@ class InverseKinematics:
 
     def tool(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return tool points (..., 3) [m] and Jacobians (..., 3, motor) [m/rad] of poses."""
-        return self._tool(self._points, pose)
+        return self._tool(0.0, pose)
 
     def axis(self, pose: FloatArray) -> FloatArray:
         """Return where z of the tool frame points, unit vectors (..., 3), of poses."""
-        points, _ = self._tool(self._pointers, pose)
+        points, _ = self._tool(POINTER_M, pose)
         return np.asarray((points[..., 3:] - points[..., :3]) / POINTER_M)
 
-    def _tool(self, points: ChainFrames, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _tool(self, pointer_m: float, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
         sense = self.robot.sensor_sense
-        point, jacobian = points.tool_points(pose * sense)
+        point, jacobian = tool_points(self.robot.chain, pose * sense, pointer_m)
         return point, jacobian * sense
 
     def solve(
@@ -138,7 +129,7 @@ class InverseKinematics:
             direction: Unit vectors along which z of the tool frame shall point, (goal, 3); None:
                 any.
         """
-        seen = self._points if direction is None else self._pointers
+        pointer_m = 0.0 if direction is None else POINTER_M
         goal = position
         if direction is not None:
             goal = np.concatenate([position, position + POINTER_M * direction], axis=-1)
@@ -146,8 +137,8 @@ class InverseKinematics:
         begin = np.broadcast_to(start, shape).reshape(-1, shape[-1])
         wanted = np.repeat(goal, shape[1], axis=0)
         free = np.ones(shape[-1], dtype=bool) if locked is None else ~locked
-        pose = self._search(seen, wanted, begin, free, shape[1])
-        point, _ = self._tool(seen, pose)
+        pose = self._search(pointer_m, wanted, begin, free, shape[1])
+        point, _ = self._tool(pointer_m, pose)
         miss_m = np.linalg.norm(wanted[:, :3] - point[:, :3], axis=-1)
         miss_rad = np.zeros(len(pose))
         if direction is not None:
@@ -158,7 +149,7 @@ class InverseKinematics:
 
     def _search(
         self,
-        seen: ChainFrames,
+        pointer_m: float,
         goal: FloatArray,
         begin: FloatArray,
         free: BoolArray,
@@ -167,14 +158,14 @@ class InverseKinematics:
         """Return the nearest poses (case, motor) for goals (case, 3 or 6), each with its starts."""
         pose = np.where(free, np.clip(begin, self.low, self.high), begin)
         damping = np.full(len(pose), DAMPING)
-        point, jacobian = self._tool(seen, pose)
+        point, jacobian = self._tool(pointer_m, pose)
         residual = goal - point
         square = np.sum(residual**2, axis=-1)
         checked = square.copy()
         for step in range(1, MOST_STEPS + 1):
             tried = pose + self._step(jacobian, residual, damping, pose, free)
             tried = np.where(free, np.clip(tried, self.low, self.high), pose)
-            point, slope = self._tool(seen, tried)
+            point, slope = self._tool(pointer_m, tried)
             left = goal - point
             error = np.sum(left**2, axis=-1)
             better = error < square
@@ -208,6 +199,31 @@ class InverseKinematics:
             step = _damped(jacobian * (free & ~outward)[:, None, :], residual, damping)
         largest = np.abs(step).max(axis=-1, keepdims=True)
         return np.asarray(step * np.minimum(1.0, LONGEST_STEP / np.maximum(largest, 1e-12)))
+
+
+def tool_points(
+    chain: SerialChain, q: FloatArray, pointer_m: float = 0.0
+) -> tuple[FloatArray, FloatArray]:
+    """Return the tool point and its Jacobian, and those of a second point along z of the tool.
+
+    Args:
+        chain: The chain.
+        q: Joint values in chain order, (..., joint) [rad or m].
+        pointer_m: Distance of the second point [m]; 0: none.
+
+    Returns:
+        (..., 3 or 6) [m] and (..., 3 or 6, joint) [m/rad or m/m].
+    """
+    rotation, origin = chain.frames(q)
+    axis, points = rotation[..., :-1, :, 2], [origin[..., -1, :]]
+    if pointer_m > 0.0:
+        points.append(points[0] + pointer_m * rotation[..., -1, :, 2])
+    slopes = [cross(axis, point[..., None, :] - origin[..., :-1, :]) for point in points]
+    slides = np.array([joint.prismatic for joint in chain.joints])
+    if slides.any():
+        slopes = [np.where(slides[:, None], axis, slope) for slope in slopes]
+    jacobian = np.concatenate(slopes, axis=-1)
+    return np.concatenate(points, axis=-1), np.swapaxes(jacobian, -1, -2)
 
 
 def angle_between(axis: FloatArray, other: FloatArray) -> FloatArray:

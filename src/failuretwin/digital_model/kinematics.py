@@ -153,44 +153,53 @@ class SerialChain:
         lead = np.shape(q)[:-1]
         return point_out.reshape(*lead, 3), jacobian.reshape(*lead, 3, len(self.joints))
 
-    def in_tool_frame(self, direction: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return a direction of the base frame as the tool's frame has it, and its Jacobian.
-
-            v = R(q)^T u,    dv/dq_j = R^T (u x axis_j)
+    def frames(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the frames of all joints, before each moves, and of the tool, in the base frame.
 
         Args:
-            direction: u in the base frame, (3,); of any length and unit.
             q: Joint values in chain order, (..., joint) [rad or m].
 
         Returns:
-            v, (..., 3), and dv/dq, (..., 3, joint) [1/rad]; a joint that slides turns nothing.
+            Rotations (..., joint + 1, 3, 3), whose third column is the joint's axis, and origins
+            (..., joint + 1, 3) [m]; the last ones are those of the tool frame.
         """
-        flat = self._flatten(q)
-        out, jacobian = np.empty((len(flat), 3)), np.zeros((len(flat), 3, len(self.joints)))
-        for rows in _chunks(len(flat)):
-            vector, columns = self._carry_up(direction, flat[rows].T.copy())
-            for axis in range(3):
-                out[rows, axis] = vector[axis]
-                for j, column in enumerate(columns):
-                    jacobian[rows, axis, j] = column[axis]
-        lead = np.shape(q)[:-1]
-        return out.reshape(*lead, 3), jacobian.reshape(*lead, 3, len(self.joints))
+        found = np.moveaxis(self._frames(q), -1, 0).reshape(*np.shape(q)[:-1], -1, 4, 3)
+        return np.swapaxes(found[..., :3, :], -1, -2), found[..., 3, :]
 
-    def _carry_up(self, direction: FloatArray, q: FloatArray) -> tuple[Vector, list[Vector]]:
-        """Carry a direction and its derivatives from base to tool for `q` (joint, pose)."""
-        vector: Vector = tuple(direction.tolist())
-        columns: list[Vector] = []
-        for joint, value in zip(self.joints, q, strict=True):
-            back = joint.T_pj.T
-            vector, columns = _turn(back, vector), [_turn(back, column) for column in columns]
-            tangent: Vector = (0.0, 0.0, 0.0)
-            if not joint.prismatic:
-                c, s = np.cos(value), -np.sin(value)
-                vector, columns = _spin(c, s, vector), [_spin(c, s, column) for column in columns]
-                tangent = (vector[1], _scale(-1.0, vector[0]), 0.0)
-            columns.append(tangent)
-        last = self.T_jt.T
-        return _turn(last, vector), [_turn(last, column) for column in columns]
+    def _frames(self, q: FloatArray) -> FloatArray:
+        """Return x, y, z axis and origin of joints and tool, (joint + 1, 4, coordinate, pose)."""
+        values = self._flatten(q).T
+        count = values.shape[1]
+        cosine, sine = np.cos(values), np.sin(values)
+        found = np.empty((len(self.joints) + 1, 4, 3, count))
+        here = np.zeros((4, 3, count))
+        here[[0, 1, 2], [0, 1, 2]] = 1.0
+        for j, T in enumerate([*(joint.T_pj for joint in self.joints), self.T_jt]):
+            np.matmul(T.T, here.reshape(4, -1), out=found[j].reshape(4, -1))
+            if j == len(self.joints):
+                break
+            here = found[j].copy()
+            if self.joints[j].prismatic:
+                here[3] += values[j] * here[2]
+            else:
+                x, y = found[j, :2]
+                here[0], here[1] = cosine[j] * x + sine[j] * y, cosine[j] * y - sine[j] * x
+        return found
+
+    def rotation_and_derivative(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the tool's rotation R (..., 3, 3) in the base frame and dR/dq (..., 3, 3, joint).
+
+        dR/dq_j = [axis_j]x R [1/rad]; 0 for a joint that slides.
+
+        Args:
+            q: Joint values in chain order, (..., joint) [rad or m].
+        """
+        frames, lead = self._frames(q), np.shape(q)[:-1]
+        turns = np.array([float(not joint.prismatic) for joint in self.joints])
+        tool, axis = frames[-1, :3], frames[:-1, 2] * turns[:, None, None]
+        slope = cross(axis[:, None], tool, -2)  # (joint, tool axis, coordinate, pose)
+        shape = (*lead, 3, 3)
+        return tool.T.reshape(shape), slope.transpose(3, 2, 1, 0).reshape(*shape, -1)
 
     def _flatten(self, q: FloatArray) -> FloatArray:
         q = as_floats(q)
@@ -222,6 +231,12 @@ class SerialChain:
                 columns = [_turn(joint.T_pj, column) for column in (tangent, *columns)]
             point = _move(joint.T_pj, point)
         return point, columns
+
+
+def cross(a: FloatArray, b: FloatArray, axis: int = -1) -> FloatArray:
+    """Return a x b of vectors along `axis`, with less overhead than `numpy.cross`."""
+    (ax, ay, az), (bx, by, bz) = np.moveaxis(a, axis, 0), np.moveaxis(b, axis, 0)
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis)
 
 
 def rotation_to_z(axis: Sequence[float]) -> FloatArray:

@@ -31,8 +31,7 @@ from failuretwin.digital_model.kinematics import GRAVITY
 from failuretwin.digital_model.sensor_profile import SensorProfile
 from failuretwin.digital_model.twin import DigitalTwin
 
-AXES3 = np.eye(3)
-UP = GRAVITY * AXES3[2]
+UP = np.array([0.0, 0.0, GRAVITY])
 """What an accelerometer at rest reads in the base frame: the push that keeps it there [m/s2]."""
 LONGEST_WAY = 3.0
 """An accelerometer that may read anything on the way reads up to so many g; assumed."""
@@ -194,10 +193,10 @@ class Orientation(Sensor):
     def expected(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return R / sqrt 2 by rows and its Jacobian [rad, rad/rad]."""
         robot = self.twin.robot
-        rows = [robot.chain.in_tool_frame(u, pose * robot.sensor_sense) for u in AXES3]
-        value = np.concatenate([v for v, _ in rows], axis=-1)
-        jacobian = np.concatenate([J for _, J in rows], axis=-2) * robot.sensor_sense
-        return value / np.sqrt(2.0), jacobian / np.sqrt(2.0)
+        R, slope = robot.chain.rotation_and_derivative(pose * robot.sensor_sense)
+        lead = pose.shape[:-1]
+        jacobian = slope.reshape(*lead, 9, -1) * robot.sensor_sense
+        return R.reshape(*lead, 9) / np.sqrt(2.0), jacobian / np.sqrt(2.0)
 
     @property
     def log_anywhere(self) -> float:
@@ -234,8 +233,9 @@ class Accelerometer(Sensor):
     def expected(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return M^T R_b^T g z and its Jacobian [m/s2, m/s2/rad]."""
         robot = self.twin.robot
-        value, jacobian = robot.loads.chain.in_tool_frame(UP, pose * robot.sense)
-        return value @ self._mount, self._mount.T @ (jacobian * robot.sense)
+        R, slope = robot.loads.chain.rotation_and_derivative(pose * robot.sense)
+        jacobian = GRAVITY * slope[..., 2, :, :] * robot.sense
+        return GRAVITY * R[..., 2, :] @ self._mount, self._mount.T @ jacobian
 
     def along(self, pose: FloatArray, step_s: FloatArray) -> FloatArray:
         """Return M^T R_b^T (a + g z), a by second differences [m/s2]."""
@@ -245,8 +245,8 @@ class Accelerometer(Sensor):
         before = np.concatenate([p[..., :1, :], p[..., :-1, :]], axis=-2)
         after = np.concatenate([p[..., 1:, :], p[..., -1:, :]], axis=-2)
         force = (before - 2.0 * p + after) / np.asarray(step_s)[..., None, None] ** 2 + UP
-        rows = np.stack([robot.loads.chain.in_tool_frame(u, q)[0] for u in AXES3], axis=-2)
-        return np.einsum("...k,...kt->...t", force, rows) @ self._mount
+        R = robot.loads.chain.frames(q)[0][..., -1, :, :]
+        return np.einsum("...k,...kt->...t", force, R) @ self._mount
 
     @property
     def noise_on_way(self) -> float:
@@ -278,7 +278,7 @@ class Gyroscope(Sensor):
         """Return M^T omega with [omega]x = R^T dR/dt by central differences [rad/s]."""
         robot = self.twin.robot
         q = pose * robot.sense
-        R = np.stack([robot.loads.chain.in_tool_frame(u, q)[0] for u in AXES3], axis=-2)
+        R = robot.loads.chain.frames(q)[0][..., -1, :, :]
         before = np.concatenate([R[..., :1, :, :], R[..., :-1, :, :]], axis=-3)
         after = np.concatenate([R[..., 1:, :, :], R[..., -1:, :, :]], axis=-3)
         rate = np.swapaxes(R, -1, -2) @ (after - before)
