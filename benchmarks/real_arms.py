@@ -35,7 +35,7 @@ from failuretwin.data_knowledge.csv_log import read_column_map
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.profile_text import fitted_text, profile_text
 from failuretwin.digital_model.robot import Robot, load_robot
-from failuretwin.digital_model.urdf_check import check_urdf
+from failuretwin.digital_model.urdf.check import check_urdf
 
 if TYPE_CHECKING:
     import xarray as xr

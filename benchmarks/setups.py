@@ -34,7 +34,7 @@ from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.read import ReadOptions, read_runs
 from failuretwin.digital_model.profile_text import profile_text
 from failuretwin.digital_model.robot import Robot, load_robot
-from failuretwin.digital_model.urdf_check import check_urdf
+from failuretwin.digital_model.urdf.check import check_urdf
 from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.inference.log_correction import LogCorrection
 from failuretwin.inference.set_ups import mistakes

@@ -32,7 +32,7 @@ from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections, Schedule
 from failuretwin.digital_model.robot import bundled_folder
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.digital_model.urdf_check import check_urdf
+from failuretwin.digital_model.urdf.check import check_urdf
 from failuretwin.failure_behavior.registry import load_modes
 
 

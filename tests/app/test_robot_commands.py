@@ -11,7 +11,7 @@ from failuretwin import load_robot
 from failuretwin.app.cli import main
 from failuretwin.core.errors import InputError
 from failuretwin.digital_model.robot import bundled_folder, bundled_robots
-from failuretwin.digital_model.urdf import read_root
+from failuretwin.digital_model.urdf.file import read_root
 
 ARM = """<robot name="arm">
   <link name="base"/>

@@ -6,7 +6,7 @@ import numpy as np
 
 from failuretwin import load_robot
 from failuretwin.digital_model.profile_text import profile_text
-from failuretwin.digital_model.urdf_check import check_urdf
+from failuretwin.digital_model.urdf.check import check_urdf
 
 H = np.pi / 2
 UR5 = (

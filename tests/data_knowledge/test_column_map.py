@@ -12,7 +12,7 @@ from failuretwin.data_knowledge.csv_log import read_column_map
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.profile_text import profile_text
-from failuretwin.digital_model.urdf_check import check_urdf
+from failuretwin.digital_model.urdf.check import check_urdf
 
 ARMS = ("armpi_fpv", "ur5e", "panda", "so101")
 MAP = """

@@ -12,7 +12,7 @@ import failuretwin as ft
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
-from failuretwin.digital_model.sensor_profile import SensorProfile
+from failuretwin.digital_model.profile import SensorProfile
 from failuretwin.digital_model.sensors import sensor_of
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.diagnoser import BayesDiagnoser

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from failuretwin.core.errors import InputError
 from failuretwin.digital_model.kinematics import CHUNK, SerialChain, rotation_to_z
 from failuretwin.digital_model.robot import bundled_folder
-from failuretwin.digital_model.urdf import read_urdf
+from failuretwin.digital_model.urdf.file import read_urdf
 
 SAME_PLACE_M = 1e-9
 

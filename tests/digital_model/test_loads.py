@@ -8,7 +8,7 @@ import pytest
 
 from failuretwin import load_robot
 from failuretwin.digital_model.robot import bundled_robots
-from failuretwin.digital_model.urdf import read_urdf
+from failuretwin.digital_model.urdf.file import read_urdf
 
 SLIDER = """<robot name="slider">
   <link name="base"/>

@@ -13,8 +13,8 @@ from failuretwin.core.errors import InputError
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import bundled_folder, bundled_robots
 from failuretwin.digital_model.servo import ServoLoop
-from failuretwin.digital_model.urdf import read_urdf
-from failuretwin.digital_model.urdf_check import MOST_MOTORS, check_urdf
+from failuretwin.digital_model.urdf.check import MOST_MOTORS, check_urdf
+from failuretwin.digital_model.urdf.file import read_urdf
 
 
 def poles(P, I, tau):  # noqa: E741

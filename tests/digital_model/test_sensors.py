@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from failuretwin.core.errors import InputError
 from failuretwin.digital_model.kinematics import GRAVITY
 from failuretwin.digital_model.physics_model import TOOL, arm_spec
+from failuretwin.digital_model.profile import SensorProfile
 from failuretwin.digital_model.robot import load_robot
-from failuretwin.digital_model.sensor_profile import SensorProfile
 from failuretwin.digital_model.sensors import SENSORS, sensor_of
 from failuretwin.digital_model.twin import DigitalTwin
 

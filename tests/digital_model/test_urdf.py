@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from failuretwin.core.errors import InputError
-from failuretwin.digital_model.urdf import read_urdf, transform
+from failuretwin.digital_model.urdf.file import read_urdf, transform
 
 ARM = """<robot name="arm">
   <link name="base"/><link name="upper"/><link name="hand"/><link name="sensor"/>

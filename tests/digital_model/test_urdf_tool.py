@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from failuretwin.digital_model.urdf import read_urdf
-from failuretwin.digital_model.urdf_check import check_urdf
-from failuretwin.digital_model.urdf_tool import is_beside
+from failuretwin.digital_model.urdf.check import check_urdf
+from failuretwin.digital_model.urdf.file import read_urdf
+from failuretwin.digital_model.urdf.tool import is_beside
 
 
 def joint(parent, child, type_="revolute", xyz="0.2 0 0", axis="0 1 0"):

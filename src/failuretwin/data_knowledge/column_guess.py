@@ -27,7 +27,7 @@ from failuretwin.data_knowledge.csv_log import (
     load_csv,
 )
 from failuretwin.digital_model.robot import Robot
-from failuretwin.digital_model.urdf import read_urdf
+from failuretwin.digital_model.urdf.file import read_urdf
 
 if TYPE_CHECKING:
     import pandas as pd

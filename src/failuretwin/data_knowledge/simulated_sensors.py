@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.nonidealities import Imperfections
-from failuretwin.digital_model.sensor_profile import KINDS
+from failuretwin.digital_model.profile import KINDS
 from failuretwin.digital_model.sensors import sensor_of
 from failuretwin.digital_model.twin import DigitalTwin
 

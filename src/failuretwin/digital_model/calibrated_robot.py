@@ -22,7 +22,8 @@ from failuretwin.digital_model.nonidealities import (
     SETTLING_LISTS,
     Imperfections,
 )
-from failuretwin.digital_model.robot import Motor, Robot, SpeedLimit, load_robot
+from failuretwin.digital_model.profile import Motor, SpeedLimit
+from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.servo import ServoLoop
 from failuretwin.digital_model.settling import Settling, largest_load
 from failuretwin.digital_model.twin import DigitalTwin

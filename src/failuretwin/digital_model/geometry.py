@@ -19,7 +19,7 @@ import numpy as np
 from failuretwin.core.config import AtLeastZero, Bounded, Bounds
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.kinematics import SerialChain, cross, rotation_to_z
-from failuretwin.digital_model.urdf import Triple, Urdf, UrdfJoint, transform
+from failuretwin.digital_model.urdf.file import Triple, Urdf, UrdfJoint, transform
 
 NO_OFFSET = (0.0, 0.0, 0.0)
 NOT_MOVED = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

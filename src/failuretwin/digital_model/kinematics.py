@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.types import FloatArray, as_floats, frozen_array
+from failuretwin.core.types import FloatArray, as_floats
 
 # Vectors of three coordinates, each a number or an array over poses.
 
@@ -346,25 +346,6 @@ def has_range(low: float, high: float) -> bool:
     return bool(np.isfinite(low) and np.isfinite(high) and low < high)
 
 
-@dataclass(frozen=True)
-class Mobility:
-    """What the joints of a chain do to its tool point, by random poses within their limits.
-
-    Attributes:
-        lever: Largest speed of the tool for unit speed of each joint over all poses tried,
-            (joint,) [m/rad or m/m].
-        reach: Farthest distance of the tool from the base frame's origin that was found [m].
-    """
-
-    lever: FloatArray
-    reach: float
-
-    @property
-    def moves(self) -> list[bool]:
-        """Whether each joint can move the tool point."""
-        return (self.lever >= CANNOT_MOVE).tolist()
-
-
 def levers(chain: SerialChain) -> FloatArray:
     """Return the largest speed of the tool for unit speed of each joint, (joint,) [m/rad, m/m]."""
     _, jacobian = chain.position_and_jacobian(_poses(chain)[2])
@@ -378,20 +359,22 @@ def idle_axes(chain: SerialChain) -> tuple[bool, bool, bool]:
     return x, y, z
 
 
-def mobility(chain: SerialChain) -> Mobility:
-    """Return what the joints do; poses climb together to where the tool is farthest away."""
+def farthest_reach(chain: SerialChain) -> float:
+    """Return the largest distance of the tool from the base frame's origin found [m].
+
+    Gradient ascent from random poses within the limits.
+    """
     low, high, poses = _poses(chain)
-    point, jacobian = chain.position_and_jacobian(poses)
-    scale = float(np.linalg.norm(point, axis=-1).max()) or 1.0
-    farthest = 0.0
+    scale, farthest = 1.0, 0.0
     for step in np.linspace(1.0, 0.01, ASCENT_STEPS):
+        point, jacobian = chain.position_and_jacobian(poses)
         distance = np.linalg.norm(point, axis=-1)
+        scale = scale if farthest else float(distance.max()) or 1.0
         farthest = max(farthest, float(distance.max()))
         outward = point / np.maximum(distance, 1e-12)[:, None]
         slope = np.einsum("pa,paj->pj", outward, jacobian)
         poses = np.clip(poses + step * slope / scale, low, high)
-        point, jacobian = chain.position_and_jacobian(poses)
-    return Mobility(frozen_array(levers(chain)), farthest)
+    return farthest
 
 
 def _poses(chain: SerialChain) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -15,7 +15,7 @@ import numpy as np
 from failuretwin.core.config import AtLeastZero, Bounded, Bounds, Share
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.types import FloatArray
-from failuretwin.digital_model.sensor_profile import SensorProfile
+from failuretwin.digital_model.profile import SensorProfile
 from failuretwin.digital_model.settling import Settling
 
 Range = Annotated[tuple[float, float], Bounds(in_order=True)]

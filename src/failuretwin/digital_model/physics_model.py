@@ -28,9 +28,10 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.digital_model.geometry import roll_pitch_yaw
 from failuretwin.digital_model.kinematics import GRAVITY
-from failuretwin.digital_model.robot import Motor, Robot
+from failuretwin.digital_model.profile import Motor
+from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import poses_in_range
-from failuretwin.digital_model.urdf import Urdf, read_root, read_urdf
+from failuretwin.digital_model.urdf.file import Urdf, read_root, read_urdf
 
 # What the physics engine needs to know of motors and gears, and where it is written down.
 
@@ -114,9 +115,9 @@ def load_parameters(robot: Robot) -> PhysicsParameters | None:
     Raises:
         InputError: If the file cannot be used or does not fit the robot.
     """
-    path = robot.physics_file
-    if path is None:
+    if robot.profile.physics is None:
         return None
+    path = robot.folder / robot.profile.physics
     parameters = from_table(PhysicsParameters, read_toml(path), str(path))
     parameters.check_fit(robot)
     return parameters

@@ -21,9 +21,10 @@ from failuretwin.core.config import from_table
 from failuretwin.core.errors import InputError
 from failuretwin.digital_model.geometry import Geometry, JointCorrection
 from failuretwin.digital_model.kinematics import has_range
-from failuretwin.digital_model.robot import Profile, bundled_folder
-from failuretwin.digital_model.urdf import UrdfJoint
-from failuretwin.digital_model.urdf_report import JointReport, UrdfReport
+from failuretwin.digital_model.profile import Profile
+from failuretwin.digital_model.robot import bundled_folder
+from failuretwin.digital_model.urdf.check import JointReport, UrdfReport
+from failuretwin.digital_model.urdf.file import UrdfJoint
 
 Numbers = TypeVar("Numbers", bound=tuple[float, ...])
 

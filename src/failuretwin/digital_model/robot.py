@@ -1,30 +1,20 @@
-"""A robot: the kinematics of its URDF and what its profile says of its motors."""
+"""A robot: the kinematics of its URDF, and its motors by its profile."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 
-from failuretwin.core.config import Bounded, Bounds, from_table, read_toml
+from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.types import BoolArray, FloatArray, ServoUnits, frozen_array
-from failuretwin.digital_model.geometry import (
-    AS_STATED,
-    NO_OFFSET,
-    NOT_MOVED,
-    Geometry,
-    Pose,
-    SensorFrame,
-    seen_chain,
-    with_tool,
-)
+from failuretwin.digital_model.geometry import SensorFrame, seen_chain, with_tool
 from failuretwin.digital_model.kinematics import (
     CANNOT_MOVE,
     Loads,
@@ -33,122 +23,8 @@ from failuretwin.digital_model.kinematics import (
     idle_axes,
     levers,
 )
-from failuretwin.digital_model.sensor_profile import SensorProfile
-from failuretwin.digital_model.servo import ServoLoop
-from failuretwin.digital_model.urdf import Triple, read_urdf
-
-POSES = ("log", "physical")
-
-
-FASTEST = 1e3
-"""Largest speed limit that makes sense [rad/s or m/s]."""
-FARTHEST = 1e3
-"""Largest target, and farthest place of a tool [rad or m]."""
-SpeedLimit = Annotated[float, Bounds(1e-6, FASTEST)]
-Angles = Annotated[tuple[float, float], Bounds(-FARTHEST, FARTHEST, in_order=True)]
-
-
-@dataclass(frozen=True)
-class Motor(Bounded):
-    """One motor that can move the tool point.
-
-    Attributes:
-        name: Name in run sets and hypotheses, such as ``motor_1``.
-        joint: Name of the URDF joint that it turns.
-        loop: Its closed position loop.
-        speed_limit: Largest speed [rad/s].
-        movement_range: Lowest and highest target of random movements [rad].
-        travel: Lowest and highest angle that it may stand at [rad]; None: the limits of its joint.
-        sense: Physical angle = sense * angle in commands and logs; +1 or -1.
-        log_column: Column of raw logs that belongs to it.
-        home: Angle at rest, round which random movements keep where the limits are wide [rad];
-            None: the middle of the limits.
-    """
-
-    name: str
-    joint: str
-    loop: ServoLoop
-    speed_limit: SpeedLimit
-    movement_range: Angles
-    travel: tuple[float, float] | None = None
-    sense: float = 1.0
-    log_column: str = ""
-    home: float | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.sense not in (1.0, -1.0):
-            raise InputError(f"motor {self.name!r}: sense is {self.sense}, expected 1 or -1.")
-        ranges = {"movement_range": self.movement_range, "travel": self.travel}
-        for name, ends in ranges.items():
-            if ends is not None and not -FARTHEST <= ends[0] < ends[1] <= FARTHEST:
-                raise InputError(
-                    f"motor {self.name!r}: {name} is {list(ends)}, expected the lowest and the "
-                    "highest angle [rad]."
-                )
-        if self.home is not None and not abs(self.home) <= FARTHEST:
-            raise InputError(
-                f"motor {self.name!r}: home is {self.home:g}, expected an angle [rad]."
-            )
-        if set(self.name) & set(":+,") or not self.name:
-            raise InputError(
-                f"motor name {self.name!r} cannot stand in hypotheses. Leave out ':', '+', ','."
-            )
-
-
-Place = Annotated[Triple, Bounds(-FARTHEST, FARTHEST)]
-
-
-@dataclass(frozen=True)
-class Profile(Bounded):
-    """What a TOML profile says beside the URDF.
-
-    Attributes:
-        name: Name of the robot.
-        urdf: URDF file, relative to the profile.
-        base_link: Link that carries the base frame.
-        tool_link: Link that carries the tool point.
-        motors: Motors that can move the tool point, in chain order.
-        tool_xyz: The tool point, in the frame of the tool link [m].
-        base_xyz_rpy: Pose of the base link in the frame of the tool positions that the sensor
-            tells; see `failuretwin.digital_model.geometry`.
-        geometry: How the arm differs from its URDF, and the sensor from a true one.
-        sensor_pose: Which angles the tool sensor's path belongs to: ``log`` (a virtual sensor
-            that applies the kinematics to angles in the log's sense) or ``physical``.
-        servo_units: Count scale of commands and readings in raw logs, if they use one.
-        imperfections: Imperfections of the healthy robot, a TOML file relative to the profile.
-        physics: Motors and gears for the physics engine, a TOML file relative to the profile.
-        inference: Lengths and angles by which its runs are read, where they are not the usual
-            ones; see `InferenceSettings`.
-        arm_class: What kind of arm it is, for what is believed of it before it is calibrated; see
-            `failuretwin.digital_model.arm_classes`. Empty: by its reach.
-        sources: Where each group of numbers comes from.
-        sensors: Sensors beside that of the tool's position, where they are not as usual.
-    """
-
-    name: str
-    urdf: str
-    base_link: str
-    tool_link: str
-    motors: tuple[Motor, ...]
-    tool_xyz: Place = NO_OFFSET
-    base_xyz_rpy: Annotated[Pose, Bounds(-FARTHEST, FARTHEST)] = NOT_MOVED
-    geometry: Geometry = AS_STATED
-    sensor_pose: str = "physical"
-    servo_units: ServoUnits | None = None
-    imperfections: str | None = None
-    physics: str | None = None
-    inference: dict[str, float] = field(default_factory=dict)
-    arm_class: str = ""
-    sources: dict[str, str] = field(default_factory=dict)
-    sensors: tuple[SensorProfile, ...] = ()
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.sensor_pose not in POSES:
-            raise unknown_name("sensor_pose", self.sensor_pose, POSES)
-        if not self.motors:
-            raise InputError(f"profile {self.name!r} has no motors. Expected at least one.")
+from failuretwin.digital_model.profile import Motor, Profile
+from failuretwin.digital_model.urdf.file import read_urdf
 
 
 @dataclass(frozen=True)
@@ -157,11 +33,10 @@ class Robot:
 
     Attributes:
         profile: Its profile.
-        chain: Its kinematics as the tool sensor sees it, in the sensor's frame; one joint for each
-            motor.
-        loads: What its motors carry; their chain is in the frame of the base link.
-        source: The file of its profile.
-        frame: Where the sensor was found to stand beside the profile; None: where that says.
+        chain: Kinematics as the tool sensor sees it, in the sensor's frame; one joint per motor.
+        loads: Masses that its motors carry; their chain is in the frame of the base link.
+        source: File of its profile.
+        frame: Displacement of the sensor from its place in the profile; None: not displaced.
     """
 
     profile: Profile
@@ -171,10 +46,7 @@ class Robot:
     frame: SensorFrame | None = None
 
     def seen_from(self, frame: SensorFrame | None) -> Robot:
-        """Return the robot as a sensor sees it that stands there; None: where the profile says.
-
-        With joints that slide, the scale is left out.
-        """
+        """Return the robot as seen by a displaced sensor; the scale of sliding arms is ignored."""
         if frame == self.frame:
             return self
         geometry = self.profile.geometry
@@ -193,7 +65,7 @@ class Robot:
 
     @property
     def folder(self) -> Path:
-        """Where the profile lies."""
+        """Folder of the profile."""
         return self.source.parent
 
     @property
@@ -224,10 +96,7 @@ class Robot:
 
     @cached_property
     def limits(self) -> FloatArray:
-        """Limits of the joints in the sense of commands, (motor, low | high) [rad or m].
-
-        Infinite where the URDF has none.
-        """
+        """Limits of the joints in the log's sense, (motor, low | high) [rad or m]; inf: none."""
         ends = np.array([(joint.low, joint.high) for joint in self.chain.joints])
         known = [has_range(low, high) for low, high in ends.tolist()]
         ends[~np.array(known)] = -np.inf, np.inf
@@ -235,13 +104,12 @@ class Robot:
 
     @cached_property
     def travel(self) -> FloatArray:
-        """Where each motor may stand, (motor, low | high) [rad or m].
+        """Possible angles of each motor, (motor, low | high) [rad or m].
 
-        What its profile says; else the limits of its joint, of one that turns no more than a full
-        turn about the middle of its movements, for angles a turn apart are one to the tool.
+        Default: the limits of its joint, at most one full turn about the middle of its movements,
+        since angles a turn apart give the same tool position.
         """
-        found = np.array([self._travel_of(k) for k in range(len(self.motors))])
-        return frozen_array(found)
+        return frozen_array([self._travel_of(k) for k in range(len(self.motors))])
 
     def _travel_of(self, k: int) -> tuple[float, float]:
         motor, (low, high) = self.motors[k], self.limits[k].tolist()
@@ -260,33 +128,27 @@ class Robot:
         return np.array([joint.prismatic for joint in self.chain.joints])
 
     def own_unit(self, motor: str, unit: str) -> str:
-        """Return the unit of a magnitude at a motor: in metres where it slides, not in radians."""
-        if not unit.startswith("rad"):
-            return unit
+        """Return the unit of a magnitude at a motor: m instead of rad where it slides."""
         slides = self.slides[self.motor_names.index(motor)]
-        return unit.replace("rad", "m", 1) if slides else unit
+        return unit.replace("rad", "m", 1) if slides and unit.startswith("rad") else unit
 
     @cached_property
     def resting_pose(self) -> FloatArray:
-        """Where an arm stands that is not asked, taken as near 0 as it moves, (motor,) [rad]."""
+        """Pose of an arm without a stated one: as near to 0 as it moves, (motor,) [rad]."""
         return np.array([float(np.clip(0.0, *motor.movement_range)) for motor in self.motors])
 
     @cached_property
     def idle_axes(self) -> tuple[bool, bool, bool]:
-        """Axes of the tool's position along which no motor moves it."""
+        """Axes of the tool position along which no motor moves it."""
         return idle_axes(self.chain)
 
     @cached_property
     def reach(self) -> float:
-        """How far the tool can be from the base at most [m]: links and slides laid end to end."""
+        """Upper bound of the tool's distance from the base [m]: links and slides end to end."""
         chain = self.loads.chain
-        links = sum(float(np.linalg.norm(joint.T_pj[:3, 3])) for joint in chain.joints)
-        slides = sum(
-            max(abs(end) for end in motor.movement_range)
-            for motor, slides in zip(self.motors, self.slides, strict=True)
-            if slides
-        )
-        return links + slides + float(np.linalg.norm(chain.T_jt[:3, 3]))
+        links = [*(joint.T_pj for joint in chain.joints), chain.T_jt]
+        slides = np.abs([m.movement_range for m in self.motors]).max(axis=1)[self.slides]
+        return float(sum(np.linalg.norm(T[:3, 3]) for T in links) + slides.sum())
 
     @property
     def servo_units(self) -> ServoUnits:
@@ -309,24 +171,17 @@ class Robot:
     @property
     def imperfections_file(self) -> Path | None:
         """File with the imperfections of the healthy robot, if the profile names one."""
-        return self._beside(self.profile.imperfections)
-
-    @property
-    def physics_file(self) -> Path | None:
-        """File with motors and gears for the physics engine, if the profile names one."""
-        return self._beside(self.profile.physics)
-
-    def _beside(self, name: str | None) -> Path | None:
+        name = self.profile.imperfections
         return None if name is None else self.folder / name
 
 
 def bundled_folder() -> Path:
-    """Return the folder of the robots that come with the package."""
+    """Return the folder of the bundled robots."""
     return Path(str(files("failuretwin.digital_model") / "robots"))
 
 
 def bundled_robots() -> list[str]:
-    """Return the names of the robots that come with the package."""
+    """Return the names of the bundled robots."""
     return sorted(path.stem for path in bundled_folder().glob("*.toml"))
 
 

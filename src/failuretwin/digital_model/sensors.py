@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.kinematics import GRAVITY
-from failuretwin.digital_model.sensor_profile import SensorProfile
+from failuretwin.digital_model.profile import SensorProfile
 from failuretwin.digital_model.twin import DigitalTwin
 
 UP = np.array([0.0, 0.0, GRAVITY])

@@ -33,7 +33,6 @@ from failuretwin.failure_behavior.fault import (
     PerMovement,
     draw_episodes,
 )
-from failuretwin.failure_behavior.reaction import Reaction
 
 Range = tuple[float, float]
 
@@ -47,6 +46,17 @@ class Signature(Enum):
     HELD = "an angle that the motor keeps"
     TRANSIENT = "a way that takes longer or begins later"
     MISSED = "single movements that are not made"
+
+
+class Reaction(Enum):
+    """What an arm that goes on working does about a fault of one of its motors."""
+
+    LOCK = "plan with the motor held where it is believed to stand"
+    INVERT = "command what the fault turns into what is wanted"
+    PARK = "let the motor rest in a known place, and work with the others"
+    REPEAT = "look whether each command came, and send it again"
+    WAIT = "give it the time that it takes"
+    SPARE = "choose poses in which it carries little, and command against its sag"
 
 
 USUAL_REACTION = {

@@ -24,8 +24,14 @@ from failuretwin.failure_behavior.fault import (
     PerMovement,
     draw_episodes,
 )
-from failuretwin.failure_behavior.mode import FaultMode, Range, Signature, SignedMode, SizedMode
-from failuretwin.failure_behavior.reaction import Reaction
+from failuretwin.failure_behavior.mode import (
+    FaultMode,
+    Range,
+    Reaction,
+    Signature,
+    SignedMode,
+    SizedMode,
+)
 
 # Modes in which the gear holds the motor: stuck, intermittent.
 

@@ -10,7 +10,7 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.decision.acting.belief import LatchedBelief, NoBelief
 from failuretwin.decision.acting.believed_arm import BelievedArm
 from failuretwin.decision.acting.outcome import ActingSettings
-from failuretwin.failure_behavior.reaction import Reaction
+from failuretwin.failure_behavior.mode import Reaction
 from failuretwin.failure_behavior.registry import MODES
 
 

@@ -22,7 +22,7 @@ from failuretwin.app.terminal import tell
 from failuretwin.core.errors import counted
 
 if TYPE_CHECKING:
-    from failuretwin.digital_model.urdf_report import UrdfReport
+    from failuretwin.digital_model.urdf.check import UrdfReport
 
 
 @click.command("import")
@@ -214,7 +214,7 @@ def robot() -> None:
 def check(urdf: Path, base: str | None, tool: str | None, sensor_noise: float) -> None:
     """Say whether a URDF can be used, which motors move the tool, and what is missing."""
     from failuretwin.app.reports import print_report
-    from failuretwin.digital_model.urdf_check import check_urdf
+    from failuretwin.digital_model.urdf.check import check_urdf
 
     report = check_urdf(urdf, base, tool, 1e-3 * sensor_noise)
     print_report(report)
@@ -244,7 +244,7 @@ def init(
     from failuretwin.data_knowledge.store import replacing
     from failuretwin.digital_model.profile_text import profile_text
     from failuretwin.digital_model.robot import load_robot
-    from failuretwin.digital_model.urdf_check import check_urdf
+    from failuretwin.digital_model.urdf.check import check_urdf
 
     if out.suffix != ".toml":
         raise InputError(f"{out}: a profile ends in .toml. Give such a name.")

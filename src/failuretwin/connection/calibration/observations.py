@@ -11,8 +11,8 @@ from failuretwin.core.runs import measured_rate
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import Readings
+from failuretwin.digital_model.profile import SensorProfile
 from failuretwin.digital_model.robot import Robot
-from failuretwin.digital_model.sensor_profile import SensorProfile
 from failuretwin.digital_model.sensors import Encoders
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.evidence import Evidence, SettledEvidence

@@ -21,7 +21,7 @@ from failuretwin.connection.calibration.result import Parameter
 from failuretwin.core.movements import find_movements
 from failuretwin.core.numerics import Covariance
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
-from failuretwin.digital_model.sensor_profile import SensorProfile
+from failuretwin.digital_model.profile import SensorProfile
 from failuretwin.digital_model.sensors import SENSORS, Encoders, Sensor, Tool, sensor_of
 from failuretwin.inference.evidence import rest_begin
 from failuretwin.inference.healthy_model import HealthyModel

@@ -15,7 +15,7 @@ import numpy as np
 
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.step_tests import StepTest
-from failuretwin.digital_model.robot import Motor
+from failuretwin.digital_model.profile import Motor
 from failuretwin.digital_model.servo import respond_limited
 
 GRID_S = 0.002

@@ -23,7 +23,8 @@ from failuretwin.data_knowledge.matlab import find_matlab_files
 from failuretwin.data_knowledge.raw_sessions import SESSION_FILES
 from failuretwin.data_knowledge.step_tests import StepTest, find_step_tests, read_step_test
 from failuretwin.digital_model.calibrated_robot import CalibratedLoop, with_loops
-from failuretwin.digital_model.robot import Motor, Robot
+from failuretwin.digital_model.profile import Motor
+from failuretwin.digital_model.robot import Robot
 
 # Overshoot and settling time, read from the steps without a model.
 

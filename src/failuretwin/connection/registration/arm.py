@@ -34,7 +34,7 @@ from failuretwin.digital_model.geometry import (
 from failuretwin.digital_model.kinematics import Loads, SerialChain, rotation_to_z
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import poses_in_range
-from failuretwin.digital_model.urdf import Triple, UrdfJoint, read_urdf, transform
+from failuretwin.digital_model.urdf.file import Triple, UrdfJoint, read_urdf, transform
 
 # Standard deviations of what is believed before any pose is seen.
 

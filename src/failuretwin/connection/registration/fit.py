@@ -27,7 +27,8 @@ from failuretwin.core.runs import check_motors
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.read import RunsLike, as_runs
 from failuretwin.digital_model.geometry import roll_pitch_yaw
-from failuretwin.digital_model.robot import Profile, Robot, load_robot
+from failuretwin.digital_model.profile import Profile
+from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.registration import align
 from failuretwin.inference.set_ups import MOST_RAD, UNIT_FACTOR, extent

@@ -27,7 +27,7 @@ from failuretwin.decision.acting.sparing import Effort
 from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, Target, Task
 from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.digital_model.inverse_kinematics import angle_between
-from failuretwin.failure_behavior.reaction import Reaction
+from failuretwin.failure_behavior.mode import Reaction
 from failuretwin.inference.healthy_model import HealthyModel
 
 SMALLEST_NEWS_RAD = 0.02

@@ -21,8 +21,7 @@ from failuretwin.core.hypothesis import HEALTHY, Hypothesis
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault, Seen
 from failuretwin.decision.acting.drifting import followed
 from failuretwin.decision.acting.judging import Judgement
-from failuretwin.failure_behavior.mode import Signature
-from failuretwin.failure_behavior.reaction import Reaction
+from failuretwin.failure_behavior.mode import Reaction, Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.healthy_model import HealthyModel
 

@@ -21,8 +21,7 @@ from failuretwin.digital_model.inverse_kinematics import usable_limits
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import sag
 from failuretwin.failure_behavior.fault import Arrival
-from failuretwin.failure_behavior.mode import FaultMode, Signature
-from failuretwin.failure_behavior.reaction import Reaction
+from failuretwin.failure_behavior.mode import FaultMode, Reaction, Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.healthy_model import HealthyModel
 

@@ -14,8 +14,7 @@ from failuretwin.core.hypothesis import HEALTHY, Hypothesis, single_faults
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.believed_arm import BelievedFault, Seen
-from failuretwin.failure_behavior.mode import Signature
-from failuretwin.failure_behavior.reaction import Reaction
+from failuretwin.failure_behavior.mode import Reaction, Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.healthy_model import HealthyModel

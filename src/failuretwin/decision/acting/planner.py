@@ -21,7 +21,7 @@ from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, Target
 from failuretwin.digital_model.inverse_kinematics import STARTS, InverseKinematics, Poses
 from failuretwin.digital_model.settling import largest_load
-from failuretwin.failure_behavior.reaction import Reaction
+from failuretwin.failure_behavior.mode import Reaction
 
 NEAR_ENOUGH = 0.6
 """A plan that uses up no more of the tolerance is not looked for any further; the rest is for how

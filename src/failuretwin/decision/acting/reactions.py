@@ -9,7 +9,7 @@ import numpy as np
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault, Seen
 from failuretwin.digital_model.robot import Robot
-from failuretwin.failure_behavior.reaction import Reaction
+from failuretwin.failure_behavior.mode import Reaction
 from failuretwin.inference.explanation import size_words
 
 LEAST_LOSS_RATE = 0.01

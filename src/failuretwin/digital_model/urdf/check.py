@@ -1,15 +1,20 @@
-"""A URDF looked over before use: its chain, its motors, and what may be wrong with it."""
+"""Check of a URDF before use: its chain, its motors, and findings of three severities.
+
+An error prevents the use of the file; a warning says what is missing or assumed; a note states a
+choice.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
-from failuretwin.core.errors import unknown_name
-from failuretwin.digital_model.kinematics import CANNOT_MOVE, has_range, mobility
-from failuretwin.digital_model.urdf import (
+from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.digital_model.kinematics import CANNOT_MOVE, farthest_reach, has_range, levers
+from failuretwin.digital_model.urdf.file import (
     HELD_TYPES,
     MOVING_TYPES,
     LinkFacts,
@@ -18,8 +23,96 @@ from failuretwin.digital_model.urdf import (
     read_root,
     read_urdf,
 )
-from failuretwin.digital_model.urdf_report import Finding, JointReport, Severity, UrdfReport
-from failuretwin.digital_model.urdf_tool import ToolChoice, choose_tool
+from failuretwin.digital_model.urdf.tool import ToolChoice, choose_tool
+
+Severity = Literal["error", "warning", "note"]
+SEVERITIES = ("error", "warning", "note")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One matter that the user should know.
+
+    Attributes:
+        severity: ``error``, ``warning`` or ``note``.
+        message: What was found and what to do about it.
+    """
+
+    severity: Severity
+    message: str
+
+
+@dataclass(frozen=True)
+class JointReport:
+    """One joint of the file and what it is to the tool.
+
+    Attributes:
+        joint: The joint as the file states it.
+        motor: Name of the motor that turns it, if one can move the tool point by it.
+        reason: Why no motor can, else empty.
+        mass: Mass of the link that it carries [kg]; None where the file states none.
+    """
+
+    joint: UrdfJoint
+    motor: str | None
+    reason: str
+    mass: float | None
+
+
+@dataclass(frozen=True)
+class UrdfReport:
+    """What a URDF holds.
+
+    Attributes:
+        source: The file.
+        findings: What the user should know, errors first.
+        name: Name of the robot in the file.
+        base_link: Link that carries the base frame; empty where an error hides it.
+        tool_link: Link whose origin is the tool point; empty where an error hides it.
+        joints: Joints from base to tool, then all others; empty where an error hides them.
+        reach: Farthest distance of the tool from the base's origin that was found [m].
+        moving_mass: Mass of everything that the first motor carries [kg].
+    """
+
+    source: Path
+    findings: tuple[Finding, ...] = ()
+    name: str = ""
+    base_link: str = ""
+    tool_link: str = ""
+    joints: tuple[JointReport, ...] = ()
+    reach: float = 0.0
+    moving_mass: float = 0.0
+
+    @property
+    def motors(self) -> list[JointReport]:
+        """Joints that can move the tool point, in chain order."""
+        return [joint for joint in self.joints if joint.motor is not None]
+
+    @property
+    def others(self) -> list[JointReport]:
+        """Joints that cannot move the tool point."""
+        return [joint for joint in self.joints if joint.motor is None]
+
+    def with_findings(self, more: Iterable[Finding]) -> UrdfReport:
+        """Return the report with more findings, sorted by severity."""
+        known = [*self.findings, *more]
+        known.sort(key=lambda finding: SEVERITIES.index(finding.severity))
+        return replace(self, findings=tuple(known))
+
+    def having(self, severity: Severity) -> list[str]:
+        """Return the messages of one severity."""
+        return [finding.message for finding in self.findings if finding.severity == severity]
+
+    def raise_errors(self) -> None:
+        """Raise what keeps the file from being used.
+
+        Raises:
+            InputError: If there is any error among the findings.
+        """
+        errors = self.having("error")
+        if errors:
+            raise InputError(f"{self.source}: " + "\n  also: ".join(errors))
+
 
 SHORT_LEVER_M = 0.01
 """A motor that moves the tool by less for each radian can hardly be watched [m/rad]."""
@@ -88,17 +181,17 @@ def _with_motors(
 ) -> UrdfReport:
     motors = [joint for joint in path if joint.has_motor]
     names = [joint.name for joint in motors]
-    motion = mobility(urdf.chain(report.base_link, report.tool_link, names))
-    moves = dict(zip(names, motion.lever.tolist(), strict=True))
-    levers = {name: lever for name, lever in moves.items() if lever >= max(noise_m, CANNOT_MOVE)}
+    chain = urdf.chain(report.base_link, report.tool_link, names)
+    moves = dict(zip(names, levers(chain).tolist(), strict=True))
+    seen = {name: lever for name, lever in moves.items() if lever >= max(noise_m, CANNOT_MOVE)}
     short = {name: lever for name, lever in moves.items() if CANNOT_MOVE <= lever < noise_m}
     moving = urdf.steps(motors[0].child)
     return replace(
         report,
-        joints=_joint_reports(urdf, path, list(levers), short),
-        reach=motion.reach,
+        joints=_joint_reports(urdf, path, list(seen), short),
+        reach=farthest_reach(chain),
         moving_mass=sum(urdf.facts[n].mass or 0.0 for n in moving if n in urdf.facts),
-    ).with_findings([*_lever_findings(levers, report.tool_link), *_short_findings(short, noise_m)])
+    ).with_findings([*_lever_findings(seen, report.tool_link), *_short_findings(short, noise_m)])
 
 
 def _joint_reports(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from failuretwin.digital_model.urdf import Urdf
+from failuretwin.digital_model.urdf.file import Urdf
 
 TOOL_NAMES = (
     r"tool0",
