@@ -1,6 +1,6 @@
 """The profile of a robot: what a TOML file states in addition to the URDF.
 
-Section: docs/sensors.md#what-the-profile-says
+Section: docs/sensors.md#sensors-in-the-profile
 """
 
 from __future__ import annotations
