@@ -13,7 +13,7 @@ from failuretwin.core.types import FloatArray
 class KeptCommands:
     """A sink that keeps commands."""
 
-    name, trouble = "commands", ""
+    trouble = ""
 
     def __init__(self) -> None:
         self.sent: list[CommandSent] = []

@@ -64,7 +64,7 @@ class Notebook:
 class Kept:
     """A sink that keeps everything."""
 
-    name, trouble = "kept", ""
+    trouble = ""
 
     def __init__(self):
         self.items = []

@@ -67,13 +67,18 @@ def test_what_a_robot_says_is_heard(armpi, port, transport):
 
 def test_the_diagnosis_has_all_that_ros_2_asks_of_a_message(armpi, port, transport):
     """The key, the hash (REP 2011: that of Jazzy), the attachment and the tokens of its node."""
-    heard, alive = [], []
+    heard = []
     hash_ = "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
     with zenoh.open(client_of(port)) as other:
         other.declare_subscriber("0/diagnostics/**", heard.append)
         sink = diagnostics_sink(armpi, STANDARD, transport)
         transport.check_listener("/diagnostics")
-        alive = [str(r.ok.key_expr) for r in other.liveliness().get("@ros2_lv/0/**")]
+
+        def alive():
+            return sorted(str(r.ok.key_expr) for r in other.liveliness().get("@ros2_lv/0/**"))
+
+        wait_for(lambda: len(alive()) == 2)
+        tokens = alive()
         sink.put(Answer(1000.5, OK, HEALTHY))
         wait_for(lambda: bool(heard))
     key = f"diagnostic_msgs::msg::dds_::DiagnosticArray_/{hash_}"
@@ -81,9 +86,9 @@ def test_the_diagnosis_has_all_that_ros_2_asks_of_a_message(armpi, port, transpo
     number, sent_ns, size = struct.unpack("<qqB", bytes(heard[0].attachment)[:17])
     assert (number, size, len(bytes(heard[0].attachment))) == (1, 16, 33)
     assert abs(sent_ns / 1e9 - time.time()) < 60.0
-    (session,) = {token.split("/")[2] for token in alive}
+    (session,) = {token.split("/")[2] for token in tokens}
     own = f"@ros2_lv/0/{session}/0"
-    assert sorted(alive) == [
+    assert tokens == [
         f"{own}/0/NN/%/%/failuretwin",
         f"{own}/1/MP/%/%/failuretwin/%diagnostics/{key}/::,10:,:,:,,",
     ]

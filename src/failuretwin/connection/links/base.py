@@ -183,7 +183,7 @@ class Sink(Protocol):
     each call `trouble` is read, and the user is told when it changes::
 
         class Printed:
-            name, trouble = "printed", ""
+            trouble = ""
 
             def put(self, item: Item) -> None:
                 if isinstance(item, Answer) and item.diagnosis is not None:
@@ -195,11 +195,6 @@ class Sink(Protocol):
             def __exit__(self, *_: object) -> None:
                 pass
     """
-
-    @property
-    def name(self) -> str:
-        """Name for messages to the user, such as a file or an address."""
-        ...
 
     @property
     def trouble(self) -> str:

@@ -171,7 +171,6 @@ class Recorder:
     def __init__(self, path: Path, robot: Robot) -> None:
         if path.suffix != ".mcap":
             raise InputError(f"{path}: recordings are MCAP. Give a name that ends in .mcap.")
-        self.name = str(path)
         self.trouble = ""
         self._path = path
         self._writer = RosWriter(robot, RECORDED)

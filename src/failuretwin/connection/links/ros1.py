@@ -174,9 +174,9 @@ class Ros1Transport(Transport):
     def __init__(self) -> None:
         self._codec = RosCodec(1)
         self._rospy = _join()
-        self._takes: dict[str, Take] = {}
+        self._takes: list[tuple[str, Take]] = []
         self._classes: dict[str, Any] = {}
-        self._subscribers: dict[str, Any] = {}
+        self._subscribers: list[Any] = []
         self._publishers: dict[str, Any] = {}
         self._master_gone, self._renewals = False, 0
         self._stop = threading.Event()
@@ -195,13 +195,14 @@ class Ros1Transport(Transport):
 
     def subscribe(self, topic: str, type_: str, take: Take) -> None:
         """Call `take` with every message of a topic, of any type."""
-        self._takes[topic] = take
-        self._subscribe(topic)
+        self._subscribers.append(self._subscriber(topic, take))
+        self._takes.append((topic, take))
 
     def advertise(self, topic: str, type_: str) -> None:
         """Prepare a topic for publishing."""
-        self._classes[topic] = message_class(self._codec, type_)
-        self._advertise(topic)
+        class_ = message_class(self._codec, type_)
+        self._publishers[topic] = self._publisher(topic, class_)
+        self._classes[topic] = class_
 
     def publish(self, message: Outgoing) -> None:
         """Publish a message."""
@@ -226,21 +227,17 @@ class Ros1Transport(Transport):
         """End all subscriptions and publishers; the process stays a node."""
         self._stop.set()
         self._thread.join()
-        for handle in (*self._subscribers.values(), *self._publishers.values()):
+        for handle in (*self._subscribers, *self._publishers.values()):
             handle.unregister()
 
-    def _subscribe(self, topic: str) -> None:
-        def take(message: Any) -> None:
-            self._takes[topic](partial(_decoded, message))
+    def _subscriber(self, topic: str, take: Take) -> Any:
+        def receive(message: Any) -> None:
+            take(partial(_decoded, message))
 
-        self._subscribers[topic] = self._rospy.Subscriber(
-            topic, self._rospy.AnyMsg, take, tcp_nodelay=True
-        )
+        return self._rospy.Subscriber(topic, self._rospy.AnyMsg, receive, tcp_nodelay=True)
 
-    def _advertise(self, topic: str) -> None:
-        self._publishers[topic] = self._rospy.Publisher(
-            topic, self._classes[topic], queue_size=QUEUE, tcp_nodelay=True
-        )
+    def _publisher(self, topic: str, class_: Any) -> Any:
+        return self._rospy.Publisher(topic, class_, queue_size=QUEUE, tcp_nodelay=True)
 
     def _watch(self) -> None:
         while not self._stop.wait(CHECK_S):
@@ -255,18 +252,22 @@ class Ros1Transport(Transport):
 
     def _is_forgotten(self) -> bool:
         """Return whether the master has forgotten a topic; raises OSError if none answers."""
-        state, node = _ask_master("getSystemState"), self._rospy.get_name()
-        for registered, handles in zip(state, (self._publishers, self._subscribers), strict=False):
-            known = {topic for topic, nodes in registered if node in nodes}
-            if not known >= {self._rospy.resolve_name(topic) for topic in list(handles)}:
+        published, subscribed, _ = _ask_master("getSystemState")
+        own, name = self._rospy.get_name(), self._rospy.resolve_name
+        for registered, topics in (
+            (published, list(self._classes)),
+            (subscribed, [topic for topic, _ in self._takes]),
+        ):
+            known = {topic for topic, nodes in registered if own in nodes}
+            if not known >= set(map(name, topics)):
                 return True
         return False
 
     def _register_again(self) -> None:
-        for topic, handle in list(self._subscribers.items()):
+        for handle in self._subscribers:
             handle.unregister()
-            self._subscribe(topic)
-        for topic, handle in list(self._publishers.items()):
-            handle.unregister()
-            self._advertise(topic)
+        self._subscribers = [self._subscriber(topic, take) for topic, take in self._takes]
+        for topic, class_ in list(self._classes.items()):
+            self._publishers[topic].unregister()
+            self._publishers[topic] = self._publisher(topic, class_)
         self._renewals += 1

@@ -238,16 +238,14 @@ class RosSink:
     """Sink that publishes items on a ROS network; it does not close the transport.
 
     Args:
-        name: Its name.
         writer: Converts items into messages.
         transport: Connection to the network.
     """
 
-    def __init__(self, name: str, writer: Writer, transport: Transport) -> None:
-        self.name = name
+    def __init__(self, writer: Writer, transport: Transport) -> None:
         self._writer = writer
         self._transport = transport
-        for topic, type_ in writer.topics:
+        for topic, type_ in dict(writer.topics).items():
             transport.advertise(topic, type_)
 
     @property
@@ -273,10 +271,9 @@ def robot_sink(robot: Robot, topics: RosTopics, transport: Transport) -> RosSink
     Raises:
         InputError: As `RosWriter`.
     """
-    return RosSink(transport.name, RosWriter(robot, topics), transport)
+    return RosSink(RosWriter(robot, topics), transport)
 
 
 def diagnostics_sink(robot: Robot, topics: RosTopics, transport: Transport) -> RosSink:
     """Return a sink that publishes answers as diagnostics."""
-    writer = DiagnosticsWriter(robot, topics.diagnostics)
-    return RosSink(f"{transport.name} diagnostics", writer, transport)
+    return RosSink(DiagnosticsWriter(robot, topics.diagnostics), transport)

@@ -126,7 +126,7 @@ class Prober:
         seed: Seed of the poses that are tried.
     """
 
-    name, trouble = "probes", ""
+    trouble = ""
 
     def __init__(
         self,

@@ -1,7 +1,9 @@
-"""ROS 1 with trouble: the master dies, messages make no sense, ten times too many come."""
+"""ROS 1: its import, and links whose master dies or that get invalid or too many messages."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from types import SimpleNamespace
 
@@ -17,6 +19,7 @@ from failuretwin.core.alarm import ALL_CLEAR, RAISED, Alarm, Episode
 from failuretwin.core.hypothesis import Diagnosis
 from little_logs import LOG_COLUMNS
 from ros_peer import RosPeer
+from roscores import need_ros
 from waiting import WAIT_S, wait_for
 
 pytest.importorskip("rosbags")
@@ -244,3 +247,47 @@ def test_diagnostics_come_every_second_and_at_once_when_it_gets_worse(monkeypatc
     assert motor["values"]["mode"] == "stuck"
     assert motor["values"]["magnitude"] == "0.5"
     assert motor["values"]["onset_s"] == "3.00"
+
+
+# The import of rospy.
+
+
+def run(code):
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    return done.stdout.split()
+
+
+def test_of_debians_modules_only_those_of_ros_are_seen():
+    need_ros()
+    if sys.prefix == "/usr":
+        pytest.skip("this is Debian's own interpreter, which sees them all")
+    code = """
+import importlib.util
+from failuretwin.connection.links.ros1 import load_rospy
+rospy = load_rospy()
+import numpy
+print(rospy.__file__)
+print(numpy.__file__)
+print(*(importlib.util.find_spec(name) is None for name in ("apt", "gi", "catkin_pkg")))
+"""
+    rospy, numpy, *hidden = run(code)
+    assert rospy.startswith("/usr/lib/python3/dist-packages/")
+    assert not numpy.startswith("/usr/lib/python3/")
+    assert hidden == ["True", "True", "False"]
+
+
+def test_without_ros_the_user_is_told_what_to_install():
+    code = """
+import sys
+from failuretwin.connection.links import ros1 as packages
+sys.modules["rospy"] = None
+packages.DEBIAN_FOLDER = "/nowhere"
+try:
+    packages.load_rospy()
+except ValueError as error:
+    print(error)
+"""
+    told = " ".join(run(code))
+    assert "apt install python3-rospy" in told
