@@ -1,4 +1,4 @@
-"""Diagnoses as files: JSON lines, an object a run, and CSV, a row a run."""
+"""Diagnoses in files: JSON lines with one object per run, and CSV with one row per run."""
 
 from __future__ import annotations
 
@@ -18,23 +18,17 @@ from failuretwin.data_knowledge.store import replacing
 from failuretwin.inference.fault_course import FaultCourse
 
 SUM_ERROR = 1e-6
-"""Probabilities of a run may sum to 1 plus or minus this."""
+"""Tolerance of the sum of probabilities."""
 NAMED_RUNS = 3
-"""So many runs are named in an error."""
+"""Number of runs named in an error."""
 JSON_EXPANSION = 20
-"""What a byte of JSON takes at most once it is read."""
+"""Largest memory per byte of JSON [bytes]."""
 EXPECTED = "Expected the output of diagnose --json."
 
 
 @dataclass(frozen=True)
 class Record:
-    """A stored diagnosis, of this package or another; the fields are those of `Diagnosis`.
-
-    Attributes:
-        run: Name of the run.
-        posterior: Probability of every hypothesis; sums to 1.
-        diagnosis: The verdict, one of them; None where there is none.
-    """
+    """A diagnosis read from a file; the fields are those of `Diagnosis`."""
 
     run: str
     posterior: dict[str, float]
@@ -56,10 +50,10 @@ KNOWN = frozenset(field.name for field in fields(Record))
 
 @dataclass(frozen=True)
 class Results:
-    """Diagnoses by one method, each run once; `name` is what errors and tables call them.
+    """Diagnoses by one method; `name` identifies them in errors and tables.
 
     Raises:
-        InputError: If a run is there twice, which would count it twice.
+        InputError: If a run occurs twice.
     """
 
     name: str
@@ -76,19 +70,16 @@ class Results:
 
 
 def some_names(names: Sequence[str]) -> str:
-    """Return the first few names, and whether there are more."""
+    """Return the first few names, with an ellipsis if there are more."""
     return ", ".join(names[:NAMED_RUNS]) + (", ..." if len(names) > NAMED_RUNS else "")
 
 
 def write_json_lines(
     diagnoses: Sequence[Diagnosis], path: Path, course: FaultCourse | None = None
 ) -> None:
-    """Write an object a line; the file appears whole or not at all.
+    """Write one JSON object per line, atomically.
 
-    Args:
-        diagnoses: One a line.
-        path: The file.
-        course: Of the robot over these runs, told beside each; None: they were judged one by one.
+    `course` adds the fault course over all runs to each; None: diagnosed independently.
     """
     records = [diagnosis.to_record() | told for diagnosis, told in _with_course(diagnoses, course)]
     with replacing(path) as partial:
@@ -99,7 +90,7 @@ def write_json_lines(
 def _with_course(
     diagnoses: Sequence[Diagnosis], course: FaultCourse | None
 ) -> Iterator[tuple[Diagnosis, dict[str, Any]]]:
-    """Yield each diagnosis with what all runs together say of its run."""
+    """Yield each diagnosis with the extra columns of the fault course."""
     for run, diagnosis in enumerate(diagnoses):
         if course is None:
             yield diagnosis, {}
@@ -110,12 +101,12 @@ def _with_course(
 
 
 def read_results(path: str | Path) -> Results:
-    """Read what `write_json_lines` wrote, or another program with the same keys.
+    """Read a file of `write_json_lines`, or of another program with the same keys.
 
-    What is null or left out is not known; keys beyond those of `Record` are passed over.
+    Missing and null values are unknown; other keys than those of `Record` are ignored.
 
     Raises:
-        InputError: If the file cannot be read, a line is not a diagnosis, or a run is there twice.
+        InputError: If the file cannot be read, a line is not a diagnosis, or a run occurs twice.
     """
     check_memory(JSON_EXPANSION * stored_bytes(Path(path)), str(path), "its lines")
     with reading(path, "results", EXPECTED):
@@ -160,12 +151,9 @@ def _check_probabilities(record: Record, where: str) -> None:
 def write_csv(
     diagnoses: Sequence[Diagnosis], path: Path, course: FaultCourse | None = None
 ) -> None:
-    """Write a row a run: plain columns, then the probability of each hypothesis.
+    """Write one CSV row per run: plain columns, then the probability of each hypothesis.
 
-    Args:
-        diagnoses: One a row.
-        path: The file.
-        course: As of `write_json_lines`.
+    `course` is that of `write_json_lines`.
     """
     with replacing(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         rows = [_csv_row(diagnosis) | told for diagnosis, told in _with_course(diagnoses, course)]

@@ -1,12 +1,11 @@
-"""The state of a robot over all its runs: healthy, faulty or open, how surely, what to do next.
+"""State of a robot over several runs: healthy, faulty or open, its probability and the next step.
 
-Runs that were weighed together have a course, and the state is that of the last run given all.
-Runs that were judged one by one are pooled linearly,
+Runs diagnosed together have a `FaultCourse`; the state is the posterior of the last run given all.
+Runs diagnosed independently are pooled linearly,
 
     p(h) = mean over runs i of p(h | run i)
 
-which is never surer than the surest run: what they share, such as a calibration that is a little
-off, is in each of them and does not average out.
+because their common errors, such as those of the calibration, do not average out.
 """
 
 from __future__ import annotations
@@ -50,9 +49,9 @@ from failuretwin.inference.posterior import log_prior
 from failuretwin.inference.set_ups import FAULT_OF_EVERY_RUN
 
 SUSPECT = 0.05
-"""Motors of an open state are named from this probability on."""
+"""Motors of an open state are listed from this probability on."""
 RUN = "run"
-"""The single thing that a verdict over several runs may rest on."""
+"""A verdict over several runs may rest on a single run."""
 DIFFERENT_STEP = (
     "If these are runs of one robot in their order, {how}; else diagnose the runs of each state "
     "alone."
@@ -68,12 +67,12 @@ ZERO_STEP = (
 
 @dataclass(frozen=True)
 class State:
-    """What one run, or all of them together, say of the robot.
+    """State of the robot according to one run or all runs.
 
     Attributes:
         kind: `HEALTHY_STATE`, `FAULTY_STATE` or `OPEN_STATE`.
-        motors: Those that are faulty, or may be, in chain order; none of a healthy robot.
-        probability: Of what `kind` and `motors` say; None where nothing can be told.
+        motors: Faulty or suspected motors in chain order; empty for a healthy robot.
+        probability: Probability of `kind` and `motors`; None without a verdict.
     """
 
     kind: str
@@ -83,17 +82,17 @@ class State:
 
 @dataclass(frozen=True)
 class MotorState:
-    """What all runs say of one motor.
+    """State of one motor over all runs.
 
     Attributes:
-        motor: Its name.
+        motor: Name of the motor.
         joint: Name of its joint in the URDF.
-        column: Its column in raw logs, which may name it by its servo; empty: none is known.
-        kind: What it is over all runs.
-        faulty: In how many runs it is named.
-        suspected: In how many it is suspected, and not named.
-        highest: Largest probability of a fault of it in one run.
-        probability: Of a fault of it over the runs that make up the state.
+        column: Its column in raw logs; empty: unknown.
+        kind: State over all runs; see `State`.
+        faulty: Number of runs in which it is faulty.
+        suspected: Number of runs in which it is only suspected.
+        highest: Largest probability of a fault in any run.
+        probability: Probability of a fault over the runs behind the state.
     """
 
     motor: str
@@ -108,15 +107,15 @@ class MotorState:
 
 @dataclass(frozen=True)
 class RobotState:
-    """The state of a robot over all runs, as people are told it.
+    """State of a robot over all runs, in words for users.
 
     Attributes:
-        state: What is the case.
-        headline: That in a few words, with the motor and its joint.
-        sureness: How sure it is, in words; empty where nothing can be told.
-        step: The one thing to do next.
-        remark: What else is to be known of the runs together; empty: nothing.
-        motors: A row for each motor, in chain order.
+        state: The state.
+        headline: The state in a few words, with motor and joint.
+        sureness: Its probability in words; empty without a verdict.
+        step: The next step.
+        remark: Remark on the runs as a whole, or empty.
+        motors: State of each motor, in chain order.
         arm_class: Kind of arm, by its actuators.
         runs: Number of runs.
     """
@@ -133,17 +132,12 @@ class RobotState:
     @property
     def line(self) -> str:
         """State, sureness and remark in one line."""
-        told = f"{self.headline}: {self.sureness}" if self.sureness else self.headline
-        return f"{told}; {self.remark}" if self.remark else told
+        line = f"{self.headline}: {self.sureness}" if self.sureness else self.headline
+        return f"{line}; {self.remark}" if self.remark else line
 
 
 def with_motors(posterior: Mapping[str, float], order: Sequence[str]) -> State:
-    """Return the state that a posterior tells, with its motors in chain order.
-
-    Args:
-        posterior: Probability of every hypothesis.
-        order: Names of the motors in chain order.
-    """
+    """Return the state of a posterior; `order` lists the motors in chain order."""
     kind, by_motor = state_of(posterior), motor_probabilities(posterior)
     if kind == HEALTHY_STATE:
         return State(kind, (), posterior[str(HEALTHY)])
@@ -157,13 +151,13 @@ def with_motors(posterior: Mapping[str, float], order: Sequence[str]) -> State:
 
 
 def state_of_run(diagnosis: Diagnosis, order: Sequence[str]) -> State:
-    """Return the state that one run tells; without a verdict nothing can be told."""
+    """Return the state of one run; it is open without a verdict."""
     return State(OPEN_STATE) if diagnosis.undecided else with_motors(diagnosis.posterior, order)
 
 
 @dataclass(frozen=True)
-class _Found:
-    """What was found over all runs, motors by their own names."""
+class _Summary:
+    """State over all runs, with motors by their names in the profile."""
 
     state: State
     headline: str
@@ -181,11 +175,10 @@ def robot_state(
     """Return the state of a robot over all its runs.
 
     Args:
-        diagnoses: Of each run, the oldest first.
+        diagnoses: Diagnosis of each run, oldest first.
         robot: The robot.
-        course: Of the robot over these runs, where they were weighed together; None: they were
-            judged one by one.
-        learned: What the runs have taught of the robot, in sentences; None: each was judged alone.
+        course: Fault course of runs diagnosed together; None: diagnosed independently.
+        learned: Sentences on what the runs taught about the robot; None: nothing was learned.
 
     Raises:
         InputError: If there is no run.
@@ -195,7 +188,7 @@ def robot_state(
     states = [state_of_run(d, robot.motor_names) for d in diagnoses]
     decided = [i for i, d in enumerate(diagnoses) if not d.undecided]
     if not decided:
-        found = _nothing(diagnoses)
+        found = _no_verdict(diagnoses)
     elif course is not None:
         found = _of_course(course, robot)
     else:
@@ -215,39 +208,34 @@ def robot_state(
 
 
 def course_of(diagnoses: Sequence[Diagnosis], diagnoser: BayesDiagnoser) -> FaultCourse:
-    """Return the course of a robot over runs that were weighed together.
-
-    Args:
-        diagnoses: Of each run, the oldest first.
-        diagnoser: What they were judged with: its hypotheses and priors.
-    """
+    """Return the fault course over runs, oldest first, with the priors of their diagnoser."""
     prior = np.exp(log_prior(diagnoser.hypothesis_set, diagnoser.priors))
     return FaultCourse.of(diagnoses, prior)
 
 
-def _with_zero(found: _Found, lines: Sequence[str]) -> _Found:
-    """Return a healthy state with what was said of a zero that is off, or a fault of every run."""
-    told = [line for line in lines if FAULT_OF_EVERY_RUN in line]
-    if found.state.kind != HEALTHY_STATE or not told:
+def _with_zero(found: _Summary, lines: Sequence[str]) -> _Summary:
+    """Return an open state if a healthy one has a remark on a zero or a fault of every run."""
+    remarks = [line for line in lines if FAULT_OF_EVERY_RUN in line]
+    if found.state.kind != HEALTHY_STATE or not remarks:
         return found
-    remark = "; ".join(filter(None, (found.remark, told[-1])))
+    remark = "; ".join(filter(None, (found.remark, remarks[-1])))
     headline = "Cannot tell yet; healthy, but for a zero that may be a fault"
     return replace(found, state=State(OPEN_STATE), headline=headline, step=ZERO_STEP, remark=remark)
 
 
-def _nothing(diagnoses: Sequence[Diagnosis]) -> _Found:
-    """Return what is said where no run allows a verdict."""
+def _no_verdict(diagnoses: Sequence[Diagnosis]) -> _Summary:
+    """Return the summary of runs without any verdict."""
     reason = diagnoses[0].undecided
-    return _Found(State(OPEN_STATE), f"Cannot tell, because {reason}", undecided_step(reason))
+    return _Summary(State(OPEN_STATE), f"Cannot tell, because {reason}", undecided_step(reason))
 
 
-def _of_course(course: FaultCourse, robot: Robot) -> _Found:
-    """Return the state after the last run, given all."""
+def _of_course(course: FaultCourse, robot: Robot) -> _Summary:
+    """Return the state at the last run given all runs."""
     last = course.posterior[-1]
     posterior = {str(h): float(p) for h, p in zip(course.hypotheses, last, strict=True)}
     steps = " ".join(next_steps(posterior, class_name(robot)))
     state = with_motors(posterior, robot.motor_names)
-    return _Found(state, _headline(state, posterior), steps, "; ".join(course.verdict), posterior)
+    return _Summary(state, _headline(state, posterior), steps, "; ".join(course.verdict), posterior)
 
 
 def _one_by_one(
@@ -256,10 +244,10 @@ def _one_by_one(
     decided: Sequence[int],
     robot: Robot,
     each_alone: bool,
-) -> _Found:
-    """Return the state that runs agree on, from the first on that names its motor.
+) -> _Summary:
+    """Return the pooled state since the first faulty run, if the runs agree.
 
-    Of runs that were not judged each alone it is not advised to weigh them together.
+    `each_alone`: the runs share nothing learned, so diagnosing them together is advised.
     """
     faulty = [i for i in decided if states[i].kind == FAULTY_STATE]
     since = faulty[0] if faulty else 0
@@ -277,11 +265,11 @@ def _one_by_one(
     step = " ".join(next_steps(posterior, class_name(robot), alone))
     if state.kind == OPEN_STATE and len(used) > 1 and each_alone:
         step = f"{step} {TOGETHER_STEP}"
-    return _Found(state, _headline(state, posterior), step, "; ".join(remarks), posterior)
+    return _Summary(state, _headline(state, posterior), step, "; ".join(remarks), posterior)
 
 
 def _alone(diagnoses: Sequence[Diagnosis], faulty: Sequence[int], decided: int) -> str:
-    """Return on what single thing a fault rests; empty: on several, or there is none."""
+    """Return `RUN` or `MOVEMENT` if a fault rests on a single one, else an empty string."""
     if len(faulty) > 1:
         return ""
     if faulty and decided > 1:
@@ -290,22 +278,22 @@ def _alone(diagnoses: Sequence[Diagnosis], faulty: Sequence[int], decided: int) 
 
 
 def _pooled(posteriors: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Return the mean of some posteriors; a hypothesis that one lacks has none of it there."""
+    """Return the mean of posteriors; missing hypotheses count as 0."""
     names = dict.fromkeys(name for posterior in posteriors for name in posterior)
     return {name: float(np.mean([p.get(name, 0.0) for p in posteriors])) for name in names}
 
 
 def _different(
     states: Sequence[State], decided: Sequence[int], posterior: Mapping[str, float], step: str
-) -> _Found:
-    """Return what is said of runs that show different states."""
+) -> _Summary:
+    """Return the summary of runs with different states."""
     counts = Counter(_short(states[i]) for i in decided)
-    told = ", ".join(f"{name} in {counted(count, 'run')}" for name, count in counts.most_common())
+    remark = ", ".join(f"{name} in {counted(n, 'run')}" for name, n in counts.most_common())
     motors = dict.fromkeys(
         m for i in decided if states[i].kind == FAULTY_STATE for m in states[i].motors
     )
     headline = "Different states in different runs"
-    return _Found(State(OPEN_STATE, tuple(motors)), headline, step, told, posterior)
+    return _Summary(State(OPEN_STATE, tuple(motors)), headline, step, remark, posterior)
 
 
 def _short(state: State) -> str:
@@ -315,21 +303,21 @@ def _short(state: State) -> str:
 
 
 def _headline(state: State, posterior: Mapping[str, float]) -> str:
-    """Return a state in a few words."""
+    """Return the state in a few words."""
     best = max(posterior, key=lambda name: posterior[name])
     name = plain_name(Hypothesis.parse(best))
     if state.kind == HEALTHY_STATE:
         return "Healthy"
     if state.kind == FAULTY_STATE:
-        told = name if posterior[best] >= SURE else " and ".join(map(_spoken, state.motors))
-        return f"Faulty: {told}"
+        faulty = name if posterior[best] >= SURE else " and ".join(map(_spoken, state.motors))
+        return f"Faulty: {faulty}"
     return f"Cannot tell yet; most probable: {name}"
 
 
 def _motor_states(
-    diagnoses: Sequence[Diagnosis], states: Sequence[State], found: _Found, robot: Robot
+    diagnoses: Sequence[Diagnosis], states: Sequence[State], found: _Summary, robot: Robot
 ) -> tuple[MotorState, ...]:
-    """Return what all runs say of each motor; where a fault is unknown, no motor is healthy."""
+    """Return the state of each motor; an unknown fault leaves every motor open."""
     by_run = [{} if d.undecided else motor_probabilities(d.posterior) for d in diagnoses]
     over_all = motor_probabilities(found.posterior)
     unknown = found.posterior.get(str(UNKNOWN), 0.0) if found.posterior else 1.0
