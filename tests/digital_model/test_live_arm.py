@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from failuretwin.digital_model.nonidealities import Schedule
-from failuretwin.digital_model.physics_engine import LiveArm, PhysicsEngine
+from failuretwin.digital_model.physics_engine import LiveArms, PhysicsEngine
 from failuretwin.digital_model.twin import Drive
 from failuretwin.failure_behavior.random_movements import RandomMovements
 
@@ -27,15 +27,18 @@ def test_stretches_are_one_run_of_the_engine(armpi, reference, cuts):
     weakness = np.zeros(reference.shape)
     weakness[400:, 2] = 0.5
     whole = engine.angles(Drive(reference[None], held[None], weakness[None]), TIME)[0]
-    arm = LiveArm(engine, reference[0], 0.01)
-    parts = [arm.angle[None]]
+    arm = LiveArms(engine, reference[:1], 0.01, np.zeros(1))
+    parts = [arm.angle]
     for part in np.split(np.arange(1, len(TIME)), cuts):
         # The engine holds a gear from the sample on where that begins, a step earlier.
-        parts.append(arm.follow(reference[part], held[part - 1], weakness[part]))
+        parts.append(
+            arm.follow(reference[None, part], held[None, part - 1], weakness[None, part])[0]
+        )
     assert_array_equal(np.concatenate(parts), whole)
 
 
 def test_a_payload_pulls_the_arm_down(armpi):
-    pose = np.array([0.0, 0.8, 0.0, 0.0])
-    light, heavy = (LiveArm(PhysicsEngine(armpi), pose, 0.01, mass) for mass in (0.0, 0.05))
-    assert np.abs(heavy.angle - pose)[1] > np.abs(light.angle - pose)[1] > 0.0
+    pose = np.array([[0.0, 0.8, 0.0, 0.0]] * 2)
+    arms = LiveArms(PhysicsEngine(armpi), pose, 0.01, np.array([0.0, 0.05]))
+    light, heavy = np.abs(arms.angle - pose)[:, 1]
+    assert heavy > light > 0.0

@@ -16,7 +16,7 @@ import numpy as np
 from failuretwin.connection.links.base import CommandSent, Event, Reading
 from failuretwin.connection.links.replay import Pace, PacedSource
 from failuretwin.core.movements import Movements
-from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.disturbances import (
     Disturbances,
     actual_movements,
@@ -26,7 +26,7 @@ from failuretwin.digital_model.disturbances import (
     stack,
 )
 from failuretwin.digital_model.nonidealities import Imperfections, vary
-from failuretwin.digital_model.physics_engine import LiveArm, PhysicsEngine
+from failuretwin.digital_model.physics_engine import LiveArms, PhysicsEngine
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.fault import INTERMITTENT, Course, EndlessEpisodes, FaultValue
@@ -114,7 +114,7 @@ class EmulatedArm:
         self._goal = self._commanded
         self._told = (self._commanded + self._self.bias + self._self.scatter[0])[None]
         engine = PhysicsEngine(emulation.robot)
-        self._arm = LiveArm(engine, self._told[0], STEP_S, float(self._self.payload))
+        self._arm = LiveArms(engine, self._told, STEP_S, np.atleast_1d(self._self.payload))
 
     def events(self) -> Iterator[Event]:
         """Yield readings and commands in the order of their times, without end."""
@@ -258,17 +258,15 @@ class EmulatedArm:
         self._index += len(time) - 1
         self._told = np.concatenate([self._told, told[1:]])[-round(MEMORY_S / STEP_S) :]
         grid = time[-1] - np.arange(len(self._told))[::-1] * STEP_S
-        followed = lagged(self._told[None], grid, lag)
-        followed = faults.on_reference(followed, as_floats(grid))[0]
-        held: BoolArray | None = faults.held(time)
-        weakness = faults.weakness(time)
+        followed = faults.on_reference(lagged(self._told[None], grid, lag), as_floats(grid))
+        held, weakness = faults.held(time), faults.weakness(time)
         before = self._arm.angle
         angles = self._arm.follow(
-            followed[-(len(time) - 1) :],
-            None if held is None else held[0, :-1],
-            None if weakness is None else weakness[0, 1:],
+            followed[:, -(len(time) - 1) :],
+            None if held is None else held[:, :-1],
+            None if weakness is None else weakness[:, 1:],
         )
-        return np.concatenate([before[None], angles])
+        return np.concatenate([before, angles[0]])
 
 
 def emulated(

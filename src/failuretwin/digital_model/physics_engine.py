@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -78,14 +78,14 @@ class PhysicsEngine:
         return np.array([getattr(motor, name) for motor in self.motors])
 
     def angles(self, drive: Drive, time: FloatArray) -> FloatArray:
-        """Return the angles that the output sides take, (run, time, motor) [rad], log's sense.
+        """Return the angles of the output sides, (run, time, motor) [rad], log's sense.
 
-        The arm starts at rest where servos and flex carry its weight.
+        The arm starts at rest, with servos and flex carrying its weight.
 
         Args:
-            drive: What the motors are told, and what hampers them. A motor that is held stands
-                still from the sample where it begins to the one after it ends. Weakness takes
-                the same share of the servo's torque at any error; the largest torque stays.
+            drive: References and faults of the motors. A held motor stands still from the sample
+                where the hold begins to the one after it ends. Weakness reduces the servo's torque
+                at any error by the same share; the largest torque stays.
             time: Uniform grid, (time,) [s].
 
         Raises:
@@ -94,142 +94,96 @@ class PhysicsEngine:
         """
         mujoco = load_mujoco()
         _check(drive, len(time), len(self.robot.motors))
-        step = uniform_step(time)
-        reference, strength = drive.reference * self.robot.sense, _strength(drive)
-        payload = np.zeros(len(reference)) if drive.payload is None else drive.payload
-        out = np.empty(reference.shape)
+        step, told = uniform_step(time), drive.reference
+        payload = np.zeros(len(told)) if drive.payload is None else drive.payload
+        weakness = np.zeros_like(told) if drive.weakness is None else drive.weakness
+        out = np.empty(told.shape)
         with mujoco.rollout.Rollout(nthread=0 if self.threads == 1 else self.threads) as pool:
             for rows in _chunks(len(out), RUNS_AT_ONCE):
-                told, share = reference[rows], strength[rows]
-                arms = _Arms(self, step, told[:, 0], share[:, 0], payload[rows], pool)
+                weak = weakness[rows]
+                arms = LiveArms(self, told[rows, 0], step, payload[rows], weak[:, 0], pool)
                 held = None if drive.held is None else drive.held[rows, :-1]
                 out[rows, 0] = arms.angle
-                out[rows, 1:] = arms.follow(told[:, 1:], held, share[:, 1:])
-        return out * self.robot.sense
+                out[rows, 1:] = arms.follow(told[rows, 1:], held, weak[:, 1:])
+        return out
 
 
 class LiveArms:
-    """Arms at rest that then follow whatever they are told next, all in step.
+    """Arms that start at rest and follow references given stretch by stretch, all in step.
 
-    Stretches that follow each other give what one run of the engine would give. Angles are in the
-    log's sense.
+    Consecutive stretches give the same angles as one run of the engine. Angles of the public
+    interface are in the log's sense, those of the private one in the physical sense.
 
     Args:
-        engine: The engine; it simulates on one thread.
-        reference: Where each arm stands, (arm, motor) [rad].
-        step_s: Step of the references to come [s].
+        engine: Robot, motors and step; without `pool` its threads are not used.
+        reference: Angle of each motor at the start, (arm, motor) [rad].
+        step_s: Time step of the references [s].
         payload: Mass at the tool points, (arm,) [kg].
+        weakness: Share of its stiffness that each motor has lost, (arm, motor); None: none.
+        pool: A `mujoco.rollout.Rollout` with the engine's threads; None: one of its own.
 
     Raises:
         InputError: If mujoco is missing.
-    """
-
-    def __init__(
-        self, engine: PhysicsEngine, reference: FloatArray, step_s: float, payload: FloatArray
-    ) -> None:
-        self._sense = engine.robot.sense
-        pool = load_mujoco().rollout.Rollout(nthread=0)
-        alone, stand = replace(engine, threads=1), reference * self._sense
-        self._arms = _Arms(alone, step_s, stand, np.ones_like(stand), payload, pool)
-
-    @property
-    def angle(self) -> FloatArray:
-        """Where the arms stand, (arm, motor) [rad]."""
-        return self._arms.angle * self._sense
-
-    def follow(
-        self, reference: FloatArray, held: BoolArray | None, weakness: FloatArray | None
-    ) -> FloatArray:
-        """Move on and return the angles at the same instants, (arm, time, motor) [rad].
-
-        Args:
-            reference: What the servos are told, one step after where the arms stand and so on,
-                (arm, time, motor) [rad].
-            held: Whether the gears are held, (arm, time, motor); None: never.
-            weakness: Share of its stiffness that each motor has lost, (arm, time, motor); None:
-                none.
-
-        Raises:
-            InputError: If the simulation becomes unstable.
-        """
-        strength = _strength(Drive(reference, weakness=weakness))
-        return self._arms.follow(reference * self._sense, held, strength) * self._sense
-
-
-class LiveArm:
-    """One arm at rest that then follows whatever it is told next; see `LiveArms`.
-
-    Args:
-        engine: The engine; its threads are not used.
-        reference: Where the arm stands, (motor,) [rad].
-        step_s: Step of the references to come [s].
-        payload: Mass at the tool point [kg].
-
-    Raises:
-        InputError: If mujoco is missing.
-    """
-
-    def __init__(
-        self, engine: PhysicsEngine, reference: FloatArray, step_s: float, payload: float = 0.0
-    ) -> None:
-        self._arms = LiveArms(engine, reference[None], step_s, np.array([payload]))
-
-    @property
-    def angle(self) -> FloatArray:
-        """Where the arm stands, (motor,) [rad]."""
-        return np.asarray(self._arms.angle[0])
-
-    def follow(
-        self, reference: FloatArray, held: BoolArray | None, weakness: FloatArray | None
-    ) -> FloatArray:
-        """Move on and return the angles at the same instants, (time, motor) [rad].
-
-        Args:
-            reference: What the servos are told, (time, motor) [rad].
-            held: Whether the gears are held, (time, motor); None: never.
-            weakness: Share of its stiffness that each motor has lost, (time, motor); None: none.
-
-        Raises:
-            InputError: If the simulation becomes unstable.
-        """
-        brake = None if held is None else held[None]
-        weak = None if weakness is None else weakness[None]
-        return np.asarray(self._arms.follow(reference[None], brake, weak)[0])
-
-
-class _Arms:
-    """Arms at rest that then follow whatever they are told next, in the physical sense.
-
-    Args:
-        engine: What moves them.
-        grid_step: Step of the references to come [s].
-        reference: Where they are told to stand, (run, motor) [rad].
-        strength: Shares of their stiffness that the servos have, (run, motor).
-        payload: Mass at the tool points, (run,) [kg].
-        pool: A `mujoco.rollout.Rollout` with the threads of the engine.
     """
 
     def __init__(
         self,
         engine: PhysicsEngine,
-        grid_step: float,
         reference: FloatArray,
-        strength: FloatArray,
+        step_s: float,
         payload: FloatArray,
-        pool: Any,
+        weakness: FloatArray | None = None,
+        pool: Any = None,
     ) -> None:
-        self._engine, self._grid_step, self._pool = engine, grid_step, pool
-        self._substeps = max(1, int(np.ceil(grid_step / engine.step_s - 1e-9)))
-        self._step = grid_step / self._substeps
+        mujoco = load_mujoco()
+        self._engine, self._grid_step, self._sense = engine, step_s, engine.robot.sense
+        self._pool = mujoco.rollout.Rollout(nthread=0) if pool is None else pool
+        self._substeps = max(1, int(np.ceil(step_s / engine.step_s - 1e-9)))
+        self._step = step_s / self._substeps
         masses, which = np.unique(payload, return_inverse=True)
         models = [build_model(engine.robot, engine.motors, self._step, float(m)) for m in masses]
         self._models = [models[i] for i in which]
-        mujoco = load_mujoco()
-        self._data = [mujoco.MjData(models[0].compiled) for _ in range(engine.threads)]
-        each = zip(self._models, reference, strength, strict=True)
-        self._state = np.array([self._rest_state(*of_run) for of_run in each])
-        self._setpoint = self._last = reference
-        self._strength = strength
+        threads = 1 if pool is None else engine.threads
+        self._data = [mujoco.MjData(models[0].compiled) for _ in range(threads)]
+        self._setpoint = self._last = reference * self._sense
+        self._strength = _strength(reference, weakness)
+        each = zip(self._models, self._setpoint, self._strength, strict=True)
+        self._state = np.array([self._rest_state(*of_arm) for of_arm in each])
+
+    @property
+    def angle(self) -> FloatArray:
+        """Angles of the output sides, (arm, motor) [rad]."""
+        return self._angle(self._state) * self._sense
+
+    def follow(
+        self, reference: FloatArray, held: BoolArray | None, weakness: FloatArray | None
+    ) -> FloatArray:
+        """Follow references and return the output sides' angles at the same instants.
+
+        Args:
+            reference: References of the servos from one step after the last instant on,
+                (arm, time, motor) [rad].
+            held: Whether gears are held on the way there, (arm, time, motor); None: never.
+            weakness: Share of its stiffness that each motor has lost, (arm, time, motor); None:
+                none.
+
+        Returns:
+            (arm, time, motor) [rad].
+
+        Raises:
+            InputError: If the simulation becomes unstable.
+        """
+        told = np.concatenate([self._last[:, None], reference * self._sense], axis=1)
+        speed = np.array([motor.speed_limit for motor in self._engine.robot.motors])
+        told = limit_speed(told, self._grid_step, speed)
+        strength = np.concatenate([self._strength[:, None], _strength(reference, weakness)], axis=1)
+        self._last, self._strength = told[:, -1], strength[:, -1]
+        out = np.empty_like(reference)
+        for part in _chunks(out.shape[1], SAMPLES_AT_ONCE):
+            span = slice(part.start, part.stop + 1)
+            brake = None if held is None else held[:, part]
+            out[:, part] = self._advance(told[:, span], brake, strength[:, span])
+        return out * self._sense
 
     def _rest_state(
         self, model: PhysicsModel, setpoint: FloatArray, strength: FloatArray
@@ -261,43 +215,10 @@ class _Arms:
         mujoco.mj_getState(model.compiled, data, state, full)
         return state
 
-    @property
-    def angle(self) -> FloatArray:
-        """Where the output sides stand, (run, motor) [rad]."""
-        return self._angle(self._state)
-
     def _angle(self, states: FloatArray) -> FloatArray:
         """Return the output sides' angles, (..., motor), of states (..., state)."""
         model, before = self._models[0], 1  # a state begins with the time
         return states[..., before + model.drive] + states[..., before + model.flex]
-
-    def follow(
-        self, reference: FloatArray, held: BoolArray | None, strength: FloatArray
-    ) -> FloatArray:
-        """Move on and return the output sides' angles at the same instants.
-
-        Args:
-            reference: What the servos are told from one step later on, (run, time, motor) [rad].
-            held: Whether gears are held on the way there, (run, time, motor); None: never.
-            strength: Shares of their stiffness that the servos have, like `reference`.
-
-        Returns:
-            (run, time, motor) [rad].
-
-        Raises:
-            InputError: If the simulation becomes unstable.
-        """
-        told = np.concatenate([self._last[:, None], reference], axis=1)
-        speed = np.array([motor.speed_limit for motor in self._engine.robot.motors])
-        told = limit_speed(told, self._grid_step, speed)
-        strength = np.concatenate([self._strength[:, None], strength], axis=1)
-        self._last, self._strength = told[:, -1], strength[:, -1]
-        out = np.empty_like(reference)
-        for part in _chunks(out.shape[1], SAMPLES_AT_ONCE):
-            span = slice(part.start, part.stop + 1)
-            brake = None if held is None else held[:, part]
-            out[:, part] = self._advance(told[:, span], brake, strength[:, span])
-        return out
 
     def _advance(
         self, reference: FloatArray, held: BoolArray | None, strength: FloatArray
@@ -373,9 +294,9 @@ def _chunks(count: int, size: int) -> Iterator[slice]:
     return (slice(start, min(start + size, count)) for start in range(0, count, size))
 
 
-def _strength(drive: Drive) -> FloatArray:
-    """Return the share of its stiffness that each servo has, (..., time, motor)."""
-    return np.ones_like(drive.reference) if drive.weakness is None else 1.0 - drive.weakness
+def _strength(reference: FloatArray, weakness: FloatArray | None) -> FloatArray:
+    """Return the share of its stiffness that each servo has, of the shape of `reference`."""
+    return np.ones_like(reference) if weakness is None else 1.0 - weakness
 
 
 def _check(drive: Drive, times: int, motors: int) -> None:
