@@ -52,7 +52,7 @@ def seen_at(model, pose, rng):
         if sensor.kind == "tool":
             parts.append(value + rng.normal(0.0, model.path_noise, value.shape))
             continue
-        error = rng.normal(0.0, 1.0, (*pose.shape[:-1], sensor.errors)) * sensor.noise
+        error = rng.normal(0.0, 1.0, (*pose.shape[:-1], sensor.dims)) * sensor.noise
         noise = sensor.noise if sensor is stack.in_doubt else np.hypot(sensor.noise, sensor.doubt)
         scale = stack.unit_m / noise
         parts.append(sensor.to_channels(sensor.with_errors(value, error)) * scale)

@@ -126,8 +126,8 @@ def test_known_bias_is_taken_off(armpi):
     for kind, bias in {"accelerometer": (0.1, 0.2, -0.3), "wire": (0.01,)}.items():
         sensor = sensor_of(kind, armpi, (SensorProfile(kind, bias=bias),))
         value, _ = sensor.expected(q)
-        told = sensor.with_errors(value, np.zeros((len(q), sensor.errors)))
-        plain = sensor_of(kind, armpi).with_errors(value, np.zeros((len(q), sensor.errors)))
+        told = sensor.with_errors(value, np.zeros((len(q), sensor.dims)))
+        plain = sensor_of(kind, armpi).with_errors(value, np.zeros((len(q), sensor.dims)))
         np.testing.assert_allclose(sensor.to_channels(told), value)
         assert np.abs(told - plain).max() == pytest.approx(max(np.abs(bias)))
 

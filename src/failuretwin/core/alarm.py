@@ -1,22 +1,22 @@
-"""Whether to call somebody: the state of a watch, and the fault episodes behind it."""
+"""Alarms: the state of monitoring, and fault episodes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 CLEAR, SUSPECTED, RAISED = "clear", "suspected", "alarm"
-"""States of an alarm, from the best to the worst."""
+"""States of an alarm, from best to worst."""
 
 
 @dataclass(frozen=True)
 class Episode:
-    """A fault from the alarm that told of it to its end.
+    """A fault from its alarm to its end.
 
     Attributes:
-        number: Which of the stream it is, from 1.
-        cause: The hypothesis that was named.
-        raised_s: When the alarm was raised, by the time of the stream [s].
-        cleared_s: When it was over [s]; None while it lasts.
+        number: Its number in the stream, from 1.
+        cause: The diagnosed hypothesis.
+        raised_s: Time of the alarm in the stream [s].
+        cleared_s: End of the fault [s]; None while it lasts.
     """
 
     number: int
@@ -26,18 +26,18 @@ class Episode:
 
     @property
     def duration_s(self) -> float | None:
-        """How long it lasted [s]; None while it does."""
+        """Its duration [s]; None while it lasts."""
         return None if self.cleared_s is None else self.cleared_s - self.raised_s
 
 
 @dataclass(frozen=True)
 class Alarm:
-    """What to do about what is believed: one rule for all who are told.
+    """Result of the alarm rule, the same for all outputs.
 
     Attributes:
         state: `CLEAR`, `SUSPECTED` or `RAISED`.
-        cause: The most probable fault; empty while all is clear.
-        episode: The last fault that an alarm told of; None before the first.
+        cause: The most probable fault; empty if the state is `CLEAR`.
+        episode: The latest fault with an alarm; None before the first.
     """
 
     state: str = CLEAR
@@ -45,9 +45,9 @@ class Alarm:
     episode: Episode | None = None
 
     def concerns(self, motor: str) -> bool:
-        """Return whether it is about a motor."""
+        """Return whether its cause includes a motor."""
         return any(part.partition(":")[0] == motor for part in self.cause.split("+"))
 
 
 ALL_CLEAR = Alarm()
-"""Nothing is suspected, and nothing was."""
+"""No fault is or was suspected."""

@@ -1,14 +1,12 @@
-"""Frozen dataclasses of arrays whose leading axes have names, such as runs and movements.
+"""Frozen dataclasses of arrays with named leading axes, such as runs and movements.
 
-A field says by `Axes` what its axes are and what stands where there is nothing; a field without is
-the same for all entries::
+`Axes` names the axes of a field and its empty value; a field without it is shared by all entries::
 
     @dataclass(frozen=True)
     class Movements(ArrayStruct):
         target: Annotated[FloatArray, Axes("run", "movement", "motor", empty=np.nan)]
 
-Whatever is done to such a value is done to all its arrays, and to those of the values within it:
-what is written into a buffer of a stream, forgotten or saved is named nowhere else.
+Indexing, writing, dropping and saving apply to every array of a value and of the values in it.
 """
 
 from __future__ import annotations
@@ -20,19 +18,19 @@ from typing import Any, ClassVar, Self, get_args, get_origin, get_type_hints
 import numpy as np
 
 ENTRY_AXES = ("run", "movement")
-"""Axes by which entries are taken; where an array has them, they lead, in this order."""
+"""Axes of entries; where an array has them, they come first, in this order."""
 
 Entries = Any
-"""Index of one run or of some, or a tuple of one for runs and one for movements."""
+"""Index of runs, or a tuple of indices for runs and movements."""
 Change = Callable[[np.ndarray, "Axes"], np.ndarray]
 
 
 class Axes:
-    """What the axes of an array are.
+    """Axes of an array.
 
     Args:
-        names: Their names; those of `ENTRY_AXES` lead.
-        empty: What stands where there is nothing; its type is that of the array.
+        names: Their names; those of `ENTRY_AXES` first.
+        empty: Value of entries without data; its type is the array's type.
     """
 
     def __init__(self, *names: str, empty: float | bool = 0.0) -> None:
@@ -40,16 +38,16 @@ class Axes:
         self._entry = [ENTRY_AXES.index(name) for name in names if name in ENTRY_AXES]
 
     def of_entries(self, entries: Entries) -> tuple[Any, ...]:
-        """Return what of an index belongs to the axes that the array has."""
+        """Return the part of an index that applies to the axes of this array."""
         index = entries if isinstance(entries, tuple) else (entries,)
         return tuple(index[i] for i in self._entry if i < len(index))
 
 
 class ArrayStruct:
-    """Base of frozen dataclasses of arrays; the arrays themselves may be written into."""
+    """Base of frozen dataclasses of arrays; the arrays themselves are writable."""
 
     _parts: ClassVar[Mapping[str, Axes | type[ArrayStruct]]]
-    """Axes of each array, and the class of each value (or tuple of them) with arrays of its own."""
+    """Axes of each array, and the class of each field (or tuple) that holds arrays itself."""
 
     def __init_subclass__(cls) -> None:
         found: dict[str, Axes | type[ArrayStruct]] = {}
@@ -64,11 +62,7 @@ class ArrayStruct:
 
     @classmethod
     def empty(cls, **sizes: int) -> Self:
-        """Return a value with nothing in it.
-
-        Args:
-            sizes: Length of every axis that its arrays have, by name.
-        """
+        """Return a value without data; `sizes` are the lengths of all axes by name."""
         return cls(
             **{
                 name: np.full([sizes[axis] for axis in of.names], of.empty)
@@ -79,7 +73,7 @@ class ArrayStruct:
         )
 
     def blank(self, *sizes: int) -> Self:
-        """Return a value like this one with nothing in it, for so many runs and movements."""
+        """Return a value like this one without data, for a number of runs and movements."""
 
         def emptied(array: np.ndarray, axes: Axes) -> np.ndarray:
             lead = axes.of_entries(sizes)
@@ -98,22 +92,22 @@ class ArrayStruct:
             array[axes.of_entries(entries)] = value
 
     def forget_oldest(self, run: int) -> None:
-        """Drop the first movement of a run; behind the last one there is then nothing."""
+        """Drop the first movement of a run; the last place becomes empty."""
         for _, array, axes in self._arrays():
             if "movement" in axes.names:
                 array[run, :-1] = array[run, 1:].copy()
                 array[run, -1] = axes.empty
 
     def to_arrays(self, prefix: str) -> dict[str, np.ndarray]:
-        """Return all arrays by ``prefix/field``, and ``prefix/field/field`` of values within."""
+        """Return all arrays by ``prefix/field``, and ``prefix/field/field`` for nested values."""
         return {prefix + name: array for name, array, _ in self._arrays()}
 
     def from_arrays(self, prefix: str, arrays: Mapping[str, np.ndarray]) -> None:
-        """Write what `to_arrays` returned into the arrays.
+        """Write the result of `to_arrays` into the arrays.
 
         Raises:
-            KeyError: If one is missing.
-            ValueError: If one is of another shape.
+            KeyError: If an array is missing.
+            ValueError: If an array has another shape.
         """
         for name, array, _ in self._arrays():
             value = arrays[prefix + name]
@@ -135,7 +129,7 @@ class ArrayStruct:
         return dataclasses.replace(self, **values)  # type: ignore[type-var]
 
     def _arrays(self) -> Iterator[tuple[str, np.ndarray, Axes]]:
-        """Yield ``/field`` of every array, the array and its axes."""
+        """Yield ``/field``, array and axes of every array."""
         for name, of in self._parts.items():
             value = getattr(self, name)
             if isinstance(of, Axes):

@@ -1,4 +1,4 @@
-"""Tables from TOML files into frozen dataclasses: a wrong key, type or number is an error."""
+"""TOML tables as frozen dataclasses: a wrong key, type or number is an error."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from failuretwin.core.foreign import read_text
 
 T = TypeVar("T")
 SHOWN = 200
-"""Letters of a wrong value that an error shows."""
+"""Longest part of a wrong value in an error text [characters]."""
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Where a number lies, or every number of a tuple: from `low` to `high`, which NaN is not.
+    """Closed interval of a number, or of every number of a tuple; NaN lies outside.
 
-    Of numbers `in_order` the first is the lowest and the second the highest.
+    With `in_order` the value is a pair: lowest, highest.
     """
 
     low: float = 0.0
@@ -54,7 +54,7 @@ AtLeastZero = Annotated[float, Bounds()]
 
 
 class Bounded:
-    """Base of dataclasses whose numbers stay within the `Bounds` that annotate their fields."""
+    """Base of dataclasses whose fields are checked against their `Bounds` annotations."""
 
     def __post_init__(self) -> None:
         for name, bounds in _bounds_of(type(self)):  # type: ignore[arg-type]
@@ -84,7 +84,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
-    """Build the dataclass `cls` from `table`, checking keys and types all the way down.
+    """Return `table` as the dataclass `cls`; keys and types are checked recursively.
 
     Args:
         cls: A dataclass; fields may be numbers, text, booleans, tuples, dictionaries of text to
@@ -93,7 +93,7 @@ def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
         where: Name of the file and table for error texts.
 
     Raises:
-        InputError: For an unknown or missing key, a wrong type or what `cls` itself refuses.
+        InputError: For an unknown or missing key, a wrong type, or a value that `cls` refuses.
     """
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
     for key in table:
@@ -165,15 +165,14 @@ PLAIN = (str, bool, int, float, type(None))
 
 
 def canonical(value: Any) -> Any:
-    """Return `value` as what JSON can hold, with the type of every dataclass beside its fields.
+    """Return `value` in JSON types; dataclasses carry the name of their type.
 
     Args:
-        value: Plain values, arrays, mappings with text as keys, sequences and dataclasses of
-            these, all the way down. Paths count for nothing: where a file lies says not what is
-            in it.
+        value: Plain values, arrays, mappings with text keys, sequences and dataclasses, nested to
+            any depth. Paths become None: the place of a file says nothing about its contents.
 
     Raises:
-        TypeError: If there is anything else in it, which could change unseen.
+        TypeError: If a value has any other type.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {f.name: canonical(getattr(value, f.name)) for f in dataclasses.fields(value)}

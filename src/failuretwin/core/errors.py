@@ -1,4 +1,4 @@
-"""Errors meant for users: what was got, what was expected, how to fix it."""
+"""Errors for users: what was found, what was expected, how to fix it."""
 
 from __future__ import annotations
 
@@ -12,21 +12,15 @@ class FailureTwinError(Exception):
 
 
 class InputError(FailureTwinError, ValueError):
-    """Something that the user gave cannot be used; the text says how to fix it."""
+    """Unusable input; the text says how to fix it."""
 
 
 class OutputError(FailureTwinError, OSError):
-    """A result could not be written; nothing half-written is left behind."""
+    """A result could not be written; no partial file is left."""
 
 
 def unknown_name(kind: str, got: str, valid: Iterable[str]) -> InputError:
-    """Return the error for a name that does not exist, with the nearest match.
-
-    Args:
-        kind: What the name stands for, such as ``"robot"``.
-        got: The name as given.
-        valid: Every name that exists.
-    """
+    """Return the error for an unknown name of a `kind` such as "robot", with the nearest match."""
     names = list(valid)
     near = get_close_matches(got, names, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
@@ -38,11 +32,11 @@ def needs_extra(who: str, extra: str) -> Iterator[None]:
     """Import optional libraries in this block.
 
     Args:
-        who: What needs them, and their names, such as ``"pictures need matplotlib"``.
-        extra: The extra of this package that brings them.
+        who: Feature and library, such as ``"pictures need matplotlib"``.
+        extra: The extra of this package that installs the library.
 
     Raises:
-        InputError: If one is missing; it says how to install it.
+        InputError: If a library is missing; the text says how to install it.
     """
     try:
         yield
@@ -54,12 +48,12 @@ def needs_extra(who: str, extra: str) -> Iterator[None]:
 
 
 def counted(count: int, noun: str) -> str:
-    """Return a number of things in words: "1 run", "2 runs"."""
+    """Return a count with its noun: "1 run", "2 runs"."""
     return f"{count} {noun}{'s' * (count != 1)}"
 
 
 def reason(error: BaseException) -> str:
-    """Return what the system or a library says of an error, on one line."""
+    """Return the message of an error of the system or a library, on one line."""
     if isinstance(error, MemoryError):
         return "not enough memory"
     text = getattr(error, "strerror", None) or str(error)
@@ -67,5 +61,5 @@ def reason(error: BaseException) -> str:
 
 
 def one_line(text: str) -> str:
-    """Return the text of another library's error on one line, without its inner details."""
+    """Return an error text on one line, without details in parentheses."""
     return " ".join(text.partition("(")[0].split())

@@ -1,9 +1,8 @@
-"""Files of other people: read without harm, or refused in one line that says what to do.
+"""Safe reading of foreign files.
 
-Three thoughts, each in one place: whatever a library raises over a file becomes an `InputError`
-(`reading`), what a file claims to hold is compared with its size and the memory there is before
-anything is allocated (`check_size`), and text out of files reaches a terminal or a spreadsheet as
-text only (`printable`, `as_cell`).
+Errors of libraries become one-line `InputError`s (`reading`). The size that a file claims is
+compared with its real size and the free memory before any allocation (`check_size`). Text from
+files is escaped for terminals and spreadsheets (`printable`, `as_cell`).
 """
 
 from __future__ import annotations
@@ -20,22 +19,22 @@ from failuretwin.core.errors import FailureTwinError, InputError, reason
 
 MB = 1_000_000
 LEAST_BYTES = 256 * MB
-"""What any file, however small, may unfold to [bytes]."""
+"""Size up to which any file may expand [bytes]."""
 EXPANSION = 200
-"""A file may unfold to so many times its size: logs at rest shrink by fifty, while deflate reaches
-1000 and Zstandard more where a file was made to harm."""
+"""Largest ratio of expanded to stored size. Logs at rest shrink by a factor of 50; deflate reaches
+1000, Zstandard more in malicious files."""
 MEMORY_SHARE = 0.5
-"""Share of the free memory that a file may fill: what is read is copied once at least."""
+"""Share of the free memory that a file may fill; data are copied at least once."""
 MEMORY_BYTES = 4_000 * MB
-"""Free memory where the system does not tell [bytes]: that of a small computer."""
+"""Free memory where the system does not report it [bytes]: a small computer."""
 TEXT_BYTES = 64 * MB
-"""Longest text, such as a profile or a URDF, that is read whole [bytes]."""
+"""Largest text file, such as a profile or a URDF [bytes]."""
 
 
 def files_below(folder: Path, pattern: str) -> list[Path]:
-    """Return the files at or below a folder whose name fits a pattern, links to folders followed.
+    """Return the files in a folder tree whose name matches a pattern.
 
-    A folder that a link leads back to is searched once.
+    Links to folders are followed; a folder that a link leads back to is searched once.
     """
     found, seen = [], set[str]()
     for here, folders, names in os.walk(folder, followlinks=True):
@@ -50,11 +49,11 @@ def files_below(folder: Path, pattern: str) -> list[Path]:
 
 @contextmanager
 def reading(path: Path | str, kind: str, fix: str = "") -> Iterator[None]:
-    """Turn whatever a library raises over a broken file into one line.
+    """Turn any error of a library into a one-line InputError.
 
     Args:
         path: The file.
-        kind: What it was read as, such as ``a MATLAB file``.
+        kind: Expected kind of file, such as ``a MATLAB file``.
         fix: What to do about it, one sentence.
 
     Raises:
@@ -73,7 +72,7 @@ def reading(path: Path | str, kind: str, fix: str = "") -> Iterator[None]:
 
 
 def check_is_file(path: Path, kind: str) -> None:
-    """Raise InputError for what is there and has no end, such as a device or a pipe."""
+    """Raise InputError for a device or a pipe, which have no end."""
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise InputError(f"{path}: is a device or a pipe. Expected a file, {kind}.")
 
@@ -82,7 +81,7 @@ def read_text(path: Path, kind: str, fix: str = "") -> str:
     """Return the text of a file.
 
     Raises:
-        InputError: If it cannot be read, is no UTF-8, or is longer than such a text can be.
+        InputError: If it cannot be read, is not UTF-8, or is larger than `TEXT_BYTES`.
     """
     with reading(path, kind, fix):
         check_is_file(path, kind)
@@ -96,12 +95,12 @@ def read_text(path: Path, kind: str, fix: str = "") -> str:
 
 
 def check_size(claimed: float, path: Path, what: str) -> None:
-    """Raise InputError if more would be allocated than the file and the machine can mean.
+    """Raise InputError if reading would take more memory than file and machine allow.
 
     Args:
-        claimed: Bytes that reading takes, by what the file says of itself.
+        claimed: Bytes needed, as the file declares them.
         path: The file, or a folder of files.
-        what: What takes them, such as ``its arrays``.
+        what: Part of the file that needs them, such as ``its arrays``.
     """
     stored = stored_bytes(path)
     if claimed > max(LEAST_BYTES, EXPANSION * stored):
@@ -114,13 +113,7 @@ def check_size(claimed: float, path: Path, what: str) -> None:
 
 
 def check_memory(claimed: float, where: str, what: str) -> None:
-    """Raise InputError if something would take more than a share of the memory that is free.
-
-    Args:
-        claimed: Bytes that it takes.
-        where: The file, for the error text.
-        what: What takes them.
-    """
+    """Raise InputError if `what` in the file `where` needs more than a share of the free memory."""
     free = free_bytes()
     if claimed > MEMORY_SHARE * free:
         raise InputError(
@@ -131,7 +124,7 @@ def check_memory(claimed: float, where: str, what: str) -> None:
 
 
 def in_bytes(count: float) -> str:
-    """Return a number of bytes as people write it."""
+    """Return a number of bytes in a readable unit."""
     for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= size:
             return f"{count / size:.3g} {unit}" if count < 1e15 else f"{count / size:.0e} {unit}"
@@ -146,7 +139,7 @@ def stored_bytes(path: Path) -> int:
 
 
 def free_bytes() -> float:
-    """Return the memory that this process may still take [bytes]."""
+    """Return the memory that is free to this process [bytes]."""
     return min(_free_of_machine(), _limit_of_process())
 
 
@@ -173,14 +166,14 @@ def _limit_of_process() -> float:
 
 KEPT = "\n\t"
 HARMFUL = ("Cc", "Cf", "Cs", "Zl", "Zp")
-"""Unicode categories that a terminal acts on instead of showing: control characters, marks that
-turn the direction of writing, halves of pairs, and separators of lines."""
+"""Unicode categories that change a terminal's state: control characters, marks of writing
+direction, lone surrogates, line separators."""
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""What a spreadsheet takes for the beginning of a formula."""
+"""Characters that start a formula in a spreadsheet."""
 
 
 def printable(text: str) -> str:
-    """Return text as a terminal may be given it: what it would act on is written out in letters."""
+    """Return text that is safe for a terminal: harmful characters are escaped."""
     if text.isascii() and text.isprintable():
         return text
     return "".join(_shown(letter) for letter in text)
@@ -193,10 +186,7 @@ def _shown(letter: str) -> str:
 
 
 def as_cell(value: object) -> object:
-    """Return what goes into a cell of a CSV file.
-
-    Text becomes `printable`; where it looks like a formula it gets a ``'``.
-    """
+    """Return the value of a CSV cell: text is `printable`, and quoted if it is like a formula."""
     if not isinstance(value, str):
         return value
     return f"'{printable(value)}" if value.startswith(FORMULA) else printable(value)

@@ -1,7 +1,7 @@
-"""Point-to-point movements, the reference they ask for, and how to find them in a reference.
+"""Point-to-point movements, their reference, and their detection in a reference.
 
-A movement is a ramp of every motor from where its reference stands to a target, all starting
-together, then a plateau until the next movement. Angles are in the log's own sense.
+A movement is a ramp of every motor from its present reference to a target, all starting together,
+then a plateau until the next movement. Angles are in the log's sense.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from failuretwin.core.polyline import REST_S, TURN_RAD, simplify
 from failuretwin.core.types import BoolArray, FloatArray
 
 ROUNDING_RAD = 2e-3
-"""Logged references are taken as few straight lines, off by no more than this [rad], a tenth of
-a degree: half a count of a coarse servo, well below any fault that can be found."""
+"""Tolerance of the straight lines that replace logged references [rad], a tenth of a degree: half a
+count of a coarse servo, well below any detectable fault."""
 
 CORNER_TOLERANCE_RAD = 1e-7
-"""Change of a reference from one step to the next [rad] that is rounding and no corner."""
+"""Largest change of slope per step that counts as rounding [rad]."""
 LONGEST_CORNER = 4
-"""Samples over which a corner between straight lines can bend; a short ramp has two corners."""
+"""Largest number of samples of a corner between straight lines; a short ramp has two corners."""
 SAME_MOVEMENT_S = 0.25
-"""Motors that start within this time [s] move together: a bus serves six servos in about 0.02 s,
-and of a smooth start the shortest travel is seen last."""
+"""Motors that start within this time belong to one movement [s]: a bus serves six servos in about
+0.02 s, and with a smooth start the shortest travel is detected last."""
 GUIDED_BENDS = 2.0
-"""Changes of speed without a stop, for each start of a movement, from which a reference is taken
-for guided by hand [-]; planned ramps that cut each other short have one at most."""
+"""Changes of speed per start of a movement from which a reference counts as guided by hand [-];
+planned ramps that interrupt each other have one at most."""
 
 
 @dataclass(frozen=True)
 class Movements(ArrayStruct):
-    """Movements of many runs as arrays; runs with fewer movements are padded with NaN at the end.
+    """Movements of many runs; runs with fewer movements are padded with NaN at the end.
 
     Attributes:
         initial: Reference before the first movement, (run, motor) [rad].
         target: Reference on the plateau, (run, movement, motor) [rad].
         ramp_duration: Time from start to target, (run, movement, motor) [s].
-        start: Time at which the ramps begin, (run, movement) [s].
+        start: Start of the ramps, (run, movement) [s].
     """
 
     initial: Annotated[FloatArray, Axes("run", "motor", empty=np.nan)]
@@ -51,13 +51,13 @@ class Movements(ArrayStruct):
 
     @property
     def exists(self) -> BoolArray:
-        """Which entries are movements and which are padding, (run, movement)."""
+        """Which entries are movements, not padding, (run, movement)."""
         return np.isfinite(self.start)
 
     def origin(self) -> FloatArray:
         """Return the reference at the start of each movement, (run, movement, motor) [rad].
 
-        A ramp that the next movement interrupts ends where it has come to.
+        An interrupted ramp ends where the next movement starts.
         """
         origin = np.empty_like(self.target)
         here = self.initial
@@ -67,7 +67,7 @@ class Movements(ArrayStruct):
         return origin
 
     def _share_done(self, m: int) -> FloatArray:
-        """Return how much of ramp `m` is done when the next movement starts, (run, motor)."""
+        """Return the completed share of ramp `m` when the next movement starts, (run, motor)."""
         if m + 1 == self.start.shape[1]:
             return np.ones_like(self.initial)
         available = (self.start[:, m + 1] - self.start[:, m])[:, None]
@@ -109,13 +109,12 @@ class Movements(ArrayStruct):
 
 
 def find_movements(command: FloatArray, time: FloatArray) -> Movements:
-    """Find the movements in references from the corners of the piecewise linear `command`.
+    """Return the movements in piecewise linear references.
 
-    A movement starts where a motor sets out or turns back; motors that do so within 0.25 s of each
-    other belong to the same movement, and a curve is one movement from rest to rest; so is all that
-    a hand guides (teleoperation), however often motors turn back in it. Corners are
-    placed between the samples, where the lines before and after them meet. The target of a ramp
-    that is interrupted is the angle it has come to.
+    A movement starts where a motor starts or reverses; starts within 0.25 s belong together. A
+    curve, and all motion guided by hand (teleoperation), is one movement from rest to rest. Corners
+    lie where the lines before and after them meet. The target of an interrupted ramp is the angle
+    reached.
 
     Args:
         command: Reference angles, (run, time, motor) [rad].
@@ -142,23 +141,23 @@ def find_movements(command: FloatArray, time: FloatArray) -> Movements:
 
 @dataclass(frozen=True)
 class _Corners:
-    """Corners of one motor's reference: times [s], angles [rad] and speeds after them [rad/s]."""
+    """Corners of one motor's reference: times [s], angles [rad] and following speeds [rad/s]."""
 
     time: FloatArray
     angle: FloatArray
     speed: FloatArray
 
     def starts(self) -> FloatArray:
-        """Return when the motor sets out or turns back [s]; mere changes of speed are curves."""
+        """Return when the motor starts or reverses [s]; other changes of speed are curves."""
         before = np.concatenate([[0.0], self.speed[:-1]])
         return self.time[(self.speed != 0.0) & (before * self.speed <= 0.0)]
 
     def bends(self) -> int:
-        """Return how often the motor changes its speed without a stop."""
+        """Return the number of changes of speed without a stop."""
         return int(np.sum((self.speed[1:] != 0.0) & (self.speed[:-1] != 0.0)))
 
     def stretches(self) -> FloatArray:
-        """Return begin and end of every line on which the motor moves, (line, 2) [s]."""
+        """Return start and end of every line with motion, (line, 2) [s]."""
         lines = np.stack([self.time[:-1], self.time[1:]], axis=1)
         return lines[self.speed[:-1] != 0.0]
 
@@ -214,7 +213,7 @@ def _corners(reference: FloatArray, time: FloatArray) -> _Corners:
 def _lines(reference: FloatArray) -> list[tuple[int, int]] | None:
     """Return first and last sample of every straight stretch of two steps or more.
 
-    None if the reference bends for longer than any corner: its lines are not straight.
+    None if the reference bends for longer than any corner.
     """
     steps = reference[1:] - reference[:-1]
     bends = np.abs(steps[1:] - steps[:-1]) > CORNER_TOLERANCE_RAD
@@ -236,11 +235,11 @@ def _merge_starts(starts: FloatArray) -> FloatArray:
 
 
 def _after_rests(start: FloatArray, moving: FloatArray) -> FloatArray:
-    """Return the starts that follow a rest of all motors, or that nothing comes before.
+    """Return the starts that follow a rest of all motors, and the first one.
 
     Args:
-        start: When motors set out, (movement,) [s].
-        moving: Begin and end of every line on which one moves, (line, 2) [s].
+        start: Start of each movement, (movement,) [s].
+        moving: Start and end of every line with motion, (line, 2) [s].
     """
     kept = []
     for at in start:
@@ -273,17 +272,17 @@ def _ramps(corners: _Corners, start: FloatArray, end: FloatArray) -> tuple[Float
 # References as they come: at uneven times, and with noise on them.
 
 NOISE_RAD = 1e-9
-"""References that typically bend by more than this from sample to sample are noisy [rad]."""
+"""Typical change of slope from which a reference counts as noisy [rad]."""
 GRID_S = 0.01
-"""Step of the grid onto which references are drawn out whose times are not even [s]."""
+"""Step of the grid for references with uneven times [s]."""
 
 
 def movements_of_samples(command: FloatArray, time: FloatArray) -> Movements:
-    """Find the movements in the references of one run that were taken at any times.
+    """Return the movements in the reference of one run with arbitrary sample times.
 
     Args:
         command: Reference angles, (sample, motor) [rad].
-        time: Increasing times of two samples at least, (sample,) [s].
+        time: Increasing times, at least two, (sample,) [s].
 
     Raises:
         InputError: If a command is not finite.
@@ -297,7 +296,7 @@ def movements_of_samples(command: FloatArray, time: FloatArray) -> Movements:
 
 
 def _evenly(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return values (time, motor) on an even grid; what is even already stays as it is."""
+    """Return values (time, motor) on an even grid, unchanged where the grid is even."""
     steps = np.diff(time)
     step = float(steps.min())
     multiples = steps / step

@@ -1,8 +1,7 @@
-"""A sampled reference as few straight lines, with the levels at which it rests as they are.
+"""Straight-line approximation of a sampled reference; rest levels stay exact.
 
-Lines between two rests may be off by a tolerance, which takes out rounding and curves; where a
-reference rests it says exactly what was commanded, however small the step from one rest to the
-next was.
+Lines between two rests may deviate by a tolerance, which removes rounding and curves. At rest the
+reference keeps the commanded value, however small the step from the previous rest.
 """
 
 from __future__ import annotations
@@ -17,33 +16,32 @@ Corner = tuple[float, float]
 """Time and value."""
 
 LEAST_STEPS = 10
-"""Changes from which a quantum can be read; fewer may share one by chance."""
+"""Smallest number of changes that determine a quantum; fewer may share one by chance."""
 
 TURN_RAD = 1e-5
-"""A reference that is further than this from where it stood moves [rad]; less is noise."""
+"""Smallest change of a reference that is motion [rad]; less is noise."""
 REST_S = 0.3
-"""A reference that a hand guides rests where no motor moves for this long [s]: twice the 0.15 s by
-which such an arm trails, so that it is seen at rest as well."""
+"""Shortest rest of all motors in a reference guided by hand [s]: twice the 0.15 s by which such an
+arm lags, so that the arm is measured at rest too."""
 STAIR_QUANTA = 4.0
-"""A stair is no higher, in quanta: what moves by more from sample to sample is no stair but a ramp
-that rounding does not hide, or a jump."""
+"""Largest step of a staircase, in quanta; a larger step is a ramp or a jump."""
 SAME = 1e-9
-"""What is as good as level, whatever the tolerance."""
+"""Largest difference that is level, whatever the tolerance."""
 CREEP = 10.0
-"""What noise may add up to within a rest, in `TURN_RAD`."""
+"""Largest sum of noise within a rest, in `TURN_RAD`."""
 
 
 def simplify(
     time: FloatArray, value: FloatArray, tolerance: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the corners of a polyline that stays within `tolerance` of the samples.
+    """Return the corners of a polyline within `tolerance` of the samples.
 
-    Douglas and Peucker's algorithm (1973) between the rests, which stay as they are. Other lines
-    that rise by less than twice the tolerance are made level; rounding leaves no false corners.
+    Douglas and Peucker's algorithm (1973) between the rests, which stay unchanged. Other lines that
+    rise by less than twice the tolerance become level; rounding leaves no false corners.
 
     Args:
         time: Increasing times, (sample,) [s].
-        value: Samples, (sample,); NaN where there is none.
+        value: Samples, (sample,); NaN = none.
         tolerance: Largest distance from the samples, in the unit of `value`.
 
     Returns:
@@ -77,16 +75,15 @@ def simplify(
 def simplify_motors(
     time: FloatArray, value: FloatArray, tolerance: float
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Return the corners of each motor's reference, as `simplify` does one by one.
+    """Return the corners of each motor's reference; see `simplify`.
 
-    Values that were rounded more coarsely than the tolerance are stairs, and of stairs nobody can
-    tell a bend from a step: where that keeps them within a quantum and a stair, each motor goes
-    straight from where all motors rest to where they rest next, until its own last step. Where that
-    takes more lines, as of a ramp so slow that its stairs look like rests, it does not.
+    Values rounded more coarsely than the tolerance form staircases, in which bends and steps look
+    alike. Each motor then moves on a straight line from one common rest to its own last step before
+    the next, if this stays within a quantum and a stair and needs fewer lines.
 
     Args:
         time: Increasing times, (sample,) [s].
-        value: Samples, (sample, motor) [rad]; NaN where there is none.
+        value: Samples, (sample, motor) [rad]; NaN = none.
         tolerance: Largest distance from the samples [rad].
     """
     quantum = max(resolution(column) for column in value.T)
@@ -105,12 +102,12 @@ def simplify_motors(
 def _between_rests(
     time: FloatArray, value: FloatArray, together: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return corners of straight lines between the rests of all motors.
+    """Return corners of straight lines between the common rests.
 
     Args:
         time: (sample,) [s].
-        value: Of one motor, (sample,) [rad].
-        together: Of all, (sample, motor) [rad].
+        value: Reference of one motor, (sample,) [rad].
+        together: References of all motors, (sample, motor) [rad].
     """
     moves = np.abs(np.diff(together, axis=0)).max(axis=1) > TURN_RAD
     edges = np.flatnonzero(np.concatenate([[True], moves, [True]]))
@@ -126,7 +123,7 @@ def _between_rests(
 
 
 def _rests(time: FloatArray, value: FloatArray) -> list[tuple[int, int]]:
-    """Return first and last sample of every stretch of `REST_S` or more without a turn."""
+    """Return first and last sample of every stretch of `REST_S` or more without motion."""
     moves = np.abs(np.diff(value)) > TURN_RAD
     edges = [0, *(np.flatnonzero(moves) + 1).tolist(), len(value)]
     stretches = [(first, stop - 1) for first, stop in pairwise(edges)]
@@ -139,7 +136,7 @@ def _rests(time: FloatArray, value: FloatArray) -> list[tuple[int, int]]:
 
 
 def resolution(value: FloatArray) -> float:
-    """Return the quantum that samples are rounded to, 0 if there is none to be seen."""
+    """Return the quantum of rounded samples; 0 if none is visible."""
     steps = np.abs(np.diff(value))
     steps = steps[steps > 1e-9]
     if len(steps) < LEAST_STEPS:
@@ -151,16 +148,10 @@ def resolution(value: FloatArray) -> float:
 def _sharpen(
     kept: IntArray, time: FloatArray, value: FloatArray, fixed: BoolArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return the corners `kept` of samples, those between two samples where their lines meet.
+    """Return times and values of the corners `kept`, and which of them belong to rests.
 
-    Args:
-        kept: Samples that are corners, (corner,).
-        time: Times of all samples, (sample,) [s].
-        value: Samples, (sample,).
-        fixed: Begins and ends of rests, (sample,).
-
-    Returns:
-        Times and values of the corners, and which of them belong to rests.
+    A corner between two samples lies where their lines meet; `fixed` marks starts and ends of
+    rests.
     """
     corners = [(float(time[i]), float(value[i])) for i in kept]
     sharp, rests, i = corners[:1], [bool(fixed[kept[0]])], 1
@@ -175,7 +166,7 @@ def _sharpen(
 
 
 def _meet(a: Corner, b: Corner, c: Corner, d: Corner) -> Corner | None:
-    """Return where the lines a-b and c-d meet, None unless that is between b and c."""
+    """Return the intersection of the lines a-b and c-d; None unless it lies between b and c."""
     before = (b[1] - a[1]) / (b[0] - a[0])
     after = (d[1] - c[1]) / (d[0] - c[0])
     if before == after:
@@ -188,12 +179,12 @@ def _meet(a: Corner, b: Corner, c: Corner, d: Corner) -> Corner | None:
 
 
 def _level(value: FloatArray, fixed: BoolArray, tolerance: float) -> FloatArray:
-    """Return corner values with each almost level line made level, at the value it begins with.
+    """Return corner values with each almost level line set to the value at its start.
 
     Args:
         value: Corner values, (corner,).
-        fixed: Corners that stay as they are, but for rounding, (corner,).
-        tolerance: What is almost level, in the unit of `value`.
+        fixed: Corners that change only by rounding, (corner,).
+        tolerance: Largest rise of an almost level line.
     """
     value = value.copy()
     for i in range(1, len(value)):

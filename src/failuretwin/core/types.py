@@ -1,4 +1,4 @@
-"""Array types and helpers shared by every room of the house."""
+"""Array types, and the count scale of position servos."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ IntArray = NDArray[np.int64]
 
 
 def frozen_array(values: ArrayLike) -> FloatArray:
-    """Return a read-only float64 copy of `values`, fit for a frozen dataclass."""
+    """Return a read-only float64 copy of `values`."""
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array
 
 
 def as_floats(values: Any) -> FloatArray:
-    """Return `values` as a float64 array, without a copy where it already is one."""
+    """Return `values` as a float64 array, copied only if necessary."""
     return np.asarray(values, dtype=np.float64)
 
 
@@ -31,7 +31,7 @@ def as_floats(values: Any) -> FloatArray:
 
 MS_PER_S = 1000.0
 LARGEST_SCALE = 2e7
-"""Largest figure of a count scale: encoders of 24 bits count to 1.7e7."""
+"""Largest value in a count scale: encoders of 24 bits count to 1.7e7."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +66,12 @@ class ServoUnits:
         return abs(self.deg_per_count) * np.pi / 180.0
 
     def to_rad(self, counts: ArrayLike) -> FloatArray:
-        """Return joint angles [rad] of `counts`, clamped to the valid range; same shape."""
+        """Return joint angles [rad] of `counts`, clamped to the valid range."""
         clamped = np.clip(as_floats(counts), self.low, self.high)
         return (self.zero_deg - self.deg_per_count * clamped) * np.pi / 180.0
 
     def to_counts(self, angle: ArrayLike) -> FloatArray:
-        """Return unrounded counts of joint angles [rad]; same shape."""
+        """Return unrounded counts of joint angles [rad]."""
         return (self.zero_deg - np.rad2deg(as_floats(angle))) / self.deg_per_count
 
     def valid(self, counts: ArrayLike) -> np.ndarray:

@@ -52,8 +52,8 @@ def simulated_sensors(
         for channels, seed in zip(true, seeds, strict=True):
             rng = np.random.default_rng([*seed, KINDS.index(kind)])
             turn = Rotation.from_rotvec(rng.normal(0.0, 1.0, 3) * sensor.turn_doubt).as_matrix()
-            constant = rng.normal(0.0, 1.0, sensor.errors) * sensor.doubt
-            noise = rng.normal(0.0, sensor.noise, (position.shape[1], sensor.errors))
+            constant = rng.normal(0.0, 1.0, sensor.dims) * sensor.doubt
+            noise = rng.normal(0.0, sensor.noise, (position.shape[1], sensor.dims))
             turned = channels @ turn.T if sensor.turn_doubt else channels
             values.append(sensor.with_errors(turned, constant + noise))
         found[sensor.variable] = np.stack(values)

@@ -1,8 +1,8 @@
-"""What arms of a kind are like: the prior of a robot that nobody has calibrated.
+"""Classes of arms: priors of an uncalibrated robot.
 
-Means go into `Settling`, what arms of the kind differ by into `Variation`: constant for one robot,
-so that a diagnosis integrates it as common to all movements. Sag comes from the masses of the URDF:
-a motor yields so far under its own rms load.
+Means go into `Settling`, differences between arms of a class into `Variation`, which is constant
+for one robot. Sag follows from the masses of the URDF: the yielding of a motor under its own rms
+load.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, loads_in_range
 
 GENERIC_NAME = "generic, not calibrated"
-"""What results say of a robot whose healthy behaviour has not been measured."""
+"""Name of the healthy behaviour in results of an uncalibrated robot."""
 
 
 @dataclass(frozen=True)
 class ArmClass(Bounded):
-    """Typical figures of a kind of arm, every motor alike, and what its arms differ by.
+    """Typical values of a class of arms, the same for every motor, and their spread.
 
     Attributes:
         bias_rad: Deviation of a motor's constant error [rad].
-        session_rad: Deviation of that error of one arm from one day to another [rad].
+        session_rad: Deviation of that error of one arm from day to day [rad].
         sag_rad: Yielding under the rms load of a motor, mean and deviation alike [rad].
-        friction_rad: How far a motor stops short, mean [rad].
+        friction_rad: Distance by which a motor stops short, mean [rad].
         friction_spread_rad: Deviation of that [rad].
-        scatter_rad: Scale of what is left, from movement to movement [rad].
+        scatter_rad: Scale of the random error from movement to movement [rad].
         tail_dof: Degrees of freedom of that scatter.
         lost: Share of movements in which one given motor misses its command [-].
         lost_together: The same of two given motors [-].
@@ -59,29 +59,25 @@ ARM_CLASSES: Mapping[str, ArmClass] = {
     "industrial": ArmClass(0.003, 0.001, 0.001, 0.0003, 0.0003, 0.0004, 4.0, 0.003, 0.0003),
     "cable-driven": ArmClass(0.02, 0.005, 0.02, 0.015, 0.01, 0.01, 4.0, 0.01, 0.001),
 }
-"""Figures by class. Hobby servos: what published measurements of such servos agree on (settled
-errors of half a degree to one degree, a twentieth of commands lost on a shared bus), rounded;
-industrial arms: absolute accuracy of joints and repeatability as makers state them; cable-driven:
-assumed, wide. The bias of hobby servos, which is also what the calibrations of two of them scatter
-by, was settled with diagnoses of one of these in sight (benchmarks/looks.md)."""
+"""Values by class. Hobby servos: rounded from published measurements (settled errors of half a
+degree to one degree, a twentieth of commands lost on a shared bus); industrial arms: makers'
+absolute accuracy of joints and repeatability; cable-driven: assumed, wide. The bias of hobby
+servos, which is also the scatter between the calibrations of two of them, was chosen with diagnoses
+of one of these known (benchmarks/looks.md)."""
 LONG_ARM_M = 0.6
-"""Arms that reach farther are taken to be industrial where the profile names no class [m]."""
+"""Reach from which an arm without a stated class counts as industrial [m]."""
 
 
 def class_of(robot: Robot) -> ArmClass:
-    """Return the figures of the class of an arm.
-
-    Raises:
-        InputError: If the profile names a class that is not known.
-    """
+    """Return the values of an arm's class; see `class_name`."""
     return ARM_CLASSES[class_name(robot)]
 
 
 def class_name(robot: Robot) -> str:
-    """Return the class of an arm: that of its profile, else by its reach.
+    """Return the class of an arm: stated in its profile, else by its reach.
 
     Raises:
-        InputError: If the profile names one that is not known.
+        InputError: If the profile names an unknown class.
     """
     name = robot.profile.arm_class
     if not name:
@@ -92,10 +88,10 @@ def class_name(robot: Robot) -> str:
 
 
 def generic_imperfections(robot: Robot) -> Imperfections:
-    """Return what arms of this kind do, for a robot whose own figures have not been measured.
+    """Return the imperfections of a typical arm of this class, for an uncalibrated robot.
 
     Raises:
-        InputError: If the profile names a class of arms that is not known.
+        InputError: If the profile names an unknown class.
     """
     name, kind, motors = class_name(robot), class_of(robot), len(robot.motors)
     load = np.sqrt(np.mean(loads_in_range(robot, 0.0) ** 2, axis=0))
@@ -128,11 +124,11 @@ def generic_imperfections(robot: Robot) -> Imperfections:
 
 
 LEAST_LOAD = 0.01
-"""Motors whose load is a smaller share of the largest are not loaded [-]."""
+"""Share of the largest load from which a motor counts as loaded [-]."""
 
 
 def _losses(robot: Robot, kind: ArmClass) -> tuple[LostCommand, ...]:
-    """Return the losses of single motors and of every two."""
+    """Return the losses of single motors and of all pairs."""
     single = [LostCommand((name,), kind.lost, kind.lost) for name in robot.motor_names]
     pairs = [
         LostCommand(pair, kind.lost_together, kind.lost_together)

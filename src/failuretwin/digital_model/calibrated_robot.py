@@ -1,7 +1,7 @@
-"""A robot as a calibration knows it: its own servo loops, and what it does that its twin does not.
+"""A calibrated robot: its own servo loops, and its differences from the twin.
 
-A calibration file holds imperfections, whose timing is what is left on top of the servo loops, and
-may hold those loops. One without the other describes no robot, so both are read here, together.
+A calibration file holds imperfections, whose timing adds to the servo loops, and may hold those
+loops. They only describe a robot together, so both are read here.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from failuretwin.digital_model.settling import Settling, largest_load
 from failuretwin.digital_model.twin import DigitalTwin
 
 CALIBRATION_TABLE = "calibration"
-"""Table of a calibration file that says of which robot and how the figures were found."""
+"""Table of a calibration file with robot, servo loops and sensor frame."""
 
 
 @dataclass(frozen=True)
 class CalibratedLoop(Bounded):
-    """Servo loop of a motor as its step tests speak for it.
+    """Servo loop of a motor from its step tests.
 
     Attributes:
         motor: Its name.
@@ -62,12 +62,12 @@ class CalibratedLoop(Bounded):
 
 @dataclass(frozen=True)
 class CalibratedRobot:
-    """A robot with its calibrated servo loops, and how it differs from their twin.
+    """A robot with calibrated servo loops, and its differences from their twin.
 
     Attributes:
-        robot: The robot; motors without a calibrated loop have that of the profile.
-        imperfections: What it does that its twin does not; their timing is on top of these loops.
-            They have the name of the calibration and its protocol.
+        robot: The robot; motors without a calibrated loop keep the profile's. imperfections:
+        Differences from the twin; their timing adds to these loops. They carry the name
+            and protocol of the calibration.
     """
 
     robot: Robot
@@ -81,27 +81,27 @@ class CalibratedRobot:
 
 @runtime_checkable
 class Learned(Protocol):
-    """What a calibration has found of a robot."""
+    """Result of a calibration."""
 
     def applied_to(self, robot: Robot) -> CalibratedRobot:
-        """Return the robot as the calibration knows it."""
+        """Return the calibrated robot."""
 
 
 RobotLike = DigitalTwin | CalibratedRobot | Robot | str | Path
-"""A robot in any form: a twin, what a calibration made of it, or a bundled name or profile."""
+"""A robot in any form: a twin, a calibrated robot, a bundled name or a profile."""
 HealthyLike = Imperfections | Learned | str | Path | None
-"""What a healthy robot does: figures, a calibration, its name or path, None: by its profile."""
+"""Healthy behaviour: values, a calibration, its name or path; None: by the robot's profile."""
 
 
 def calibrated(robot: RobotLike, healthy: HealthyLike = None) -> CalibratedRobot:
-    """Return a robot with what is known of it, whatever form both are given in.
+    """Return a robot with its healthy behaviour.
 
     Args:
-        robot: The robot; a `CalibratedRobot` is returned as it is where `healthy` is None.
-        healthy: What it does that its twin does not.
+        robot: The robot; a `CalibratedRobot` is returned unchanged where `healthy` is None.
+        healthy: Its differences from the twin.
 
     Raises:
-        InputError: If there is no such robot or calibration, or it is of another robot.
+        InputError: If there is no such robot or calibration, or they do not belong together.
     """
     if isinstance(robot, CalibratedRobot) and healthy is None:
         return robot
@@ -130,22 +130,23 @@ def with_loops(robot: Robot, loops: Sequence[CalibratedLoop]) -> Robot:
 
 
 GENERIC = "generic"
-"""Name of what a kind of arm is like, whatever its profile names."""
+"""Name of the prior of the arm's class, whatever its profile names."""
 
 
 def load_calibration(
     name_or_path: str | Path | None, robot: Robot | str | Path = "armpi_fpv"
 ) -> CalibratedRobot:
-    """Load a calibration, or imperfections typed by hand.
+    """Load a calibration, or imperfections written by hand.
 
     Args:
-        name_or_path: ``none``; ``generic`` for what this kind of arm is like; the name of `robot`
-            for the calibration of its profile, the name of another file beside that, or a TOML
-            file. None: the calibration of its profile, ``generic`` if that names none.
-        robot: The robot it is for, its name or its profile.
+        name_or_path: ``none``; ``generic`` for the prior of the arm's class; the name of `robot`
+        for
+            the calibration of its profile, the name of another file in that folder, or a TOML file.
+            None: the calibration of its profile, ``generic`` if it names none.
+        robot: The robot, its name or its profile.
 
     Raises:
-        InputError: If there is none under this name, or it belongs to another robot or does not fit
+        InputError: If there is no such calibration, or it belongs to another robot or does not fit
             its motors.
     """
     robot = load_robot(robot)
@@ -168,7 +169,7 @@ def load_calibration(
 
 
 def _file_of(name_or_path: str, robot: Robot) -> Path:
-    """Return the file of a name: that of the profile or one beside it; or of a path."""
+    """Return the file of a name (the profile's or one in its folder) or a path."""
     path, own = Path(name_or_path), robot.imperfections_file
     known = {}
     if own is not None:
@@ -185,7 +186,7 @@ def _file_of(name_or_path: str, robot: Robot) -> Path:
 
 
 def _completed(imperfections: Imperfections, motors: int) -> Imperfections:
-    """Return the imperfections with zeros for what is left out of the settling."""
+    """Return the imperfections with zeros for missing lists of the settling."""
     settling = imperfections.settling
     if settling is None:
         return imperfections
@@ -196,13 +197,13 @@ def _completed(imperfections: Imperfections, motors: int) -> Imperfections:
 
 
 LARGEST_ERROR, LARGEST_PLAY = 1.0 / 8.0, 1.0 / 24.0
-"""Largest error of a healthy motor as a share of where it may stand, such as 20 of 160 deg, and
-largest friction and scatter, such as 7 deg: guesses, ten times what hobby servos do. Far beyond it
-a healthy motor looks like a stuck one."""
+"""Largest error of a healthy motor as a share of its travel, such as 20 of 160 deg, and largest
+friction and scatter, such as 7 deg: assumed, ten times that of hobby servos. Far beyond it a
+healthy motor is indistinguishable from a stuck one."""
 
 
 def _check_sane(settling: Settling | None, robot: Robot, path: Path) -> None:
-    """Raise InputError unless the settled errors of a file can be those of a healthy robot."""
+    """Raise InputError unless the settled errors of a file are those of a healthy robot."""
     if settling is None:
         return
     travel = np.diff(robot.travel, axis=1)[:, 0]
@@ -223,14 +224,14 @@ def _check_sane(settling: Settling | None, robot: Robot, path: Path) -> None:
 
 @dataclass(frozen=True)
 class _Record:
-    """What of the calibration's own table matters to the robot."""
+    """Parts of the calibration's own table that change the robot."""
 
     robot: str = ""
     loops: tuple[CalibratedLoop, ...] = ()
     frame: SensorFrame | None = None
 
     def applied_to(self, robot: Robot) -> Robot:
-        """Return a robot with what the calibration knows of its loops and its sensor."""
+        """Return a robot with the calibrated loops and sensor frame."""
         with_own = with_loops(robot, self.loops)
         return with_own.seen_from(self.frame)
 
@@ -243,13 +244,7 @@ def _record(table: object, path: Path) -> _Record:
 
 
 def check_fit(imperfections: Imperfections, robot: Robot, where: Path | str) -> None:
-    """Raise InputError unless figures are those of a robot with these motors.
-
-    Args:
-        imperfections: What it does that its twin does not.
-        robot: The robot.
-        where: Their file or name, for error texts.
-    """
+    """Raise InputError unless imperfections fit the robot's motors; `where` names their file."""
     count = len(robot.motors)
     lists = [(t, name) for t in ("settling", "variation") for name in SETTLING_LISTS]
     for table, name in [*lists, ("readings", "glitch_rate")]:

@@ -1,10 +1,10 @@
-"""How near an arm comes to the floor and to itself: its links as capsules round straight lines.
+"""Clearance of an arm to the floor and to itself: links as capsules around straight lines.
 
     gap of links i, j = distance of their lines - 2 radius
 
-No URDF is asked for shapes, and the physics engine knows no contacts: a link is the line from one
-joint to the next, the base that from its frame to the first joint, all of one radius. Links that
-join, or that lie side by side in most poses of the arm's own movements, are not pairs.
+No shapes are read from the URDF: a link is the line from one joint to the next, the base that from
+its frame to the first joint, all with one radius. Adjacent links, and links that are close in most
+poses of the arm's own movements, are not compared.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import poses_in_range
 
 RADIUS_OF_REACH = 0.04
-"""Radius of links as a share of the arm's reach; assumed: 12 mm of an arm of 0.3 m, 5 cm of one of
-1.3 m."""
+"""Radius of links as a share of the arm's reach; assumed: 12 mm for an arm of 0.3 m, 5 cm for 1.3
+m."""
 OFTEN = 0.2
-"""Links that come nearer than their radii in so many poses of healthy movements are neighbours."""
+"""Share of healthy poses from which close links count as neighbours."""
 SHORTEST_LINK = 1e-6
-"""Joints that share a place have no link between them [m]."""
+"""Shortest distance of joints that have a link between them [m]."""
 
 
 @dataclass(frozen=True)
 class Clearance:
-    """Gaps of the links of a robot, in the physical sense of its angles and the frame of its base.
+    """Gaps between the links of a robot, in the base frame.
 
     Attributes:
         robot: The robot.
         radius_m: Radius of its links [m].
-        floor_m: Height below which no joint and no tool may come, in the base frame [m].
+        floor_m: Lowest height of joints and tool in the base frame [m].
     """
 
     robot: Robot
@@ -46,13 +46,12 @@ class Clearance:
     def of(
         cls, robot: Robot, radius_m: float | None = None, floor_m: float | None = None
     ) -> Clearance:
-        """Return that of a robot.
+        """Return the clearance of a robot.
 
         Args:
             robot: The robot.
             radius_m: Radius of its links [m]; None: by its reach.
-            floor_m: Height of the floor [m]; None: that of its base, or of its lowest joint where
-                that lies lower.
+            floor_m: Height of the floor [m]; None: the base, or the lowest joint if it is lower.
         """
         if radius_m is None:
             radius_m = RADIUS_OF_REACH * robot.reach
@@ -63,7 +62,7 @@ class Clearance:
 
     @cached_property
     def pairs(self) -> IntArray:
-        """Links that must keep apart, (pair, 2): 0 is the base, the last carries the tool."""
+        """Links to compare, (pair, 2): 0 is the base, the last carries the tool."""
         points = joint_points(self.robot.loads.chain, poses_in_range(self.robot))
         length = np.linalg.norm(np.diff(points, axis=-2), axis=-1).max(axis=0)
         links = np.flatnonzero(length > SHORTEST_LINK)
@@ -86,15 +85,11 @@ class Clearance:
         return joint_points(self.robot.loads.chain, pose * self.robot.sense)
 
     def gap(self, pose: FloatArray) -> FloatArray:
-        """Return the least gap between links, (...) [m]; below 0 they touch.
-
-        Args:
-            pose: Angles in the log's sense, (..., motor) [rad].
-        """
+        """Return the smallest gap between links, (...) [m], of poses (..., motor) [rad]."""
         return self._gap(self.points(pose))
 
     def height(self, pose: FloatArray) -> FloatArray:
-        """Return how far the lowest moving joint or the tool is above the floor, (...) [m]."""
+        """Return the height of the lowest moving joint or the tool above the floor, (...) [m]."""
         return self._height(self.points(pose))
 
     def gap_and_height(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -103,7 +98,7 @@ class Clearance:
         return self._gap(points), self._height(points)
 
     def margin(self, pose: FloatArray) -> FloatArray:
-        """Return the lesser of gap and height, (...) [m]; below 0 a pose is not allowed."""
+        """Return the smaller of gap and height, (...) [m]; negative for a forbidden pose."""
         return np.minimum(*self.gap_and_height(pose))
 
     def _gap(self, points: FloatArray) -> FloatArray:
@@ -117,7 +112,7 @@ class Clearance:
         return np.asarray(z.min(axis=-1) - self.floor_m)
 
     def _distances(self, points: FloatArray, pairs: IntArray) -> FloatArray:
-        """Return how far the lines of pairs of links are apart, (..., pair) [m]."""
+        """Return the distance of the lines of pairs of links, (..., pair) [m]."""
         a, b = pairs.T
         return segment_distance(
             points[..., a, :], points[..., a + 1, :], points[..., b, :], points[..., b + 1, :]
@@ -137,16 +132,10 @@ def joint_points(chain: SerialChain, q: FloatArray) -> FloatArray:
 def segment_distance(
     start_a: FloatArray, end_a: FloatArray, start_b: FloatArray, end_b: FloatArray
 ) -> FloatArray:
-    """Return the least distance of straight lines of given ends, (...) [m].
+    """Return the distance of two straight segments, (...) [m], given their ends (..., 3) [m].
 
-    The nearest points of two lines are found on both without ends, then brought back to the ends,
-    first on a, then on b, then on a again; exact for lines that have a length.
-
-    Args:
-        start_a: (..., 3) [m]; the others alike.
-        end_a: The other end of the first.
-        start_b: One end of the second.
-        end_b: The other end of it.
+    The nearest points of the infinite lines are clipped to the ends, first on a, then on b, then on
+    a again; exact for segments of nonzero length.
     """
     along_a, along_b, between = end_a - start_a, end_b - start_b, start_a - start_b
     aa, bb = _dot(along_a, along_a), _dot(along_b, along_b)

@@ -1,7 +1,7 @@
-"""The robot of one run and its bad luck: all that imperfections leave to chance.
+"""Random disturbances of a run: everything that imperfections leave to chance.
 
-Chance and computation are apart: everything is drawn first, from one generator for each run; the
-motions and the sensors' readings that follow are deterministic, for many runs at once.
+All random numbers are drawn first, from one generator per run; motions and readings then follow
+deterministically, for many runs at once.
 """
 
 from __future__ import annotations
@@ -22,24 +22,20 @@ from failuretwin.digital_model.twin import DigitalTwin
 
 @dataclass(frozen=True)
 class Disturbances:
-    """The robot of a run and what chance does to it, or of many along a leading run axis.
+    """Robot and random disturbances of one run, or of many along a leading run axis.
 
     Attributes:
-        bias: Constant error of each motor, (motor,) [rad].
-        compliance: Its yielding under load, (motor,) [rad/(N m)].
-        friction: How far it stops short, (motor,) [rad].
-        payload: Mass at the tool point, () [kg].
-        lost: Commands that do not arrive, (movement, motor).
-        scatter: Settled scatter, (1 + movement, motor) [rad]; the first row is before the run.
-        delay: Dead time, () [s].
-        lag: Time constant of a first-order lag, () [s].
-        shortening: Share by which ramps end early, ().
-        late: Late start, (movement,) [s].
-        stalled: Whether the command after the run is late, so that the last movement's readings
-            stop too, ().
-        gap_start: Readings stop this long after a movement before a late one, (movement,) [s].
+        bias: Constant error of each motor, (motor,) [rad]. compliance: Its yielding under load,
+        (motor,) [rad/(N m)]. friction: Distance by which it stops short, (motor,) [rad]. payload:
+        Mass at the tool point, () [kg]. lost: Lost commands, (movement, motor). scatter: Random
+        settled error, (1 + movement, motor) [rad]; the first row is before the run. delay: Dead
+        time, () [s]. lag: Time constant of a first-order lag, () [s]. shortening: Share by which
+        ramps end early, (). late: Late start, (movement,) [s]. stalled: Whether the command after
+        the run is late, so that the last movement's readings stop
+            too, ().
+        gap_start: Time from the start of a movement until readings stop, (movement,) [s].
         reading_time: Times of the readings, (reading,) [s].
-        glitch: Raw counts of spoilt readings, NaN where sound, (reading, motor).
+        glitch: Raw counts of corrupted readings, NaN where sound, (reading, motor).
         noise: Noise of the tool sensor, (reading, axis) [m].
     """
 
@@ -67,13 +63,13 @@ def draw_disturbances(
     duration: float,
     rng: np.random.Generator,
 ) -> Disturbances:
-    """Draw the disturbances of one run.
+    """Return the disturbances of one run.
 
     Args:
-        imperfections: What the robot is like.
+        imperfections: Imperfections of the robot.
         robot: The robot.
         movements: Number of movements in the run.
-        duration: Longest time that readings are needed for [s].
+        duration: Time for which readings are needed [s].
         rng: The run's own generator.
     """
     imperfections = vary(imperfections, rng)
@@ -111,7 +107,7 @@ def stack(draws: Sequence[Disturbances]) -> Disturbances:
 def _draw_losses(
     imperfections: Imperfections, robot: Robot, late: BoolArray, rng: np.random.Generator
 ) -> BoolArray:
-    """Return which motors lose which command, (movement, motor); at most one set a movement."""
+    """Return which motors lose which command, (movement, motor); at most one set per movement."""
     names = robot.motor_names
     lost = np.zeros((len(late), len(names)), dtype=bool)
     chance, below = rng.random(len(late)), np.zeros(len(late))
@@ -152,10 +148,10 @@ def _draw_readings(
 
 
 def delay_commands(movements: Movements, late: FloatArray) -> Movements:
-    """Return the movements as commanded when each late start also delays all that follow.
+    """Return the commanded movements when each late start also delays all later ones.
 
-    A stalled bus holds up the sender: the command keeps its early stamp, the next one is sent a
-    full period after the late start.
+    A stalled bus blocks the sender: the command keeps its early stamp, the next one is sent a full
+    period after the late start.
 
     Args:
         movements: The undisturbed schedule.
@@ -166,15 +162,14 @@ def delay_commands(movements: Movements, late: FloatArray) -> Movements:
 
 
 def actual_movements(movements: Movements, chance: Disturbances) -> Movements:
-    """Return the movements that the motors really make, without gravity sag.
+    """Return the actual movements of the motors, without gravity sag.
+
+    Lost commands, bias, friction and scatter change targets; late starts, delay and early ramp ends
+    change times.
 
     Args:
-        movements: As commanded (after any fault that alters targets).
+        movements: As commanded (after any fault that changes targets).
         chance: Disturbances of the same runs.
-
-    Returns:
-        Movements with lost commands, bias, friction and scatter in their targets, and with late
-        starts, delay and early ramp ends in their times.
     """
     initial = here = movements.initial + chance.bias + chance.scatter[:, 0]
     target, commanded = np.empty_like(movements.target), movements.initial
@@ -198,7 +193,7 @@ def lagged(reference: FloatArray, time: FloatArray, lag: FloatArray) -> FloatArr
     Args:
         reference: (run, time, motor) [rad], at rest at its first value.
         time: Uniform grid, (time,) [s].
-        lag: Time constant of each run, (run,) [s]; 0 leaves a run as it is.
+        lag: Time constant of each run, (run,) [s]; 0 leaves a run unchanged.
     """
     if not lag.any():
         return reference
@@ -217,19 +212,17 @@ def sense(
     movement_start: FloatArray,
     chance: Disturbances,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the tool path and the motors' angles as the sensors report them.
+    """Return tool path (run, time, axis) [m] and angles (run, time, motor) [rad] by the sensors.
+
+    NaN where there is no sample.
 
     Args:
         twin: Kinematics of the robot.
         readings: The sensor; None: perfect, one sample at every grid time.
         position: True angles, (run, time, motor) [rad].
         time: Uniform grid, (time,) [s].
-        movement_start: Starts as commanded, (run, movement) [s]; gaps hang on them.
+        movement_start: Starts as commanded, (run, movement) [s]; gaps are relative to them.
         chance: Disturbances of the same runs.
-
-    Returns:
-        Tool path (run, time, axis) [m] and angles (run, time, motor) [rad], NaN where there is no
-        sample.
     """
     if readings is None:
         return twin.path(position), position
@@ -262,7 +255,7 @@ def _at_times(position: FloatArray, time: FloatArray, at: FloatArray) -> FloatAr
 
 
 def _in_gap(chance: Disturbances, start: FloatArray) -> BoolArray:
-    """Return which readings the stalled bus swallows, (run, reading)."""
+    """Return which readings a stalled bus drops, (run, reading)."""
     stalled = np.concatenate([chance.late[:, 1:] > 0.0, chance.stalled[:, None]], axis=1)
     begin = start + chance.gap_start
     end = np.full_like(start, np.inf)
@@ -275,7 +268,7 @@ def _in_gap(chance: Disturbances, start: FloatArray) -> BoolArray:
 def _draw_out(
     twin: DigitalTwin, read: FloatArray, chance: Disturbances, missing: BoolArray, time: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return path and angles drawn out to the grid by straight lines, as published."""
+    """Return path and angles interpolated on the grid, as published."""
     units = twin.robot.servo_units
     counts = np.where(np.isfinite(chance.glitch), chance.glitch, units.to_counts(read))
     filled = np.empty((len(read), len(time), read.shape[-1]))

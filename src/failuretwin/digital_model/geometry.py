@@ -1,12 +1,12 @@
-"""What is known of an arm's geometry beside its URDF: frames, zeros and where its axes really are.
+"""Geometry of an arm in addition to its URDF: sensor frame, zero angles and joint corrections.
 
     p_seen = (1 + k) R(rpy) p_base + xyz,     T_pc' = T_pc T(xyz_j, rpy_j) Rot(axis_j, zero_j)
 
-p_base is the tool point in the base link's frame and p_seen what the sensor tells of it [m]; k the
-sensor's scale error [-]. T_pc is the pose of joint j in its parent link as the URDF states it; the
-correction is in the joint's own frame, and the joint then stands at sense * command + zero.
+p_base is the tool point in the base link's frame and p_seen its position by the sensor [m]; k is
+the sensor's scale error [-]. T_pc is the pose of joint j in its parent link by the URDF; the
+correction is in the joint's own frame, and the joint angle is sense * command + zero.
 
-Section: docs/another_arm.md#fit-the-frame-and-the-geometry
+Section: docs/registration.md#what-the-profile-says
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from failuretwin.digital_model.urdf.file import Triple, Urdf, UrdfJoint, transfo
 NO_OFFSET = (0.0, 0.0, 0.0)
 NOT_MOVED = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 Pose = tuple[float, float, float, float, float, float]
-"""x, y, z [m], roll, pitch, yaw [rad]: turned about the fixed axes x, y, z, in this order."""
+"""x, y, z [m], roll, pitch, yaw [rad]: rotations about the fixed axes x, y, z, in this order."""
 
 
 @dataclass(frozen=True)
 class JointCorrection:
-    """How a joint differs from what the URDF states.
+    """Difference of a joint from the URDF.
 
     Attributes:
-        joint: Its name in the URDF.
-        zero: Angle of the URDF where commands say 0 [rad], or place [m].
-        xyz: Where its frame really is, in the frame that the URDF states [m].
-        rpy: How it is turned there [rad].
+        joint: Name in the URDF.
+        zero: URDF angle [rad] or position [m] at command 0.
+        xyz: True origin of its frame, in the URDF's frame of the joint [m].
+        rpy: Rotation of its frame there [rad].
     """
 
     joint: str
@@ -44,7 +44,7 @@ class JointCorrection:
     rpy: Triple = NO_OFFSET
 
     def apply(self, joint: UrdfJoint) -> UrdfJoint:
-        """Return the joint as it really is; its limits are those of what is commanded."""
+        """Return the corrected joint; its limits are those of commands."""
         T = joint.T_pc @ transform(self.xyz, self.rpy)
         moved = np.eye(4)
         if joint.type == "prismatic":
@@ -57,14 +57,13 @@ class JointCorrection:
 
 @dataclass(frozen=True)
 class Geometry(Bounded):
-    """What was fitted of an arm and its sensor beside frames and tool point.
+    """Fitted geometry of arm and sensor, in addition to frames and tool point.
 
     Attributes:
         joints: Joints that differ from the URDF.
-        sensor_scale: Length that the sensor tells of a metre, 1 + k [-].
-        sensor_noise_m: What it leaves unexplained on each axis, a standard deviation [m]; 0: not
-            known.
-        source: Where the figures come from.
+        sensor_scale: Length that the sensor reports for a metre, 1 + k [-].
+        sensor_noise_m: Standard deviation of the fit's residual on each axis [m]; 0: unknown.
+        source: Source of the values.
     """
 
     joints: tuple[JointCorrection, ...] = ()
@@ -73,7 +72,7 @@ class Geometry(Bounded):
     source: str = ""
 
     def apply(self, urdf: Urdf) -> Urdf:
-        """Return the URDF with its joints where they really are.
+        """Return the URDF with corrected joints.
 
         Raises:
             InputError: If it has no such joint.
@@ -83,20 +82,20 @@ class Geometry(Bounded):
 
 @dataclass(frozen=True)
 class SensorFrame(Bounded):
-    """Where the tool sensor was found to stand, beside what the profile says.
+    """Displacement of the tool sensor from its place in the profile.
 
-    x_seen = scale R(rpy) x_profile + xyz
+        x_seen = scale R(rpy) x_profile + xyz
 
     Attributes:
-        xyz_rpy: Pose of the frame that the profile states in the frame that was found.
-        scale: Length that the sensor tells of a metre of the profile's sensor [-].
+        xyz_rpy: Pose of the profile's sensor frame in the actual one.
+        scale: Length that the sensor reports for a metre of the profile's sensor [-].
     """
 
     xyz_rpy: Pose = NOT_MOVED
     scale: Annotated[float, Bounds(0.5, 2.0)] = 1.0
 
     def after(self, first: SensorFrame | None) -> SensorFrame:
-        """Return the frame of a sensor found here beside another one that was found before."""
+        """Return this displacement applied after a first one."""
         if first is None:
             return self
         before, this = (transform(f.xyz_rpy[:3], f.xyz_rpy[3:]) for f in (first, self))
@@ -108,7 +107,7 @@ class SensorFrame(Bounded):
 
 
 AS_STATED = Geometry()
-"""The arm is as its URDF states it."""
+"""No difference from the URDF."""
 
 
 def with_tool(chain: SerialChain, tool_xyz: Triple) -> SerialChain:
@@ -119,12 +118,12 @@ def with_tool(chain: SerialChain, tool_xyz: Triple) -> SerialChain:
 
 
 def seen_chain(chain: SerialChain, base_xyz_rpy: Pose, scale: float = 1.0) -> SerialChain:
-    """Return the chain whose tool point is what the sensor tells, in the frame of the sensor.
+    """Return the chain to the tool point in the sensor's frame and scale.
 
     Args:
-        chain: The chain from the base link; with joints that slide its scale must be 1.
-        base_xyz_rpy: Pose of the base link in the frame of the sensor.
-        scale: Length that the sensor tells of a metre.
+        chain: The chain from the base link; with sliding joints the scale must be 1.
+        base_xyz_rpy: Pose of the base link in the sensor's frame.
+        scale: Length that the sensor reports for a metre.
     """
     if base_xyz_rpy == NOT_MOVED and scale == 1.0:
         return chain
@@ -176,7 +175,7 @@ def turned_about(axis: Triple, angle: float) -> FloatArray:
 
 
 def roll_pitch_yaw(R: FloatArray) -> Triple:
-    """Return the angles of a rotation (3, 3) as a URDF has them [rad]."""
+    """Return the URDF angles of a rotation (3, 3) [rad]."""
     pitch = float(np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0])))
     if np.hypot(R[0, 0], R[1, 0]) < 1e-12:  # roll and yaw are about one axis: all is roll
         return float(np.arctan2(-R[1, 2], R[1, 1])), pitch, 0.0

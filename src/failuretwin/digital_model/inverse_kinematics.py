@@ -1,10 +1,10 @@
-"""Poses that bring the tool to a point: damped least squares with limits and locked joints.
+"""Inverse kinematics: damped least squares with limits and locked joints.
 
     dq = J^T (J J^T + lambda I)^-1 r,    r = goal - tool(q)
 
-Joints at a limit that dq would leave, and joints that are locked, have no column in J; a step that
-does not bring the tool nearer is not taken and raises lambda (Levenberg-Marquardt). Every goal is
-tried from many poses at once, for a single start misses poses at limits.
+Locked joints, and joints that dq would move beyond a limit, have no column in J. A step that does
+not reduce the error is rejected and raises lambda (Levenberg-Marquardt). Each goal is tried from
+many start poses at once, since a single start misses poses at limits.
 """
 
 from __future__ import annotations
@@ -19,37 +19,36 @@ from failuretwin.digital_model.kinematics import SerialChain, cross
 from failuretwin.digital_model.robot import Robot
 
 POINTER_M = 0.1
-"""An approach direction is two tool points so far apart [m]: 1 mm between them is 0.6 deg."""
+"""Distance of the two tool points that express a direction [m]: 1 mm between them is 0.6 deg."""
 CLOSE_M = 1e-5
-"""A pose that brings the tool so near to its goal is good enough [m]."""
+"""Accepted distance of the tool from its goal [m]."""
 MOST_STEPS = 60
 SLOWEST = 0.9
-"""A search whose error has not fallen to this share in `PATIENCE` steps is stuck in a corner."""
+"""Share to which the error must fall in `PATIENCE` steps; otherwise the search stops."""
 PATIENCE = 5
 ENOUGH = 0.3
-"""A goal that so many of its starts have come to is not searched for any longer."""
+"""Share of successful starts at which the search for a goal ends."""
 LONGEST_STEP = 0.5
-"""Longest step of a joint at a time [rad or m]."""
+"""Largest change of a joint per step [rad or m]."""
 DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-9, 10.0
-"""lambda at the start and its bounds [m2]."""
+"""Initial lambda and its bounds [m2]."""
 EASED, RAISED = 0.2, 5.0
-"""Factors on lambda after a step that helps and after one that does not."""
+"""Factors on lambda after an accepted and a rejected step."""
 AT_LIMIT = 1e-9
 STARTS = 10
-"""Poses that a search begins with, unless told otherwise."""
+"""Default number of start poses."""
 UNLIMITED = np.pi
-"""Range tried on either side of zero for a joint without limits [rad or m]."""
+"""Range on either side of zero for a joint without limits [rad or m]."""
 
 
 @dataclass(frozen=True)
 class Poses:
-    """What was found for each goal from each start.
+    """Result for each goal and start.
 
     Attributes:
-        pose: Angles in the log's sense, (goal, start, motor) [rad].
-        miss_m: How far the tool then is from the goal, (goal, start) [m].
-        miss_rad: Angle between tool axis and approach direction, (goal, start) [rad]; 0 where none
-            was asked for.
+        pose: Angles in the log's sense, (goal, start, motor) [rad]. miss_m: Distance of the tool
+        from the goal, (goal, start) [m]. miss_rad: Angle between tool axis and requested direction,
+        (goal, start) [rad]; 0 without one.
     """
 
     pose: FloatArray
@@ -59,7 +58,7 @@ class Poses:
 
 @dataclass(frozen=True)
 class InverseKinematics:
-    """Finds poses of a robot, in the log's sense and in the frame of its tool sensor.
+    """Inverse kinematics of a robot, in the log's sense and the frame of its tool sensor.
 
     Attributes:
         robot: The robot.
@@ -87,13 +86,7 @@ class InverseKinematics:
     def starts(
         self, count: int, rng: np.random.Generator, first: FloatArray | None = None
     ) -> FloatArray:
-        """Return poses to begin with, (start, motor) [rad]: one that is given, then any.
-
-        Args:
-            count: How many.
-            rng: Source of chance.
-            first: Where the arm stands, (motor,) [rad].
-        """
+        """Return `count` random poses, (start, motor) [rad]; the first is `first` where given."""
         drawn = rng.uniform(self.low, self.high, (count, len(self.low)))
         if first is not None:
             drawn[0] = np.clip(first, self.low, self.high)
@@ -104,7 +97,7 @@ class InverseKinematics:
         return self._tool(0.0, pose)
 
     def axis(self, pose: FloatArray) -> FloatArray:
-        """Return where z of the tool frame points, unit vectors (..., 3), of poses."""
+        """Return the z axis of the tool frame, unit vectors (..., 3), of poses."""
         points, _ = self._tool(POINTER_M, pose)
         return np.asarray((points[..., 3:] - points[..., :3]) / POINTER_M)
 
@@ -123,11 +116,10 @@ class InverseKinematics:
         """Return the poses that bring the tool nearest to some goals.
 
         Args:
-            position: Where the tool shall be, (goal, 3) [m].
-            start: Poses to begin with, (goal, start, motor) or (start, motor) [rad].
-            locked: Motors that stay where `start` has them, even beyond their limits, (motor,).
-            direction: Unit vectors along which z of the tool frame shall point, (goal, 3); None:
-                any.
+            position: Goals of the tool, (goal, 3) [m].
+            start: Start poses, (goal, start, motor) or (start, motor) [rad].
+            locked: Motors that keep their angle in `start`, even beyond their limits, (motor,).
+            direction: Goals of the tool frame's z axis, unit vectors (goal, 3); None: any.
         """
         pointer_m = 0.0 if direction is None else POINTER_M
         goal = position
@@ -155,7 +147,7 @@ class InverseKinematics:
         free: BoolArray,
         starts: int,
     ) -> FloatArray:
-        """Return the nearest poses (case, motor) for goals (case, 3 or 6), each with its starts."""
+        """Return the nearest poses (case, motor) for goals (case, 3 or 6)."""
         pose = np.where(free, np.clip(begin, self.low, self.high), begin)
         damping = np.full(len(pose), DAMPING)
         point, jacobian = self._tool(pointer_m, pose)
@@ -191,7 +183,7 @@ class InverseKinematics:
         pose: FloatArray,
         free: BoolArray,
     ) -> FloatArray:
-        """Return the damped step of each case, (case, motor); none leaves its limits at one."""
+        """Return the damped step of each case, (case, motor); none leaves its limits."""
         step = _damped(jacobian * free, residual, damping)
         outward = (step > 0.0) & (pose >= self.high - AT_LIMIT)
         outward |= (step < 0.0) & (pose <= self.low + AT_LIMIT)
@@ -232,7 +224,7 @@ def angle_between(axis: FloatArray, other: FloatArray) -> FloatArray:
 
 
 def _unfinished(square: FloatArray, starts: int) -> BoolArray:
-    """Return which cases are still looked at, (case,), by their squared errors [m2]."""
+    """Return which cases continue, (case,), by their squared errors [m2]."""
     close = (square <= CLOSE_M**2).reshape(-1, starts)
     enough = close.mean(axis=1, keepdims=True) >= ENOUGH
     return np.asarray((~close & ~enough).ravel())
@@ -250,7 +242,7 @@ def _damped(jacobian: FloatArray, residual: FloatArray, damping: FloatArray) -> 
 def usable_limits(robot: Robot) -> tuple[FloatArray, FloatArray]:
     """Return lowest and highest angle of each motor, (motor,) [rad]; half a turn where unlimited.
 
-    Where commands are servo counts, no more than these can say.
+    Servo counts limit the angles further.
     """
     low, high = robot.limits.T.copy()
     low[~np.isfinite(low)], high[~np.isfinite(high)] = -UNLIMITED, UNLIMITED
@@ -262,12 +254,12 @@ def usable_limits(robot: Robot) -> tuple[FloatArray, FloatArray]:
 
 
 def feedback_factor(jacobian: FloatArray) -> FloatArray:
-    """Return by what a correction shrinks the error if motor k does not move, (..., motor).
+    """Return the convergence factor of corrections while motor k is stuck, (..., motor).
 
         rho_k = (J+)_k J_k
 
     With motor k held, nominal corrections dq = J+ r leave J_k (J+)_k r, a matrix of rank one: each
-    leaves rho_k of the last error. Near 1 feedback alone never gets there.
+    step leaves rho_k of the last error. Near 1, feedback alone does not converge.
 
     Args:
         jacobian: Of the tool position, (..., 3, motor) [m/rad].

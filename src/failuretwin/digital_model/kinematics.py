@@ -1,8 +1,8 @@
-"""A serial chain, batched: tool position and its Jacobian, gravity's torques, and its reach.
+"""Serial chains in batches: tool position, Jacobian, joint frames, gravity torques and reach.
 
-Every joint turns about (or slides along) the z axis of its own frame; what lies between two such
-frames is a constant transform. The tool point is carried from the tip to the base as three
-coordinates, and entries of the constants that are 0 or 1 cost nothing.
+Every joint turns about (or slides along) the z axis of its own frame; between two such frames lies
+a constant transform. Position and Jacobian are carried from the tip to the base as three
+coordinates; entries of the constants that are 0 or 1 cost nothing.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from failuretwin.core.types import FloatArray, as_floats
 # Vectors of three coordinates, each a number or an array over poses.
 
 Scalar = float | FloatArray
-"""A coordinate: the same for every pose (float) or one per pose (array)."""
+"""A coordinate: common to all poses (float) or one per pose (array)."""
 Vector = tuple[Scalar, Scalar, Scalar]
 Scalars = FloatArray | Sequence[float]
-"""A number of each joint, or one of each joint and pose."""
+"""One number per joint, or per joint and pose."""
 
 GRAVITY = 9.81
 """Acceleration of free fall, along -z of the base [m/s2]."""
 
 CHUNK = 8000
-"""Poses at a time: 64 kB an array, so that the working set stays in the second-level cache."""
+"""Poses per block: 64 kB an array, so that the working set stays in the second-level cache."""
 
 
 def _chunks(count: int) -> Iterator[slice]:
@@ -213,8 +213,8 @@ class SerialChain:
     def _carry(self, q: FloatArray, *, derivatives: bool) -> tuple[Vector, list[Vector]]:
         """Carry the tool point from tip to base for `q` (joint, pose).
 
-        Each derivative starts at its joint, where it is a simple vector, and is then turned like
-        any direction by the joints below.
+        Each derivative starts at its joint as a simple vector; the joints below turn it like any
+        direction.
         """
         point: Vector = tuple(float(x) for x in self.T_jt[:3, 3])  # type: ignore[assignment]
         columns: list[Vector] = []
@@ -258,7 +258,7 @@ class Loads:
 
     Attributes:
         chain: The chain from base to tool.
-        mass: Mass that moves with each joint and none beyond it, (joint,) [kg].
+        mass: Mass between each joint and the next, (joint,) [kg].
         centre: Its centre in the frame that turns with the joint, (joint, 3) [m].
     """
 
@@ -267,14 +267,11 @@ class Loads:
     centre: FloatArray
 
     def torque(self, q: FloatArray, payload: FloatArray | float = 0.0) -> FloatArray:
-        """Return the torque with which gravity drives every joint.
+        """Return the torque of gravity on every joint, (..., joint) [N m or N].
 
         Args:
             q: Joint values in the physical sense, (..., joint) [rad or m].
-            payload: Mass at the tool point, () or as many leading axes as `q` [kg].
-
-        Returns:
-            (..., joint) [N m, or N for a joint that slides]; positive drives the joint up.
+            payload: Mass at the tool point, () or the leading axes of `q` [kg].
         """
         q = as_floats(q)
         flat = q.reshape(-1, q.shape[-1])
@@ -294,8 +291,8 @@ class Loads:
     def _carry(self, q: Scalars, cosine: Scalars, sine: Scalars, payload: Scalar) -> list[Scalar]:
         """Return the torque of each joint for `q`, its cosine and sine, (joint, pose) or (joint,).
 
-        Gravity is carried from base to tip, mass times position from tip to base; at each joint
-        their cross product about its axis is the torque.
+        Gravity is carried from base to tip, mass times position from tip to base; the torque is
+        their cross product about the joint's axis.
         """
         down = self._gravity(cosine, sine)
         mass = payload
@@ -315,7 +312,7 @@ class Loads:
         return torque[::-1]
 
     def _gravity(self, cosine: Scalars, sine: Scalars) -> list[Vector]:
-        """Return gravity in the frame of each joint before the joint turns [m/s2]."""
+        """Return gravity in the frame of each joint before it turns [m/s2]."""
         here: Vector = (0.0, 0.0, -GRAVITY)
         seen = []
         for joint, c, s in zip(self.chain.joints, cosine, sine, strict=True):
@@ -330,30 +327,30 @@ class Loads:
 
 POSES = 256
 SEED = 0
-"""The poses are the same each time, so that a report can be repeated."""
+"""Fixed, so that reports are reproducible."""
 
 CANNOT_MOVE = 1e-9
-"""A lever arm below this at every pose is rounding, not motion [m/rad or m/m]."""
+"""Largest lever arm that is rounding error [m/rad or m/m]."""
 
 FREE_RANGE = np.pi
-"""Range tried on either side of zero for a joint without limits [rad or m]."""
+"""Range on either side of zero for a joint without limits [rad or m]."""
 
 ASCENT_STEPS = 100
 
 
 def has_range(low: float, high: float) -> bool:
-    """Return whether limits are a range; exporters write 0 and 0 for ones they do not know."""
+    """Return whether limits form a range; exporters write 0 and 0 for unknown ones."""
     return bool(np.isfinite(low) and np.isfinite(high) and low < high)
 
 
 def levers(chain: SerialChain) -> FloatArray:
-    """Return the largest speed of the tool for unit speed of each joint, (joint,) [m/rad, m/m]."""
+    """Return the largest tool speed per unit speed of each joint, (joint,) [m/rad, m/m]."""
     _, jacobian = chain.position_and_jacobian(_poses(chain)[2])
     return np.linalg.norm(jacobian, axis=-2).max(axis=0)
 
 
 def idle_axes(chain: SerialChain) -> tuple[bool, bool, bool]:
-    """Return along which axes of the base no joint moves the tool, such as z of a planar arm."""
+    """Return the axes of the base along which no joint moves the tool."""
     _, jacobian = chain.position_and_jacobian(_poses(chain)[2])
     x, y, z = (np.abs(jacobian).max(axis=(0, 2)) < CANNOT_MOVE).tolist()
     return x, y, z

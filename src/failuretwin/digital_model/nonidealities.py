@@ -1,8 +1,8 @@
-"""What a healthy robot does that its twin does not: one value, every part switchable.
+"""Imperfections: differences of a healthy robot from its twin, each part optional.
 
-Figures of a real robot live in TOML files beside the robot's profile, with their source; the way to
-read one is `calibrated_robot.load_calibration`. Ranges are drawn anew for each run, rates apply to
-each movement or reading.
+Values of a real robot lie in TOML files beside its profile, with their source; read them with
+`calibrated_robot.load_calibration`. Ranges are drawn for each run, rates apply to each movement or
+reading.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ from failuretwin.digital_model.settling import Settling
 Range = Annotated[tuple[float, float], Bounds(in_order=True)]
 """Lowest and highest value, from zero on."""
 LONGEST_LAG_S = 5.0
-"""No arm that is watched at work trails its commands by more [s]."""
+"""Longest lag of an arm behind its commands [s]."""
 LONGEST_S = 60.0
 """Longest delay or time between movements [s]: logs with a longer silence are not read."""
 Seconds = Annotated[tuple[float, float], Bounds(0.0, LONGEST_S, in_order=True)]
 Spreads = Annotated[tuple[float, ...], Bounds()]
 
 PROTOCOLS = ("P0", "P0c", "P1", "P2")
-"""How much real data was used: none, healthy logs, unlabelled or labelled runs of the test set."""
+"""Real data used: none, healthy logs, unlabelled or labelled runs of the test set."""
 SETTLING_LISTS = ("bias", "compliance", "friction", "scatter")
-"""Figures of `Settling` and `Variation` that have one value for each motor."""
+"""Fields of `Settling` and `Variation` with one value per motor."""
 
 
 @dataclass(frozen=True)
 class Timing(Bounded):
-    """How motions run late against their commands.
+    """Delays of motions behind their commands.
 
     Attributes:
-        delay_s: Range of the dead time on top of the servo loop [s].
-        lag_s: Range of the time constant of a first-order lag on top of the servo loop [s].
-        ramp_shortening: Range of the share by which ramps end early [-].
-        late_rate: Share of movements that a stalled bus makes start late [-].
-        late_s: Range of the late start, common to all motors [s].
-        gap_start_s: When readings stop, after the movement before the late one began [s]; they
-            come back with the late start.
+        delay_s: Range of the dead time in addition to the servo loop [s]. lag_s: Range of the time
+        constant of a first-order lag in addition to the servo loop [s]. ramp_shortening: Range of
+        the share by which ramps end early [-]. late_rate: Share of movements that start late
+        because of a stalled bus [-]. late_s: Range of the late start, common to all motors [s].
+        gap_start_s: Time from the start of the previous movement until readings stop [s]; they
+        resume
+            with the late start.
     """
 
     delay_s: Annotated[tuple[float, float], Bounds(-1.0, LONGEST_S, in_order=True)] = (0.0, 0.0)
@@ -57,11 +57,11 @@ class Timing(Bounded):
 
 @dataclass(frozen=True)
 class LostCommand(Bounded):
-    """A set of motors that lose a command together and stay where they are for one movement.
+    """A set of motors that miss one command together and stay at their angles.
 
     Attributes:
         motors: Their names.
-        rate: Share of punctual movements in which exactly these motors lose it [-].
+        rate: Share of punctual movements missed by exactly these motors [-].
         rate_when_late: The same for movements that start late [-].
     """
 
@@ -72,7 +72,7 @@ class LostCommand(Bounded):
 
 @dataclass(frozen=True)
 class Schedule(Bounded):
-    """When movements are commanded and on what scale.
+    """Times and scale of commands.
 
     Attributes:
         first_start_s: Range of the first movement's start [s].
@@ -87,17 +87,16 @@ class Schedule(Bounded):
 
 @dataclass(frozen=True)
 class Readings(Bounded):
-    """How the tool sensor samples the motion; without it, every grid time has a sample.
+    """Sampling of the tool sensor; without it, every grid time has a sample.
 
     Attributes:
-        rate_hz: Nominal rate of the readings [Hz].
-        jitter_s: Standard deviation of their times [s].
+        rate_hz: Nominal rate [Hz]. jitter_s: Standard deviation of the sample times [s].
         whole_counts: Whether the angles behind the virtual sensor are whole servo counts.
-        glitch_rate: Share of readings spoilt by each motor [-].
-        noise_m: Standard deviation of noise on each axis [m].
-        drawn_out: Fill the grid by straight lines between readings, glitches clamped to the
-            servo's range, as the published data do; otherwise leave readings at the nearest
-            grid time, and gaps and glitches missing.
+        glitch_rate: Share of readings corrupted by each motor [-]. noise_m: Standard deviation of
+        noise on each axis [m]. drawn_out: Interpolate the grid between readings, with glitches
+        clamped to the servo's range, as
+            the published data do; otherwise readings lie at the nearest grid time, and gaps and
+            glitches are missing.
     """
 
     rate_hz: Annotated[float, Bounds(0.1, 1e5)]
@@ -110,18 +109,16 @@ class Readings(Bounded):
 
 @dataclass(frozen=True)
 class Variation(Bounded):
-    """How far a robot may differ from the figures: drawn anew for every run.
+    """Differences of a robot from the stated values, drawn for every run.
 
-    One value for each motor in chain order, or none at all for no variation.
+    One value per motor in chain order; empty for no variation.
 
     Attributes:
-        bias: Standard deviation of the constant error [rad].
-        compliance: Standard deviation of the compliance's logarithm [-].
-        friction: Standard deviation of the friction [rad].
-        scatter: Standard deviation of the scatter's logarithm [-].
-        rates: Standard deviation of the logarithm of every rate of losses, late starts and
-            glitches [-].
-        payload: Range of a payload on top of the known one [kg].
+        bias: Standard deviation of the constant error [rad]. compliance: Standard deviation of the
+        compliance's logarithm [-]. friction: Standard deviation of the friction [rad]. scatter:
+        Standard deviation of the scatter's logarithm [-]. rates: Standard deviation of the
+        logarithm of every rate of losses, late starts and glitches [-]. payload: Range of the
+        additional payload [kg].
     """
 
     bias: Spreads = ()
@@ -134,19 +131,19 @@ class Variation(Bounded):
 
 @dataclass(frozen=True)
 class Imperfections:
-    """Everything that sets a healthy robot apart from the published twin.
+    """All differences of a healthy robot from the published twin.
 
     Attributes:
-        name: What to call it in results.
-        source: Where the figures come from.
-        protocol: How much real data the figures have seen: P0 none, P0c healthy logs only.
-        settling: Where motors settle; None: exactly at their targets.
+        name: Name in results.
+        source: Source of the values.
+        protocol: Real data used: P0 none, P0c healthy logs only.
+        settling: Settled errors; None: motors reach their targets exactly.
         timing: Delays, late starts, gaps.
-        lost_commands: Sets of motors whose commands never arrive, and how often.
-        schedule: When movements are commanded.
-        readings: The tool sensor; None: a perfect sample at every grid time.
-        variation: Differences from run to run; None: every run has the same robot.
-        sensors: What was learned of sensors beside that of the tool's position.
+        lost_commands: Sets of motors whose commands are lost, and how often.
+        schedule: Times of commands.
+        readings: Tool sensor; None: a perfect sample at every grid time.
+        variation: Differences from run to run; None: the same robot in every run.
+        sensors: Calibrated sensors in addition to the tool's position.
     """
 
     name: str
@@ -170,7 +167,7 @@ class Imperfections:
 
     @property
     def highest_loss(self) -> float:
-        """Share of movements in which some command is lost: punctual or late ones, the larger."""
+        """Share of movements with any lost command: of punctual or late ones, the larger."""
         losses = self.lost_commands
         return max(sum(e.rate for e in losses), sum(e.rate_when_late for e in losses))
 
@@ -180,13 +177,13 @@ NO_IMPERFECTIONS = Imperfections("none", "the published twin")
 # Robots of a kind: imperfections drawn around given ones, for training and for honest doubt.
 
 HIGHEST_LOSS = 0.9
-"""Bound on the share of movements in which some command is lost, however unlucky the draw."""
+"""Upper bound on the share of movements with any lost command."""
 
 
 def vary(imperfections: Imperfections, rng: np.random.Generator) -> Imperfections:
-    """Return the imperfections of one robot drawn from the variation of `imperfections`.
+    """Return the imperfections of one robot drawn from their variation.
 
-    Without a variation they are returned as they are, and nothing is drawn.
+    Without a variation they are returned unchanged, and no random number is drawn.
     """
     variation = imperfections.variation
     if variation is None:
@@ -213,7 +210,7 @@ def _vary_settling(settling: Settling, variation: Variation, rng: np.random.Gene
 
 
 def _scale_rates(imperfections: Imperfections, factor: float) -> Imperfections:
-    """Return the imperfections with every rate multiplied by `factor`, as far as shares can be."""
+    """Return the imperfections with every rate multiplied by `factor`, capped at 1."""
     timing, readings = imperfections.timing, imperfections.readings
     share = min(factor, HIGHEST_LOSS / max(imperfections.highest_loss, 1e-9))
     if readings is not None:
@@ -231,7 +228,7 @@ def _scale_rates(imperfections: Imperfections, factor: float) -> Imperfections:
 
 
 def deterministic(imperfections: Imperfections) -> Imperfections:
-    """Return imperfections that leave nothing to chance; ranges shrink to their middles."""
+    """Return the imperfections without randomness; ranges shrink to their middles."""
     timing, settling = imperfections.timing, imperfections.settling
     if settling is not None:
         settling = replace(settling, scatter=(0.0,) * len(settling.scatter))

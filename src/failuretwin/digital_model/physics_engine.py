@@ -1,4 +1,4 @@
-"""The physics engine: many runs of a robot by MuJoCo, a motion that no inference of ours owns."""
+"""The physics engine: many runs of a robot by MuJoCo, independent of the inference."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ from failuretwin.digital_model.servo import first_order_lag
 from failuretwin.digital_model.twin import Drive, uniform_step
 
 STEP_S = 0.005
-"""Default step [s]; see docs/generation.md#servo-engine-and-physics-engine for its error."""
+"""Default step [s]; for its error see docs/generation.md#servo-engine-and-physics-engine."""
 RUNS_AT_ONCE = 64
 SAMPLES_AT_ONCE = 250
-"""Bounds what is in memory: states and controls of 64 runs at two steps each take about 10 MB."""
+"""Limits memory: states and controls of 64 runs at two steps each take about 10 MB."""
 WEAKEST = 0.99
-"""Largest weakness; a servo with less left does not carry the arm."""
+"""Largest weakness; a weaker servo does not carry the arm."""
 ITERATIONS = 200
 AT_REST_RAD = 1e-13
 
 
 @dataclass(frozen=True)
 class PhysicsEngine:
-    """Moves a robot by rigid-body dynamics with servos, sticking gears and flexing joints.
+    """Rigid-body dynamics with servos, sticking gears and flexing joints.
 
-    Stiffness is the engine's own: `Drive.compliance` is left aside. What a run does depends on
-    neither the runs beside it nor the number of threads, bit for bit.
+    Stiffness is the engine's own: `Drive.compliance` is ignored. A run depends neither on the runs
+    beside it nor on the number of threads, bit for bit.
 
     Attributes:
         robot: The robot.
         parameters: Its motors and gears; None: those of its profile, or ones derived from its URDF.
-        threads: Runs simulated side by side.
+        threads: Number of threads.
         step_s: Largest time step [s]; a whole number of steps makes up a step of the time grid.
     """
 
@@ -64,17 +64,17 @@ class PhysicsEngine:
 
     @property
     def name(self) -> str:
-        """What the engine is called on the command line."""
+        """Name on the command line."""
         return "physics"
 
     @cached_property
     def motors(self) -> tuple[MotorPhysics, ...]:
-        """Motors and gears that it simulates."""
+        """Simulated motors and gears."""
         given = self.parameters or load_parameters(self.robot)
         return (given or default_parameters(self.robot)).motors
 
     def figures(self, name: str) -> FloatArray:
-        """Return one figure of every motor, (motor,)."""
+        """Return one parameter of every motor, (motor,)."""
         return np.array([getattr(motor, name) for motor in self.motors])
 
     def angles(self, drive: Drive, time: FloatArray) -> FloatArray:
@@ -190,7 +190,7 @@ class LiveArms:
     ) -> FloatArray:
         """Return the full state (state,) of an arm at rest: servo and flex balance the weight.
 
-        The gears' friction is relaxed. Set-points [rad] and strengths are those of each motor.
+        The gears' friction is relaxed. Set-points [rad] and strengths are (motor,).
         """
         data = self._data[0]
         mujoco = load_mujoco()
@@ -260,7 +260,7 @@ class LiveArms:
 
 
 def limit_speed(reference: FloatArray, step: float, speed: FloatArray) -> FloatArray:
-    """Return references that chase the given ones no faster than each motor can.
+    """Return references that follow the given ones within a speed limit.
 
     Args:
         reference: (run, time, motor) [rad].

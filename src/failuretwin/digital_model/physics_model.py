@@ -1,13 +1,13 @@
-"""The arm with its motors: rotors, gears that stick and flex, servos, and brakes for held gears.
+"""MuJoCo model of the arm with its motors: rotors, sticking and flexing gears, servos, gear brakes.
 
 Every joint of the URDF becomes two about the same axis: the drive (rotor and gear) and the flex of
-the gear's output side. Three actuators act on the drive, and each has a control, so that all that
-changes during a run is data:
+the gear's output side. Three actuators act on the drive, each with a control, so that all changes
+during a run are data:
 
 - set-point: a torque, the part of the servo's law that does not depend on the drive's angle;
 - feedback: -(stiffness * q + derivative * q') times its control, the share of its strength that
   the servo has left. (MuJoCo's own PID has fixed gains, so it cannot weaken during a run.)
-- brake: viscous, far stiffer than the servo, times its control: 1 holds the gear wherever it is.
+- brake: viscous, far stiffer than the servo, times its control: 1 holds the gear at its angle.
 
 Set-point and feedback pull a tendon whose total force is limited, as the motor's torque is; the
 brake is part of the gear and not limited. Friction of the gear is a spring that yields.
@@ -43,25 +43,25 @@ class MotorPhysics(Bounded):
     """A motor with its servo and its gear. For a sliding joint read N for N m and m for rad.
 
     Servo: torque = stiffness * (s - q) + derivative * (s' - q'), within the torque limit, with q
-    the angle of the drive and s the reference after a first-order filter. The motor's largest speed
-    is a fact of the robot's profile.
+    the angle of the drive and s the reference after a first-order filter. The largest speed is in
+    the profile.
 
     Attributes:
         name: Name of the motor.
         stiffness: Proportional gain of the servo [N m/rad].
         derivative: Gain of the servo on the error's speed [N m s/rad].
         filter_s: Time constant of the set-point filter [s].
-        damping: Back-EMF and viscous friction of the drive [N m s/rad]; the motor can turn no
-            faster than torque_limit / damping.
-        armature: Inertia of the rotor as seen behind the gear [kg m2].
-        friction: Coulomb friction of the gear [N m]; the drive comes to rest up to friction /
-            stiffness away from its set-point, which is all the dead band there is.
-        friction_yield: How far teeth and grease give before the gear slips [rad].
+        damping: Back-EMF and viscous friction of the drive [N m s/rad]; the speed is limited to
+            torque_limit / damping.
+        armature: Inertia of the rotor behind the gear [kg m2]. friction: Coulomb friction of the
+        gear [N m]; the drive stops up to friction / stiffness from its
+            set-point.
+        friction_yield: Elastic travel before the gear slips [rad].
         torque_limit: Stall torque [N m].
         flex_stiffness: Stiffness of the gear's output side [N m/rad].
         flex_damping: Damping of the output side [N m s/rad].
-        flex_inertia: Inertia that takes part in the flexing alone, such as the gear's last stage
-            [kg m2]; it bounds how fast the flex of a light link can ring.
+        flex_inertia: Inertia that only takes part in the flexing, such as the gear's last stage
+            [kg m2]; it limits the ringing frequency of a light link.
     """
 
     name: str
@@ -79,28 +79,24 @@ class MotorPhysics(Bounded):
 
     @property
     def compliance(self) -> float:
-        """How far the output side gives way under load at rest [rad/(N m)]."""
+        """Yielding of the output side under load at rest [rad/(N m)]."""
         return 1.0 / self.stiffness + 1.0 / self.flex_stiffness
 
 
 @dataclass(frozen=True)
 class PhysicsParameters:
-    """The motors of one robot.
+    """Motors of one robot.
 
     Attributes:
-        source: Where the figures come from.
-        motors: One entry for each motor of the robot, in chain order.
+        source: Source of the values.
+        motors: One entry per motor of the robot, in chain order.
     """
 
     source: str
     motors: tuple[MotorPhysics, ...]
 
     def check_fit(self, robot: Robot) -> None:
-        """Raise an error unless the motors are those of `robot`.
-
-        Raises:
-            InputError: If names or their order differ.
-        """
+        """Raise InputError unless the motors are those of `robot`, in its order."""
         names = [motor.name for motor in self.motors]
         if names != robot.motor_names:
             raise InputError(
@@ -110,7 +106,7 @@ class PhysicsParameters:
 
 
 def load_parameters(robot: Robot) -> PhysicsParameters | None:
-    """Return the parameters in the file that the robot's profile names; None if it names none.
+    """Return the parameters in the file that the robot's profile names; None without one.
 
     Raises:
         InputError: If the file cannot be used or does not fit the robot.
@@ -149,20 +145,20 @@ TOOL = "tool point"
 """Name of the site at the tool point."""
 
 JOINT_PARTS = ("parent", "child", "origin", "axis")
-"""What is taken over of a joint; limits, friction and mimicry are not."""
+"""Copied parts of a joint; limits, friction and mimicry are dropped."""
 NEXT_TO_NOTHING = 1e-9
-"""Mass [kg] and moment of inertia [kg m2] of links for which the URDF states none."""
+"""Mass [kg] and moment of inertia [kg m2] of links without stated ones."""
 
 
 def arm_spec(robot: Robot, payload: float = 0.0) -> Any:
     """Return the robot as a `mujoco.MjSpec` that can still be changed.
 
-    Joints turn in the physical sense and keep their URDF names; those without a motor are held at
+    Joints turn in the physical sense and keep their URDF names; joints without a motor stay at
     zero. Gravity points down the z axis of the base frame.
 
     Args:
         robot: The robot.
-        payload: Mass of a point at the tool point [kg].
+        payload: Point mass at the tool point [kg].
 
     Raises:
         InputError: If mujoco is missing or cannot use the URDF.
@@ -192,7 +188,7 @@ def arm_spec(robot: Robot, payload: float = 0.0) -> Any:
 
 
 def _strip(root: ElementTree.Element, moving: set[str]) -> None:
-    """Leave links with their masses and joints, of which only `moving` move."""
+    """Reduce the tree to links with masses and joints, of which only `moving` move."""
     for element in list(root):
         keep = {"link": ("inertial",), "joint": JOINT_PARTS}.get(element.tag)
         if keep is None:
@@ -207,7 +203,7 @@ def _strip(root: ElementTree.Element, moving: set[str]) -> None:
 
 
 def _correct(root: ElementTree.Element, robot: Robot) -> None:
-    """Put the joints that the profile corrects where they really are."""
+    """Apply the joint corrections of the profile."""
     corrected = {c.joint for c in robot.profile.geometry.joints}
     urdf = robot.profile.geometry.apply(read_urdf(robot.urdf_file))
     poses = {joint.name: joint.T_pc for joint in urdf.joints if joint.name in corrected}
@@ -296,8 +292,8 @@ def _inertia(inertia: float, damping: float, step: float) -> float:
     """Return the inertia to enter for a joint whose damping is integrated implicitly.
 
     The integrator's step for x'' = -k x - d x' is, to second order, the exact solution for an
-    inertia that is larger by d * step / 2. Entered that much smaller, the error falls with the
-    square of the step. At steps too long for that it falls with the step itself.
+    inertia larger by d * step / 2. With that subtracted, the error falls with the square of the
+    step; at very long steps, with the step itself.
     """
     return max(inertia - 0.5 * damping * step, LEAST_SHARE * inertia)
 

@@ -1,4 +1,4 @@
-"""Sensors on an arm: what each tells of a pose, at rest and on the way.
+"""Sensors on an arm: their expected readings at rest and in motion.
 
     tool           y = p(q)                          [m]      in the frame of the sensor
     orientation    y = R(q) / sqrt 2                 [rad]    the same; run sets hold log R(q)
@@ -7,9 +7,9 @@
     wire           y = |p_b(q) - anchor|             [m]
     encoders       y = q                             [rad, m] in the log's sense
 
-with the tool at p, turned by R, in the frame of the tool positions (p_b, R_b: of the base link),
-and the sensor turned by M on the tool link. Channels y are such that y seen minus y expected is
-what is off, give or take noise: a rotation stands as a matrix, whose distance is the angle.
+The tool has position p and rotation R in the frame of the tool positions (p_b, R_b: of the base
+link); M is the sensor's rotation on the tool link. A rotation is stored as a matrix, so that the
+difference of two sets of channels is the angle between them.
 
 Section: docs/sensors.md
 """
@@ -32,13 +32,13 @@ from failuretwin.digital_model.profile import SensorProfile
 from failuretwin.digital_model.twin import DigitalTwin
 
 UP = np.array([0.0, 0.0, GRAVITY])
-"""What an accelerometer at rest reads in the base frame: the push that keeps it there [m/s2]."""
+"""Reading of an accelerometer at rest in the base frame [m/s2]."""
 LONGEST_WAY = 3.0
-"""An accelerometer that may read anything on the way reads up to so many g; assumed."""
+"""Largest reading of an accelerometer in motion [g]; assumed."""
 JERKY = 0.08
-"""What bent ramps, servo transients and a shaking arm add to an accelerometer on the way [g]."""
+"""Deviation of an accelerometer in motion by bent ramps, servo transients and vibration [g]."""
 UNEVEN = 0.05
-"""The same of a gyroscope, as a share of the fastest motor's speed [-]."""
+"""Deviation of a gyroscope in motion, as a share of the fastest motor's speed [-]."""
 
 
 @dataclass(frozen=True)
@@ -47,31 +47,31 @@ class Sensor(ABC):
 
     Attributes:
         twin: Kinematics of the arm.
-        profile: What is known of this one.
+        profile: Mount, noise and bias of this sensor; None: defaults of its kind.
     """
 
     twin: DigitalTwin
     profile: SensorProfile | None = None
 
     kind: ClassVar[str]
-    """Its name on the command line."""
+    """Name on the command line."""
     variable: ClassVar[str]
     """Variable of a run set that holds its readings."""
     usual_noise: ClassVar[float] = 0.0
     usual_doubt: ClassVar[float] = 0.0
     circular: ClassVar[bool] = False
-    """Whether a motor that turns takes it along a circle."""
+    """Whether a turning motor moves its channels along a circle."""
     at_rest: ClassVar[bool] = True
-    """Whether it tells of the pose at rest."""
+    """Whether it measures the pose at rest."""
 
     @property
     def channels(self) -> int:
-        """How many channels it has."""
+        """Number of channels."""
         return 3
 
     @property
     def dims(self) -> int:
-        """In how many dimensions they can differ."""
+        """Degrees of freedom of the channels, and of their errors."""
         return self.channels
 
     @property
@@ -81,18 +81,18 @@ class Sensor(ABC):
 
     @property
     def doubt(self) -> float:
-        """Standard deviation of a constant error that nobody knows [unit]."""
-        known = self.profile is not None and self.profile.doubt >= 0.0
-        return self.profile.doubt if known and self.profile else self.usual_doubt
+        """Standard deviation of the unknown constant error [unit]."""
+        known = self.profile.doubt if self.profile else -1.0
+        return known if known >= 0.0 else self.usual_doubt
 
     @property
     def turn_doubt(self) -> float:
-        """Standard deviation of how it is turned on its mount, about each axis [rad]."""
+        """Standard deviation of the mount's rotation about each axis [rad]."""
         return self.profile.turn_doubt if self.profile else 0.0
 
     @property
     def noise_on_way(self) -> float:
-        """What a reading on the way may be off by [unit]."""
+        """Standard deviation of a reading in motion [unit]."""
         return self.noise
 
     @abstractmethod
@@ -102,11 +102,11 @@ class Sensor(ABC):
     @property
     @abstractmethod
     def log_anywhere(self) -> float:
-        """Log density of its channels at rest if the arm may stand anyhow [log 1/unit^dims]."""
+        """Log density of its channels at rest for an arbitrary pose [log 1/unit^dims]."""
 
     @property
     def log_anywhere_on_way(self) -> float:
-        """The same of a reading on the way."""
+        """Log density of a reading in motion for an arbitrary pose."""
         return self.log_anywhere
 
     def along(self, pose: FloatArray, step_s: FloatArray) -> FloatArray:
@@ -114,39 +114,45 @@ class Sensor(ABC):
 
         Args:
             pose: Angles at even times, (..., time, motor) [rad]; at rest before and after.
-            step_s: Time between two, (...) [s].
+            step_s: Time step, (...) [s].
         """
         del step_s
         return self.expected(pose)[0]
 
     def to_channels(self, readings: FloatArray) -> FloatArray:
-        """Return the channels of what a run set holds, (..., channel), what is known of it off."""
+        """Return channels (..., channel) of the readings in a run set, without the known bias."""
         return readings - self._bias
 
     def with_errors(self, channels: FloatArray, error: FloatArray) -> FloatArray:
-        """Return what a run set holds of channels that err; `error` is (..., error)."""
+        """Return the readings in a run set of channels with errors (..., dims)."""
         return channels + self._bias + error
-
-    @property
-    def errors(self) -> int:
-        """How many numbers say how a reading errs."""
-        return self.channels
 
     @cached_property
     def _bias(self) -> FloatArray:
         bias = self.profile.bias if self.profile else ()
-        if len(bias) not in (0, self.errors):
+        if len(bias) not in (0, self.dims):
             raise InputError(
                 f"{self.kind}: bias has {len(bias)} values, expected one for each of "
-                f"{self.errors} channels."
+                f"{self.dims} channels."
             )
-        return np.asarray(bias or 0.0)
+        return np.asarray(bias or [0.0] * self.dims)
 
     @cached_property
     def _mount(self) -> FloatArray:
-        """M, which takes directions of the sensor's frame to the tool link's, (3, 3)."""
+        """Rotation M from the sensor's frame to the tool link's, (3, 3)."""
         rpy = self.profile.rpy if self.profile else (0.0, 0.0, 0.0)
         return np.asarray(Rotation.from_euler("xyz", rpy).as_matrix())
+
+    def _motion(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return tool positions (..., time, 3) and rotations (..., time, 3, 3), base frame."""
+        robot = self.twin.robot
+        rotation, origin = robot.loads.chain.frames(pose * robot.sense)
+        return origin[..., -1, :], rotation[..., -1, :, :]
+
+
+def _neighbours(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the values before and after each, along axis 0; the ends are repeated."""
+    return np.concatenate([values[:1], values[:-1]]), np.concatenate([values[1:], values[-1:]])
 
 
 class Tool(Sensor):
@@ -170,24 +176,19 @@ class Tool(Sensor):
 
 
 class Orientation(Sensor):
-    """How the tool is turned in the frame of the tool positions; in run sets a rotation vector."""
+    """Rotation of the tool in the frame of the tool positions; a rotation vector in run sets."""
 
     kind, variable, circular = "orientation", "tool_orientation", True
     usual_noise, usual_doubt = 0.003, 0.0
 
     @property
     def channels(self) -> int:
-        """The entries of a matrix."""
+        """Entries of a rotation matrix."""
         return 9
 
     @property
     def dims(self) -> int:
-        """Rotations have three."""
-        return 3
-
-    @property
-    def errors(self) -> int:
-        """A turn about three axes of the tool's frame."""
+        """Degrees of freedom of a rotation."""
         return 3
 
     def expected(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -200,7 +201,7 @@ class Orientation(Sensor):
 
     @property
     def log_anywhere(self) -> float:
-        """All rotations are as likely: their volume is 8 pi^2 [log 1/rad3]."""
+        """Uniform over all rotations, whose volume is 8 pi^2 [log 1/rad3]."""
         return -float(np.log(8.0 * np.pi**2))
 
     def to_channels(self, readings: FloatArray) -> FloatArray:
@@ -208,20 +209,17 @@ class Orientation(Sensor):
         flat = readings.reshape(-1, 3)
         seen = np.isfinite(flat).all(axis=1)
         out = np.full((len(flat), 9), np.nan)
-        turn = Rotation.from_rotvec(flat[seen]) * Rotation.from_rotvec(self._three()).inv()
+        turn = Rotation.from_rotvec(flat[seen]) * Rotation.from_rotvec(self._bias).inv()
         out[seen] = turn.as_matrix().reshape(-1, 9) / np.sqrt(2.0)
         return out.reshape(*readings.shape[:-1], 9)
 
     def with_errors(self, channels: FloatArray, error: FloatArray) -> FloatArray:
-        """Return rotation vectors, the sensor turned by `error` in the tool's frame [rad]."""
+        """Return rotation vectors of a sensor turned by `error` in the tool's frame [rad]."""
         true = Rotation.from_matrix(np.sqrt(2.0) * channels.reshape(-1, 3, 3))
-        told = (
-            true * Rotation.from_rotvec(error.reshape(-1, 3)) * Rotation.from_rotvec(self._three())
+        turned = true * Rotation.from_rotvec(error.reshape(-1, 3))
+        return np.asarray(
+            (turned * Rotation.from_rotvec(self._bias)).as_rotvec().reshape(error.shape)
         )
-        return np.asarray(told.as_rotvec()).reshape(error.shape)
-
-    def _three(self) -> FloatArray:
-        return np.zeros(3) + self._bias
 
 
 class Accelerometer(Sensor):
@@ -239,48 +237,41 @@ class Accelerometer(Sensor):
 
     def along(self, pose: FloatArray, step_s: FloatArray) -> FloatArray:
         """Return M^T R_b^T (a + g z), a by second differences [m/s2]."""
-        robot = self.twin.robot
-        q = pose * robot.sense
-        p = robot.loads.chain.position(q)
-        before = np.concatenate([p[..., :1, :], p[..., :-1, :]], axis=-2)
-        after = np.concatenate([p[..., 1:, :], p[..., -1:, :]], axis=-2)
+        p, R = self._motion(pose)
+        before, after = (np.moveaxis(x, 0, -2) for x in _neighbours(np.moveaxis(p, -2, 0)))
         force = (before - 2.0 * p + after) / np.asarray(step_s)[..., None, None] ** 2 + UP
-        R = robot.loads.chain.frames(q)[0][..., -1, :, :]
         return np.einsum("...k,...kt->...t", force, R) @ self._mount
 
     @property
     def noise_on_way(self) -> float:
-        """What bends and shakes on the way adds to its noise [m/s2]."""
+        """Noise with vibration and bent ramps [m/s2]."""
         return float(np.hypot(self.noise, JERKY * GRAVITY))
 
     @property
     def log_anywhere(self) -> float:
-        """Gravity from any direction, its size as noise has it [log (m/s2)^-3]."""
+        """Gravity from any direction, its size within the noise [log (m/s2)^-3]."""
         return -float(np.log(4.0 * np.pi * GRAVITY**2 * np.sqrt(2.0 * np.pi) * self.noise))
 
     @property
     def log_anywhere_on_way(self) -> float:
-        """Anything up to some g [log (m/s2)^-3]."""
+        """Uniform up to `LONGEST_WAY` [log (m/s2)^-3]."""
         return -float(np.log(4.0 / 3.0 * np.pi * (LONGEST_WAY * GRAVITY) ** 3))
 
 
 class Gyroscope(Sensor):
-    """Turn rate of the tool, in the sensor's frame [rad/s]; tells nothing at rest."""
+    """Angular velocity of the tool in the sensor's frame [rad/s]; zero at rest."""
 
     kind, variable, at_rest = "gyroscope", "gyroscope", False
     usual_noise, usual_doubt = 0.005, 0.005
 
     def expected(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return no turn, whatever the pose."""
+        """Return zeros for any pose."""
         return np.zeros((*pose.shape[:-1], 3)), np.zeros((*pose.shape[:-1], 3, pose.shape[-1]))
 
     def along(self, pose: FloatArray, step_s: FloatArray) -> FloatArray:
         """Return M^T omega with [omega]x = R^T dR/dt by central differences [rad/s]."""
-        robot = self.twin.robot
-        q = pose * robot.sense
-        R = robot.loads.chain.frames(q)[0][..., -1, :, :]
-        before = np.concatenate([R[..., :1, :, :], R[..., :-1, :, :]], axis=-3)
-        after = np.concatenate([R[..., 1:, :, :], R[..., -1:, :, :]], axis=-3)
+        _, R = self._motion(pose)
+        before, after = (np.moveaxis(x, 0, -3) for x in _neighbours(np.moveaxis(R, -3, 0)))
         rate = np.swapaxes(R, -1, -2) @ (after - before)
         skew = (rate - np.swapaxes(rate, -1, -2)) / 2.0
         vector = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
@@ -288,13 +279,13 @@ class Gyroscope(Sensor):
 
     @property
     def noise_on_way(self) -> float:
-        """What uneven motion adds to its noise [rad/s]."""
+        """Noise with uneven motion [rad/s]."""
         fastest = max(motor.speed_limit for motor in self.twin.robot.motors)
         return float(np.hypot(self.noise, UNEVEN * fastest))
 
     @property
     def log_anywhere(self) -> float:
-        """Any turn rate up to that of all motors together [log (rad/s)^-3]."""
+        """Uniform up to the speed of all motors together [log (rad/s)^-3]."""
         fastest = sum(motor.speed_limit for motor in self.twin.robot.motors)
         return -float(np.log(4.0 / 3.0 * np.pi * fastest**3))
 
@@ -312,7 +303,7 @@ class Wire(Sensor):
 
     @cached_property
     def anchor(self) -> FloatArray:
-        """Where it begins, in the base link's frame [m]; usual: beside the arm, on its floor."""
+        """Its start in the base link's frame [m]; default: beside the arm, on its floor."""
         reach = self.twin.robot.reach
         told = self.profile.anchor if self.profile else ()
         return np.asarray(told or (reach, 0.5 * reach, 0.0))
@@ -328,7 +319,7 @@ class Wire(Sensor):
 
     @property
     def log_anywhere(self) -> float:
-        """Any length within what the arm can span [log 1/m]."""
+        """Uniform over the span of the arm [log 1/m]."""
         return -float(np.log(2.0 * self.twin.robot.reach))
 
     def to_channels(self, readings: FloatArray) -> FloatArray:
@@ -341,7 +332,7 @@ class Wire(Sensor):
 
 
 class Encoders(Sensor):
-    """Readings of the motors themselves, in the log's sense [rad, m]: component level."""
+    """Position readings of the motors in the log's sense [rad, m]: component level."""
 
     kind, variable = "encoders", "position"
     usual_noise = 0.0015
@@ -358,7 +349,7 @@ class Encoders(Sensor):
 
     @property
     def log_anywhere(self) -> float:
-        """Every motor anywhere within its travel [log 1/rad^motors]."""
+        """Uniform over every motor's travel [log 1/rad^motors]."""
         return -float(np.log(np.ptp(self.twin.robot.travel, axis=1)).sum())
 
 
@@ -374,13 +365,12 @@ def sensor_of(kind: str, twin: DigitalTwin, *profiles: tuple[SensorProfile, ...]
     Args:
         kind: Its name.
         twin: Kinematics of the arm.
-        profiles: What is said of its sensors; the first that says something of this kind counts,
-            then the profile of the robot. Otherwise it is as usual.
+        profiles: Groups of sensor profiles; the first one of this kind applies.
 
     Raises:
         InputError: If there is no such kind.
     """
     if kind not in SENSORS:
         raise unknown_name("sensor", kind, SENSORS)
-    said = [one for told in profiles for one in told if one.kind == kind]
-    return SENSORS[kind](twin, said[0] if said else None)
+    found = [one for group in profiles for one in group if one.kind == kind]
+    return SENSORS[kind](twin, found[0] if found else None)

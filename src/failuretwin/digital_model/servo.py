@@ -1,7 +1,10 @@
-"""The servo loop of the published Simulink model, with and without a limit of its speed.
+"""Servo loop of the published Simulink model, with and without a speed limit.
 
-Each motor is a PI loop around a second-order input filter and the joint follows exactly:
-closed loop (P s + I) / (s (tau s + 1)^2 + P s + I). All is solved exactly between samples.
+Each motor is a PI loop around a second-order input filter, and the joint follows exactly:
+
+    (P s + I) / (s (tau s + 1)^2 + P s + I)
+
+All solutions are exact between samples.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
 
 SLOWEST_S = 100.0
-"""Longest time constant of a loop [s]: slower than that, no movement is ever seen."""
+"""Longest time constant of a loop [s]; with a slower one no movement is visible."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,7 @@ class ServoLoop(Bounded):
         filter_s: Time constant tau of the input filter [s].
 
     Raises:
-        InputError: If the loop never gets to its command or is not stable.
+        InputError: If the loop does not reach its command or is unstable.
     """
 
     P: AtLeastZero
@@ -65,7 +68,7 @@ def respond(loops: Sequence[ServoLoop], command: FloatArray, step: float) -> Flo
     """Return the angles of motors that start at rest at their first command.
 
     Args:
-        loops: One loop for each motor.
+        loops: One loop per motor.
         command: References, (..., time, motor) [rad], linear between samples.
         step: Time step [s].
 
@@ -73,7 +76,7 @@ def respond(loops: Sequence[ServoLoop], command: FloatArray, step: float) -> Flo
         Angles at the same instants, (..., time, motor) [rad].
 
     Raises:
-        InputError: If the last axis does not hold one column for each loop.
+        InputError: If the last axis does not have one column per loop.
     """
     from scipy.signal import lfilter
 
@@ -96,7 +99,7 @@ def first_order_lag(
 
     Args:
         reference: (..., time), sampled every `step` [s].
-        before: What the lag has put out at the first sample, (...); the result begins with it.
+        before: Output of the lag at the first sample, (...); the result begins with it.
         step: Time between samples [s].
         tau: Time constant [s].
     """
@@ -115,15 +118,15 @@ def first_order_lag(
 def respond_limited(
     gains: FloatArray, limit: FloatArray, reference: FloatArray, step: float
 ) -> FloatArray:
-    """Return the angles of motors that start at rest and can turn no faster than `limit`.
+    """Return the angles of motors with a speed limit that start at rest.
 
-    Both regimes, free and at the limit, are solved exactly for references that are linear between
-    samples; which of them holds is decided at the beginning of every sample.
+    Both regimes, free and at the limit, are solved exactly for references linear between samples;
+    the regime is chosen at the start of every sample.
 
     Args:
         gains: P [-], I [1/s] and filter time constant [s] of each variant, (variant, 3).
         limit: Speed limit of each variant, (variant,) [rad/s].
-        reference: What the motor is told, (variant, test, time) [rad].
+        reference: References, (variant, test, time) [rad].
         step: Time step [s].
 
     Returns:
@@ -151,11 +154,11 @@ def respond_limited(
 
 
 def _transitions(gains: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
-    """Return the matrices that carry the state (u, filtered u, angle) over one time step.
+    """Return the matrices of one time step for the state (u, filtered u, angle).
 
-    Both act from the right. The first, (variant, 5, 4), takes state, reference and its slope to the
-    next state and to the speed u' that the controller asks for now; the second, (variant, 4, 3),
-    takes state and capped speed to the next state.
+    Both act from the right. The first, (variant, 5, 4), maps state, reference and its slope to the
+    next state and the demanded speed u'; the second, (variant, 4, 3), maps state and capped speed
+    to the next state.
     """
     from scipy.linalg import expm
 

@@ -1,4 +1,4 @@
-"""Where motors come to rest: bias, gravity sag, friction, and gears that hold them."""
+"""Settled errors of healthy motors (bias, gravity sag, friction), and held gears."""
 
 from __future__ import annotations
 
@@ -14,19 +14,21 @@ from failuretwin.digital_model.robot import Robot
 
 @dataclass(frozen=True)
 class Settling(Bounded):
-    """Settled error of each motor and its scatter; one value for each motor in chain order.
+    """Settled error of each motor and its scatter; one value per motor in chain order.
 
-    A motor gives way under the load torque of the links and the payload in the pose that the arm
-    is really in; friction stops it short of its target, seen in the direction of travel.
+        error = bias + compliance * load - friction * direction + scatter * t_dof
+
+    The load is the gravity torque of links and payload at the actual pose; friction stops the motor
+    short of its target in the direction of travel.
 
     Attributes:
         bias: Constant error [rad].
-        compliance: Yielding for each unit of load torque [rad/(N m)].
-        friction: How far it stops short [rad].
-        scatter: Scale of what is left, from movement to movement [rad].
+        compliance: Yielding per load torque [rad/(N m)].
+        friction: Distance by which it stops short [rad].
+        scatter: Scale of the random error from movement to movement [rad].
         tail_dof: Degrees of freedom of the scatter's Student t distribution; small = heavy tails.
-        source: Where the figures come from.
-        payload: Mass carried at the tool point beside what the URDF knows [kg].
+        source: Source of the values.
+        payload: Mass at the tool point in addition to the URDF [kg].
     """
 
     bias: Annotated[tuple[float, ...], Bounds(-7.0, 1e3)] = ()
@@ -39,20 +41,17 @@ class Settling(Bounded):
 
     @classmethod
     def ideal(cls, motors: int) -> Settling:
-        """Return the settling of a motor that always reaches its target."""
+        """Return the settling of motors that always reach their targets."""
         zero = (0.0,) * motors
         return cls(zero, zero, zero, zero, np.inf, "ideal motors")
 
     def offset(self, robot: Robot, pose: FloatArray, direction: FloatArray) -> FloatArray:
-        """Return the mean settled error of a healthy motor.
+        """Return the mean settled error of a healthy motor, (..., motor) [rad], log's sense.
 
         Args:
             robot: The robot.
-            pose: Angles that the arm settles near, in the log's sense, (..., motor) [rad].
+            pose: Approximate settled angles in the log's sense, (..., motor) [rad].
             direction: Sign of each motor's last travel in the log's sense, (..., motor).
-
-        Returns:
-            Settled angle minus commanded angle in the log's sense, (..., motor) [rad].
         """
         offset = np.asarray(self.bias) - np.asarray(self.friction) * direction
         if not any(self.compliance):
@@ -61,7 +60,7 @@ class Settling(Bounded):
 
 
 def poses_in_range(robot: Robot) -> FloatArray:
-    """Return 500 physical poses spread over the motors' ranges, (pose, motor) [rad]."""
+    """Return 500 random physical poses within the motors' ranges, (pose, motor) [rad]."""
     low, high = np.array([motor.movement_range for motor in robot.motors]).T
     return np.random.default_rng(0).uniform(low, high, (500, len(low))) * robot.sense
 
@@ -72,18 +71,18 @@ def loads_in_range(robot: Robot, payload: float) -> FloatArray:
 
 
 def largest_load(robot: Robot, payload: float) -> FloatArray:
-    """Return the largest gravity torque that each motor meets in its range, (motor,) [N m]."""
+    """Return the largest gravity torque of each motor in its range, (motor,) [N m]."""
     return np.abs(loads_in_range(robot, payload)).max(axis=0)
 
 
 def sag(
     robot: Robot, pose: FloatArray, compliance: FloatArray, payload: FloatArray | float
 ) -> FloatArray:
-    """Return how far gravity moves every motor, (..., motor) [rad], log's sense.
+    """Return the displacement of every motor by gravity, (..., motor) [rad], log's sense.
 
     Args:
         robot: The robot.
-        pose: Angles that the arm is in, in the log's sense, (..., motor) [rad].
+        pose: Angles of the arm in the log's sense, (..., motor) [rad].
         compliance: Yielding of each motor, (..., motor) [rad/(N m)].
         payload: Mass at the tool point, () or the leading axes of `pose` [kg].
     """
@@ -95,12 +94,12 @@ def hold(
 ) -> FloatArray:
     """Return the angles of motors that are held at times.
 
-    While held, a motor keeps the angle that it has at the first such sample. After that it makes
-    for the free motion at its speed limit, and follows it once it has caught up.
+    A held motor keeps its angle at the first held sample. Released, it returns to the free motion
+    at its speed limit.
 
     Args:
         position: Free motion, (run, time, motor) [rad].
-        held: When a motor is held, (run, time, motor); None: never.
+        held: Whether a motor is held, (run, time, motor); None: never.
         time: Uniform grid, (time,) [s].
         speed_limit: Largest speed of each motor, (motor,) [rad/s].
 
@@ -120,7 +119,7 @@ def hold(
 
 
 def _let_go(position: FloatArray, held: BoolArray, reach: FloatArray) -> FloatArray:
-    """Return `hold` of motors (time, case) let go at least once, with (case,) `reach` a step."""
+    """Return `hold` of motors (time, case) released at least once; `reach` [rad] is a step's."""
     followed = np.empty_like(position)
     here = followed[0] = position[0]
     behind = np.zeros(len(reach), dtype=bool)

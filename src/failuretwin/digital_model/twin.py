@@ -1,4 +1,4 @@
-"""The digital model in one object: commands to motor angles to the path of the tool."""
+"""The digital model: commands to motor angles to the path of the tool."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from failuretwin.digital_model.settling import hold, sag
 
 @dataclass(frozen=True)
 class DigitalTwin:
-    """The published twin of a healthy robot: exact servo loops and rigid kinematics.
+    """Twin of a healthy robot as published: exact servo loops and rigid kinematics.
 
-    Works for one pose, one run or thousands of runs at once; nothing in it ever changes.
+    Immutable; works on one pose, one run or thousands of runs at once.
     """
 
     robot: Robot
@@ -33,7 +33,7 @@ class DigitalTwin:
         """Return the motor angles that follow from commands.
 
         The motors are at rest at the first command; between samples the command is linear.
-        The published data put each response beside the command one sample before it.
+        Published data store each response one sample earlier.
 
         Args:
             command: Reference angles in the log's sense, (..., time, motor) [rad].
@@ -54,7 +54,7 @@ class DigitalTwin:
         return servo.respond(loops, command, uniform_step(grid))
 
     def path(self, position: ArrayLike) -> FloatArray:
-        """Return what the tool sensor sees, (..., axis) [m] in the base frame.
+        """Return the tool position as the sensor sees it, (..., axis) [m].
 
         Args:
             position: Motor angles in the log's sense, (..., motor) [rad].
@@ -85,7 +85,7 @@ class DigitalTwin:
 
     @cached_property
     def _turned(self) -> FloatArray | None:
-        """Sense of the motors in the sensor's pose, (motor,); None: as in the log."""
+        """Sense of the motors in the sensor's pose, (motor,); None: the log's sense."""
         sense = self.robot.sensor_sense
         return None if np.all(sense == 1.0) else sense
 
@@ -101,21 +101,21 @@ def uniform_step(time: FloatArray) -> float:
 # Engines: from what the motors are told and what hampers them to the angles they take.
 
 SAG_ROUNDS = 2
-"""Rounds in which sag and pose settle together; each takes off all but a few hundredths."""
+"""Iterations of sag and pose; each leaves a few hundredths of the error."""
 
 
 @dataclass(frozen=True)
 class Drive:
-    """What the motors of many runs are told, and what hampers them. Angles in the log's sense.
+    """Input of an engine for many runs. Angles are in the log's sense.
 
     Attributes:
-        reference: Angles that the servo loops follow, (run, time, motor) [rad].
-        held: When a motor is held by its gear, (run, time, motor); None: never.
+        reference: References of the servo loops, (run, time, motor) [rad].
+        held: Whether the gear holds a motor, (run, time, motor); None: never.
         weakness: Share of its stiffness that a motor has lost, (run, time, motor) in [0, 1); None:
             none.
-        compliance: How far each motor gives way under load, (run, motor) [rad/(N m)]; an engine
-            with a stiffness of its own leaves it aside. None: rigid.
-        payload: Mass carried at the tool point, (run,) [kg]; None: none.
+        compliance: Yielding of each motor under load, (run, motor) [rad/(N m)]; ignored by engines
+            with a stiffness of their own. None: rigid.
+        payload: Mass at the tool point, (run,) [kg]; None: none.
     """
 
     reference: FloatArray
@@ -126,15 +126,15 @@ class Drive:
 
 
 class Engine(Protocol):
-    """Moves a robot: the interface of the servo engine and of the physics engine."""
+    """Interface of the servo engine and the physics engine."""
 
     @property
     def name(self) -> str:
-        """What the engine is called on the command line."""
+        """Name on the command line."""
         ...
 
     def angles(self, drive: Drive, time: FloatArray) -> FloatArray:
-        """Return the angles that the motors take, (run, time, motor) [rad], log's sense.
+        """Return the motor angles, (run, time, motor) [rad], in the log's sense.
 
         The arm is at rest at the first reference; `time` is a uniform grid, (time,) [s].
         """
@@ -143,16 +143,16 @@ class Engine(Protocol):
 
 @dataclass(frozen=True)
 class ServoEngine:
-    """The published twin: exact servo loops, rigid links; motors give way as far as they are told.
+    """The published twin: exact servo loops, rigid links, and compliant motors.
 
-    Gravity pulls at the pose that the arm is really in, and a motor that is held does not give way.
+    Gravity acts at the actual pose; a held motor does not yield.
     """
 
     robot: Robot
     name: str = "servo"
 
     def angles(self, drive: Drive, time: FloatArray) -> FloatArray:
-        """Return the angles that the motors take, (run, time, motor) [rad], log's sense."""
+        """Return the motor angles, (run, time, motor) [rad], in the log's sense."""
         free = DigitalTwin(self.robot).respond(drive.reference, time)
         limits = np.array([motor.speed_limit for motor in self.robot.motors])
         position = hold(free, drive.held, time, limits)

@@ -81,9 +81,9 @@ def _fit(runs: xr.Dataset, model: HealthyModel, sensor: Sensor) -> SensorFit | N
     if len(seen) < LEAST_MOVEMENTS:
         return None
     value, jacobian = plain.expected(pose)
-    turns = before.turn_doubt > 0.0 and plain.errors == plain.channels == 3
+    turns = before.turn_doubt > 0.0 and plain.dims == plain.channels == 3
     columns = _columns(plain, value, turns)
-    errors = plain.errors
+    errors = plain.dims
     far = FAR * max(plain.usual_doubt, noise)
     prior = np.concatenate([np.full(errors, far), np.full(3 * turns, before.turn_doubt)])
     root = jacobian * model.scatter
@@ -106,9 +106,9 @@ def _fit(runs: xr.Dataset, model: HealthyModel, sensor: Sensor) -> SensorFit | N
 
 def _columns(sensor: Sensor, value: FloatArray, turns: bool) -> FloatArray:
     """Return the derivative of the channels by b, and by w, (movement, channel, parameter)."""
-    step, none = 1e-5, np.zeros((len(value), sensor.errors))
+    step, none = 1e-5, np.zeros((len(value), sensor.dims))
     parts = []
-    for unit in step * np.eye(sensor.errors):
+    for unit in step * np.eye(sensor.dims):
         moved = sensor.to_channels(sensor.with_errors(value, none + unit))
         parts.append((moved - value) / step)
     columns = np.stack(parts, axis=-1)
@@ -190,8 +190,8 @@ def _parameters(
     factor, unit = UNITS[sensor.kind]
     found = []
     for k, (value, sd) in enumerate(zip(estimate, deviation, strict=True)):
-        constant = k < sensor.errors
-        name = f"constant error {k + 1}" if constant else f"turn {k + 1 - sensor.errors}"
+        constant = k < sensor.dims
+        name = f"constant error {k + 1}" if constant else f"turn {k + 1 - sensor.dims}"
         scale, of = (factor, unit) if constant else (DEG, "deg")
         low, high = float(value - 1.96 * sd), float(value + 1.96 * sd)
         told = (scale * float(value), scale * low, scale * high)
