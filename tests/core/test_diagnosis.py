@@ -28,6 +28,7 @@ def test_record_is_the_contract():
         "truth": None,
         "diagnosis": "motor_3:stuck",
         "probability": 0.7,
+        "state": "cannot tell",
         "posterior": POSTERIOR,
         "runner_up": "healthy",
         "onset_s": 0.5,

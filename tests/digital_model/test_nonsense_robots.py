@@ -15,6 +15,7 @@ from failuretwin.digital_model.robot import bundled_folder, bundled_robots
 from failuretwin.digital_model.servo import ServoLoop
 from failuretwin.digital_model.urdf.check import MOST_MOTORS, check_urdf
 from failuretwin.digital_model.urdf.file import read_urdf
+from failuretwin.digital_model.urdf.tool import choose_tool
 
 
 def poles(P, I, tau):  # noqa: E741
@@ -155,7 +156,7 @@ def test_the_work_of_a_check_grows_as_the_joints_do(tmp_path, monkeypatch):
 
         urdf.__dict__["_next"] = Counting(urdf._next)
         assert len(urdf.path("l0", f"l{joints}")) == joints
-        urdf.tools("l0")
+        choose_tool(urdf, "l0")
         counts.append(asked / joints)
     assert counts[1] == pytest.approx(counts[0], rel=0.02)
 

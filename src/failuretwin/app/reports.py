@@ -28,8 +28,8 @@ from failuretwin.decision.evaluation import (
 from failuretwin.decision.robot_state import RobotState
 from failuretwin.digital_model.kinematics import has_range
 from failuretwin.digital_model.robot import Robot
-from failuretwin.digital_model.urdf.check import JointReport, UrdfReport
 from failuretwin.digital_model.urdf.file import UrdfJoint
+from failuretwin.digital_model.urdf.report import JointReport, UrdfReport
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.explanation import joint_names_in, plain_name, size_words

@@ -23,8 +23,8 @@ from failuretwin.digital_model.geometry import Geometry, JointCorrection
 from failuretwin.digital_model.kinematics import has_range
 from failuretwin.digital_model.profile import Profile
 from failuretwin.digital_model.robot import bundled_folder
-from failuretwin.digital_model.urdf.check import JointReport, UrdfReport
 from failuretwin.digital_model.urdf.file import UrdfJoint
+from failuretwin.digital_model.urdf.report import JointReport, UrdfReport
 
 Numbers = TypeVar("Numbers", bound=tuple[float, ...])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -133,42 +133,30 @@ class Injection:
         return followed
 
     def held(self, time: FloatArray) -> BoolArray | None:
-        """Return when which motor is held by its gear.
-
-        Args:
-            time: Uniform grid, (time,) [s].
-
-        Returns:
-            (run, time, motor); None where none ever is.
-        """
-        held = None
-        for group in self._groups:
-            rows = group.mode.held(group.faults, time)
-            if rows is None:
-                continue
-            if held is None:
-                held = np.zeros((len(self.faults), len(time), len(self.motors)), dtype=bool)
-            held[group.runs, :, group.motor] |= rows
-        return held
+        """Return whether each motor is held by its gear, (run, time, motor); None: never."""
+        return self._over_time(lambda mode, faults: mode.held(faults, time), time, bool)
 
     def weakness(self, time: FloatArray) -> FloatArray | None:
-        """Return the share of stiffness that each motor has lost.
+        """Return the lost share of stiffness, (run, time, motor) in [0, 1); None: none."""
+        return self._over_time(lambda mode, faults: mode.weakness(faults, time), time, float)
 
-        Args:
-            time: Uniform grid, (time,) [s].
-
-        Returns:
-            (run, time, motor) in [0, 1); None where none has lost any.
-        """
-        weakness = None
+    def _over_time(
+        self,
+        stage: Callable[[FaultMode, FaultGroup], np.ndarray | None],
+        time: FloatArray,
+        dtype: type,
+    ) -> np.ndarray | None:
+        """Return a stage's values of all faults, (run, time, motor); None without any."""
+        merged: np.ndarray | None = None
         for group in self._groups:
-            rows = group.mode.weakness(group.faults, time)
+            rows = stage(group.mode, group.faults)
             if rows is None:
                 continue
-            if weakness is None:
-                weakness = np.zeros((len(self.faults), len(time), len(self.motors)))
-            weakness[group.runs, :, group.motor] = rows
-        return weakness
+            if merged is None:
+                merged = np.zeros((len(self.faults), len(time), len(self.motors)), dtype=dtype)
+            before = merged[group.runs, :, group.motor]
+            merged[group.runs, :, group.motor] = np.maximum(before, rows)
+        return merged
 
     def as_struck(
         self, position: FloatArray, time: FloatArray, start: FloatArray

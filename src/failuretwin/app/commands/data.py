@@ -22,7 +22,7 @@ from failuretwin.app.terminal import tell
 from failuretwin.core.errors import counted
 
 if TYPE_CHECKING:
-    from failuretwin.digital_model.urdf.check import UrdfReport
+    from failuretwin.digital_model.urdf.report import UrdfReport
 
 
 @click.command("import")

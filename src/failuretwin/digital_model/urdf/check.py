@@ -1,18 +1,13 @@
-"""Check of a URDF before use: its chain, its motors, and findings of three severities.
-
-An error prevents the use of the file; a warning says what is missing or assumed; a note states a
-choice.
-"""
+"""Check of a URDF before use: its chain, its motors, and findings for the user."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
-from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.errors import unknown_name
 from failuretwin.digital_model.kinematics import CANNOT_MOVE, farthest_reach, has_range, levers
 from failuretwin.digital_model.urdf.file import (
     HELD_TYPES,
@@ -23,129 +18,40 @@ from failuretwin.digital_model.urdf.file import (
     read_root,
     read_urdf,
 )
+from failuretwin.digital_model.urdf.report import Finding, JointReport, Severity, UrdfReport
 from failuretwin.digital_model.urdf.tool import ToolChoice, choose_tool
 
-Severity = Literal["error", "warning", "note"]
-SEVERITIES = ("error", "warning", "note")
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One matter that the user should know.
-
-    Attributes:
-        severity: ``error``, ``warning`` or ``note``.
-        message: What was found and what to do about it.
-    """
-
-    severity: Severity
-    message: str
-
-
-@dataclass(frozen=True)
-class JointReport:
-    """One joint of the file and what it is to the tool.
-
-    Attributes:
-        joint: The joint as the file states it.
-        motor: Name of the motor that turns it, if one can move the tool point by it.
-        reason: Why no motor can, else empty.
-        mass: Mass of the link that it carries [kg]; None where the file states none.
-    """
-
-    joint: UrdfJoint
-    motor: str | None
-    reason: str
-    mass: float | None
-
-
-@dataclass(frozen=True)
-class UrdfReport:
-    """What a URDF holds.
-
-    Attributes:
-        source: The file.
-        findings: What the user should know, errors first.
-        name: Name of the robot in the file.
-        base_link: Link that carries the base frame; empty where an error hides it.
-        tool_link: Link whose origin is the tool point; empty where an error hides it.
-        joints: Joints from base to tool, then all others; empty where an error hides them.
-        reach: Farthest distance of the tool from the base's origin that was found [m].
-        moving_mass: Mass of everything that the first motor carries [kg].
-    """
-
-    source: Path
-    findings: tuple[Finding, ...] = ()
-    name: str = ""
-    base_link: str = ""
-    tool_link: str = ""
-    joints: tuple[JointReport, ...] = ()
-    reach: float = 0.0
-    moving_mass: float = 0.0
-
-    @property
-    def motors(self) -> list[JointReport]:
-        """Joints that can move the tool point, in chain order."""
-        return [joint for joint in self.joints if joint.motor is not None]
-
-    @property
-    def others(self) -> list[JointReport]:
-        """Joints that cannot move the tool point."""
-        return [joint for joint in self.joints if joint.motor is None]
-
-    def with_findings(self, more: Iterable[Finding]) -> UrdfReport:
-        """Return the report with more findings, sorted by severity."""
-        known = [*self.findings, *more]
-        known.sort(key=lambda finding: SEVERITIES.index(finding.severity))
-        return replace(self, findings=tuple(known))
-
-    def having(self, severity: Severity) -> list[str]:
-        """Return the messages of one severity."""
-        return [finding.message for finding in self.findings if finding.severity == severity]
-
-    def raise_errors(self) -> None:
-        """Raise what keeps the file from being used.
-
-        Raises:
-            InputError: If there is any error among the findings.
-        """
-        errors = self.having("error")
-        if errors:
-            raise InputError(f"{self.source}: " + "\n  also: ".join(errors))
-
-
 SHORT_LEVER_M = 0.01
-"""A motor that moves the tool by less for each radian can hardly be watched [m/rad]."""
+"""Lever below which a motor's faults are hardly visible [m/rad]."""
 
 MOST_MOTORS = 64
-"""Motors of an arm: the longest snakes have half as many."""
+"""Largest number of motors of an arm: the longest snakes have half as many."""
 NAMES_SHOWN = 4
 PICTURE = "Only the picture is missing; kinematics works."
 
 FRAME_MASS_KG = 1e-6
-"""Exporters give frames that are no bodies a mass below this and no inertia [kg]."""
+"""Largest mass that exporters give to frames without a body [kg]."""
 
 
 NOISE_M = 0.0005
-"""Noise of a tool sensor of which nothing is known, on each axis [m]: assumed, a fair camera."""
+"""Assumed noise of an unknown tool sensor on each axis [m]: a fair camera."""
 
 
 def check_urdf(
     path: Path, base: str | None = None, tool: str | None = None, noise_m: float = NOISE_M
 ) -> UrdfReport:
-    """Look a URDF over; meshes, inertias and mimic joints are never needed for its kinematics.
+    """Return the report on a URDF; its kinematics need no meshes, inertias or mimic joints.
 
     Args:
         path: The file.
         base: Link that carries the base frame; None: the root.
         tool: Link whose origin is the tool point; None: by its name, else the end of the branch
             with the most moving joints.
-        noise_m: Noise of the tool sensor [m]; a joint that moves the tool by less for each radian
-            has no motor to watch.
+        noise_m: Noise of the tool sensor [m]; a joint with a shorter lever has no motor.
 
     Raises:
         InputError: If the file cannot be read, is not XML, is a xacro template or not a URDF, or
-            there is no chain from `base` to `tool`. All else becomes findings.
+            there is no chain from `base` to `tool`. All other problems become findings.
     """
     report = UrdfReport(path).with_findings(_file_findings(path))
     if report.having("error"):
@@ -191,26 +97,21 @@ def _with_motors(
         joints=_joint_reports(urdf, path, list(seen), short),
         reach=farthest_reach(chain),
         moving_mass=sum(urdf.facts[n].mass or 0.0 for n in moving if n in urdf.facts),
-    ).with_findings([*_lever_findings(seen, report.tool_link), *_short_findings(short, noise_m)])
+    ).with_findings(_lever_findings(seen, short, report.tool_link, noise_m))
 
 
 def _joint_reports(
     urdf: Urdf, path: Sequence[UrdfJoint], movers: Sequence[str], short: Collection[str]
 ) -> tuple[JointReport, ...]:
     on_path = {joint.name for joint in path}
-    number = {name: k for k, name in enumerate(movers, start=1)}
     ordered = [*path, *(joint for joint in urdf.joints if joint.name not in on_path)]
-    return tuple(
-        JointReport(
-            joint=joint,
-            motor=f"motor_{number[joint.name]}" if joint.name in number else None,
-            reason=""
-            if joint.name in number
-            else _reason(joint, joint.name in on_path, joint.name in short),
-            mass=urdf.facts[joint.child].mass if joint.child in urdf.facts else None,
-        )
-        for joint in ordered
-    )
+    motors = {name: f"motor_{k}" for k, name in enumerate(movers, start=1)}
+    reports = []
+    for joint in ordered:
+        motor, fact = motors.get(joint.name), urdf.facts.get(joint.child)
+        reason = "" if motor else _reason(joint, joint.name in on_path, joint.name in short)
+        reports.append(JointReport(joint, motor, reason, None if fact is None else fact.mass))
+    return tuple(reports)
 
 
 def _reason(joint: UrdfJoint, on_path: bool, short: bool) -> str:
@@ -228,7 +129,7 @@ def _reason(joint: UrdfJoint, on_path: bool, short: bool) -> str:
 
 
 def _of_names(severity: Severity, names: Collection[str], text: str) -> list[Finding]:
-    """Return a finding with the names where `text` says NAMES; none if there are no names."""
+    """Return a finding with names in place of NAMES in `text`; none without names."""
     quoted = [repr(name) for name in names]
     more = len(quoted) - NAMES_SHOWN
     listed = ", ".join(quoted[:NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
@@ -359,40 +260,37 @@ def _oddities(joint: UrdfJoint) -> Iterator[tuple[Severity, str]]:
             yield "warning", f"{stated}: a range will be assumed. Add {limit} to it."
 
 
-def _lever_findings(levers: Mapping[str, float], tool_link: str) -> Iterator[Finding]:
-    """Yield what is wrong with the largest lever arms of the motors, by joint [m/rad or m/m]."""
-    if not levers:
+def _lever_findings(
+    seen: Mapping[str, float], short: Mapping[str, float], tool_link: str, noise_m: float
+) -> Iterator[Finding]:
+    """Yield findings on the levers of joints above and below the sensor's noise [m/rad or m/m]."""
+    if not seen:
         yield Finding(
             "error",
             f"no motor can move the tool point, the origin of link {tool_link!r}: the axes of all "
             "of them run through it. Name a link farther out with --tool LINK.",
         )
-    for name, lever in levers.items():
-        if lever < SHORT_LEVER_M:
-            yield Finding(
-                "note",
-                f"joint {name!r} moves the tool by {1e3 * lever:.2g} mm for each rad at most, so "
-                "faults of its motor will hardly show. A tool point farther from its axis would "
-                "help.",
+    slight = {name: lever for name, lever in seen.items() if lever < SHORT_LEVER_M}
+    for name, lever in (slight | dict(short)).items():
+        text = f"joint {name!r} moves the tool by {1e3 * lever:.2g} mm for each rad at most, "
+        if name in short:
+            text += (
+                f"less than the sensor's noise of {1e3 * noise_m:.2g} mm, so it has no motor to "
+                "watch. A marker off its axis would show it."
             )
-
-
-def _short_findings(levers: Mapping[str, float], noise_m: float) -> Iterator[Finding]:
-    """Yield which joints move the tool by less than the noise of its sensor, by joint [m/rad]."""
-    for name, lever in levers.items():
-        yield Finding(
-            "note",
-            f"joint {name!r} moves the tool by {1e3 * lever:.2g} mm for each rad at most, less "
-            f"than the sensor's noise of {1e3 * noise_m:.2g} mm, so it has no motor to watch. A "
-            "marker off its axis would show it.",
-        )
+        else:
+            text += (
+                "so faults of its motor will hardly show. A tool point farther from its axis "
+                "would help."
+            )
+        yield Finding("note", text)
 
 
 def _mass_findings(urdf: Urdf, path: Sequence[UrdfJoint]) -> Iterator[Finding]:
-    """Yield what gravity cannot be computed of.
+    """Yield links for which gravity or inertia cannot be computed.
 
     Links held together by fixed joints are one body, so a frame without mass on a heavy link is
-    fine; what a moving joint carries has to weigh something.
+    valid; the body on a moving joint needs a mass.
     """
     bodies = _bodies(urdf, path)
     facts = {n: urdf.facts[n] for body in bodies for n in body if n in urdf.facts}
@@ -411,7 +309,7 @@ def _mass_findings(urdf: Urdf, path: Sequence[UrdfJoint]) -> Iterator[Finding]:
 
 
 def _bodies(urdf: Urdf, path: Sequence[UrdfJoint]) -> list[list[str]]:
-    """Return the links of each body that a moving joint of the path carries, its own link first."""
+    """Return the links of each body on a moving joint of the path, the joint's own link first."""
     onward: dict[str, list[str]] = {}
     for joint in urdf.joints:
         if joint.type == "fixed":
@@ -432,7 +330,7 @@ def _bodies(urdf: Urdf, path: Sequence[UrdfJoint]) -> list[list[str]]:
 
 
 def _mesh_findings(links: Iterable[LinkFacts], folder: Path) -> Iterator[Finding]:
-    """Yield what cannot be shown: meshes change no number."""
+    """Yield meshes that cannot be shown; they change no number."""
     meshes = dict.fromkeys(mesh for link in links for mesh in link.meshes)
     remote = [mesh for mesh in meshes if "://" in mesh and not mesh.startswith("file://")]
     elsewhere = set(remote)

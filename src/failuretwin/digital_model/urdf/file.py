@@ -1,4 +1,4 @@
-"""URDF files: their links and joints, how these hang together, and serial chains out of them."""
+"""URDF files: their links and joints, and the serial chains in them."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ HELD_TYPES = ("fixed", "floating", "planar")
 
 Triple = tuple[float, float, float]
 FARTHEST = 1e3
-"""Largest length or angle of a URDF [m or rad]."""
+"""Largest accepted length or angle [m or rad]."""
 LARGEST_NUMBER = 1e9
-"""Largest mass, moment, speed or limit of a URDF, in SI units; beyond it there is none."""
+"""Largest accepted mass, moment, speed or limit, in SI units; a larger one counts as missing."""
 
 _XML_COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
 _XACRO = re.compile(rb"<xacro:|\$\{|\$\((?:find|arg|eval|env|optenv)\b")
-"""What only a template holds; an expanded file may still declare the namespace."""
+"""Found only in a template; an expanded file may still declare the namespace."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class UrdfJoint:
 
     @property
     def has_motor(self) -> bool:
-        """Whether a motor of its own can move it."""
+        """Whether it can have a motor of its own."""
         return self.type in MOVING_TYPES and self.mimic is None
 
     @property
@@ -76,13 +76,13 @@ class UrdfJoint:
 
 @dataclass(frozen=True)
 class LinkFacts:
-    """What a file says of one link.
+    """Contents of one link.
 
     Attributes:
         mass: Its mass [kg]; None where the file states none that can be read.
-        centre: Centre of the mass in the link's frame [m]; the frame's origin where none is stated.
+        centre: Centre of mass in the link's frame [m]; default: the frame's origin.
         has_inertia: Whether all three moments of inertia are stated and above zero.
-        meshes: Mesh files as the file names them.
+        meshes: Mesh files by their names in the file.
     """
 
     mass: float | None
@@ -93,14 +93,14 @@ class LinkFacts:
 
 @dataclass(frozen=True)
 class Urdf:
-    """The joints and links of a URDF file.
+    """Joints and links of a URDF file.
 
     Attributes:
         source: The file.
-        links: Names of the links, as often as the file has them.
+        links: Names of the links, with repetitions.
         joints: Its joints.
         name: Name of the robot.
-        facts: What it says of each link, by name.
+        facts: Contents of each link, by name.
     """
 
     source: str
@@ -111,13 +111,13 @@ class Urdf:
 
     @property
     def roots(self) -> list[str]:
-        """Links that hang from no other."""
+        """Links that are no joint's child."""
         children = {joint.child for joint in self.joints}
         return [link for link in dict.fromkeys(self.links) if link not in children]
 
     @cached_property
     def _next(self) -> Mapping[str, Sequence[UrdfJoint]]:
-        """Joints that lead on from each link: first to its children, then back by fixed joints."""
+        """Joints that lead on from each link: to its children, then back over fixed joints."""
         onward: dict[str, list[UrdfJoint]] = {}
         for joint in self.joints:
             onward.setdefault(joint.parent, []).append(joint)
@@ -127,9 +127,9 @@ class Urdf:
         return onward
 
     def steps(self, base: str) -> dict[str, UrdfJoint | None]:
-        """Return the joint by which each link hangs from `base`, nearer links first; its own: None.
+        """Return the joint before each link on the way from `base`, nearer links first.
 
-        What `base` is fixed to hangs from it too: a fixed joint leads either way.
+        `base` has None; a fixed joint leads in both directions.
         """
         steps: dict[str, UrdfJoint | None] = {base: None}
         waiting = [base]
@@ -140,37 +140,11 @@ class Urdf:
                     waiting.append(joint.child)
         return steps
 
-    def tools(self, base: str) -> dict[str, int]:
-        """Return the ends of all branches above `base` and how many motors are on the way there.
-
-        The best candidate for the tool, that with the most motors, comes first and, among equals,
-        the one with the longest way along the joint frames.
-        """
-        ends = set(self.links) - {joint.parent for joint in self.joints}
-        ways = self.lengths(base)
-        rank = {
-            link: (-motors, -round(length, 9), link)
-            for link, (motors, length) in ways.items()
-            if link in ends
-        }
-        return {link: -rank[link][0] for link in sorted(rank, key=rank.__getitem__)}
-
-    def lengths(self, base: str) -> dict[str, tuple[int, float]]:
-        """Return how many motors and how much length [m] lie between `base` and each link."""
-        known: dict[str, tuple[int, float]] = {}
-        for link, joint in self.steps(base).items():
-            motors, length = known[joint.parent] if joint else (0, 0.0)
-            if joint is not None:
-                motors += joint.has_motor
-                length += float(np.linalg.norm(joint.T_pc[:3, 3]))
-            known[link] = motors, length
-        return known
-
     def path(self, base_link: str, tool_link: str) -> tuple[UrdfJoint, ...]:
         """Return the joints from `base_link` to `tool_link`, in that order.
 
         Raises:
-            InputError: If a link does not exist or the tool does not hang from the base.
+            InputError: If a link does not exist or no chain leads to the tool.
         """
         for link in (base_link, tool_link):
             if link not in self.links:
@@ -188,9 +162,7 @@ class Urdf:
         return tuple(reversed(way))
 
     def chain(self, base_link: str, tool_link: str, moving: Collection[str]) -> SerialChain:
-        """Return the chain to the tool link in which the joints `moving` move.
-
-        Joints of the path that are not named stay at zero.
+        """Return the chain to the tool link with the joints `moving`; other joints stay at zero.
 
         Raises:
             InputError: If a named joint is not on the path or of a type that cannot move.
@@ -219,7 +191,7 @@ class Urdf:
         return SerialChain(tuple(joints), _snap(T))
 
     def with_joints(self, changes: Mapping[str, Callable[[UrdfJoint], UrdfJoint]]) -> Urdf:
-        """Return the same with some joints changed, by name.
+        """Return a copy with some joints changed, by name.
 
         Raises:
             InputError: If there is no such joint.
@@ -232,7 +204,7 @@ class Urdf:
         return replace(self, joints=tuple(joints))
 
     def loads(self, base_link: str, chain: SerialChain) -> Loads:
-        """Return what each joint of the `chain` from `base_link` carries; others are at zero.
+        """Return the masses on each joint of the `chain` from `base_link`; others stay at zero.
 
         Links without a mass weigh nothing.
         """
@@ -261,7 +233,7 @@ class Urdf:
 
 
 def _snap(T: FloatArray) -> FloatArray:
-    """Return `T` with rotation entries within rounding of 0, 1 or -1 put exactly there."""
+    """Return `T` with rotation entries within rounding of 0, 1 or -1 set to these values."""
     T = T.copy()
     near = np.abs(T[:3, :3] - np.round(T[:3, :3])) < 1e-15
     T[:3, :3][near] = np.round(T[:3, :3][near])
@@ -378,7 +350,7 @@ def _number(element: ElementTree.Element | None, key: str, where: str) -> float:
 
 
 def _above_zero(element: ElementTree.Element | None, key: str, where: str) -> float | None:
-    """Return a limit; exporters write 0 for one that they do not know."""
+    """Return a limit; None for 0, which exporters write for unknown ones."""
     value = _number(element, key, where)
     return value if 0.0 < value <= LARGEST_NUMBER else None
 
@@ -397,7 +369,7 @@ def transform(xyz: Triple, rpy: Triple) -> FloatArray:
 
 
 def _read_link(link: ElementTree.Element) -> LinkFacts:
-    """Return what is said of a link; figures that cannot be read are as good as none."""
+    """Return the contents of a link; unreadable numbers count as missing."""
     inertia, origin = link.find("inertial/inertia"), link.find("inertial/origin")
     moments = [_stated(inertia, key) for key in ("ixx", "iyy", "izz")]
     at = "" if origin is None else origin.get("xyz", "")

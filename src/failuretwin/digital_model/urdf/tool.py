@@ -1,4 +1,4 @@
-"""Which link of a URDF carries the tool: by its name first, never a finger, a camera or an IMU."""
+"""Choice of the tool link of a URDF: by its name first, never a finger, a camera or an IMU."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ TOOL_NAMES = (
     r"gripper|hand",
     r"flange",
 )
-"""Names of links that carry a tool, the surest first; a name counts where it stands as a word."""
+"""Names of tool links, the most certain first; a name counts as a whole word."""
 BESIDE = r"finger|jaw|knuckle|thumb|pad|camera|cam|optical|imu|lidar|laser|sensor|marker|inertial"
-"""Names of what hangs on a hand and is no tool."""
+"""Names of parts on a hand that are no tools."""
 HALFWAY = r"shoulder|elbow"
 """Names of places on an arm; their tips are no tools."""
 COMPARED = 100
-"""Candidates for the tool that are compared with the best one."""
+"""Number of candidates that are compared with the best one."""
 OWN_MOTORS = 2
-"""Motors of its own from which another branch is an arm and no finger."""
+"""Number of own motors from which another branch is an arm and no finger."""
 
 
 @dataclass(frozen=True)
 class ToolChoice:
-    """Which link carries the tool.
+    """Chosen tool link.
 
     Attributes:
-        link: The link; empty where no link can be chosen.
-        candidates: Links that could carry it, the best first, with their motors.
-        unclear: Whether nothing speaks for the first rather than for the others.
+        link: The link; empty where none can be chosen.
+        candidates: Possible links, the best first, with their numbers of motors.
+        unclear: Whether the first candidate is no better than the others.
     """
 
     link: str
@@ -44,13 +44,8 @@ class ToolChoice:
 
 
 def choose_tool(urdf: Urdf, base: str) -> ToolChoice:
-    """Return which link carries the tool.
-
-    Args:
-        urdf: The robot.
-        base: Link that carries the base frame.
-    """
-    ends = {name: count for name, count in urdf.tools(base).items() if not is_beside(name)}
+    """Return the tool link of a robot with this base link."""
+    ends = {name: count for name, count in _tools(urdf, base).items() if not is_beside(name)}
     named = _named(urdf, base)
     if named:
         return ToolChoice(
@@ -63,20 +58,46 @@ def choose_tool(urdf: Urdf, base: str) -> ToolChoice:
     return ToolChoice(link, ends, _on_other_arms(urdf, base, links[:COMPARED]))
 
 
+def _tools(urdf: Urdf, base: str) -> dict[str, int]:
+    """Return the end link of every branch above `base` with its number of motors.
+
+    Most motors first; among equals, the longest way along the joint frames.
+    """
+    ends = set(urdf.links) - {joint.parent for joint in urdf.joints}
+    rank = {
+        link: (-motors, -round(length, 9), link)
+        for link, (motors, length) in _lengths(urdf, base).items()
+        if link in ends
+    }
+    return {link: -rank[link][0] for link in sorted(rank, key=rank.__getitem__)}
+
+
+def _lengths(urdf: Urdf, base: str) -> dict[str, tuple[int, float]]:
+    """Return the number of motors and the length [m] between `base` and each link."""
+    known: dict[str, tuple[int, float]] = {}
+    for link, joint in urdf.steps(base).items():
+        motors, length = known[joint.parent] if joint else (0, 0.0)
+        if joint is not None:
+            motors += joint.has_motor
+            length += float(np.linalg.norm(joint.T_pc[:3, 3]))
+        known[link] = motors, length
+    return known
+
+
 def is_beside(link: str) -> bool:
-    """Return whether a link is named like something that hangs on a hand and is no tool."""
+    """Return whether a link has the name of a part on a hand that is no tool."""
     return bool(_word(BESIDE, link))
 
 
 def _word(pattern: str, link: str) -> bool:
-    """Return whether a word of a name, which may be numbered or prefixed, is of a pattern."""
+    """Return whether a name, which may be numbered or prefixed, contains a word of a pattern."""
     spaced = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", link).lower()
     return bool(re.search(rf"(^|[_/.\-\s]|left|right)({pattern})s?\d*([_/.\-\s]|$)", spaced))
 
 
 def _named(urdf: Urdf, base: str) -> list[str]:
-    """Return links with the surest name that moving joints carry, most motors first."""
-    ways, surest = urdf.lengths(base), _surest_names(urdf, base)
+    """Return links with the most certain name on moving joints, most motors first."""
+    ways, surest = _lengths(urdf, base), _surest_names(urdf, base)
     if not surest:
         return []
     links = [link for link, rank in surest.items() if rank == min(surest.values())]
@@ -86,10 +107,10 @@ def _named(urdf: Urdf, base: str) -> list[str]:
 
 
 def _surest_names(urdf: Urdf, base: str) -> dict[str, int]:
-    """Return links named like a tool that moving joints carry, and how sure that is, 0 the surest.
+    """Return links on moving joints named like a tool, with ranks, 0 the most certain.
 
-    What a motor moves against a body that has no less sure a name is a jaw and left out, unless
-    link after link has such a name.
+    A link moved by a motor against a body with an equally certain name is a jaw and left out,
+    unless link after link has such a name.
     """
     movers: dict[str, tuple[str, ...]] = {}  # of each link: the last three motors before it
     for link, joint in urdf.steps(base).items():
@@ -113,7 +134,7 @@ def _surest_names(urdf: Urdf, base: str) -> dict[str, int]:
 
 
 def _rank(link: str) -> int | None:
-    """Return how sure the name of a tool is, 0 the surest; None: it is none."""
+    """Return the certainty of a tool's name, 0 the most certain; None: no tool."""
     if is_beside(link) or _word(HALFWAY, link):
         return None
     return next((k for k, pattern in enumerate(TOOL_NAMES) if _word(pattern, link)), None)
@@ -124,7 +145,7 @@ def _counts(urdf: Urdf, base: str, links: list[str]) -> dict[str, int]:
 
 
 def _on_other_arms(urdf: Urdf, base: str, links: list[str]) -> bool:
-    """Return whether another candidate hangs on motors of its own, as the first one does."""
+    """Return whether another candidate is on an arm of its own."""
     movers = [{j.name for j in urdf.path(base, link) if j.has_motor} for link in links]
     return any(
         len(other - movers[0]) >= OWN_MOTORS and len(movers[0] - other) >= OWN_MOTORS
@@ -133,15 +154,13 @@ def _on_other_arms(urdf: Urdf, base: str, links: list[str]) -> bool:
 
 
 def _before_fingers(urdf: Urdf, base: str) -> dict[str, int]:
-    """Return the last links before whatever hangs on them, where all ends are no tools."""
+    """Return the last links before the fingers, where all ends are no tools."""
     counts: dict[str, int] = {}
-    for link in urdf.tools(base):
+    for link in _tools(urdf, base):
         for joint in reversed(urdf.path(base, link)):
             if not is_beside(joint.parent):
                 counts |= _counts(urdf, base, [joint.parent])
                 break
-    length = {
-        link: sum(float(np.linalg.norm(j.T_pc[:3, 3])) for j in urdf.path(base, link))
-        for link in counts
-    }
-    return {link: counts[link] for link in sorted(counts, key=lambda k: (-counts[k], -length[k]))}
+    ways = _lengths(urdf, base)
+    order = sorted(counts, key=lambda link: (-counts[link], -ways[link][1]))
+    return {link: counts[link] for link in order}
