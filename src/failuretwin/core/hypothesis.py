@@ -1,13 +1,13 @@
-"""What may be wrong: a fault of one motor, and hypotheses made of such faults.
+"""Faults, hypotheses and diagnoses.
 
-The text form is the contract with files and the command line: ``healthy``, ``unknown``,
-``motor_1:stuck`` or several faults joined by ``+`` in chain order.
+Text form in files and on the command line: ``healthy``, ``unknown``, ``motor_1:stuck``, or several
+faults joined by ``+`` in chain order.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from failuretwin.core.errors import InputError, unknown_name
@@ -15,11 +15,7 @@ from failuretwin.core.errors import InputError, unknown_name
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault mode of one motor, without its size or onset.
-
-    Which modes there are is for those to say who act on them: results may name a mode that is
-    registered elsewhere.
-    """
+    """One fault mode of one motor, without size and onset; the mode may be registered elsewhere."""
 
     motor: str
     mode: str
@@ -30,7 +26,7 @@ class Fault:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A state of the robot: no fault, one or several faults, or none that we know."""
+    """A state of the robot: healthy, one or several faults, or unknown."""
 
     faults: tuple[Fault, ...] = ()
     known: bool = True
@@ -42,17 +38,18 @@ class Hypothesis:
 
     @property
     def is_healthy(self) -> bool:
-        """True for the hypothesis without any fault."""
+        """Whether there is no fault."""
         return self.known and not self.faults
 
     @classmethod
     def parse(cls, text: str, motors: Sequence[str] | None = None) -> Hypothesis:
-        """Read the text form.
+        """Return the hypothesis of a text form.
 
         Args:
             text: Such as ``"motor_1:stuck+motor_3:drift"``.
             motors: Names of the robot's motors in chain order; None: any names in any order, for
-                text that comes from a result.
+            text from
+                results.
 
         Raises:
             InputError: If the text does not follow the form or names an unknown motor.
@@ -65,14 +62,7 @@ class Hypothesis:
         return hypothesis
 
     def check_motors(self, motors: Sequence[str]) -> None:
-        """Refuse what a robot with these motors cannot have.
-
-        Args:
-            motors: Names of the robot's motors in chain order.
-
-        Raises:
-            InputError: If a motor is unknown, there twice or out of order.
-        """
+        """Raise InputError for motors that are not in `motors`, repeated or out of order."""
         for fault in self.faults:
             if fault.motor not in motors:
                 raise unknown_name("motor", fault.motor, motors)
@@ -119,15 +109,15 @@ def paper_hypotheses(motors: Sequence[str]) -> tuple[Hypothesis, ...]:
 def parse_hypotheses(
     given: Iterable[Hypothesis | str], motors: Sequence[str]
 ) -> tuple[Hypothesis, ...]:
-    """Read several hypotheses; refuses an empty list and repeats.
+    """Return several hypotheses.
 
     Args:
         given: Hypotheses, or their text form.
         motors: Names of the robot's motors in chain order.
 
     Raises:
-        InputError: If one cannot be read or names another motor, is given twice, none is given, or
-            one text is given in place of a list.
+        InputError: If one is not valid or repeated, none is given, or a text is given instead of a
+        list.
     """
     if isinstance(given, str):
         raise InputError(
@@ -182,13 +172,21 @@ def state_of(posterior: Mapping[str, float]) -> str:
 Interval = tuple[float, float]
 
 
+RECORD = (
+    *("run", "truth", "state", "diagnosis", "probability", "posterior", "runner_up"),
+    *("onset_s", "onset_90", "magnitude", "magnitude_unit", "magnitude_90", "verdict"),
+    *("explanation", "evidence", "quality", "protocol", "method"),
+)
+"""Keys of the JSON object of a diagnosis."""
+
+
 @dataclass(frozen=True)
 class MovementEvidence:
-    """What one movement says.
+    """Evidence of one movement.
 
     Attributes:
         movement: Its number in the run, from 1.
-        nats: How much it speaks for the most probable hypothesis over the second.
+        nats: Log Bayes factor of the most probable hypothesis over the second.
     """
 
     movement: int
@@ -197,24 +195,24 @@ class MovementEvidence:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Diagnosis of one run. `None` stands for what is not known or does not apply.
+    """Diagnosis of one run. `None`: unknown or not applicable.
 
     Attributes:
         run: Name of the run.
         posterior: Probability of every hypothesis; sums to 1.
-        truth: True hypothesis, where the run set knows it.
-        onset_s: When the fault began [s]; 0 when it was there before the run.
+        truth: True hypothesis, where the run set states it.
+        onset_s: Onset of the fault [s]; 0 if it was there before the run.
         onset_90: 90 % interval of the onset [s].
         magnitude: Size of the fault in `magnitude_unit`.
         magnitude_unit: Unit of the fault mode.
         magnitude_90: 90 % interval of the magnitude.
         verdict: One plain sentence.
-        explanation: Why, what else it may be, and what to do now, a line each.
-        evidence: What each usable movement says.
-        quality: What is wrong with the log, a line each; empty when nothing is.
+        explanation: Reasons, alternatives and next steps, one per line.
+        evidence: Evidence of each usable movement.
+        quality: Problems of the log, one per line.
         undecided: Why there is no verdict; empty where there is one.
-        protocol: How much real data the method has seen: P0, P0c, P1 or P2.
-        method: Which diagnoser, with which healthy behaviour.
+        protocol: Real data used by the method: P0, P0c, P1 or P2.
+        method: Diagnoser and healthy behaviour.
     """
 
     run: str
@@ -275,23 +273,7 @@ class Diagnosis:
 
     def to_record(self) -> dict[str, Any]:
         """Return the JSON object of the contract."""
-        return {
-            "run": self.run,
-            "truth": self.truth,
-            "state": self.state,
-            "diagnosis": self.diagnosis,
-            "probability": self.probability,
-            "posterior": dict(self.posterior),
-            "runner_up": self.runner_up,
-            "onset_s": self.onset_s,
-            "onset_90": self.onset_90,
-            "magnitude": self.magnitude,
-            "magnitude_unit": self.magnitude_unit,
-            "magnitude_90": self.magnitude_90,
-            "verdict": self.verdict,
-            "explanation": list(self.explanation),
-            "evidence": [{"movement": e.movement, "nats": e.nats} for e in self.evidence],
-            "quality": list(self.quality),
-            "protocol": self.protocol,
-            "method": self.method,
-        }
+        record = {name: getattr(self, name) for name in RECORD}
+        record["posterior"] = dict(self.posterior)
+        record["evidence"] = [asdict(movement) for movement in self.evidence]
+        return record | {name: list(record[name]) for name in ("explanation", "quality")}

@@ -1,4 +1,4 @@
-"""Sums and integrals of probabilities in logarithms."""
+"""Numerics of probabilities: log sums, quantiles, Student t densities, covariances."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from failuretwin.core.types import BoolArray, FloatArray, as_floats
 
 @dataclass(frozen=True)
 class Weighted:
-    """A distribution as values with weights, (value,) each; weights need not add up to 1."""
+    """A discrete distribution: values and weights, (value,) each; weights need not sum to 1."""
 
     values: FloatArray
     weights: FloatArray
@@ -24,7 +24,7 @@ class Weighted:
         return weighted_quantiles(self.values, self.weights, levels)
 
     def draw(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Return draws, (count,): between the values by straight lines, as quantiles are."""
+        """Return draws, (count,), by linear interpolation of the quantiles."""
         return self.quantiles(tuple(rng.random(count).tolist()))
 
 
@@ -44,10 +44,7 @@ def log_of(values: ArrayLike) -> FloatArray:
 
 
 def log_trapezoid_weights(nodes: FloatArray) -> FloatArray:
-    """Return log weights of the trapezoidal rule on sorted `nodes` (..., node), same shape.
-
-    Nodes that coincide get weight 0 between them.
-    """
+    """Return log weights of the trapezoidal rule on sorted `nodes` (..., node), same shape."""
     steps = np.diff(nodes, axis=-1)
     weights = np.zeros_like(nodes)
     weights[..., :-1] += 0.5 * steps
@@ -56,7 +53,7 @@ def log_trapezoid_weights(nodes: FloatArray) -> FloatArray:
 
 
 SAME_VALUE = 1e-9
-"""Values that differ by a smaller share of their range are the same [-]."""
+"""Values that differ by a smaller share of their range are equal [-]."""
 
 
 def weighted_quantiles(
@@ -64,8 +61,8 @@ def weighted_quantiles(
 ) -> FloatArray:
     """Return quantiles of each row of weighted `values`, (..., value) -> (..., level).
 
-    Between the middles of their weights by straight lines. Values that are the same but for
-    rounding are an atom with a step, lest their order, which is then by chance, should matter.
+    Linear between the middles of the weights. Values that differ only by rounding form one atom
+    with a step, so that their order does not matter.
     """
     order = np.argsort(values, axis=-1)
     values = np.take_along_axis(values, order, axis=-1)
@@ -93,12 +90,13 @@ def _quantiles(values: FloatArray, weights: FloatArray, levels: tuple[float, ...
 
 @dataclass(frozen=True)
 class Covariance(ABC):
-    """Covariances (...) of deviations in d dimensions.
+    """Covariances (...) of deviations in d dimensions, S = A A^T + noise I.
 
     Attributes:
         determinant: (...).
-        dims: Dimensions that deviations can have; the density is a Student t in so many. Fewer than
-            d where what sensors see lies on a surface, such as rotations among matrices.
+        dims: Dimension of the Student t density; less than d where deviations lie on a surface,
+        such as
+            rotations among matrices.
     """
 
     determinant: FloatArray
@@ -111,7 +109,7 @@ class Covariance(ABC):
         Args:
             root: A, (..., d, column).
             noise: Variance added on each axis.
-            dims: Dimensions that deviations can have; None: d.
+            dims: Dimension of the density; None: d.
         """
         made = Ellipsoid if root.shape[-2] == 3 else DenseCovariance
         return made.of_root(root, noise, dims or root.shape[-2])
@@ -140,7 +138,7 @@ class Covariance(ABC):
 
 @dataclass(frozen=True)
 class Ellipsoid(Covariance):
-    """Covariances in space by their adjugates, which numpy handles faster than small matrices.
+    """Covariances in three dimensions by their adjugates, faster than small matrices in numpy.
 
     Attributes:
         adjugate: xx, yy, zz, xy, xz, yz of the adjugate, each (...).
@@ -221,23 +219,18 @@ class DenseCovariance(Covariance):
 
 
 NORMAL_DOF = 1e8
-"""Degrees of freedom from which lgamma has no digits left that tell a Student t from a normal."""
+"""Degrees of freedom from which a Student t equals a normal in double precision."""
 
 
 def log_norm(dof: float, dims: int = 3) -> float:
-    """Return log c, the log density at the centre of a Student t with S = I.
-
-    Args:
-        dof: nu; infinite: normal.
-        dims: d.
-    """
+    """Return log c for `dof` = nu and `dims` = d; infinite nu: normal."""
     if dof > NORMAL_DOF:
         return -0.5 * dims * log(2.0 * pi)
     return lgamma((dof + dims) / 2.0) - lgamma(dof / 2.0) - 0.5 * dims * log(dof * pi)
 
 
 def log_fall(square: FloatArray, dof: float, dims: int = 3) -> FloatArray:
-    """Return how far the log density of a Student t has fallen from its centre, (...).
+    """Return the log density of a Student t relative to its centre, (...).
 
     Args:
         square: x^T S^-1 x, (...).
@@ -265,7 +258,7 @@ def log_student(error: FloatArray, root: FloatArray, noise: float, dof: float) -
 
 
 def log_normal_2d(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return log N(error; 0, S) in two dimensions, (...): in closed form, as LAPACK takes longer.
+    """Return log N(error; 0, S) in two dimensions, (...), in closed form.
 
     Args:
         error: (..., 2).
@@ -282,14 +275,11 @@ def log_normal_2d(error: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def masked_median(values: FloatArray, kept: BoolArray) -> FloatArray:
-    """Return the median of the values that are kept in each row.
+    """Return the median of the kept values in each row, (row,); 0 without any.
 
     Args:
         values: (row, value).
         kept: Which of them count, same axes.
-
-    Returns:
-        (row,); 0 where none is kept.
     """
     if values.shape[1] == 0:
         return np.zeros(len(values))
@@ -307,9 +297,9 @@ def masked_median(values: FloatArray, kept: BoolArray) -> FloatArray:
 def along_polyline(
     path: FloatArray, longest: FloatArray, since: FloatArray
 ) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Return place and velocity on polylines whose knots are passed at an even pace.
+    """Return position and velocity on polylines with equal times between knots.
 
-    Before the first knot and after the last one all is at rest there.
+    Before the first knot and after the last one the motion is at rest.
 
     Args:
         path: The knots, (item, case, knot, axis).

@@ -1,10 +1,10 @@
 """The run set: an `xarray.Dataset` of commands and tool paths on one uniform time grid.
 
-Shorter runs are padded: `measured` NaN, `command` held. Variables, dimensions and units are those
-of `VARIABLES`; only `command` and `measured` are required. `measured` is NaN throughout where
-nobody watched the tool's position, but another sensor: `tool_orientation`, a rotation vector in the
-frame of `measured`; `accelerometer` and `gyroscope` on the tool, in their own frames; `wire`, a
-length; `position`, the readings of the motors. `goal` is the goal that each motor reports to have
+`VARIABLES` lists variables, dimensions and units; only `command` and `measured` are required.
+Shorter runs are padded: `measured` NaN, `command` held. Without a position sensor of the tool,
+`measured` is NaN throughout and other sensors are read: `tool_orientation`, a rotation vector in
+the frame of `measured`; `accelerometer` and `gyroscope` on the tool, in their own frames; `wire`, a
+length; `position`, the motors' readings. `goal` is the goal that each motor reports to have
 received.
 """
 
@@ -48,12 +48,13 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str]] = {
     "gyroscope": (("run", "time", "axis"), "rad/s"),
     "wire": (("run", "time"), "m"),
 }
-"""Dimensions and unit of every variable that a run set may hold."""
+"""Dimensions and unit of every variable of a run set."""
 
 GOAL_VARIABLE = "goal"
 """Variable of the goals that motors report to have received."""
 UNIFORM = 1e-3
-"""Steps of a time grid may differ by this share; single precision rounds by a tenth of it."""
+"""Largest relative difference of steps in a uniform grid; single precision rounds by a tenth of
+it."""
 LARGEST = {
     "command": 1e6,
     "measured": 1e6,
@@ -62,13 +63,13 @@ LARGEST = {
     "gyroscope": 1e4,
     "wire": 1e6,
 }
-"""Largest sensible value of each, in its unit."""
+"""Largest accepted value of each variable, in its unit."""
 REQUIRED = ("command", "measured")
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What was wrong with each run: arrays over runs, as in the run set."""
+    """True fault of each run: arrays over runs, as in the run set."""
 
     fault: Sequence[str]
     detail: Sequence[Mapping[str, Any]]
@@ -78,7 +79,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class RunTable:
-    """The plain arrays behind a run set, before they get names.
+    """Plain arrays of a run set.
 
     Attributes:
         run: Unique name of each run.
@@ -88,10 +89,10 @@ class RunTable:
         measured: (run, time, axis) [m]; NaN = no sample.
         measured_rate_hz: True rate of the tool sensor [Hz].
         duration: True length of each run, (run,) [s]; None: the whole grid.
-        movements: The movements commanded, where known.
-        truth: What was wrong, where known.
+        movements: Commanded movements, where known.
+        truth: True faults, where known.
         position: Motor readings, (run, time, motor) [rad], where known.
-        sensors: What sensors beside that of the tool's position read, by variable.
+        sensors: Readings of other sensors, by variable.
     """
 
     run: Sequence[str]
@@ -108,7 +109,7 @@ class RunTable:
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
     def to_dataset(self) -> xr.Dataset:
-        """Return the run set; checks it on the way.
+        """Return the checked run set.
 
         Raises:
             InputError: If shapes or coordinates do not fit together.
@@ -170,13 +171,13 @@ def run_set(
         time: Uniform grid from 0, (time,) [s].
         command: Reference of each motor, (run, time, motor), or (time, motor) of one run [rad].
         measured: Path of the tool in the base frame, (run, time, axis), or (time, axis) of one
-            run [m]; NaN = no sample. None: nobody watched it.
+            run [m]; NaN = no sample. None: not measured.
         motors: Names of the motors in chain order; None: ``motor_1``, ``motor_2``, ...
         names: Unique name of each run; None: ``run_1``, ``run_2``, ...
-        measured_rate_hz: True rate of the tool sensor [Hz]; None: every sample of the grid is a
-            reading of its own.
-        sensors: What others read, by variable (`accelerometer`, `position`, ...), each with a first
-            axis for runs, or without where `command` has none.
+        measured_rate_hz: True rate of the tool sensor [Hz]; None: the rate of the grid.
+        sensors: Readings of other sensors, by variable (`accelerometer`, `position`, ...), each
+        with a
+            first axis for runs, or without where `command` has none.
 
     Raises:
         InputError: If shapes do not fit together, or the grid is not uniform from 0.
@@ -209,14 +210,14 @@ def run_set(
 
 
 def check_runs(runs: xr.Dataset, where: str) -> xr.Dataset:
-    """Return `runs` if it keeps the contract of a run set.
+    """Return `runs` if they satisfy the contract of a run set.
 
     Args:
         runs: The dataset to check.
-        where: What to call it in an error, such as its path.
+        where: Its name in errors, such as its path.
 
     Raises:
-        InputError: Naming the first thing that is missing or wrong, and what is expected.
+        InputError: With the first violation and the expected value.
     """
     _check_variables(runs, where)
     if runs.sizes["run"] == 0:
@@ -238,7 +239,7 @@ def check_runs(runs: xr.Dataset, where: str) -> xr.Dataset:
 
 
 def check_motors(runs: xr.Dataset, robot: str, names: Sequence[str]) -> None:
-    """Raise InputError unless the runs are of a robot with these motors."""
+    """Raise InputError unless the runs have the motors `names` of the robot."""
     motors = [str(name) for name in runs["motor"].values]
     if motors != list(names):
         raise InputError(
@@ -295,7 +296,7 @@ def _check_time(time: FloatArray, where: str) -> None:
 
 
 def check_duration(runs: xr.Dataset, where: str, last: float = np.inf) -> None:
-    """Raise InputError unless every run is longer than nothing and ends by the time `last` [s]."""
+    """Raise InputError unless every run has a positive duration and ends by the time `last` [s]."""
     if "duration" not in runs:
         return
     numbers = runs["duration"].dtype.kind in "fiu"
@@ -316,15 +317,15 @@ def time_step(runs: xr.Dataset) -> float:
 
 
 def measured_rate(runs: xr.Dataset) -> float:
-    """Return the true rate of the tool sensor [Hz]; without the attribute, the grid's own."""
+    """Return the true rate of the tool sensor [Hz]; default: the rate of the grid."""
     return float(runs.attrs.get("measured_rate_hz", 1.0 / time_step(runs)))
 
 
 def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     """Return one run set of all runs in `parts`, padded to the longest, with unique names.
 
-    Only variables that every part holds are kept. Run names that repeat get a number. Of several
-    sensor rates the lowest is kept, so that no reading counts twice.
+    Variables missing in any part are dropped; repeated run names get a number. The lowest sensor
+    rate is kept, so that no reading counts twice.
 
     Raises:
         InputError: If there are no parts or they differ in motors or time step.
@@ -362,7 +363,7 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
 
 
 def padded_bytes(runs: int, samples: int, motors: int) -> float:
-    """Return what runs take that are padded to one length: commands, tool path, readings."""
+    """Return the memory of padded runs: commands, tool path, readings [bytes]."""
     return 8.0 * runs * samples * (2 * motors + len(AXES))
 
 
@@ -390,7 +391,7 @@ def _pad(part: xr.Dataset, time: FloatArray, movements: int) -> xr.Dataset:
 
 
 def unique_names(names: Sequence[str]) -> list[str]:
-    """Return `names` with a number behind each that was there before."""
+    """Return `names` with a number appended to repeated ones."""
     given, used, unique = set(names), set[str](), []
     for name in names:
         number, candidate = 2, name
@@ -402,5 +403,5 @@ def unique_names(names: Sequence[str]) -> list[str]:
 
 
 def truth_of(runs: xr.Dataset) -> list[str] | None:
-    """Return the true hypothesis of every run, or None where the run set does not say."""
+    """Return the true hypothesis of every run, or None where the run set has none."""
     return [str(f) for f in runs["fault"].values] if "fault" in runs else None

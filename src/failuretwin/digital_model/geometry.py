@@ -6,7 +6,7 @@ p_base is the tool point in the base link's frame and p_seen its position by the
 the sensor's scale error [-]. T_pc is the pose of joint j in its parent link by the URDF; the
 correction is in the joint's own frame, and the joint angle is sense * command + zero.
 
-Section: docs/registration.md#what-the-profile-says
+Section: docs/another_arm.md#fit-the-frame-and-the-geometry
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from failuretwin.core.config import AtLeastZero, Bounded, Bounds, from_table, read_toml
-from failuretwin.core.errors import InputError
+from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.digital_model.geometry import roll_pitch_yaw
 from failuretwin.digital_model.kinematics import GRAVITY
@@ -128,14 +128,9 @@ def load_mujoco() -> Any:
     Raises:
         InputError: If it is not installed.
     """
-    try:
+    with needs_extra("the physics engine needs mujoco", "physics"):
         import mujoco
         import mujoco.rollout
-    except ImportError as error:
-        raise InputError(
-            f"the physics engine needs mujoco ({error}). Install it: "
-            "pip install 'failuretwin[physics]'."
-        ) from error
     return mujoco
 
 
@@ -230,15 +225,15 @@ def _up(urdf: Urdf, base_link: str) -> FloatArray:
 
 BRAKE_S = 2e4
 """Brake torque [N m] at 1 rad/s per N m/rad of servo stiffness [s]. A load under which the servo
-would sag by 3 deg makes a held gear creep by 3e-5 rad in 10 s, and stopping a gear takes no
-acceleration that MuJoCo would mistake for a simulation gone wrong."""
+sags by 3 deg makes a held gear creep by 3e-5 rad in 10 s; stopping a gear stays below the
+acceleration that MuJoCo treats as an unstable simulation."""
 LEAST_SHARE = 0.2
-"""Share of an inertia that is entered at least, however long the step."""
+"""Smallest share of an inertia that is entered, however long the step."""
 
 
 @dataclass(frozen=True)
 class PhysicsModel:
-    """A compiled model and where to find the motors in it.
+    """A compiled model and the indices of its motors.
 
     Attributes:
         compiled: The `mujoco.MjModel`.
@@ -263,7 +258,7 @@ def build_model(
         robot: The robot.
         motors: Its motors and gears.
         step: Time step [s].
-        payload: Mass carried at the tool point [kg].
+        payload: Mass at the tool point [kg].
 
     Raises:
         InputError: If mujoco is missing or cannot use the URDF.
@@ -340,31 +335,31 @@ def _add_actuators(spec: Any, gears: Mapping[str, MotorPhysics]) -> None:
 # Motors and gears for a robot of which only URDF and profile are known: assumed, not measured.
 
 SAG_RAD = math.radians(0.5)
-"""How far a joint gives way under its largest load, at most."""
+"""Largest displacement of a joint under its largest load."""
 FRICTION_RAD = math.radians(0.1)
-"""How far from its set-point friction lets a drive come to rest, at most."""
+"""Largest distance from its set-point at which friction stops a drive."""
 YIELD_RAD = FRICTION_RAD
 FLEX_SHARE = 1.0 / 3.0
-"""Share of the sag that comes from the gear's output side, the rest from the servo."""
+"""Share of the sag in the gear's output side, the rest is in the servo."""
 FULL_TORQUE_RAD = math.radians(20.0)
-"""Error at which a servo gives all its torque, at most."""
+"""Largest error at which a servo gives its full torque."""
 SERVO_RAD_S = 40.0
-"""Natural frequency of a servo that moves its joint's largest inertia, at least."""
+"""Smallest natural frequency of a servo with its joint's largest inertia."""
 RINGING_RAD_S = 150.0
-"""Rotors and gears are given enough inertia to ring no faster than this by themselves."""
+"""Largest natural frequency of rotors and gears alone; it sets their inertia."""
 FILTER_S = 0.03
-"""Time constant of the set-point filter, at least [s]; slower where the torque that is left under
-the largest load would not bring the largest inertia to the speed of a fast ramp within it."""
+"""Smallest time constant of the set-point filter [s]; larger where the torque beyond the largest
+load needs more time to bring the largest inertia to the speed of a fast ramp."""
 FAST_RAMP_S = 0.6
-"""Time of a fast ramp from zero or through the movement range: the shortest that the paper draws
-(arXiv 2411.01360)."""
+"""Time of a fast ramp from zero or through the movement range: the paper's shortest (arXiv
+2411.01360)."""
 FLEX_DAMPING_RATIO = 0.3
 BACK_EMF_SHARE = 0.2
-"""Share of its torque that a motor needs to turn at its largest speed."""
+"""Share of its torque that a motor needs at its largest speed."""
 ROTOR_SHARE = 0.2
-"""Inertia of a rotor behind its gear over the largest inertia of the joint, at least."""
+"""Smallest ratio of a rotor's inertia behind its gear to the joint's largest inertia."""
 SPARE_TORQUE = 2.0
-"""Torque of a motor over its largest load, at least; a URDF that states less has a placeholder."""
+"""Smallest ratio of a motor's torque to its largest load; a URDF with less has a placeholder."""
 
 
 def default_parameters(robot: Robot) -> PhysicsParameters:

@@ -1,7 +1,7 @@
-"""A robot profile as text: written for a URDF, changed so that what people wrote in it stays.
+"""Robot profiles as text: written for a URDF, or changed without loss of the user's comments.
 
-Keys are set in their lines, tables that a fit owns are written anew at the end; what comes out is
-read again and must say what it should.
+Keys are set in their lines and the geometry tables are rewritten at the end; the result is read
+again and compared.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ DIGITS = 9
 """Decimals of lengths and angles: a nanometre."""
 
 GEOMETRY_NOTE = """\
-# What `failuretwin robot fit` found; see the page "Registration and geometry" of the documentation.
-# zero: angle of the URDF where commands say 0 [rad]; xyz [m] and rpy [rad]: where the joint's frame
-# really is, in the frame that the URDF states."""
+# Written by `failuretwin robot fit`; see the page "Use another arm" of the documentation.
+# zero: angle of the URDF at command 0 [rad]; xyz [m] and rpy [rad]: displacement of the joint's
+# frame, in the URDF's frame of the joint."""
 
 
 def fitted_text(text: str, old: Path, new: Path, profile: Profile) -> str:
     """Return the text of a profile with the frames, senses and geometry of another.
 
     Args:
-        text: The profile as it is.
-        old: Where it lies.
-        new: Where the result will lie; files are named from there.
-        profile: What the result shall say, files as `old` names them.
+        text: The present profile.
+        old: Its path.
+        new: Path of the result; files are named relative to it.
+        profile: Contents of the result, with files as `old` names them.
 
     Raises:
-        InputError: If the text is written in a way that cannot be changed line by line.
+        InputError: If the text cannot be changed line by line.
     """
     moved = _moved(rounded(profile), old.parent, new.parent)
     lines = _without_own_tables(text.splitlines())
@@ -73,7 +73,7 @@ def fitted_text(text: str, old: Path, new: Path, profile: Profile) -> str:
 
 
 def rounded(profile: Profile) -> Profile:
-    """Return a profile whose lengths and angles of geometry have the decimals that are written."""
+    """Return a profile with its geometry rounded to `DIGITS`."""
     geometry = profile.geometry
     joints = tuple(
         JointCorrection(c.joint, round(c.zero, DIGITS), _round(c.xyz), _round(c.rpy))
@@ -110,7 +110,7 @@ def _moved(profile: Profile, old: Path, new: Path) -> Profile:
 
 
 def _without_own_tables(lines: Sequence[str]) -> list[str]:
-    """Return the lines without tables that a fit owns, nor the remarks above them."""
+    """Return the lines without the geometry tables and the comments above them."""
     kept: list[str] = []
     own = False
     for line in lines:
@@ -124,7 +124,7 @@ def _without_own_tables(lines: Sequence[str]) -> list[str]:
 
 
 def _set(lines: Sequence[str], start: int, values: Mapping[str, object]) -> list[str]:
-    """Return lines with keys of the table that begins at `start` set; None takes a key away."""
+    """Return lines with keys of the table that begins at `start` set; None removes a key."""
     headers = [i for i in range(start, len(lines)) if HEADER.match(lines[i])]
     stop = headers[0] if headers else len(lines)
     own, missing = list(lines[start:stop]), dict(values)
@@ -145,7 +145,7 @@ def _line(key: str, value: object, comment: str) -> str:
 
 
 def _comment(line: str) -> str:
-    """Return the remark at the end of a line with what stands before it, empty if there is none."""
+    """Return the comment at the end of a line with the space before it, or an empty string."""
     found = re.search(r"\s+#[^\"'\]]*$", line)
     return found.group() if found else ""
 
@@ -182,32 +182,32 @@ def _check(text: str, path: Path, expected: Profile) -> None:
 # A commented robot profile, written from what a URDF states and plain assumptions elsewhere.
 
 PROFILE_TEMPLATE = "profile.template"
-"""A profile with $placeholders, the last table being that of one motor. Its gains are near those
+"""A profile with $placeholders; its last table is that of one motor. Its gains are near those
 published for the bus servos of the ArmPi FPV."""
 
 ASSUMED_SPEED = math.pi
 """Speed limit where the URDF states none [rad/s or m/s]."""
 
 WIDEST_RAD = math.pi / 2
-"""Farthest target of random movements from the middle of the range [rad]."""
+"""Largest distance of random targets from the middle of the range [rad]."""
 
 WIDEST_M = 0.1
-"""The same for a joint that slides [m]."""
+"""The same for a sliding joint [m]."""
 
 LONGEST_RAMP_S = 1.0
-"""Time in which the speed limit must allow the longest travel: half of a movement [s]."""
+"""Time for the longest travel at the speed limit: half of a movement [s]."""
 
 
 def profile_text(report: UrdfReport, profile: Path, home: Sequence[float] = ()) -> str:
     """Return a TOML profile for the robot of a URDF.
 
     Args:
-        report: The URDF, looked over without errors.
-        profile: Where the profile will lie; it names the URDF relative to its own folder.
-        home: Angle at rest of each motor [rad or m]; empty: the middle of its limits.
+        report: Report on the URDF, without errors.
+        profile: Path of the profile; it names the URDF relative to its own folder.
+        home: Rest angle of each motor [rad or m]; empty: the middle of its limits.
 
     Raises:
-        InputError: If the report holds an error, or there is not one angle for each motor.
+        InputError: If the report holds an error, or the number of angles is not that of the motors.
     """
     report.raise_errors()
     if home and len(home) != len(report.motors):
@@ -263,15 +263,15 @@ def _origin(stated: str, assumed: Sequence[str]) -> str:
 
 
 def speed_limit(joint: UrdfJoint) -> float:
-    """Return the speed limit of the URDF [rad/s or m/s], an assumed one where it has none."""
+    """Return the speed limit of the URDF, or the assumed one [rad/s or m/s]."""
     return ASSUMED_SPEED if joint.velocity is None else joint.velocity
 
 
 def movement_range(joint: UrdfJoint, home: float | None = None) -> tuple[float, float, str]:
-    """Return the lowest and the highest target [rad or m] and a sentence on where they are from.
+    """Return the lowest and the highest target [rad or m] and a sentence on their source.
 
-    Targets far apart leave no time at rest within a movement, so the limits are narrowed about
-    their middle, or about the angle at rest where one is given.
+    The limits are narrowed about their middle or the rest angle, so that movements keep time at
+    rest.
     """
     widest = WIDEST_M if joint.type == "prismatic" else WIDEST_RAD
     half = min(widest, speed_limit(joint) * LONGEST_RAMP_S / 2.0)
@@ -288,7 +288,7 @@ def movement_range(joint: UrdfJoint, home: float | None = None) -> tuple[float, 
 
 
 def relative_to(target: Path, folder: Path) -> str:
-    """Return the way from `folder` to the file `target` with forward slashes."""
+    """Return the path from `folder` to the file `target` with forward slashes."""
     try:
         way = os.path.relpath(target.resolve(), folder.resolve())
     except ValueError:  # another drive

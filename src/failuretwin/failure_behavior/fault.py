@@ -1,4 +1,4 @@
-"""Faults as they strike: one in one run, and those of one mode at one motor over many runs."""
+"""Faults in runs: one fault in one run, and those of one mode at one motor over many runs."""
 
 from __future__ import annotations
 
@@ -16,22 +16,21 @@ from failuretwin.core.types import BoolArray, FloatArray
 # Courses: how severe a fault is over time, from 0 (not there) to 1 (full magnitude).
 
 STEP, RAMP, INTERMITTENT = PROFILES = ("step", "ramp", "intermittent")
-"""Time profiles: at once, growing linearly, coming and going."""
+"""Time profiles: sudden, growing linearly, episodic."""
 
 _ROUNDING_S = 1e-9
-"""Times this close are the same: grids and onsets carry rounding errors [s]."""
+"""Rounding error of grids and onsets [s]."""
 
 
 @dataclass(frozen=True)
 class Course:
-    """Severity of one fault over time.
+    """Severity of one fault over time, from 0 (absent) to 1 (full magnitude).
 
     Attributes:
         profile: One of `PROFILES`.
-        onset_s: When the fault begins [s].
+        onset_s: Onset of the fault [s].
         rise_s: Time from the onset to full severity [s]; 0 unless the profile is a ramp.
-        episodes: Begin and end of each time the fault is there [s], in order; for the
-            intermittent profile alone.
+        episodes: Start and end of each episode [s], in order; of the intermittent profile only.
     """
 
     profile: str
@@ -49,14 +48,11 @@ class Course:
 
 
 def severities(courses: Sequence[Course], time: FloatArray) -> FloatArray:
-    """Return the severity of many faults.
+    """Return the severity of many faults, (run, time), in [0, 1].
 
     Args:
-        courses: One for each run.
+        courses: One per run.
         time: Instants, common to all runs (time,) or of each run (run, time) [s].
-
-    Returns:
-        (run, time), in [0, 1].
     """
     onset, rise = _columns(courses)
     severity = np.where(
@@ -73,15 +69,7 @@ def severities(courses: Sequence[Course], time: FloatArray) -> FloatArray:
 
 
 def exposures(courses: Sequence[Course], time: FloatArray) -> FloatArray:
-    """Return for how long each fault has been there: the integral of its severity.
-
-    Args:
-        courses: One for each run.
-        time: Instants, (time,) [s].
-
-    Returns:
-        (run, time) [s].
-    """
+    """Return the integral of the severity up to `time` (time,) [s]: (run, time) [s]."""
     onset, rise = _columns(courses)
     since = np.maximum(time - onset, 0.0)
     growing = since**2 / (2.0 * np.where(rise > 0.0, rise, 1.0))
@@ -107,20 +95,20 @@ def draw_episodes(
     length_s: tuple[float, float],
     rng: np.random.Generator,
 ) -> tuple[tuple[float, float], ...]:
-    """Draw episodes that fill exactly a share of the time from the onset to the end of the run.
+    """Return random episodes that fill a given share of the time from the onset on.
 
-    The first begins at the onset. Lengths are drawn uniformly and then scaled so that they add
-    up; the gaps between are uniform over all ways to divide what is left.
+    The first starts at the onset. Lengths are uniform, scaled to their sum; the gaps are uniform
+    over all divisions of the rest.
 
     Args:
-        onset_s: Begin of the first episode [s].
+        onset_s: Start of the first episode [s].
         end_s: End of the run [s].
         share: Share of the time to fill, in [0, 1].
         length_s: Range of the lengths [s].
-        rng: Source of chance.
+        rng: Random generator.
 
     Returns:
-        Begin and end of each [s]; none where there is nothing to fill.
+        Start and end of each [s]; none where the share is 0.
     """
     span = end_s - onset_s
     filled = share * span
@@ -136,19 +124,19 @@ def draw_episodes(
 
 @dataclass
 class EndlessEpisodes:
-    """Episodes of a fault that comes and goes for ever, drawn as time goes on.
+    """Episodes of an intermittent fault without end, drawn as time proceeds.
 
-    The first begins at the onset. Lengths are uniform, gaps exponential with mean
+    The first starts at the onset. Lengths are uniform, gaps exponential with mean
 
         E[gap] = E[length] (1 - share) / share
 
-    which is what `draw_episodes` comes to in a long run.
+    the limit of `draw_episodes` for a long run.
 
     Attributes:
-        begin_s: Begin of the first [s].
+        begin_s: Start of the first [s].
         share: Share of the time that they fill in the long run, in (0, 1].
         length_s: Range of their lengths [s].
-        rng: Source of chance, of these alone.
+        rng: Random generator of these episodes only.
     """
 
     begin_s: float
@@ -161,7 +149,7 @@ class EndlessEpisodes:
         self._next_s = self.begin_s
 
     def within(self, begin_s: float, end_s: float) -> tuple[tuple[float, float], ...]:
-        """Return those that are there at any time between two times, begin and end of each [s]."""
+        """Return the episodes that overlap a time interval, start and end of each [s]."""
         rate = (1.0 - self.share) / self.share
         while self._next_s < end_s and self.share > 0.0:
             length = float(self.rng.uniform(*self.length_s))
@@ -173,19 +161,19 @@ class EndlessEpisodes:
 
 
 PerMovement = NDArray[np.float64 | np.bool_]
-"""Something drawn for each movement: a number, or yes or no."""
+"""A random number or truth value for each movement."""
 
 
 @dataclass(frozen=True)
 class FaultValue:
-    """One fault as it strikes one run.
+    """One fault in one run.
 
     Attributes:
         fault: Motor and mode.
-        magnitude: Size at full severity in the mode's unit; NaN where it is not known, or not
-            before the motion is.
+        magnitude: Size at full severity in the mode's unit; NaN if unknown, or before the motion is
+            known.
         course: Onset and severity over time.
-        per_movement: What was drawn for each movement, (movement,), by its name in the truth.
+        per_movement: Values drawn for each movement, (movement,), by their name in the truth.
     """
 
     fault: Fault
@@ -195,15 +183,11 @@ class FaultValue:
 
     @property
     def onset_s(self) -> float:
-        """When it begins [s]."""
+        """Its onset [s]."""
         return self.course.onset_s
 
     def detail(self, unit: str) -> dict[str, Any]:
-        """Return the full truth as a JSON object; what is not known is None.
-
-        Args:
-            unit: Unit of its magnitude: that of its mode.
-        """
+        """Return the full truth as a JSON object; unknown values are None, `unit` is the mode's."""
         return {
             "motor": self.fault.motor,
             "mode": self.fault.mode,
@@ -221,8 +205,8 @@ class FaultGroup:
 
     Attributes:
         magnitude: Size in the mode's unit, (run,).
-        courses: Onset and severity over time, one for each run, or one for all.
-        per_movement: What was drawn for each movement, (run, movement), by name.
+        courses: Onset and severity over time, one per run, or one for all.
+        per_movement: Values drawn for each movement, (run, movement), by name.
     """
 
     magnitude: FloatArray
@@ -231,7 +215,7 @@ class FaultGroup:
 
     @classmethod
     def of(cls, values: Sequence[FaultValue]) -> FaultGroup:
-        """Return the faults of several runs as one value."""
+        """Return the faults of several runs as one group."""
         return cls(
             magnitude=np.array([value.magnitude for value in values]),
             courses=[value.course for value in values],
@@ -259,13 +243,13 @@ class FaultGroup:
 
 @dataclass(frozen=True)
 class MotorOrders:
-    """What one motor is told in many runs.
+    """Commands of one motor in many runs.
 
     Attributes:
-        target: Where to go, (run, movement) [rad].
+        target: Targets, (run, movement) [rad].
         ramp_duration: Time from start to target, (run, movement) [s].
-        start: When movements begin, (run, movement) [s].
-        lost: Commands that do not arrive, (run, movement).
+        start: Start of each movement, (run, movement) [s].
+        lost: Lost commands, (run, movement).
     """
 
     target: FloatArray
@@ -276,12 +260,12 @@ class MotorOrders:
 
 @dataclass(frozen=True)
 class MotorMotion:
-    """What one motor did in many runs.
+    """Motion of one motor in many runs.
 
     Attributes:
         position: Its angles, (run, time) [rad].
         time: Grid of all runs, (time,) [s].
-        start: When movements were commanded, (run, movement) [s].
+        start: Commanded start of each movement, (run, movement) [s].
     """
 
     position: FloatArray
@@ -291,14 +275,14 @@ class MotorMotion:
 
 @dataclass(frozen=True)
 class Arrival:
-    """Where one motor comes to rest after movements; shapes broadcast against each other.
+    """End of a movement of one motor; shapes broadcast against each other.
 
     Attributes:
-        origin: Where a movement begins [rad].
-        target: Where it leads [rad].
+        origin: Start angle of the movement [rad].
+        target: Its target [rad].
         direction: Sign of the last travel.
-        since_onset: For how long the fault has been there then [s].
-        sag: How far the load has moved the healthy motor [rad].
+        since_onset: Time since the onset of the fault [s].
+        sag: Displacement of the healthy motor by the load [rad].
     """
 
     origin: FloatArray

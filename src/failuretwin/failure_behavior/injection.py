@@ -1,4 +1,4 @@
-"""Faults into runs, stage by stage: movements, reference, gear, stiffness."""
+"""Injection of faults into runs, stage by stage: movements, reference, gear, stiffness."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from failuretwin.failure_behavior.registry import MODES
 
 @dataclass(frozen=True)
 class _Group:
-    """Faults of one mode at one motor: who has them, and where they stand among a run's faults."""
+    """Faults of one mode at one motor: their runs, and their places among a run's faults."""
 
     mode: FaultMode
     motor: int
@@ -41,13 +41,13 @@ class _Group:
     faults: FaultGroup
 
     def rows(self, values: FloatArray) -> FloatArray:
-        """Return the group's part (run, ...) of `values` (run, ..., motor)."""
+        """Return the part (run, ...) of `values` (run, ..., motor) for this group."""
         return np.asarray(values[self.runs, :, self.motor])
 
 
 @dataclass(frozen=True)
 class Injection:
-    """The faults of many runs, ready to act.
+    """The faults of many runs.
 
     Attributes:
         faults: Faults of each run.
@@ -77,14 +77,11 @@ class Injection:
         ]
 
     def on_movements(self, movements: Movements, lost: BoolArray) -> tuple[Movements, BoolArray]:
-        """Return the movements that the motors are really told to make.
+        """Return the movements and lost commands with faults; the given objects without any.
 
         Args:
             movements: As commanded.
-            lost: Commands that do not arrive anyway, (run, movement, motor).
-
-        Returns:
-            Movements and lost commands; the given objects where no fault acts on them.
+            lost: Commands lost in any case, (run, movement, motor).
         """
         target, ramp, gone = movements.target.copy(), movements.ramp_duration.copy(), lost.copy()
         acted = False
@@ -107,14 +104,13 @@ class Injection:
         return replace(movements, target=target, ramp_duration=ramp), gone
 
     def on_reference(self, reference: FloatArray, time: FloatArray) -> FloatArray:
-        """Return the reference that the servo loops follow.
+        """Return the reference of the servo loops, (run, time, motor) [rad].
 
         Args:
-            reference: As the movements have it, (run, time, motor) [rad].
+            reference: Reference of the movements, (run, time, motor) [rad]; returned unchanged
+            where no
+                fault acts on it.
             time: Uniform grid, (time,) [s].
-
-        Returns:
-            (run, time, motor) [rad]: a new array, or the given one where no fault acts on it.
         """
         followed = reference
         for group in self._groups:
@@ -161,12 +157,12 @@ class Injection:
     def as_struck(
         self, position: FloatArray, time: FloatArray, start: FloatArray
     ) -> list[list[FaultValue]]:
-        """Return the faults of each run with what only the motion tells, such as held angles.
+        """Return the faults of each run with values from the motion, such as held angles.
 
         Args:
             position: Angles of the motors, (run, time, motor) [rad].
             time: Uniform grid, (time,) [s].
-            start: When movements were commanded, (run, movement) [s].
+            start: Commanded start of each movement, (run, movement) [s].
         """
         struck = [list(values) for values in self.faults]
         for group in self._groups:
@@ -190,12 +186,12 @@ FORM = "MOTOR:MODE@START or MOTOR:MODE@START-END with times in seconds, such as 
 
 @dataclass(frozen=True)
 class ScheduledFault:
-    """A fault that comes, and may go.
+    """A fault with a start and, where it is repaired, an end.
 
     Attributes:
         fault: Motor and mode.
-        start_s: When it begins [s].
-        end_s: When it is repaired [s]; infinity: never.
+        start_s: Its start [s].
+        end_s: Its repair [s]; infinity: never.
     """
 
     fault: Fault
@@ -211,21 +207,21 @@ class ScheduledFault:
 
     @property
     def course(self) -> Course:
-        """Its severity over time: none or all."""
+        """Its severity over time: 0 or 1."""
         if math.isinf(self.end_s):
             return Course(STEP, self.start_s)
         return Course(INTERMITTENT, self.start_s, episodes=((self.start_s, self.end_s),))
 
     def overlaps(self, begin_s: float, end_s: float) -> bool:
-        """Return whether it is there at any time between two times [s]."""
+        """Return whether it is present at any time in an interval [s]."""
         return self.start_s < end_s and begin_s < self.end_s
 
     @classmethod
     def parse(cls, text: str, motors: Sequence[str]) -> ScheduledFault:
-        """Read the text form.
+        """Return the fault of a text form such as ``motor_3:stuck@40-80``.
 
         Args:
-            text: Such as ``motor_3:stuck@40-80``.
+            text: The text.
             motors: Names of the robot's motors in chain order.
 
         Raises:
@@ -253,15 +249,11 @@ def state_at(schedule: Iterable[ScheduledFault], time_s: float, motors: Sequence
 # Faults as a run set tells them, made again.
 
 _SURE, _NEVER = -1.0, 2.0
-"""Chances below and above any share of commands lost."""
+"""Chances below and above any share of lost commands."""
 
 
 def replayed(detail: Mapping[str, Any]) -> FaultValue:
-    """Return a fault that strikes as it did before.
-
-    Args:
-        detail: What `FaultValue.detail` says of a fault that has struck.
-    """
+    """Return the fault that a run set's `FaultValue.detail` records."""
     magnitude, profile = detail["magnitude"], detail["profile"]
     course = Course(
         profile["shape"],

@@ -1,9 +1,9 @@
-"""What every fault mode is.
+"""Base classes of fault modes.
 
-A mode is one class: how large it is and when it begins, what it does to the motion at each stage,
-where a motor settles with it, what is believed of it beforehand, and its words. Simulation and
-diagnosis ask the same object. It never touches the twin; each stage does nothing unless a mode says
-otherwise, and works on all runs at once that have the mode at the same motor.
+A mode is one class: distributions of magnitude and onset, its effect on the motion at each stage,
+the settled angle of a faulty motor, its prior, and its words. Simulation and diagnosis use the same
+object. Stages work on all runs at once that have the mode at the same motor; by default they change
+nothing.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Range = tuple[float, float]
 
 
 class Signature(Enum):
-    """How a fault shows, which decides how its likelihood is summed."""
+    """Observable effect of a fault, which decides how its likelihood is computed."""
 
     OFFSET = "an offset of each target that one size decides for the whole run"
     GROWING_OFFSET = "the same, growing with the time since the onset"
@@ -49,7 +49,7 @@ class Signature(Enum):
 
 
 class Reaction(Enum):
-    """What an arm that goes on working does about a fault of one of its motors."""
+    """Reaction of an arm that goes on working to a fault of one of its motors."""
 
     LOCK = "plan with the motor held where it is believed to stand"
     INVERT = "command what the fault turns into what is wanted"
@@ -67,26 +67,26 @@ USUAL_REACTION = {
     Signature.TRANSIENT: Reaction.WAIT,
     Signature.MISSED: Reaction.REPEAT,
 }
-"""What is done about a fault that shows in such a way."""
+"""Default reaction to each signature."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FaultMode(ABC):
     """A fault mode with the distributions of its parameters.
 
-    All ranges are drawn from uniformly, anew for each run; equal ends fix the value. A mode that
-    has no use for one of them makes it a field that cannot be set, so that nobody sets it in vain.
+    All ranges are uniform and drawn for each run; equal ends fix the value. A mode without use for
+    one of them makes it a field that cannot be set.
 
     Attributes:
-        onset_s: Range of the onset [s]; no later than the end of the run.
-        profiles: Time profiles that occur, each equally often.
-        rise_s: Range of the time that a ramp takes from the onset to full severity [s].
+        onset_s: Range of the onset [s]; limited to the end of the run.
+        profiles: Time profiles, each with the same probability.
+        rise_s: Range of the time from the onset to full severity of a ramp [s].
         episode_s: Range of the lengths of intermittent episodes [s].
         episode_share: Range of the share of the time after the onset that episodes fill.
 
     Raises:
-        InputError: If a range is out of order or out of bounds, or the mode does not know a
-            profile.
+        InputError: If a range is out of order or out of bounds, or the mode does not allow a
+        profile.
     """
 
     mode: ClassVar[str]
@@ -94,36 +94,36 @@ class FaultMode(ABC):
     unit: ClassVar[str]
     """Unit of its magnitude, such as ``rad``; ``ratio`` for a share."""
     signature: ClassVar[Signature] = Signature.OFFSET
-    """How it shows."""
+    """Its observable effect."""
     sizes: ClassVar[Range | None] = None
-    """Magnitudes that diagnosis considers, all as likely; None: those that are drawn."""
+    """Range of magnitudes in diagnosis, uniform; None: the range drawn in simulation."""
     signed: ClassVar[bool] = False
-    """Whether magnitudes also come with a minus."""
+    """Whether magnitudes can be negative."""
     down_to_visible: ClassVar[bool] = False
-    """Whether the least magnitude considered is what can be seen of the motor, on robots whose
-    profile states none; `sizes` are then those of a motor that turns through half a turn."""
+    """Whether the smallest magnitude in diagnosis is the smallest visible one on robots whose
+    profile states none; `sizes` then apply to a motor with half a turn of travel."""
     misses: ClassVar[tuple[float, float]] = (1.0, 0.0)
-    """Of `MISSED` movements, for each unit of magnitude: the probability that the motor stays where
-    it stood, and that it stands somewhere on the way."""
+    """For `MISSED`, per unit of magnitude: probability that the motor stays at its origin, and that
+    it stops on the way."""
     prior_odds: ClassVar[float] = 0.3
-    """Odds against healthy for each motor before a run is seen; 1: as likely."""
+    """Prior odds against healthy for each motor."""
     before_run: ClassVar[float] = 0.9
-    """Probability that the fault was there before the run, if it is there; what wears out rarely
-    does so within the ten seconds of one run."""
+    """Probability that an existing fault was there before the run; wear rarely starts within a
+    run."""
     name: ClassVar[str] = ""
-    """What a person calls it, ``{motor}`` standing for the motor; empty: by its id."""
+    """Name for users with ``{motor}`` for the motor; empty: by its id."""
     size_words: ClassVar[str] = " ({size:.3g} {unit})"
-    """How a magnitude is told behind the name, in the unit that people read."""
+    """Text of a magnitude after the name, in the unit for users."""
     mechanisms: ClassVar[tuple[str, ...]] = ()
-    """What breaks."""
+    """Possible causes."""
     advice: ClassVar[str] = ""
-    """What to do now."""
+    """Next steps."""
     allowed_profiles: ClassVar[tuple[str, ...]] = PROFILES
-    """Time profiles that make sense for it."""
+    """Valid time profiles."""
     own_reaction: ClassVar[Reaction | None] = None
-    """What to do about it; None: what is usual for how it shows."""
+    """Reaction to it; None: the default of its signature."""
     needs_compliance: ClassVar[bool] = False
-    """Whether it shows only at a motor that gives way under load."""
+    """Whether it is only visible at a motor that yields under load."""
 
     onset_s: Range = (0.0, 5.0)
     profiles: tuple[str, ...] = (STEP,)
@@ -158,7 +158,7 @@ class FaultMode(ABC):
     def draw(
         self, motor: str, movements: int, duration: float, rng: np.random.Generator
     ) -> FaultValue:
-        """Return the fault as it strikes one run.
+        """Return a random fault for one run.
 
         Args:
             motor: Name of the motor.
@@ -179,7 +179,7 @@ class FaultMode(ABC):
     def _draw_per_movement(
         self, movements: int, rng: np.random.Generator
     ) -> dict[str, PerMovement]:
-        """Draw what differs from movement to movement, (movement,), by name."""
+        """Draw values for each movement, (movement,), by name."""
         return {}
 
     def _draw_course(
@@ -198,18 +198,18 @@ class FaultMode(ABC):
         return Course(profile, onset_s)
 
     def on_movements(self, faults: FaultGroup, orders: MotorOrders) -> MotorOrders:
-        """Return the orders that the motor follows; the same object where none changes."""
+        """Return the orders that the motor follows; the same object without a change."""
         return orders
 
     def on_reference(
         self, faults: FaultGroup, reference: FloatArray, time: FloatArray
     ) -> FloatArray:
-        """Return the reference (run, time) [rad] that the servo loop follows.
+        """Return the reference (run, time) [rad] of the servo loop.
 
         Args:
             faults: The faults of these runs.
-            reference: As the orders have it, (run, time) [rad]; the same object is returned
-                where nothing changes.
+            reference: Reference of the orders, (run, time) [rad]; returned unchanged without
+            effect.
             time: Uniform grid, (time,) [s].
         """
         return reference
@@ -223,38 +223,35 @@ class FaultMode(ABC):
         return None
 
     def as_struck(self, faults: FaultGroup, motion: MotorMotion) -> FaultGroup:
-        """Return the faults with what only the motion tells: held angles, movements hit."""
+        """Return the faults with values that follow from the motion: held angles, movements hit."""
         return faults
 
     # What diagnosis asks; by default it is found from the stages above.
 
     @property
     def considered(self) -> Range:
-        """Lowest and highest magnitude that diagnosis considers; NaN where it has none."""
+        """Lowest and highest magnitude in diagnosis; NaN without one."""
         drawn: Range = getattr(self, "magnitude", (math.nan, math.nan))
         return self.sizes or drawn
 
     @property
     def reaction(self) -> Reaction:
-        """What an arm does about it that has to go on working."""
+        """Reaction of an arm that goes on working."""
         return self.own_reaction or USUAL_REACTION[self.signature]
 
     def plain_name(self, motor: str) -> str:
-        """Return what a person calls the fault of a motor."""
+        """Return the name of the fault of a motor for users."""
         return (self.name or f"{{motor}} {self.mode.replace('_', ' ')}").format(motor=motor)
 
     def settled_offset(self, size: FloatArray, arrival: Arrival) -> FloatArray:
-        """Return by how much a motor settles beside where it would without the fault [rad].
+        """Return the settled angle with the fault minus that without it [rad].
 
-        Here: what becomes of a motor that stands at the origin, then at the target, once its
-        orders, reference, gear and stiffness have had the fault, at full severity since the onset.
+        Default: the stages applied to a motor that stands at the origin, then at the target, at
+        full severity since the onset.
 
         Args:
             size: Magnitudes, broadcast against `arrival`.
-            arrival: Where the motor comes to rest.
-
-        Returns:
-            Of the shape of both.
+            arrival: Ends of movements.
         """
         since = np.asarray(arrival.since_onset)
         size, origin, target, sag, each = np.broadcast_arrays(
@@ -277,22 +274,22 @@ class FaultMode(ABC):
         return np.asarray(settled - target[:, 0]).reshape(shape)
 
     def amount(self, size: FloatArray) -> FloatArray:
-        """Return what the settled offset is proportional to, if not to the size itself."""
+        """Return the factor of the settled offset if it is not the size itself."""
         return size
 
     def size_of(self, amount: FloatArray) -> FloatArray:
-        """Return the size that has this `amount`."""
+        """Return the size with this `amount`."""
         return amount
 
     def ramp_factor(self, size: FloatArray) -> FloatArray:
-        """Return how many times as long as commanded a movement takes, (size,)."""
+        """Return the duration of a movement relative to its command, (size,)."""
         one = np.ones((len(size), 1))
         orders = MotorOrders(0.0 * one, one, 0.0 * one, one < 0.0)
         faults = FaultGroup(size, [Course(STEP, 0.0)])
         return np.asarray(self.on_movements(faults, orders).ramp_duration[:, 0])
 
     def dead_time(self, size: FloatArray) -> FloatArray:
-        """Return how much later than the others the motor starts, (size,) [s]."""
+        """Return the delay of the motor relative to the others, (size,) [s]."""
         return np.zeros_like(size)
 
 
@@ -301,16 +298,16 @@ class FaultMode(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class SizedMode(FaultMode):
-    """A fault mode whose magnitude is drawn.
+    """A fault mode with a random magnitude.
 
     Attributes:
         magnitude: Range of the magnitude, in the mode's unit.
     """
 
     lowest: ClassVar[float] = 0.0
-    """Smallest magnitude that makes sense."""
+    """Smallest valid magnitude."""
     highest: ClassVar[float] = math.inf
-    """Largest magnitude that makes sense."""
+    """Largest valid magnitude."""
 
     magnitude: Range
 
@@ -327,8 +324,8 @@ class SignedMode(SizedMode):
     """A fault mode whose magnitude has a sign.
 
     Attributes:
-        both_signs: Whether half of the magnitudes change their sign; otherwise they are drawn
-            from the range as it stands, which may be negative.
+        both_signs: Whether magnitudes change their sign with probability 1/2; otherwise the range
+            applies as given and may be negative.
     """
 
     lowest: ClassVar[float] = -math.inf
@@ -338,7 +335,7 @@ class SignedMode(SizedMode):
 
     @property
     def considered(self) -> Range:
-        """Lowest and highest magnitude that diagnosis considers, whatever their sign."""
+        """Lowest and highest absolute magnitude in diagnosis."""
         low, high = self.magnitude
         return self.sizes or (max(low, -high, 0.0), max(-low, high))
 

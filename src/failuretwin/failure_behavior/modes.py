@@ -1,7 +1,7 @@
-"""The fault modes that are built in.
+"""The built-in fault modes.
 
-What breaks and what follows: stuck and steady-state error from arXiv 2411.01360, section III-B, the
-others by engineering judgement; odds without a source are assumed.
+Causes and effects: stuck and steady-state error from arXiv 2411.01360, section III-B, the others by
+engineering judgement; odds without a source are assumed.
 """
 
 from __future__ import annotations
@@ -41,9 +41,10 @@ PUBLISHED_ONSET_S = 0.49
 
 @dataclass(frozen=True, kw_only=True)
 class Stuck(FaultMode):
-    """The motor keeps the angle that it has at the onset; its magnitude is that angle [rad].
+    """The motor keeps its angle at the onset; its magnitude is that angle [rad].
 
-    Intermittent, it is held in episodes, and the magnitude is the angle of the first.
+    With the intermittent profile it is held in episodes, and the magnitude is the angle of the
+    first.
     """
 
     mode: ClassVar[str] = "stuck"
@@ -67,11 +68,11 @@ class Stuck(FaultMode):
         return np.nan
 
     def held(self, faults: FaultGroup, time: FloatArray) -> BoolArray:
-        """Return when the motor is held: wherever the fault is there."""
+        """Return when the motor is held: while the fault is present."""
         return faults.severity(time) > 0.0
 
     def as_struck(self, faults: FaultGroup, motion: MotorMotion) -> FaultGroup:
-        """Return the faults with the angle at the first instant that the motor is held."""
+        """Return the faults with the angle at the first held instant."""
         held = self.held(faults, motion.time)
         first = np.argmax(held, axis=1)
         angle = motion.position[np.arange(len(first)), first]
@@ -80,7 +81,7 @@ class Stuck(FaultMode):
 
 @dataclass(frozen=True, kw_only=True)
 class Intermittent(SizedMode):
-    """The motor is held in episodes; its magnitude is their share of the time from the onset on."""
+    """The motor is held in episodes; its magnitude is their share of the time after the onset."""
 
     mode: ClassVar[str] = "intermittent"
     unit = "ratio"
@@ -108,7 +109,7 @@ class Intermittent(SizedMode):
     def _draw_course(
         self, magnitude: float, onset_s: float, end_s: float, rng: np.random.Generator
     ) -> Course:
-        """Draw episodes that fill the share that the magnitude says."""
+        """Draw episodes that fill the share given by the magnitude."""
         episodes = draw_episodes(onset_s, end_s, magnitude, self.episode_s, rng)
         return Course(INTERMITTENT, onset_s, episodes=episodes)
 
@@ -124,7 +125,7 @@ CHANCE, LOST = "chance", "lost"
 
 @dataclass(frozen=True, kw_only=True)
 class Slow(SizedMode):
-    """The motor loses a share of its speed; movements cut short what they interrupt."""
+    """The motor loses a share of its speed; late movements are interrupted by the next."""
 
     mode: ClassVar[str] = "slow"
     unit = "ratio"
@@ -140,16 +141,16 @@ class Slow(SizedMode):
     profiles: tuple[str, ...] = (STEP, RAMP)
 
     def on_movements(self, faults: FaultGroup, orders: MotorOrders) -> MotorOrders:
-        """Draw out the ramps of movements that start after the onset."""
+        """Lengthen the ramps of movements that start after the onset."""
         speed = 1.0 - faults.effect(orders.start)
         return replace(orders, ramp_duration=orders.ramp_duration / speed)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Lag(SizedMode):
-    """The motor follows its reference late by a dead time [s].
+    """The motor follows its reference with a dead time [s].
 
-    The default range lies above the 0.04 to 0.06 s by which healthy motors of the ArmPi FPV lag.
+    The default range lies above the lag of 0.04 to 0.06 s of healthy motors of the ArmPi FPV.
     """
 
     mode: ClassVar[str] = "lag"
@@ -166,7 +167,7 @@ class Lag(SizedMode):
     def on_reference(
         self, faults: FaultGroup, reference: FloatArray, time: FloatArray
     ) -> FloatArray:
-        """Delay the reference; it waits where the dead time grows and never runs backwards."""
+        """Delay the reference; where the dead time grows, it waits and never runs backwards."""
         step = (time[-1] - time[0]) / (len(time) - 1)
         place = np.arange(len(time)) - faults.effect(time) / step
         place = np.maximum.accumulate(np.maximum(place, 0.0), axis=1)
@@ -182,10 +183,10 @@ class Lag(SizedMode):
 
 @dataclass(frozen=True, kw_only=True)
 class Backlash(SizedMode):
-    """The joint has play [rad]: it keeps its place until the motor has turned through it.
+    """The joint has play [rad]: it stays until the motor has turned through the play.
 
-    At the onset the motor stands in the middle of the play, so that the joint settles half of it
-    short of each target, seen in the direction of travel.
+    At the onset the motor is in the middle of the play, so that the joint settles half of it short
+    of each target in the direction of travel.
     """
 
     mode: ClassVar[str] = "backlash"
@@ -206,7 +207,7 @@ class Backlash(SizedMode):
     def on_reference(
         self, faults: FaultGroup, reference: FloatArray, time: FloatArray
     ) -> FloatArray:
-        """Pass the reference through the play."""
+        """Apply the play to the reference."""
         half = 0.5 * faults.effect(time).T
         low, high = reference.T - half, reference.T + half
         output = np.empty_like(low)
@@ -217,13 +218,13 @@ class Backlash(SizedMode):
         return output.T
 
     def settled_offset(self, size: FloatArray, arrival: Arrival) -> FloatArray:
-        """Return half of the play, against the last travel: the play is taken up by then."""
+        """Return half of the play, against the last travel."""
         return -0.5 * size * arrival.direction
 
 
 @dataclass(frozen=True, kw_only=True)
 class LostCommands(SizedMode):
-    """A share of the commands never arrives: the motor stays where it is for that movement."""
+    """A share of the commands is lost: the motor stays at its angle for that movement."""
 
     mode: ClassVar[str] = "lost_commands"
     unit = "ratio"
@@ -250,15 +251,15 @@ class LostCommands(SizedMode):
         return np.asarray(faults.per_movement[CHANCE] < faults.effect(start))
 
     def on_movements(self, faults: FaultGroup, orders: MotorOrders) -> MotorOrders:
-        """Lose commands beside those that get lost anyway."""
+        """Add lost commands to those lost in any case."""
         return replace(orders, lost=orders.lost | self._lost(faults, orders.start))
 
     def settled_offset(self, size: FloatArray, arrival: Arrival) -> FloatArray:
-        """Return that of a movement which is lost."""
+        """Return the offset of a lost movement."""
         return arrival.origin - arrival.target
 
     def as_struck(self, faults: FaultGroup, motion: MotorMotion) -> FaultGroup:
-        """Return the faults with the movements that this fault has lost."""
+        """Return the faults with the movements that they lost."""
         return replace(faults, per_movement={LOST: self._lost(faults, motion.start)})
 
 
@@ -272,7 +273,7 @@ OFFSET = "offset_rad"
 
 @dataclass(frozen=True, kw_only=True)
 class SteadyStateError(SizedMode):
-    """Every target is missed by an error of random size and sign, drawn anew for each movement.
+    """Every target is missed by an error of random size and sign, drawn for each movement.
 
     The magnitude of a run is the rms of its errors over the movements that start after the onset.
 
@@ -307,16 +308,16 @@ class SteadyStateError(SizedMode):
         return {OFFSET: sign * rng.uniform(*self.magnitude, movements)}
 
     def on_movements(self, faults: FaultGroup, orders: MotorOrders) -> MotorOrders:
-        """Add its error to every target."""
+        """Add the errors to the targets."""
         offset = faults.per_movement[OFFSET] * faults.severity(orders.start)
         return replace(orders, target=orders.target + offset)
 
     def settled_offset(self, size: FloatArray, arrival: Arrival) -> FloatArray:
-        """Return the size: of one error, that is the offset."""
+        """Return the size: that of one error."""
         return size
 
     def as_struck(self, faults: FaultGroup, motion: MotorMotion) -> FaultGroup:
-        """Return the faults with the errors as severe as they were, and their rms."""
+        """Return the faults with the actual errors and their rms."""
         severity = faults.severity(motion.start)
         offset = faults.per_movement[OFFSET] * severity
         hit = np.maximum(np.count_nonzero(severity, axis=1), 1)
@@ -326,7 +327,7 @@ class SteadyStateError(SizedMode):
 
 @dataclass(frozen=True, kw_only=True)
 class EncoderBias(SignedMode):
-    """The position sensor is off by an angle [rad], and so is the motor, everywhere."""
+    """The position sensor has a constant error [rad], and so has the motor at every angle."""
 
     mode: ClassVar[str] = "encoder_bias"
     unit = "rad"
@@ -348,10 +349,10 @@ class EncoderBias(SignedMode):
 
 @dataclass(frozen=True, kw_only=True)
 class EncoderScale(SignedMode):
-    """The position sensor is off in proportion to the angle: the motor goes (1 + magnitude) as far.
+    """The position sensor has a scale error: the motor goes (1 + magnitude) as far from zero.
 
-    Seen from the motor's zero angle. The default range is nearly that of runs recorded in 2024
-    with a proportional error, which had shares from -0.63 to 0.73.
+    The default range is nearly that of runs recorded in 2024 with a proportional error, with shares
+    from -0.63 to 0.73.
     """
 
     mode: ClassVar[str] = "encoder_scale"
@@ -373,13 +374,13 @@ class EncoderScale(SignedMode):
     def on_reference(
         self, faults: FaultGroup, reference: FloatArray, time: FloatArray
     ) -> FloatArray:
-        """Stretch the reference about zero."""
+        """Scale the reference about zero."""
         return reference * (1.0 + faults.effect(time))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Drift(SignedMode):
-    """The motor slips away from its target at a rate [rad/s]; what has slipped stays slipped."""
+    """The motor drifts from its target at a rate [rad/s]; the displacement remains."""
 
     mode: ClassVar[str] = "drift"
     unit = "rad/s"
@@ -397,11 +398,11 @@ class Drift(SignedMode):
     def on_reference(
         self, faults: FaultGroup, reference: FloatArray, time: FloatArray
     ) -> FloatArray:
-        """Shift the reference by what has slipped so far."""
+        """Shift the reference by the accumulated drift."""
         return reference + faults.accumulated(time)
 
     def settled_offset(self, size: FloatArray, arrival: Arrival) -> FloatArray:
-        """Return what has slipped so far."""
+        """Return the accumulated drift."""
         return size * arrival.since_onset
 
 
@@ -432,11 +433,11 @@ class TorqueLoss(SizedMode):
         return faults.effect(time)
 
     def amount(self, size: FloatArray) -> FloatArray:
-        """Return how many times as far as a healthy motor it sags beyond that."""
+        """Return the additional sag relative to that of a healthy motor."""
         return size / (1.0 - size)
 
     def size_of(self, amount: FloatArray) -> FloatArray:
-        """Return the share lost by a motor that sags so far."""
+        """Return the lost share of stiffness for an additional sag."""
         return amount / (1.0 + amount)
 
 

@@ -1,4 +1,4 @@
-"""The paper's random movements: targets anywhere in the range, ramps of three lengths, plateaus."""
+"""The paper's random movements: uniform targets, ramps of three lengths, plateaus."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from failuretwin.digital_model.nonidealities import Schedule
 from failuretwin.digital_model.robot import Robot
 
 SPEED_CAP_RAD_S = np.deg2rad(272.0)
-"""The published generator moves a reference by at most 2.72 deg in 10 ms [rad/s]."""
+"""Largest speed of a reference in the published generator: 2.72 deg in 10 ms [rad/s]."""
 
 
 @dataclass(frozen=True)
 class RandomMovements:
-    """How random movements are drawn.
+    """Distribution of random movements.
 
     Attributes:
         count: Movements in a run.
         period_s: Nominal time from one movement to the next [s].
-        ramp_shares: Shares of the nominal period that a ramp may take.
+        ramp_shares: Possible shares of the nominal period for a ramp.
     """
 
     count: int = 5
@@ -44,13 +44,13 @@ class RandomMovements:
     ) -> Movements:
         """Return the movements of one run, with a leading run axis of 1.
 
-        Ramps that would exceed the speed cap take longer.
+        Ramps beyond the speed cap take longer.
 
         Args:
             robot: The robot.
-            schedule: When movements are commanded.
+            schedule: Times of commands.
             rng: The run's own generator.
-            initial: Where the arm starts, (motor,) [rad]; None: at its zero pose.
+            initial: Start of the arm, (motor,) [rad]; None: its zero pose.
         """
         low, high = np.array([motor.movement_range for motor in robot.motors]).T
         target = rng.uniform(low, high, (self.count, len(low)))
@@ -78,7 +78,7 @@ def _cap_speed(initial: FloatArray, target: FloatArray, ramp: FloatArray) -> Flo
 
 
 def stack_movements(parts: Sequence[Movements]) -> Movements:
-    """Return the movements of all `parts` along the run axis; they must be equally many."""
+    """Return the movements of all `parts` along the run axis; their counts must be equal."""
     return Movements(
         *(
             np.concatenate([getattr(part, name) for part in parts])

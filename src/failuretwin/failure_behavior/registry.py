@@ -1,4 +1,4 @@
-"""Which fault modes there are: those built in, those of installed packages, those registered."""
+"""Registry of fault modes: built in, from installed packages, and registered."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from failuretwin.failure_behavior.mode import FaultMode
 from failuretwin.failure_behavior.modes import BUILT_IN
 
 ENTRY_POINTS = "failuretwin.modes"
-"""Group of entry points by which an installed package names a module that registers modes."""
+"""Group of entry points; each names a module that registers modes."""
 
 
 class ModeRegistry(Mapping[str, FaultMode]):
-    """The fault modes by id, filled when it is first read."""
+    """The fault modes by id, loaded at the first access."""
 
     def __init__(self) -> None:
         self._modes: dict[str, FaultMode] = {}
@@ -45,11 +45,7 @@ class ModeRegistry(Mapping[str, FaultMode]):
         self._modes[mode.mode] = mode
 
     def find(self, mode: str) -> FaultMode:
-        """Return a mode by id.
-
-        Raises:
-            InputError: If there is none.
-        """
+        """Return a mode by id; raise InputError if there is none."""
         if mode not in self:
             known = unknown_name("fault mode", mode, self)
             raise InputError(f"{known} If it is one of your own, name its module with --plugin.")
@@ -70,24 +66,24 @@ MODES = ModeRegistry()
 
 
 def register_mode(mode: FaultMode) -> None:
-    """Make a mode of your own known to simulation, diagnosis and the command line.
+    """Make a mode of your own available to simulation, diagnosis and the command line.
 
     Args:
         mode: The mode with its default distributions.
 
     Raises:
-        InputError: If it is no mode, lacks what every mode needs, or there is another of that id.
+        InputError: If it is not a mode, is incomplete, or its id is taken.
     """
     MODES.add(mode)
 
 
 def _origin(mode: FaultMode) -> tuple[str, str]:
-    """Return where the class of a mode stands: a module that is run again replaces its modes."""
+    """Return module and class of a mode: a module that is run again replaces its modes."""
     return type(mode).__module__, type(mode).__qualname__
 
 
 def _check_complete(mode: FaultMode) -> None:
-    """Refuse what is no instance of a fault mode, or lacks a field that has no default."""
+    """Raise InputError unless `mode` is an instance of a fault mode with all required fields."""
     if not isinstance(mode, FaultMode):
         raise InputError(
             f"{mode!r} is no fault mode. Expected an object of a class derived from FaultMode, "
@@ -137,11 +133,9 @@ def _is_being_imported(name: str) -> bool:
 
 
 def _import_modes(name: str, what: str) -> Path | None:
-    """Import a module that registers modes and return its file.
+    """Import the module `name` that registers modes and return its file.
 
-    Args:
-        name: Its dotted name.
-        what: What to call it in errors.
+    Errors call it `what`.
     """
     before = set(MODES)
     try:
@@ -163,7 +157,7 @@ def _import_modes(name: str, what: str) -> Path | None:
 
 
 def plugin_files() -> list[Path]:
-    """Return the files of modes that are not built in, for workers elsewhere to import."""
+    """Return the files of modes that are not built in, for workers to import."""
     names = {type(mode).__module__ for mode in MODES.values()}
     files = [getattr(sys.modules.get(name), "__file__", None) for name in sorted(names)]
     own = Path(__file__).parents[1]
@@ -175,18 +169,15 @@ def plugin_files() -> list[Path]:
 
 
 def load_modes(path: Path) -> Mapping[str, FaultMode]:
-    """Load distributions from a TOML file with one table for each mode.
+    """Return all modes by id, with distributions from a TOML file with one table per mode.
 
     Args:
-        path: The file. Modes that it leaves out stay as they are in `MODES`; keys that it leaves
-            out have the defaults of their mode.
-
-    Returns:
-        All modes by id.
+        path: The file. Missing modes stay as in `MODES`; missing keys have the defaults of their
+        mode.
 
     Raises:
-        InputError: If the file cannot be read, or names a mode or key that does not exist, or a
-            value makes no sense.
+        InputError: If the file cannot be read, names an unknown mode or key, or has an invalid
+        value.
     """
     modes = dict(MODES)
     for name, table in read_toml(path).items():

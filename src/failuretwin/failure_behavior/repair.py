@@ -1,8 +1,7 @@
-"""What to do about a fault that is sure, by the kind of actuator.
+"""Advice on certain faults by class of arm.
 
 The `advice` of a mode is for hobby servos: no brake, a horn on a splined shaft. Industrial drives
-hold with a brake and keep an error log; cables stretch and slip on pulleys. By engineering
-judgement.
+have a holding brake and an error log; cables stretch and slip on pulleys. By engineering judgement.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from collections.abc import Mapping
 from failuretwin.failure_behavior.mode import FaultMode
 
 INDUSTRIAL, CABLE_DRIVEN = "industrial", "cable-driven"
-"""Classes of arms whose advice is another; see `failuretwin.digital_model.arm_classes`."""
+"""Classes of arms with advice of their own; see `failuretwin.digital_model.arm_classes`."""
 
 ADVICE: Mapping[str, Mapping[str, str]] = {
     INDUSTRIAL: {
@@ -80,14 +79,14 @@ ADVICE: Mapping[str, Mapping[str, str]] = {
         ),
     },
 }
-"""Advice by class of arm and mode; a mode that a class does not name keeps its own."""
+"""Advice by class of arm and mode; default: the mode's own."""
 
 
 def advice_for(mode: FaultMode, arm_class: str) -> str:
-    """Return what to do about a fault of this mode that is sure; empty: the mode does not say.
+    """Return the advice on a certain fault of this mode; empty: the mode has none.
 
     Args:
         mode: The mode.
-        arm_class: Kind of arm, such as ``industrial``; empty: not known.
+        arm_class: Class of arm, such as ``industrial``; empty: unknown.
     """
     return ADVICE.get(arm_class, {}).get(mode.mode, mode.advice)
