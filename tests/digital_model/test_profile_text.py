@@ -60,7 +60,7 @@ def test_a_second_fit_takes_the_place_of_the_first(tmp_path):
     result = fitted_text(out.read_text(encoding="utf-8"), out, out, second)
 
     assert tomllib.loads(result)["geometry"]["source"] == "second"
-    assert result.count("# What `failuretwin robot fit` found") == 1
+    assert result.count("# Written by `failuretwin robot fit`") == 1
     assert "first" not in result
 
 
