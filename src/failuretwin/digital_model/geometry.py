@@ -150,16 +150,13 @@ def geometry_columns(chain: SerialChain, q: FloatArray, scale: float = 1.0) -> F
         (..., 3, 6 * joint): x, y, z [m/m] and roll, pitch, yaw [m/rad] of the first joint, then of
         the next.
     """
-    rotation, origin = chain.frames(q)
-    axes = rotation[..., :-1, :, :]
-    arm = origin[..., -1:, :] - origin[..., :-1, :]
-    columns = np.concatenate([scale * axes, cross(axes, arm[..., None], -2)], axis=-1)
+    frames, count = chain.frames_by_joint(q), len(chain.joints)
+    columns = np.empty((count, 6, 3, frames.shape[-1]))
     for j, joint in enumerate(chain.joints):
-        if joint.axis != (0.0, 0.0, 1.0):
-            parts = columns[..., j, :, :].reshape(*q.shape[:-1], 3, 2, 3)
-            to_urdf = np.dot(parts, rotation_to_z(joint.axis).T)
-            columns[..., j, :, :] = to_urdf.reshape(*q.shape[:-1], 3, 6)
-    return np.moveaxis(columns, -3, -2).reshape(*q.shape[:-1], 3, 6 * q.shape[-1])
+        axes = (joint.to_urdf @ frames[j, :3].reshape(3, -1)).reshape(3, 3, -1)
+        columns[j, :3] = scale * axes
+        columns[j, 3:] = cross(axes, frames[-1, 3] - frames[j, 3], -2)
+    return columns.reshape(6 * count, 3, -1).T.reshape(*np.shape(q)[:-1], 3, 6 * count)
 
 
 def _scaled(T: FloatArray, scale: float) -> FloatArray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -109,6 +110,11 @@ class Joint:
     high: float = np.inf
     axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
+    @cached_property
+    def to_urdf(self) -> FloatArray:
+        """Rotation (3, 3) of this frame in the frame that the URDF gives the joint."""
+        return rotation_to_z(self.axis)
+
 
 @dataclass(frozen=True)
 class SerialChain:
@@ -163,10 +169,10 @@ class SerialChain:
             Rotations (..., joint + 1, 3, 3), whose third column is the joint's axis, and origins
             (..., joint + 1, 3) [m]; the last ones are those of the tool frame.
         """
-        found = np.moveaxis(self._frames(q), -1, 0).reshape(*np.shape(q)[:-1], -1, 4, 3)
+        found = np.moveaxis(self.frames_by_joint(q), -1, 0).reshape(*np.shape(q)[:-1], -1, 4, 3)
         return np.swapaxes(found[..., :3, :], -1, -2), found[..., 3, :]
 
-    def _frames(self, q: FloatArray) -> FloatArray:
+    def frames_by_joint(self, q: FloatArray) -> FloatArray:
         """Return x, y, z axis and origin of joints and tool, (joint + 1, 4, coordinate, pose)."""
         values = self._flatten(q).T
         count = values.shape[1]
@@ -194,7 +200,7 @@ class SerialChain:
         Args:
             q: Joint values in chain order, (..., joint) [rad or m].
         """
-        frames, lead = self._frames(q), np.shape(q)[:-1]
+        frames, lead = self.frames_by_joint(q), np.shape(q)[:-1]
         turns = np.array([float(not joint.prismatic) for joint in self.joints])
         tool, axis = frames[-1, :3], frames[:-1, 2] * turns[:, None, None]
         slope = cross(axis[:, None], tool, -2)  # (joint, tool axis, coordinate, pose)
