@@ -50,10 +50,10 @@ def test_an_arm_that_folds_onto_itself_or_bows_to_the_floor(armpi):
     clearance, upright = Clearance(armpi, 0.02), np.zeros(4)
     assert clearance.margin(upright) > 0.01
     folded = np.array([0.0, 1.57, -2.09, 2.09])  # the hand comes down onto the base
-    assert clearance.gap(folded) < -0.005
+    assert clearance.gap_and_height(folded)[0] < -0.005
     bowed = np.array([0.0, 1.57, -0.9, 0.6])
-    assert clearance.height(bowed) < 0.0
-    assert Clearance.of(armpi, floor_m=-0.5).height(bowed) > 0.0
+    assert clearance.gap_and_height(bowed)[1] < 0.0
+    assert Clearance.of(armpi, floor_m=-0.5).gap_and_height(bowed)[1] > 0.0
 
 
 def test_wider_links_leave_less(armpi):
@@ -61,4 +61,4 @@ def test_wider_links_leave_less(armpi):
     thin, thick = Clearance(armpi, 0.005), Clearance(armpi, 0.01)
     shared = [pair for pair in thin.pairs.tolist() if pair in thick.pairs.tolist()]
     assert shared == thin.pairs.tolist()
-    assert thin.gap(pose) - thick.gap(pose) == pytest.approx(0.01)
+    assert thin.gap_and_height(pose)[0] - thick.gap_and_height(pose)[0] == pytest.approx(0.01)

@@ -84,32 +84,22 @@ class Clearance:
         """Return base, joints and tool, (..., point, 3) [m], of poses in the log's sense."""
         return joint_points(self.robot.loads.chain, pose * self.robot.sense)
 
-    def gap(self, pose: FloatArray) -> FloatArray:
-        """Return the smallest gap between links, (...) [m], of poses (..., motor) [rad]."""
-        return self._gap(self.points(pose))
-
-    def height(self, pose: FloatArray) -> FloatArray:
-        """Return the height of the lowest moving joint or the tool above the floor, (...) [m]."""
-        return self._height(self.points(pose))
-
     def gap_and_height(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return both, each (...) [m], for poses (..., motor) [rad]."""
+        """Return the smallest gap between links and the lowest height above the floor.
+
+        Both (...) [m], for poses (..., motor) in the log's sense [rad]; the height is that of the
+        lowest moving joint or the tool.
+        """
         points = self.points(pose)
-        return self._gap(points), self._height(points)
+        height = points[..., self._first_moved :, 2].min(axis=-1) - self.floor_m
+        if len(self.pairs) == 0:
+            return np.full(points.shape[:-2], np.inf), height
+        apart = self._distances(points, self.pairs)
+        return np.asarray(apart.min(axis=-1) - 2.0 * self.radius_m), height
 
     def margin(self, pose: FloatArray) -> FloatArray:
         """Return the smaller of gap and height, (...) [m]; negative for a forbidden pose."""
         return np.minimum(*self.gap_and_height(pose))
-
-    def _gap(self, points: FloatArray) -> FloatArray:
-        if len(self.pairs) == 0:
-            return np.full(points.shape[:-2], np.inf)
-        apart = self._distances(points, self.pairs)
-        return np.asarray(apart.min(axis=-1) - 2.0 * self.radius_m)
-
-    def _height(self, points: FloatArray) -> FloatArray:
-        z = points[..., self._first_moved :, 2]
-        return np.asarray(z.min(axis=-1) - self.floor_m)
 
     def _distances(self, points: FloatArray, pairs: IntArray) -> FloatArray:
         """Return the distance of the lines of pairs of links, (..., pair) [m]."""
