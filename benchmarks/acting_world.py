@@ -15,7 +15,7 @@ from failuretwin.connection.links.base import Order
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot
 from failuretwin.digital_model.nonidealities import Imperfections, vary
-from failuretwin.digital_model.physics_engine import LiveArms, PhysicsEngine
+from failuretwin.digital_model.physics.engine import LiveArms, PhysicsEngine
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, sag
 from failuretwin.failure_behavior.fault import EndlessEpisodes

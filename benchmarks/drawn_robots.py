@@ -29,7 +29,7 @@ from failuretwin.core.hypothesis import Diagnosis, paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import Imperfections, vary
-from failuretwin.digital_model.physics_model import load_parameters
+from failuretwin.digital_model.physics.motors import load_parameters
 from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.failure_behavior.modes import SteadyStateError
 from failuretwin.failure_behavior.registry import MODES

@@ -12,7 +12,7 @@ from failuretwin import DigitalTwin, load_robot
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.nonidealities import Schedule
-from failuretwin.digital_model.physics_engine import PhysicsEngine
+from failuretwin.digital_model.physics.engine import PhysicsEngine
 from failuretwin.digital_model.twin import Drive
 from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
 

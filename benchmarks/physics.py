@@ -14,7 +14,7 @@ import numpy as np
 from failuretwin import load_robot
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.nonidealities import Schedule
-from failuretwin.digital_model.physics_engine import STEP_S, PhysicsEngine
+from failuretwin.digital_model.physics.engine import STEP_S, PhysicsEngine
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import Drive
 from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements

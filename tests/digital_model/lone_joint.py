@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from failuretwin import load_robot
-from failuretwin.digital_model.physics_model import MotorPhysics, PhysicsParameters
+from failuretwin.digital_model.physics.motors import MotorPhysics, PhysicsParameters
 
 MASS_KG = 0.7
 ROD_M = 0.4

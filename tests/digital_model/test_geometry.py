@@ -7,7 +7,7 @@ import pytest
 
 from failuretwin.core.errors import InputError
 from failuretwin.digital_model.geometry import JointCorrection, SensorFrame
-from failuretwin.digital_model.physics_model import TOOL, arm_spec
+from failuretwin.digital_model.physics.arm import TOOL, arm_spec
 from failuretwin.digital_model.robot import _assembled, load_robot
 from failuretwin.digital_model.twin import DigitalTwin
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from failuretwin.digital_model.nonidealities import Schedule
-from failuretwin.digital_model.physics_engine import LiveArms, PhysicsEngine
+from failuretwin.digital_model.physics.engine import LiveArms, PhysicsEngine
 from failuretwin.digital_model.twin import Drive
 from failuretwin.failure_behavior.random_movements import RandomMovements
 

@@ -12,14 +12,10 @@ from hypothesis.extra.numpy import arrays
 
 from failuretwin import load_robot
 from failuretwin.core.errors import InputError
-from failuretwin.digital_model.physics_engine import PhysicsEngine, limit_speed, refine
-from failuretwin.digital_model.physics_model import (
-    TOOL,
-    arm_spec,
-    build_model,
-    default_parameters,
-    load_parameters,
-)
+from failuretwin.digital_model.physics.arm import TOOL, arm_spec
+from failuretwin.digital_model.physics.engine import PhysicsEngine, limit_speed, refine
+from failuretwin.digital_model.physics.model import build_model
+from failuretwin.digital_model.physics.motors import default_parameters, load_parameters
 from failuretwin.digital_model.robot import bundled_robots
 from failuretwin.digital_model.servo import first_order_lag
 from failuretwin.digital_model.twin import Drive

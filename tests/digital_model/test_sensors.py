@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from failuretwin.core.errors import InputError
 from failuretwin.digital_model.kinematics import GRAVITY
-from failuretwin.digital_model.physics_model import TOOL, arm_spec
+from failuretwin.digital_model.physics.arm import TOOL, arm_spec
 from failuretwin.digital_model.profile import SensorProfile
 from failuretwin.digital_model.robot import load_robot
 from failuretwin.digital_model.sensors import SENSORS, sensor_of

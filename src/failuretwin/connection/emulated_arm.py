@@ -26,7 +26,7 @@ from failuretwin.digital_model.disturbances import (
     stack,
 )
 from failuretwin.digital_model.nonidealities import Imperfections, vary
-from failuretwin.digital_model.physics_engine import LiveArms, PhysicsEngine
+from failuretwin.digital_model.physics.engine import LiveArms, PhysicsEngine
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.fault import INTERMITTENT, Course, EndlessEpisodes, FaultValue

@@ -43,7 +43,7 @@ from failuretwin.digital_model.disturbances import (
     stack,
 )
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfections
-from failuretwin.digital_model.physics_engine import PhysicsEngine
+from failuretwin.digital_model.physics.engine import PhysicsEngine
 from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.settling import Settling, loads_in_range
 from failuretwin.digital_model.twin import DigitalTwin, Drive, Engine, ServoEngine

@@ -11,13 +11,12 @@ import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.digital_model.physics_model import (
+from failuretwin.digital_model.physics.arm import load_mujoco
+from failuretwin.digital_model.physics.model import PhysicsModel, build_model
+from failuretwin.digital_model.physics.motors import (
     MotorPhysics,
-    PhysicsModel,
     PhysicsParameters,
-    build_model,
     default_parameters,
-    load_mujoco,
     load_parameters,
 )
 from failuretwin.digital_model.robot import Robot

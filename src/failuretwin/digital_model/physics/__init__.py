@@ -1,0 +1,1 @@
+"""The physics engine: a robot with its motors and gears in MuJoCo."""
