@@ -109,8 +109,8 @@ def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     try:
         return cls(**values)
     except InputError as error:
-        told = str(error).startswith(where)
-        raise InputError(f"{error}" if told else f"{where}: {error}") from error
+        includes_place = str(error).startswith(where)
+        raise InputError(f"{error}" if includes_place else f"{where}: {error}") from error
 
 
 def _required(field: dataclasses.Field[Any]) -> bool:

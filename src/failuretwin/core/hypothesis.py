@@ -139,7 +139,7 @@ def _as_hypothesis(given: Hypothesis | str) -> Hypothesis:
     return given if isinstance(given, Hypothesis) else Hypothesis.parse(str(given).strip())
 
 
-# The state that a posterior tells.
+# State of a robot by its posterior.
 
 HEALTHY_STATE, FAULTY_STATE, OPEN_STATE = "healthy", "faulty", "cannot tell"
 SURE = 0.95
@@ -167,7 +167,7 @@ def state_of(posterior: Mapping[str, float]) -> str:
     return OPEN_STATE
 
 
-# The answer for one run: what, how sure, since when, how large.
+# Diagnosis of one run.
 
 Interval = tuple[float, float]
 

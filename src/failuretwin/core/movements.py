@@ -269,7 +269,7 @@ def _ramps(corners: _Corners, start: FloatArray, end: FloatArray) -> tuple[Float
     return target, duration
 
 
-# References as they come: at uneven times, and with noise on them.
+# Raw references: uneven times and noise.
 
 NOISE_RAD = 1e-9
 """Typical change of slope from which a reference counts as noisy [rad]."""

@@ -134,8 +134,8 @@ class InverseKinematics:
         miss_m = np.linalg.norm(wanted[:, :3] - point[:, :3], axis=-1)
         miss_rad = np.zeros(len(pose))
         if direction is not None:
-            axis, asked = point[:, 3:] - point[:, :3], wanted[:, 3:] - wanted[:, :3]
-            miss_rad = angle_between(axis / POINTER_M, asked / POINTER_M)
+            axis, requested = point[:, 3:] - point[:, :3], wanted[:, 3:] - wanted[:, :3]
+            miss_rad = angle_between(axis / POINTER_M, requested / POINTER_M)
         by_goal = shape[:2]
         return Poses(pose.reshape(shape), miss_m.reshape(by_goal), miss_rad.reshape(by_goal))
 

@@ -329,7 +329,7 @@ class Loads:
         return seen
 
 
-# Which joints can move the tool point, and how far it gets: by trying poses.
+# Levers and reach, by random poses.
 
 POSES = 256
 SEED = 0

@@ -174,7 +174,7 @@ class Imperfections:
 
 NO_IMPERFECTIONS = Imperfections("none", "the published twin")
 
-# Robots of a kind: imperfections drawn around given ones, for training and for honest doubt.
+# Robots of a class: imperfections drawn around given ones.
 
 HIGHEST_LOSS = 0.9
 """Upper bound on the share of movements with any lost command."""

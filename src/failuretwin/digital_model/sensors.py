@@ -305,8 +305,8 @@ class Wire(Sensor):
     def anchor(self) -> FloatArray:
         """Its start in the base link's frame [m]; default: beside the arm, on its floor."""
         reach = self.twin.robot.reach
-        told = self.profile.anchor if self.profile else ()
-        return np.asarray(told or (reach, 0.5 * reach, 0.0))
+        anchor = self.profile.anchor if self.profile else ()
+        return np.asarray(anchor or (reach, 0.5 * reach, 0.0))
 
     def expected(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the length and its Jacobian [m, m/rad]."""

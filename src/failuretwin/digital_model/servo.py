@@ -135,9 +135,9 @@ def respond_limited(
     free, held = _transitions(gains, step)
     begin = reference[..., :1]
     relative, most = reference - begin, limit[:, None]
-    told = np.stack([relative[..., :-1], np.diff(relative, axis=-1) / step], axis=-1)
+    inputs = np.stack([relative[..., :-1], np.diff(relative, axis=-1) / step], axis=-1)
     # What the reference adds in every time step, (time - 1, variant, test, 4).
-    drive = np.ascontiguousarray(np.moveaxis(told @ free[:, None, 3:], 2, 0))
+    drive = np.ascontiguousarray(np.moveaxis(inputs @ free[:, None, 3:], 2, 0))
     response = np.zeros((reference.shape[-1], *reference.shape[:2]))
     x = np.zeros((*reference.shape[:2], 3))
     for i, driven in enumerate(drive):
@@ -163,9 +163,9 @@ def _transitions(gains: FloatArray, step: float) -> tuple[FloatArray, FloatArray
     from scipy.linalg import expm
 
     P, I, rate = gains[:, 0], gains[:, 1], 1.0 / gains[:, 2]  # noqa: E741 - integral gain
-    asked = np.stack([0.0 * P, -P * rate, P * rate - I, I, P], axis=1)
+    demanded = np.stack([0.0 * P, -P * rate, P * rate - I, I, P], axis=1)
     free = np.zeros((len(gains), 5, 5))
-    free[:, 0] = asked
+    free[:, 0] = demanded
     free[:, 1, 0] = free[:, 2, 1] = rate
     free[:, 1, 1] = free[:, 2, 2] = -rate
     free[:, 3, 4] = 1.0
@@ -173,4 +173,4 @@ def _transitions(gains: FloatArray, step: float) -> tuple[FloatArray, FloatArray
     held[:, 1:3, :3] = free[:, 1:3, :3]
     held[:, 0, 3] = 1.0
     ahead, capped = (np.swapaxes(np.asarray(expm(step * m)), 1, 2) for m in (free, held))
-    return np.concatenate([ahead[..., :3], asked[..., None]], axis=2), capped[..., :3]
+    return np.concatenate([ahead[..., :3], demanded[..., None]], axis=2), capped[..., :3]

@@ -98,7 +98,7 @@ def uniform_step(time: FloatArray) -> float:
     return float((time[-1] - time[0]) / len(steps))
 
 
-# Engines: from what the motors are told and what hampers them to the angles they take.
+# Engines: from references and faults to motor angles.
 
 SAG_ROUNDS = 2
 """Iterations of sag and pose; each leaves a few hundredths of the error."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from failuretwin.core.hypothesis import Fault
 from failuretwin.core.types import BoolArray, FloatArray
 
-# Courses: how severe a fault is over time, from 0 (not there) to 1 (full magnitude).
+# Courses: severity over time.
 
 STEP, RAMP, INTERMITTENT = PROFILES = ("step", "ramp", "intermittent")
 """Time profiles: sudden, growing linearly, episodic."""
@@ -238,7 +238,7 @@ class FaultGroup:
         return self.magnitude[:, None] * exposures(self.courses, time)
 
 
-# What a fault acts on, for one motor in many runs: its orders, its motion, where it arrives.
+# Inputs of a fault, for one motor in many runs: orders, motion, end of a movement.
 
 
 @dataclass(frozen=True)

@@ -167,19 +167,19 @@ class Injection:
         struck = [list(values) for values in self.faults]
         for group in self._groups:
             motion = MotorMotion(group.rows(position), time, start[group.runs])
-            told = group.mode.as_struck(group.faults, motion)
-            if told is group.faults:
+            observed = group.mode.as_struck(group.faults, motion)
+            if observed is group.faults:
                 continue
             for i, (run, place) in enumerate(zip(group.runs, group.places, strict=True)):
                 struck[run][place] = replace(
                     struck[run][place],
-                    magnitude=float(told.magnitude[i]),
-                    per_movement={name: rows[i] for name, rows in told.per_movement.items()},
+                    magnitude=float(observed.magnitude[i]),
+                    per_movement={name: rows[i] for name, rows in observed.per_movement.items()},
                 )
         return struck
 
 
-# Faults on a schedule: which motor fails how, from when, and when it is repaired.
+# Scheduled faults: motor, mode, start and repair.
 
 FORM = "MOTOR:MODE@START or MOTOR:MODE@START-END with times in seconds, such as motor_3:stuck@40-80"
 
@@ -246,7 +246,7 @@ def state_at(schedule: Iterable[ScheduledFault], time_s: float, motors: Sequence
     return str(Hypothesis(tuple(sorted(there, key=lambda fault: motors.index(fault.motor)))))
 
 
-# Faults as a run set tells them, made again.
+# Faults recorded in a run set.
 
 _SURE, _NEVER = -1.0, 2.0
 """Chances below and above any share of lost commands."""

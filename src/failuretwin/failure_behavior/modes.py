@@ -118,7 +118,7 @@ class Intermittent(SizedMode):
         return faults.severity(time) > 0.0
 
 
-# Modes that spoil the way to the target: slow, lag, backlash, lost commands.
+# Modes that disturb the motion to the target: slow, lag, backlash, lost commands.
 
 CHANCE, LOST = "chance", "lost"
 
@@ -263,7 +263,7 @@ class LostCommands(SizedMode):
         return replace(faults, per_movement={LOST: self._lost(faults, motion.start)})
 
 
-# Modes that put the motor beside its target: steady-state error, encoder faults, drift.
+# Modes with an offset from the target: steady-state error, encoder faults, drift.
 
 PUBLISHED_ERROR_RAD = (float(np.deg2rad(10 * 0.24)), float(np.deg2rad(50 * 0.24)))
 """Bounds of the paper's steady-state errors: 10 and 50 counts of 0.24 deg [rad]."""
@@ -406,7 +406,7 @@ class Drift(SignedMode):
         return size * arrival.since_onset
 
 
-# The mode in which the motor cannot carry its load: torque loss.
+# The mode with too little stiffness: torque loss.
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -93,17 +93,17 @@ class PhysicsEngine:
         """
         mujoco = load_mujoco()
         _check(drive, len(time), len(self.robot.motors))
-        step, told = uniform_step(time), drive.reference
-        payload = np.zeros(len(told)) if drive.payload is None else drive.payload
-        weakness = np.zeros_like(told) if drive.weakness is None else drive.weakness
-        out = np.empty(told.shape)
+        step, reference = uniform_step(time), drive.reference
+        payload = np.zeros(len(reference)) if drive.payload is None else drive.payload
+        weakness = np.zeros_like(reference) if drive.weakness is None else drive.weakness
+        out = np.empty(reference.shape)
         with mujoco.rollout.Rollout(nthread=0 if self.threads == 1 else self.threads) as pool:
             for rows in _chunks(len(out), RUNS_AT_ONCE):
                 weak = weakness[rows]
-                arms = LiveArms(self, told[rows, 0], step, payload[rows], weak[:, 0], pool)
+                arms = LiveArms(self, reference[rows, 0], step, payload[rows], weak[:, 0], pool)
                 held = None if drive.held is None else drive.held[rows, :-1]
                 out[rows, 0] = arms.angle
-                out[rows, 1:] = arms.follow(told[rows, 1:], held, weak[:, 1:])
+                out[rows, 1:] = arms.follow(reference[rows, 1:], held, weak[:, 1:])
         return out
 
 
@@ -172,16 +172,16 @@ class LiveArms:
         Raises:
             InputError: If the simulation becomes unstable.
         """
-        told = np.concatenate([self._last[:, None], reference * self._sense], axis=1)
+        limited = np.concatenate([self._last[:, None], reference * self._sense], axis=1)
         speed = np.array([motor.speed_limit for motor in self._engine.robot.motors])
-        told = limit_speed(told, self._grid_step, speed)
+        limited = limit_speed(limited, self._grid_step, speed)
         strength = np.concatenate([self._strength[:, None], _strength(reference, weakness)], axis=1)
-        self._last, self._strength = told[:, -1], strength[:, -1]
+        self._last, self._strength = limited[:, -1], strength[:, -1]
         out = np.empty_like(reference)
         for part in _chunks(out.shape[1], SAMPLES_AT_ONCE):
             span = slice(part.start, part.stop + 1)
             brake = None if held is None else held[:, part]
-            out[:, part] = self._advance(told[:, span], brake, strength[:, span])
+            out[:, part] = self._advance(limited[:, span], brake, strength[:, span])
         return out * self._sense
 
     def _rest_state(

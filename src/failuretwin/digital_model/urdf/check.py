@@ -194,9 +194,9 @@ def _loop_findings(urdf: Urdf, path: Sequence[UrdfJoint]) -> Iterator[Finding]:
         "only serial chains can be used. Remove all but one of them."
     )
     yield from _of_names("error", on_path, text)
-    beside = [link for link in twice if link not in on_path]
+    elsewhere = [link for link in twice if link not in on_path]
     text = "link NAMES is the child of several joints; not on the way to the tool, so it "
-    yield from _of_names("warning", beside, text + "changes nothing.")
+    yield from _of_names("warning", elsewhere, text + "changes nothing.")
 
 
 def _tool_findings(choice: ToolChoice) -> Iterator[Finding]:
@@ -234,9 +234,9 @@ def _joint_findings(urdf: Urdf, path: Sequence[UrdfJoint]) -> Iterator[Finding]:
             yield Finding(severity, f"joint {joint.name!r} {text}")
     known = {joint.name for joint in path}
     followers = [joint.name for joint in urdf.joints if joint.mimic is not None]
-    beside = [name for name in followers if name not in known]
+    elsewhere = [name for name in followers if name not in known]
     text = "joint NAMES follows another joint (mimic), so it is no motor."
-    yield from _of_names("note", beside, text)
+    yield from _of_names("note", elsewhere, text)
 
 
 def _oddities(joint: UrdfJoint) -> Iterator[tuple[Severity, str]]:
@@ -322,9 +322,9 @@ def _bodies(urdf: Urdf, path: Sequence[UrdfJoint]) -> list[list[str]]:
         body = [joint.child]
         seen.add(joint.child)
         for link in body:
-            beside = [name for name in onward.get(link, ()) if name not in seen]
-            seen.update(beside)
-            body += dict.fromkeys(beside)
+            attached = [name for name in onward.get(link, ()) if name not in seen]
+            seen.update(attached)
+            body += dict.fromkeys(attached)
         bodies.append(body)
     return bodies
 
