@@ -49,7 +49,7 @@ from failuretwin.decision.acting.task import Task
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
 from failuretwin.digital_model.robot import Robot
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 TOLERANCE_M = 0.005
 MOST_STEPS = 90

@@ -15,7 +15,7 @@ import numpy as np
 import failuretwin as ft
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.decision.maintenance.expected_cost import Costs, cost_table
-from failuretwin.inference.priors import MONITORING
+from failuretwin.inference.faults.priors import MONITORING
 
 COSTS = Costs(
     targets=10.0, missed_target=3.0, compensate=1.0, slow_down=1.0, inspect=3.0, replace=10.0,

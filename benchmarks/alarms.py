@@ -33,14 +33,14 @@ from failuretwin.decision.streaming.learning import LifeLearner
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections, vary
-from failuretwin.inference.fault_filter import FaultFilter
-from failuretwin.inference.healthy_density import healthy_log_density
-from failuretwin.inference.healthy_mixture import FOREIGN, HealthyMixture
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.joint_likelihood import movement_likelihoods
-from failuretwin.inference.priors import Priors
-from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.sensors import SensorStack, parse_sensing
+from failuretwin.inference.faults.priors import Priors
+from failuretwin.inference.movements.healthy_density import healthy_log_density
+from failuretwin.inference.movements.joint_likelihood import movement_likelihoods
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.sensors import SensorStack, parse_sensing
+from failuretwin.inference.together.fault_filter import FaultFilter
+from failuretwin.inference.together.healthy_mixture import FOREIGN, HealthyMixture
 
 BUDGETS = (0.1, 1.0, 3.0, 10.0, 30.0, 100.0)
 """False alarms in 100 hours that are allowed."""

@@ -25,9 +25,9 @@ from failuretwin.digital_model.nonidealities import Imperfections, vary
 from failuretwin.digital_model.settling import sag
 from failuretwin.digital_model.twin import SAG_ROUNDS, DigitalTwin
 from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
-from failuretwin.inference.evidence import JUST_AFTER_S, SETTLING_S, SettledEvidence
-from failuretwin.inference.sensors import SensorStack
-from failuretwin.inference.settings import InferenceSettings
+from failuretwin.inference.observation.evidence import JUST_AFTER_S, SETTLING_S, SettledEvidence
+from failuretwin.inference.observation.sensors import SensorStack
+from failuretwin.inference.observation.settings import InferenceSettings
 
 READ_S = 0.05
 """Time from a command to the first reading after it [s], if the bus does not stall."""

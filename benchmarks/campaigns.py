@@ -18,7 +18,7 @@ import failuretwin as ft
 from failuretwin.connection.calibration.calibrate import fit_calibration
 from failuretwin.connection.calibration.cross_validation import predict, robust_scale
 from failuretwin.connection.calibration.result import mean_gain
-from failuretwin.data_knowledge.raw_sessions import find_sessions
+from failuretwin.data_knowledge.readers.raw_sessions import find_sessions
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:

@@ -32,11 +32,11 @@ from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.failure_behavior.fault import FaultValue
 from failuretwin.failure_behavior.modes import SteadyStateError, Stuck
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.evidence import Evidence
+from failuretwin.inference.faults.priors import OnsetPrior, Priors
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import Evidence
+from failuretwin.inference.observation.settings import InferenceSettings
 from failuretwin.inference.posterior import marginal_likelihood_of
-from failuretwin.inference.priors import OnsetPrior, Priors
-from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.settings import InferenceSettings
 
 EARLY = 0.5
 ERROR_RANGES = InferenceSettings.of(ft.load_robot("armpi_fpv")).error_ranges

@@ -31,7 +31,7 @@ import numpy as np
 
 import failuretwin as ft
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.raw_sessions import (
+from failuretwin.data_knowledge.readers.raw_sessions import (
     SESSION_FILES,
     RawSession,
     find_sessions,

@@ -23,18 +23,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import failuretwin as ft
-from failuretwin.app.plots import plot_runs
+from failuretwin.app.reports.plots import plot_runs
 from failuretwin.connection.calibration.calibrate import calibrate
 from failuretwin.connection.calibration.result import Calibration
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import as_floats
-from failuretwin.data_knowledge.raw_sessions import find_sessions
+from failuretwin.data_knowledge.readers.raw_sessions import find_sessions
 from failuretwin.decision.evaluation import Judged, compare, score_line
 from failuretwin.decision.results import write_json_lines
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, sag
-from failuretwin.inference.priors import OnsetPrior, priors_of
+from failuretwin.inference.faults.priors import OnsetPrior, priors_of
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -30,8 +30,8 @@ from failuretwin.connection.links.ros_link import RosSource, robot_sink
 from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.connection.links.ros_writer import RosWriter
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.bag_messages import NS_PER_S
-from failuretwin.data_knowledge.raw_sessions import (
+from failuretwin.data_knowledge.readers.bag_messages import NS_PER_S
+from failuretwin.data_knowledge.readers.raw_sessions import (
     RawSession,
     read_session,
     session_runs,

@@ -17,7 +17,7 @@ import numpy as np
 import failuretwin as ft
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.decision.proportions import wilson_interval
-from failuretwin.inference.fault_course import FaultCourse
+from failuretwin.inference.together.fault_course import FaultCourse
 
 RUNS, SHORTEST, OF_CLASS, NEAR = 30, 4, 60, 2
 

@@ -41,19 +41,19 @@ WARM = ("scipy.integrate", "scipy.optimize", "scipy.special", "h5netcdf", "xarra
 GOLDEN = "tests/golden"
 """Stored posteriors; the first to run, where they are there."""
 AREAS: dict[str, tuple[str, ...]] = {
-    "inference/readings.py": ("tests/data_knowledge/test_true_readings.py",),
-    "inference/log_quality.py": ("tests/data_knowledge/test_log_quality.py",),
-    "inference/evidence.py": (
+    "inference/observation/readings.py": ("tests/data_knowledge/test_true_readings.py",),
+    "inference/observation/log_quality.py": ("tests/data_knowledge/test_log_quality.py",),
+    "inference/observation/evidence.py": (
         "tests/data_knowledge/test_settled_evidence.py",
         "tests/data_knowledge/test_moving_evidence.py",
     ),
-    "inference/healthy_model.py": (
+    "inference/observation/healthy_model.py": (
         "tests/connection/test_healthy.py",
         "tests/decision/test_likelihood_terms.py",
         "tests/decision/test_motor_profile.py",
         "tests/decision/test_ramps.py",
     ),
-    "inference/command_loss.py": (
+    "inference/observation/command_loss.py": (
         "tests/connection/test_losses_in_a_row.py",
         "tests/connection/test_alternatives.py",
         "tests/connection/test_healthy.py",
@@ -80,48 +80,48 @@ AREAS: dict[str, tuple[str, ...]] = {
         "tests/decision/test_isolability.py",
     ),
     "inference/explanation.py": ("tests/decision/test_wording.py",),
-    "inference/shared_unknowns.py": ("tests/decision/test_shared_unknowns.py",),
-    "inference/linear_response.py": (
+    "inference/theta/shared_unknowns.py": ("tests/decision/test_shared_unknowns.py",),
+    "inference/theta/linear_response.py": (
         "tests/decision/test_linear_response.py",
         "tests/decision/test_shared_likelihood.py",
     ),
-    "inference/scatter_score.py": (
+    "inference/theta/scatter_score.py": (
         "tests/decision/test_shared_likelihood.py",
         "tests/decision/test_folder_posterior.py",
     ),
-    "inference/shared_likelihood.py": (
+    "inference/theta/shared_likelihood.py": (
         "tests/decision/test_shared_likelihood.py",
         "tests/decision/test_folder_posterior.py",
     ),
-    "inference/shared_posterior.py": ("tests/decision/test_shared_posterior.py",),
-    "inference/shared_weighing.py": (
+    "inference/theta/shared_posterior.py": ("tests/decision/test_shared_posterior.py",),
+    "inference/theta/shared_weighing.py": (
         "tests/decision/test_shared_posterior.py",
         "tests/decision/test_shared_likelihood.py",
     ),
-    "inference/folder_posterior.py": ("tests/decision/test_folder_posterior.py",),
-    "inference/shared_belief.py": (
+    "inference/together/folder_posterior.py": ("tests/decision/test_folder_posterior.py",),
+    "inference/theta/shared_belief.py": (
         "tests/decision/test_folder_posterior.py",
         "tests/connection/test_life_filter.py",
     ),
-    "inference/runs_together.py": (
+    "inference/together/runs_together.py": (
         "tests/decision/test_folder_posterior.py",
         "tests/connection/test_life_filter.py",
     ),
-    "inference/life_filter.py": ("tests/connection/test_life_filter.py",),
-    "inference/wear_limits.py": ("tests/connection/test_life_filter.py",),
-    "inference/fault_course.py": ("tests/decision/test_fault_course.py",),
-    "inference/mixed_runs.py": ("tests/decision/test_mixed_runs.py",),
-    "inference/wrong_setup.py": ("tests/decision/test_wrong_setup.py",),
-    "inference/registration.py": (
+    "inference/together/life_filter.py": ("tests/connection/test_life_filter.py",),
+    "inference/together/wear_limits.py": ("tests/connection/test_life_filter.py",),
+    "inference/together/fault_course.py": ("tests/decision/test_fault_course.py",),
+    "inference/together/mixed_runs.py": ("tests/decision/test_mixed_runs.py",),
+    "inference/set_ups/wrong_setup.py": ("tests/decision/test_wrong_setup.py",),
+    "inference/set_ups/registration.py": (
         "tests/decision/test_wrong_setup.py",
         "tests/connection/test_registration.py",
     ),
-    "inference/sensors.py": ("tests/decision/test_sensing.py",),
-    "inference/path_likelihood.py": (
+    "inference/observation/sensors.py": ("tests/decision/test_sensing.py",),
+    "inference/movements/path_likelihood.py": (
         "tests/decision/test_likelihood_way.py",
         "tests/decision/test_sensing.py",
     ),
-    "inference/unknown.py": ("tests/decision/test_unknown.py",),
+    "inference/faults/unknown.py": ("tests/decision/test_unknown.py",),
     "inference": (
         "tests/decision/test_start_delay.py",
         "tests/decision/test_inference_settings.py",

@@ -28,7 +28,7 @@ from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.inference.evidence import settled_evidence
+from failuretwin.inference.observation.evidence import settled_evidence
 
 FOLDS = 5
 MOVEMENTS = 5

@@ -27,11 +27,11 @@ from failuretwin.decision.maintenance.remaining_life import RemainingLife, remai
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
 from failuretwin.digital_model.nonidealities import vary
 from failuretwin.digital_model.settling import sag
-from failuretwin.inference.evidence import SettledEvidence
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.life_filter import LifeFilter
-from failuretwin.inference.shared_unknowns import SetupPrior
-from failuretwin.inference.wear_limits import WearLimits, wear_unit
+from failuretwin.inference.observation.evidence import SettledEvidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.set_ups.setup_prior import SetupPrior
+from failuretwin.inference.together.life_filter import LifeFilter
+from failuretwin.inference.together.wear_limits import WearLimits, wear_unit
 
 LIMIT, NOISE, DELAY = 4.0, 0.4, 25
 MOVEMENTS, BATCH, NOISE_M = 5, 10, 0.0005

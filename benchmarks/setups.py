@@ -31,13 +31,13 @@ from scipy.spatial.transform import Rotation
 import failuretwin as ft
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.data_knowledge.read import ReadOptions, read_runs
+from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
 from failuretwin.digital_model.profile_text import profile_text
 from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.urdf.check import check_urdf
 from failuretwin.failure_behavior.random_movements import RandomMovements
-from failuretwin.inference.log_correction import LogCorrection
-from failuretwin.inference.set_ups import mistakes
+from failuretwin.inference.set_ups.log_correction import LogCorrection
+from failuretwin.inference.set_ups.set_ups import mistakes
 
 if TYPE_CHECKING:
     import xarray as xr

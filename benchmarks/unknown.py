@@ -50,8 +50,8 @@ from failuretwin.inference.expected_bayes_factors import (
     expected_log_bayes_factors,
     truth_and_faults,
 )
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.posterior import unlisted as unlisted_in_full
-from failuretwin.inference.run_likelihood import RunLikelihood
 
 FOREIGN_NATS = 5.0
 DISTANCES = (FOREIGN_NATS, 15.0, 40.0, np.inf)

@@ -27,7 +27,7 @@ from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import loads_in_range
 from failuretwin.failure_behavior.modes import SteadyStateError
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.life_filter import LifeFilter
+from failuretwin.inference.together.life_filter import LifeFilter
 
 if TYPE_CHECKING:
     import xarray as xr

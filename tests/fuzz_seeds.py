@@ -19,12 +19,12 @@ from failuretwin.connection.calibration.result import read_calibration
 from failuretwin.connection.links.ros_topics import load_topics
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.hypothesis import parse_hypotheses
-from failuretwin.data_knowledge.bags import BagTopics
-from failuretwin.data_knowledge.csv_log import read_column_map
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.data_knowledge.lerobot import LeRobotAngles
-from failuretwin.data_knowledge.matlab import export_runs
-from failuretwin.data_knowledge.read import ReadOptions
+from failuretwin.data_knowledge.readers.bags import BagTopics
+from failuretwin.data_knowledge.readers.csv_log import read_column_map
+from failuretwin.data_knowledge.readers.lerobot import LeRobotAngles
+from failuretwin.data_knowledge.readers.matlab import export_runs
+from failuretwin.data_knowledge.readers.read import ReadOptions
 from failuretwin.data_knowledge.step_tests import read_step_test
 from failuretwin.data_knowledge.store import save_run_set
 from failuretwin.decision.results import read_results

@@ -102,6 +102,40 @@ def test_all_code_is_in_a_room():
     assert homes - {"__main__.py"} == {"__init__.py", *ROOMS}
 
 
+def test_no_folder_has_more_than_twenty_files():
+    folders = {path.parent for path in source_files()}
+    crowded = {str(f): len(list(f.glob("*.py"))) - 1 for f in folders}
+    assert {name: count for name, count in crowded.items() if count > 20} == {}
+
+
+def circles(arrows: dict[str, set[str]]) -> list[str]:
+    """Return the modules that import each other in a loop, found by removing leaves."""
+    left = dict(arrows)
+    while leaves := [name for name, to in left.items() if not to & left.keys()]:
+        for name in leaves:
+            del left[name]
+    while roots := [name for name in left if not any(name in to for to in left.values())]:
+        for name in roots:
+            del left[name]
+    return sorted(left)
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    names = {module_name(path).removesuffix(".__init__") for path in source_files()}
+    arrows = {}
+    for path in source_files():
+        module = module_name(path)
+        found = set(imported_modules(module, path.read_text("utf-8")))
+        found |= {name.rpartition(".")[0] for name in found}
+        own = module.removesuffix(".__init__")
+        arrows[own] = {name for name in found & names if name.count(".") > 1} - {own}
+    assert circles(arrows) == []
+
+
+def test_a_circle_is_caught():
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": set(), "e": {"a"}}) == ["b", "c"]
+
+
 @pytest.mark.parametrize(
     "source",
     [

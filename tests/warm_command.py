@@ -23,8 +23,12 @@ from pathlib import Path
 WARM = (
     *("h5netcdf", "pandas", "scipy.integrate", "scipy.interpolate", "scipy.optimize"),
     *("scipy.signal", "scipy.stats", "xarray", "rich.progress", "rich.table"),
-    *("failuretwin.app.cli", "failuretwin.app.reports", "failuretwin.connection.tracked_diagnosis"),
-    *("failuretwin.app.calibration_report", "failuretwin.data_knowledge.generate"),
+    *(
+        "failuretwin.app.cli",
+        "failuretwin.app.reports.reports",
+        "failuretwin.connection.tracked_diagnosis",
+    ),
+    *("failuretwin.app.reports.calibration_report", "failuretwin.data_knowledge.generate"),
 )
 LIMIT_S = 120.0
 DISK_BYTES = 500

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from failuretwin.app.acting import emulated_arm
-    from failuretwin.app.plots import run_figure
+    from failuretwin.app.reports.plots import run_figure
     from failuretwin.connection.calibration.calibrate import calibrate
     from failuretwin.connection.calibration.result import Calibration, save_calibration
     from failuretwin.connection.links.base import (
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from failuretwin.core.hypothesis import Diagnosis, Fault, Hypothesis
     from failuretwin.core.runs import run_set
     from failuretwin.data_knowledge.generate import Plan, iterate, simulate
-    from failuretwin.data_knowledge.read import ReadOptions, read_runs
+    from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
     from failuretwin.data_knowledge.sample_log import sample_log
     from failuretwin.decision.acting.reach import reach
     from failuretwin.decision.acting.session import act
@@ -53,9 +53,9 @@ if TYPE_CHECKING:
     from failuretwin.failure_behavior.mode import FaultMode, SizedMode
     from failuretwin.failure_behavior.registry import register_mode
     from failuretwin.inference.diagnoser import BayesDiagnoser, Diagnoser, diagnose
+    from failuretwin.inference.faults.priors import OnsetPrior, Priors
     from failuretwin.inference.isolability import IsolabilityReport, isolability
-    from failuretwin.inference.priors import OnsetPrior, Priors
-    from failuretwin.inference.shared_unknowns import SetupPrior
+    from failuretwin.inference.set_ups.setup_prior import SetupPrior
 
 __version__ = "0.1.0"
 
@@ -76,16 +76,16 @@ _HOME = {
     "InputError": "core.errors",
     "IsolabilityReport": "inference.isolability",
     "LinkCounts": "connection.links.base",
-    "OnsetPrior": "inference.priors",
+    "OnsetPrior": "inference.faults.priors",
     "Order": "connection.links.base",
     "Plan": "data_knowledge.generate",
     "Population": "connection.population",
-    "Priors": "inference.priors",
-    "ReadOptions": "data_knowledge.read",
+    "Priors": "inference.faults.priors",
+    "ReadOptions": "data_knowledge.readers.read",
     "Reading": "connection.links.base",
     "Robot": "digital_model.robot",
     "SelfCalibratingDiagnoser": "connection.self_calibration",
-    "SetupPrior": "inference.shared_unknowns",
+    "SetupPrior": "inference.set_ups.setup_prior",
     "Sink": "connection.links.base",
     "SizedMode": "failure_behavior.mode",
     "Source": "connection.links.base",
@@ -109,10 +109,10 @@ _HOME = {
     "monitor": "decision.streaming.monitor",
     "reach": "decision.acting.reach",
     "read_results": "decision.results",
-    "read_runs": "data_knowledge.read",
+    "read_runs": "data_knowledge.readers.read",
     "register_mode": "failure_behavior.registry",
     "remaining_life": "decision.maintenance.remaining_life",
-    "run_figure": "app.plots",
+    "run_figure": "app.reports.plots",
     "run_set": "core.runs",
     "sample_log": "data_knowledge.sample_log",
     "save_calibration": "connection.calibration.result",

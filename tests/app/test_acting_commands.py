@@ -9,9 +9,9 @@ import failuretwin as ft
 from failuretwin import DigitalTwin, InputError
 from failuretwin.app.acting import spared_of
 from failuretwin.app.emulation import emulated_faults
-from failuretwin.app.reach_report import held_of
+from failuretwin.app.reports.reach_report import held_of
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 pytest.importorskip("mujoco")
 TASK = "x,y,z\n0.1,0.1,0.2\n-0.1,0.12,0.18\n0.05,0.15,0.15\n0,0.12,0.25\n0.08,0.1,0.22\n"

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from failuretwin import load_robot
-from failuretwin.app.calibration_report import (
+from failuretwin.app.reports.calibration_report import (
     figure,
     left_out_line,
     parameter_groups,
@@ -28,7 +28,7 @@ from failuretwin.connection.calibration.result import (
     save_calibration,
 )
 from failuretwin.core.errors import InputError, OutputError
-from failuretwin.data_knowledge.read import ReadOptions, read_runs
+from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import save_run_set
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import load_calibration

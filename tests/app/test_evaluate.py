@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from failuretwin.app.tables import Table, escaped, latex
+from failuretwin.app.reports.tables import Table, escaped, latex
 from failuretwin.core.runs import RunTable, Truth
 from failuretwin.data_knowledge.store import save_run_set
 

@@ -78,7 +78,8 @@ def test_exported_csv_is_read_back(failuretwin, log):
 
 TELL_PROGRESS = """
 from contextlib import contextmanager
-from failuretwin.app import cli, tables
+from failuretwin.app import cli
+from failuretwin.app.reports import tables
 @contextmanager
 def telling(*_):
     yield lambda runs: print(runs, flush=True)

@@ -11,7 +11,7 @@ import subprocess
 import pytest
 
 from failuretwin import load_robot
-from failuretwin.app.technician_page import write_page
+from failuretwin.app.reports.technician_page import write_page
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.decision.robot_state import robot_state
 from failuretwin.inference.explanation import worded

@@ -22,7 +22,7 @@ from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.streaming.monitor import Believed, monitor
 from failuretwin.decision.test_motions.probing import Prober, ProbeRules
 from failuretwin.digital_model.calibrated_robot import load_calibration
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 from fake_rosbridge import FakeRosbridge
 from roscores import free_port
 from waiting import WAIT_S, wait_for

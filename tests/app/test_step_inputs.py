@@ -15,7 +15,7 @@ from failuretwin.connection.calibration.step_parameters import (
     with_step_tests,
 )
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.read import read_runs
+from failuretwin.data_knowledge.readers.read import read_runs
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from step_writers import step_rows, write_step_test
 

@@ -12,6 +12,14 @@ import pytest
 from click.testing import CliRunner
 
 from failuretwin.app.cli import cli
+from failuretwin.app.reports.study_page import (
+    TABLE_2,
+    TABLE_3,
+    mean_confusion,
+    ratio_spreads,
+    spread_of,
+    write_study_page,
+)
 from failuretwin.app.study import (
     FEATURES,
     PAGE,
@@ -26,14 +34,6 @@ from failuretwin.app.study import (
     quick_plan,
     run_study,
     stand_in_test_set,
-)
-from failuretwin.app.study_page import (
-    TABLE_2,
-    TABLE_3,
-    mean_confusion,
-    ratio_spreads,
-    spread_of,
-    write_study_page,
 )
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.generate import Plan, simulate

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from failuretwin.app import tables
-from failuretwin.app.tables import Table, figures_table, progress_bar, show
+from failuretwin.app.reports import tables
+from failuretwin.app.reports.tables import Table, figures_table, progress_bar, show
 from failuretwin.app.terminal import tell
 
 COUNTS = figures_table(("motor [counts]", "n"), [("a:smile: [b]", "1"), ("c", "20")], "counted")

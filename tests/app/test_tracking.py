@@ -10,8 +10,8 @@ from failuretwin import load_robot
 from failuretwin.core.runs import concatenate
 from failuretwin.data_knowledge.store import load_run_set, save_run_set
 from failuretwin.digital_model.calibrated_robot import load_calibration
-from failuretwin.inference.life_filter import WINDOW
-from failuretwin.inference.wear_limits import WearLimits
+from failuretwin.inference.together.life_filter import WINDOW
+from failuretwin.inference.together.wear_limits import WearLimits
 
 RUNS = 32
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from failuretwin.core.movements import Movements
 from failuretwin.digital_model.nonidealities import Imperfections, LostCommand, Timing
-from failuretwin.inference.command_loss import CHANCE_GOAL, STALE_GOAL
-from failuretwin.inference.evidence import SettledEvidence
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.command_loss import CHANCE_GOAL, STALE_GOAL
+from failuretwin.inference.observation.evidence import SettledEvidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 OUTLIER_RATE = 0.01
 

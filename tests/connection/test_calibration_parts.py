@@ -33,8 +33,8 @@ from failuretwin.core.runs import RunTable
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.disturbances import lagged
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.evidence import SettledEvidence
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.evidence import SettledEvidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 COUNT = np.deg2rad(0.24)
 NAMES = ["motor_1", "motor_2", "motor_3", "motor_4"]

@@ -20,10 +20,10 @@ from failuretwin.digital_model.nonidealities import (
     Variation,
 )
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.evidence import settled_evidence
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.priors import OnsetPrior, priors_of
-from failuretwin.inference.shared_unknowns import SetupPrior
+from failuretwin.inference.faults.priors import OnsetPrior, priors_of
+from failuretwin.inference.observation.evidence import settled_evidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.set_ups.setup_prior import SetupPrior
 
 PATH_NOISE_M, OUTLIER_RATE = 0.001, 0.01
 

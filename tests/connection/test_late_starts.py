@@ -12,9 +12,9 @@ from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.disturbances import draw_disturbances
 from failuretwin.digital_model.nonidealities import LostCommand, Timing
-from failuretwin.inference.command_loss import LostCommands
-from failuretwin.inference.evidence import settled_evidence
-from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.command_loss import LostCommands
+from failuretwin.inference.observation.evidence import settled_evidence
 
 RUNS = 60
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")

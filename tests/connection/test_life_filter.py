@@ -23,14 +23,14 @@ from worn_robot import (
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.life_filter import CHANCE, MOST_DOUBT, WINDOW
-from failuretwin.inference.linear_response import LinearResponse
-from failuretwin.inference.scatter_score import told_of_scatter
-from failuretwin.inference.shared_belief import Belief
-from failuretwin.inference.shared_likelihood import Normal, local_likelihood
-from failuretwin.inference.shared_unknowns import SharedComponent, SharedLayout
-from failuretwin.inference.wear_limits import WearLimits, wear_unit
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.theta.linear_response import LinearResponse
+from failuretwin.inference.theta.scatter_score import told_of_scatter
+from failuretwin.inference.theta.shared_belief import Belief
+from failuretwin.inference.theta.shared_likelihood import Normal, local_likelihood
+from failuretwin.inference.theta.shared_unknowns import SharedComponent, SharedLayout
+from failuretwin.inference.together.life_filter import CHANCE, MOST_DOUBT, WINDOW
+from failuretwin.inference.together.wear_limits import WearLimits, wear_unit
 
 STATIC = WearLimits(rate=0.0, reach=1e3, limit=1e3)
 BATCH = 10

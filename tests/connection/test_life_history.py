@@ -16,7 +16,7 @@ from worn_robot import CALIBRATION, life, seen, truth
 
 from failuretwin.connection.life_history import History, history_path, keep_history, open_history
 from failuretwin.core.errors import InputError, OutputError
-from failuretwin.inference.wear_limits import WearLimits
+from failuretwin.inference.together.wear_limits import WearLimits
 
 RUNS = 9
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from failuretwin.inference.command_loss import ConsecutiveLossHmm
+from failuretwin.inference.observation.command_loss import ConsecutiveLossHmm
 
 SETS = [s for size in (1, 2) for s in combinations(range(3), size)]
 MOVEMENTS = 4

@@ -15,7 +15,7 @@ from failuretwin.connection.links.recorder import Recorder
 from failuretwin.connection.links.replay import Pace, replay
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.data_knowledge.bag_file import read_messages
+from failuretwin.data_knowledge.readers.bag_file import read_messages
 
 pytest.importorskip("mcap")
 pytest.importorskip("mujoco")

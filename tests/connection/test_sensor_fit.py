@@ -13,7 +13,7 @@ from failuretwin.connection.calibration.sensor_fit import fit_sensors
 from failuretwin.core.errors import InputError
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.profile import SensorProfile
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 BIAS = {"accelerometer": (0.3, -0.2, 0.1), "orientation": (0.02, -0.01, 0.03), "wire": (0.004,)}
 NOISE = {"accelerometer": 0.08, "orientation": 0.005, "wire": 0.001}

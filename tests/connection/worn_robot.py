@@ -11,11 +11,11 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.digital_model.nonidealities import Imperfections, Readings, Variation
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.evidence import SettledEvidence
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.life_filter import LifeFilter
-from failuretwin.inference.shared_unknowns import SetupPrior
-from failuretwin.inference.wear_limits import WearLimits
+from failuretwin.inference.observation.evidence import SettledEvidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.set_ups.setup_prior import SetupPrior
+from failuretwin.inference.together.life_filter import LifeFilter
+from failuretwin.inference.together.wear_limits import WearLimits
 
 COUNT = np.deg2rad(0.24)
 MOVEMENTS = 5

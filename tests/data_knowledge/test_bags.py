@@ -11,10 +11,10 @@ from failuretwin import BayesDiagnoser
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.data_knowledge.bags import BagTopics, is_bag, read_bag
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.data_knowledge.raw_sessions import read_session
-from failuretwin.data_knowledge.timed_log import Targets, timed_run
+from failuretwin.data_knowledge.readers.bags import BagTopics, is_bag, read_bag
+from failuretwin.data_knowledge.readers.raw_sessions import read_session
+from failuretwin.data_knowledge.readers.timed_log import Targets, timed_run
 from failuretwin.digital_model.calibrated_robot import load_calibration
 
 pytest.importorskip("rosbags", reason="needs rosbags")

@@ -7,9 +7,9 @@ import pytest
 from failuretwin import BayesDiagnoser, DigitalTwin, ReadOptions, load_robot, read_runs
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.data_knowledge.column_guess import column_map_text, guess_columns
-from failuretwin.data_knowledge.csv_log import read_column_map
 from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.data_knowledge.readers.column_guess import column_map_text, guess_columns
+from failuretwin.data_knowledge.readers.csv_log import read_column_map
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.profile_text import profile_text
 from failuretwin.digital_model.urdf.check import check_urdf

@@ -30,10 +30,10 @@ from failuretwin.core.foreign import (
     read_text,
 )
 from failuretwin.core.hypothesis import parse_hypotheses
-from failuretwin.data_knowledge.bag_claims import check_chunks
-from failuretwin.data_knowledge.file_claims import check_matlab, check_npz
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.data_knowledge.matlab import export_runs, write_csv
+from failuretwin.data_knowledge.readers.bag_claims import check_chunks
+from failuretwin.data_knowledge.readers.file_claims import check_matlab, check_npz
+from failuretwin.data_knowledge.readers.matlab import export_runs, write_csv
 from failuretwin.data_knowledge.resumable import produce
 from failuretwin.data_knowledge.store import filling, load_run_set, replacing, save_run_set
 

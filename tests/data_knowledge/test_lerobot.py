@@ -9,7 +9,7 @@ import pytest
 
 from failuretwin import DigitalTwin, ReadOptions, diagnose, load_robot, read_runs
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.lerobot import LeRobotAngles
+from failuretwin.data_knowledge.readers.lerobot import LeRobotAngles
 
 NAMES = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
 WIDE = {"low": (-110.0, -100.0, -97.0, -95.0, -180.0), "high": (110.0, 100.0, 97.0, 95.0, 180.0)}

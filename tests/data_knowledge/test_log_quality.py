@@ -12,7 +12,7 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Readings
-from failuretwin.inference.log_quality import log_quality
+from failuretwin.inference.observation.log_quality import log_quality
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import scipy.io
 
 from failuretwin import BayesDiagnoser, ReadOptions, read_runs
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.matlab import export_runs, hypothesis_of_label, label_text
+from failuretwin.data_knowledge.readers.matlab import export_runs, hypothesis_of_label, label_text
 
 PAIRS = ("Healthy", "Motor_3_Stuck", "Motor_1_Steady_state_error")
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
-from failuretwin.inference.evidence import Evidence
+from failuretwin.inference.observation.evidence import Evidence
 
 MOST_READINGS = 12
 

@@ -11,14 +11,19 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.data_knowledge.generate import Plan, simulate_runs
-from failuretwin.data_knowledge.recovery import (
+from failuretwin.data_knowledge.recovery.recovery import (
     path_error,
     published_time,
     published_time_bases,
     recover_movements,
 )
-from failuretwin.data_knowledge.recovery_inverse_kinematics import plane_arm
-from failuretwin.data_knowledge.recovery_ramps import Free, PathPart, Ramps, fit_ramps
+from failuretwin.data_knowledge.recovery.recovery_inverse_kinematics import plane_arm
+from failuretwin.data_knowledge.recovery.recovery_ramps import (
+    Free,
+    PathPart,
+    Ramps,
+    fit_ramps,
+)
 from failuretwin.digital_model.calibrated_robot import load_calibration
 
 FROM_ZERO = np.linspace(0.0, 10.0, 1000)

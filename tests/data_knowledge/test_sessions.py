@@ -8,7 +8,11 @@ import pytest
 
 from failuretwin import ReadOptions, read_runs
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.raw_sessions import SESSION_FILES, find_sessions, read_session
+from failuretwin.data_knowledge.readers.raw_sessions import (
+    SESSION_FILES,
+    find_sessions,
+    read_session,
+)
 
 COMMAND, DURATION, POSITION = SESSION_FILES
 

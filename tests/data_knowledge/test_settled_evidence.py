@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from failuretwin.inference.evidence import settled_evidence
+from failuretwin.inference.observation.evidence import settled_evidence
 
 TARGETS = [[0.5, -0.3], [-0.4, 0.2], [0.1, 0.6]]
 POINTS = np.array([[0.1, 0.0, 0.2], [0.0, 0.1, 0.3], [-0.1, 0.05, 0.25]])

@@ -6,7 +6,13 @@ import pytest
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.polyline import resolution, simplify, simplify_motors
-from failuretwin.data_knowledge.timed_log import STEP_S, Samples, Targets, TimedLog, timed_run
+from failuretwin.data_knowledge.readers.timed_log import (
+    STEP_S,
+    Samples,
+    Targets,
+    TimedLog,
+    timed_run,
+)
 
 AT = np.arange(0.0, 6.0, 0.1)
 

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
-from failuretwin.inference.evidence import settled_evidence
-from failuretwin.inference.log_quality import log_quality
-from failuretwin.inference.readings import measured_samples
+from failuretwin.inference.observation.evidence import settled_evidence
+from failuretwin.inference.observation.log_quality import log_quality
+from failuretwin.inference.observation.readings import measured_samples
 
 STARTS = np.array([0.03, 2.05, 4.06, 6.07])
 TARGETS = np.array([[0.5, -0.3], [-0.4, 0.2], [0.1, 0.6], [0.7, -0.5]])

@@ -11,11 +11,15 @@ from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.digital_model.settling import Settling
 from failuretwin.failure_behavior.random_movements import RandomMovements
-from failuretwin.inference.evidence import Evidence, SettledEvidence
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.linear_response import LinearResponse
-from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.shared_unknowns import SharedLayout, offsets_of, registered_evidence
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import Evidence, SettledEvidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.theta.linear_response import LinearResponse
+from failuretwin.inference.theta.shared_unknowns import (
+    SharedLayout,
+    offsets_of,
+    registered_evidence,
+)
 
 SETTLING = Settling(
     bias=(0.01, -0.02, 0.03, -0.01),

@@ -13,9 +13,9 @@ from scipy import stats
 
 from failuretwin.digital_model.nonidealities import Imperfections, Readings
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.evidence import settled_evidence
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import settled_evidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 SCATTER_M, NOISE_M, DOF = 0.006, 0.001, 5.0
 OUTLIERS = 0.01 / (4.0 / 3.0 * np.pi * 0.3**3)

@@ -12,10 +12,10 @@ from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.inference import diagnoser as bayes
-from failuretwin.inference import fault_sizes, stuck
-from failuretwin.inference.evidence import settled_evidence
-from failuretwin.inference.priors import Priors, priors_of
-from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.faults import fault_sizes, stuck
+from failuretwin.inference.faults.priors import Priors, priors_of
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import settled_evidence
 
 PAPER = [str(h) for h in paper_hypotheses([f"motor_{k}" for k in range(1, 5)])]
 COUNT = np.deg2rad(0.24)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from failuretwin.inference.clock import Way, _together
+from failuretwin.inference.set_ups.clock import Way, _together
 
 
 def straight(time):

@@ -9,7 +9,7 @@ import pytest
 
 from failuretwin import InputError
 from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.inference.fault_course import FaultCourse
+from failuretwin.inference.together.fault_course import FaultCourse
 
 NAMES = ["healthy", "motor_1:stuck", "motor_2:steady_state_error"]
 PRIOR = np.array([0.5, 0.2, 0.3])

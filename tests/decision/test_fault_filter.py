@@ -13,11 +13,11 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import parse_hypotheses
 from failuretwin.data_knowledge.generate import simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
-from failuretwin.inference.evidence import Evidence
-from failuretwin.inference.fault_filter import FaultEvidence, FaultFilter, FaultRates
-from failuretwin.inference.healthy_mixture import CHANGED, HealthyMixture
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import Evidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.together.fault_filter import FaultEvidence, FaultFilter, FaultRates
+from failuretwin.inference.together.healthy_mixture import CHANGED, HealthyMixture
 
 NAMES = ["healthy", "motor_2:stuck", "motor_2:steady_state_error", "motor_3:stuck"]
 RATES = FaultRates(faults_per_1000_h=4e4, repairs_per_1000_h=6e4)

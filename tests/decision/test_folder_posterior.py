@@ -23,17 +23,18 @@ from failuretwin.core.numerics import log_sum
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.nonidealities import Imperfections, LostCommand
 from failuretwin.failure_behavior.random_movements import RandomMovements
-from failuretwin.inference import folder_posterior as folder
-from failuretwin.inference import habits, runs_together, shared_unknowns
-from failuretwin.inference.evidence import Evidence
-from failuretwin.inference.folder_posterior import folder_posterior
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.priors import Priors
-from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.shared_belief import mixed as moments_of
-from failuretwin.inference.shared_belief import positive
-from failuretwin.inference.shared_unknowns import offsets_of
-from failuretwin.inference.shared_weighing import SharedWeighing
+from failuretwin.inference.faults.priors import Priors
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import Evidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.theta import shared_unknowns
+from failuretwin.inference.theta.shared_belief import mixed as moments_of
+from failuretwin.inference.theta.shared_belief import positive
+from failuretwin.inference.theta.shared_unknowns import offsets_of
+from failuretwin.inference.theta.shared_weighing import SharedWeighing
+from failuretwin.inference.together import folder_posterior as folder
+from failuretwin.inference.together import habits, runs_together
+from failuretwin.inference.together.folder_posterior import folder_posterior
 
 SURE = Priors(setup=SetupPrior.known())
 USUAL = Priors()

@@ -11,10 +11,10 @@ from scipy import stats
 from failuretwin.core.movements import Movements
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import LostCommand, Timing
-from failuretwin.inference.evidence import SettledEvidence
-from failuretwin.inference.healthy_density import healthy_log_density, wide_scatter
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.joint_likelihood import movement_likelihoods
+from failuretwin.inference.movements.healthy_density import healthy_log_density, wide_scatter
+from failuretwin.inference.movements.joint_likelihood import movement_likelihoods
+from failuretwin.inference.observation.evidence import SettledEvidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 LOST = 0.05
 TARGETS = np.array(

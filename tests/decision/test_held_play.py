@@ -12,9 +12,9 @@ from slide_runs import PLAIN, TARGETS
 from failuretwin import Hypothesis, Plan, calibrate, simulate
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfections
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.evidence import settled_evidence
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import settled_evidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 SCATTER = (0.001, 0.0, 0.003, 0.006)
 SETTLING = Settling((0.0,) * 4, (0.0,) * 4, (0.0,) * 4, SCATTER, np.inf, "made up")

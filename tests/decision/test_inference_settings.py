@@ -13,9 +13,9 @@ from failuretwin.core.runs import RunTable
 from failuretwin.digital_model.geometry import Geometry, seen_chain
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Readings
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.evidence import Evidence
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.settings import InferenceSettings
+from failuretwin.inference.observation.evidence import Evidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.settings import InferenceSettings
 
 COUNT_RAD = 0.24 * np.pi / 180.0
 

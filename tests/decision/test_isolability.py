@@ -21,7 +21,7 @@ from failuretwin.inference.expected_bayes_factors import (
     ExpectedLogBayesFactor,
     expected_distance_factor,
 )
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.isolability import (
     FOUND_NATS,
     MonteCarloFaults,
@@ -29,7 +29,7 @@ from failuretwin.inference.isolability import (
     _motions,
     needed_nats,
 )
-from failuretwin.inference.priors import Priors
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 TIME = 0.01 * np.arange(1000)
 TARGETS = np.array(

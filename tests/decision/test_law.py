@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 
-from failuretwin.inference.marginal import ChangePointPosterior, change_points, leave_one_out
+from failuretwin.inference.faults.marginal import ChangePointPosterior, change_points, leave_one_out
 
 
 def problem(seed, movements, cells, ways):

@@ -9,22 +9,22 @@ from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import UNKNOWN, Hypothesis, single_faults
 from failuretwin.failure_behavior.mode import FaultMode
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference import double_faults as pairs
-from failuretwin.inference.evidence import settled_evidence
-from failuretwin.inference.fault_models import (
+from failuretwin.inference.faults import double_faults as pairs
+from failuretwin.inference.faults.fault_models import (
     growing_offset_model,
     offset_model,
     redrawn_offset_model,
     transient_model,
 )
-from failuretwin.inference.fault_sizes import SizePrior, redrawn_nodes, size_nodes
+from failuretwin.inference.faults.fault_sizes import SizePrior, redrawn_nodes, size_nodes
+from failuretwin.inference.faults.priors import OnsetPrior, Priors
+from failuretwin.inference.faults.stuck import _onsets, stuck_model
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import settled_evidence
 from failuretwin.inference.posterior import (
     marginal_likelihood_of,
     marginal_likelihoods,
 )
-from failuretwin.inference.priors import OnsetPrior, Priors
-from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.stuck import _onsets, stuck_model
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 RANGES = ((0.02, 0.08), (0.04, 0.2))

@@ -18,10 +18,10 @@ from slide_runs import (
 )
 
 from failuretwin.digital_model.nonidealities import Timing
-from failuretwin.inference.marginal import marginal_likelihood
-from failuretwin.inference.priors import OnsetPrior
-from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.stuck import stuck_model
+from failuretwin.inference.faults.marginal import marginal_likelihood
+from failuretwin.inference.faults.priors import OnsetPrior
+from failuretwin.inference.faults.stuck import stuck_model
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
 
 LOW, HIGH = -0.552, 0.552
 """Where the motor may be held: its travel, 0.46 m either way, and a tenth of that length [m]."""

@@ -24,15 +24,15 @@ from slide_runs import (
 
 from failuretwin.digital_model.nonidealities import LostCommand
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.fault_models import (
+from failuretwin.inference.faults.fault_models import (
     growing_offset_model,
     offset_model,
     redrawn_offset_model,
     transient_model,
 )
-from failuretwin.inference.fault_sizes import SizePrior
-from failuretwin.inference.marginal import marginal_likelihood
-from failuretwin.inference.missed_movements import missed_movements_likelihood
+from failuretwin.inference.faults.fault_sizes import SizePrior
+from failuretwin.inference.faults.marginal import marginal_likelihood
+from failuretwin.inference.faults.missed_movements import missed_movements_likelihood
 
 
 def test_a_healthy_slide_has_the_density_of_student(run_on):

@@ -19,9 +19,9 @@ from slide_runs import (
 )
 
 from failuretwin.digital_model.nonidealities import LostCommand
-from failuretwin.inference.evidence import Evidence
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import Evidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 TRUST = 0.1
 ROUGHNESS_M, JITTER_S = 0.0021, 0.012

@@ -12,9 +12,9 @@ from failuretwin.digital_model.nonidealities import (
     Readings,
 )
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.evidence import settled_evidence
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import settled_evidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 PATH_NOISE_M, OUTLIER_RATE = 0.001, 0.01
 

@@ -12,11 +12,14 @@ from small_arms import GANTRY, small_twin
 from failuretwin.core.movements import Movements
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfections, Readings
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.evidence import SettledEvidence, settled_evidence
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.two_joint_likelihood import GaussianBelief, two_joint_likelihood
-from failuretwin.inference.unknown import unmodelled_offsets_likelihood
+from failuretwin.inference.faults.unknown import unmodelled_offsets_likelihood
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.movements.two_joint_likelihood import (
+    GaussianBelief,
+    two_joint_likelihood,
+)
+from failuretwin.inference.observation.evidence import SettledEvidence, settled_evidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 MOTORS = ("motor_1", "motor_2", "motor_3", "motor_4")
 SCATTER = np.array([0.005, 0.006, 0.005, 0.004])

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
-from failuretwin.inference.priors import (
+from failuretwin.inference.faults.priors import (
     MONITORING,
     OnsetIntervals,
     OnsetPrior,

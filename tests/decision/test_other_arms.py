@@ -21,9 +21,9 @@ from failuretwin.failure_behavior.modes import SteadyStateError
 from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference import diagnoser as bayes
-from failuretwin.inference.evidence import settled_evidence
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import settled_evidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 KINDS = {
     "none": lambda robot: NO_IMPERFECTIONS,

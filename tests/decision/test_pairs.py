@@ -7,10 +7,10 @@ from failuretwin import BayesDiagnoser
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
-from failuretwin.inference.evidence import settled_evidence
+from failuretwin.inference.faults.priors import OnsetPrior, Priors
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import settled_evidence
 from failuretwin.inference.posterior import marginal_likelihood_of
-from failuretwin.inference.priors import OnsetPrior, Priors
-from failuretwin.inference.run_likelihood import RunLikelihood
 
 PAIRS = tuple(
     Hypothesis.parse(text)
@@ -76,8 +76,8 @@ def test_a_second_fault_that_cannot_show_changes_nothing(twin, imperfect, monkey
     """A fault of motor 4 whose only size is nothing leaves what is said of a fault of motor 1."""
     from failuretwin.core.numerics import log_of
     from failuretwin.inference import posterior as weighing
-    from failuretwin.inference.marginal import FaultModel
-    from failuretwin.inference.priors import immediate
+    from failuretwin.inference.faults.marginal import FaultModel
+    from failuretwin.inference.faults.priors import immediate
 
     def nothing(likelihood, fault, priors):
         motor = weighing.motor_of(likelihood, fault)

@@ -8,9 +8,9 @@ from failuretwin.core.movements import Movements
 from failuretwin.core.runs import RunTable
 from failuretwin.digital_model.nonidealities import Imperfections, Readings, Timing
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.evidence import Evidence
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import Evidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 DOF, GLITCH_RATE, ROUGHNESS_M = 4.0, 0.03, 0.002
 NOISE_M = 0.0003

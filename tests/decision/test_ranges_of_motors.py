@@ -20,9 +20,9 @@ from failuretwin.digital_model.settling import Settling
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.explanation import size_words
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.log_quality import commands_beyond
-from failuretwin.inference.priors import Priors, priors_of
+from failuretwin.inference.faults.priors import Priors, priors_of
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.log_quality import commands_beyond
 
 SCATTER = 2e-4
 SHARP = replace(

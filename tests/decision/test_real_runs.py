@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from failuretwin import BayesDiagnoser, ReadOptions, read_runs
-from failuretwin.inference.priors import priors_of
+from failuretwin.inference.faults.priors import priors_of
 
 BOTH = pytest.mark.parametrize("how", ["measured", "published"])
 

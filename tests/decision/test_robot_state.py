@@ -28,7 +28,7 @@ from failuretwin.inference.advice import (
     rests_on_one_movement,
     sureness,
 )
-from failuretwin.inference.fault_course import FaultCourse
+from failuretwin.inference.together.fault_course import FaultCourse
 
 ROBOT = load_robot("armpi_fpv")
 

@@ -10,7 +10,7 @@ from failuretwin.core.movements import Movements, find_movements
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.failure_behavior.random_movements import RandomMovements
-from failuretwin.inference.rounding import grid_of
+from failuretwin.inference.observation.rounding import grid_of
 
 
 @pytest.fixture

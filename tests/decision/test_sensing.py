@@ -16,8 +16,8 @@ from failuretwin.digital_model.profile import SensorProfile
 from failuretwin.digital_model.sensors import sensor_of
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.diagnoser import BayesDiagnoser
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.sensors import parse_sensing, sensing_of
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.sensors import parse_sensing, sensing_of
 
 KINDS = ["accelerometer", "gyroscope", "orientation", "wire"]
 STACKS = ["orientation", "accelerometer", "wire", "encoders", "tool+wire", "tool+orientation"]

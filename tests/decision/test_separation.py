@@ -16,8 +16,8 @@ from failuretwin.inference.expected_bayes_factors import (
     expected_log_bayes_factors,
     truth_and_faults,
 )
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.priors import Priors
+from failuretwin.inference.faults.priors import Priors
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 SETTLED = ("stuck", "encoder_bias", "encoder_scale", "backlash", "torque_loss", "drift")
 """Modes whose members settle exactly somewhere, that is, with nothing drawn for each movement."""

@@ -16,12 +16,12 @@ from failuretwin.decision.robot_state import robot_state
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from failuretwin.failure_behavior.random_movements import RandomMovements
-from failuretwin.inference.evidence import Evidence
-from failuretwin.inference.log_correction import CorrectionTable, LogCorrection
-from failuretwin.inference.priors import Priors
+from failuretwin.inference.faults.priors import Priors
+from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.set_up_posterior import SetUpPosterior, WeighedSetUp
 from failuretwin.inference.set_up_weighing import ANOTHER
-from failuretwin.inference.set_ups import FAULT_OF_EVERY_RUN, SetUp, mistakes, zero_off
+from failuretwin.inference.set_ups.log_correction import CorrectionTable, LogCorrection
+from failuretwin.inference.set_ups.set_ups import FAULT_OF_EVERY_RUN, SetUp, mistakes, zero_off
 
 TRUTHS = ["healthy", "motor_2:stuck", "motor_3:steady_state_error"]
 NONE = LogCorrection.none(4)

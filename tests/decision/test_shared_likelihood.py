@@ -11,10 +11,10 @@ from shared_runs import FAULTS, FRAME, WIDTH, drawn_from_its_model, scene, some_
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.digital_model.nonidealities import LostCommand
+from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.posterior import marginal_likelihood_of
-from failuretwin.inference.priors import Priors
-from failuretwin.inference.scatter_score import told_of_scatter
-from failuretwin.inference.shared_likelihood import (
+from failuretwin.inference.theta.scatter_score import told_of_scatter
+from failuretwin.inference.theta.shared_likelihood import (
     Fit,
     LocalLikelihood,
     Normal,

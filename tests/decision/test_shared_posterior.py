@@ -16,14 +16,14 @@ from failuretwin.core.numerics import log_sum
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.nonidealities import Imperfections, Timing
 from failuretwin.failure_behavior.random_movements import RandomMovements
-from failuretwin.inference import shared_likelihood
-from failuretwin.inference.evidence import Evidence
+from failuretwin.inference.faults.priors import Priors
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.posterior import compute_posterior, log_prior, marginal_likelihood_of
-from failuretwin.inference.priors import Priors
-from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.shared_posterior import Mixture, set_up_in_doubt, shared_posterior
-from failuretwin.inference.shared_unknowns import registered_evidence
-from failuretwin.inference.shared_weighing import SharedWeighing
+from failuretwin.inference.theta import shared_likelihood
+from failuretwin.inference.theta.shared_posterior import Mixture, set_up_in_doubt, shared_posterior
+from failuretwin.inference.theta.shared_unknowns import registered_evidence
+from failuretwin.inference.theta.shared_weighing import SharedWeighing
 
 KNOWN = Imperfections("made up", "test", settling=replace(SETTLING, tail_dof=5.0))
 DOUBTED = replace(KNOWN, variation=DOUBT)

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from failuretwin import SetupPrior
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.evidence import SettledEvidence, TransientSamples
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.shared_unknowns import (
+from failuretwin.inference.observation.evidence import SettledEvidence, TransientSamples
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.theta.shared_unknowns import (
     SharedLayout,
     columns,
     components,

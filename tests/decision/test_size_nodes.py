@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import integrate
 
-from failuretwin.inference.fault_sizes import redrawn_nodes, size_nodes
+from failuretwin.inference.faults.fault_sizes import redrawn_nodes, size_nodes
 
 LOW, HIGH = 0.02, 0.85
 pointed = arrays(np.float64, (2, 3), elements=st.floats(-2, 2))

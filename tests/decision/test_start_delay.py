@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from failuretwin.inference.start_delay import StartDelay
+from failuretwin.inference.observation.start_delay import StartDelay
 
 
 def moments(delay, share):

@@ -16,12 +16,12 @@ from failuretwin.core.hypothesis import (
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.inference import posterior as weighing
-from failuretwin.inference.evidence import settled_evidence
 from failuretwin.inference.expected_bayes_factors import expected_log_bayes_factors
-from failuretwin.inference.marginal import MarginalLikelihood
+from failuretwin.inference.faults.marginal import MarginalLikelihood
+from failuretwin.inference.faults.unknown import unknown_likelihood
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import settled_evidence
 from failuretwin.inference.posterior import marginal_likelihoods
-from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.unknown import unknown_likelihood
 
 TWO_AT_ONCE = (
     Hypothesis.parse("motor_1:steady_state_error+motor_3:steady_state_error"),

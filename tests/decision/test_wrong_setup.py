@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 from failuretwin import DigitalTwin, load_robot
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.inference.explanation import with_joint_names
-from failuretwin.inference.registration import align
-from failuretwin.inference.wrong_setup import wrong_setup
+from failuretwin.inference.set_ups.registration import align
+from failuretwin.inference.set_ups.wrong_setup import wrong_setup
 
 TURN = Rotation.from_euler("xyz", [20.0, -30.0, 140.0], degrees=True)
 

@@ -16,7 +16,7 @@ from failuretwin.digital_model.calibrated_robot import (
 )
 from failuretwin.digital_model.robot import load_robot
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 LOOPS = (
     CalibratedLoop("motor_2", 0.05, 17.5, 0.012, 4.25),

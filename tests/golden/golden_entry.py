@@ -26,11 +26,12 @@ from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import LostCommand, Readings
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference import seen_runs, shared_posterior
-from failuretwin.inference.evidence import Evidence
+from failuretwin.inference import seen_runs
 from failuretwin.inference.expected_bayes_factors import expected_log_bayes_factors
-from failuretwin.inference.log_quality import log_quality
-from failuretwin.inference.priors import MONITORING, priors_of
+from failuretwin.inference.faults.priors import MONITORING, priors_of
+from failuretwin.inference.observation.evidence import Evidence
+from failuretwin.inference.observation.log_quality import log_quality
+from failuretwin.inference.theta import shared_posterior
 
 __all__ = [
     "MODES",

@@ -26,7 +26,7 @@ from failuretwin.digital_model.calibrated_robot import (
     RobotLike,
     calibrated,
 )
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 PLACES = f"{EMULATED}, {NETWORKS}"
 

@@ -16,13 +16,13 @@ from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis, parse_hypotheses
 from failuretwin.core.types import as_floats
-from failuretwin.data_knowledge.bags import BagTopics
-from failuretwin.data_knowledge.column_guess import column_map_text, guess_columns
-from failuretwin.data_knowledge.csv_log import CORRECTION, read_column_map
-from failuretwin.data_knowledge.lerobot import LeRobotAngles, is_lerobot, lerobot_map_text
-from failuretwin.data_knowledge.matlab import RECOVERY_ERROR, RECOVERY_WORST
-from failuretwin.data_knowledge.raw_sessions import As
-from failuretwin.data_knowledge.read import ReadOptions, read_runs
+from failuretwin.data_knowledge.readers.bags import BagTopics
+from failuretwin.data_knowledge.readers.column_guess import column_map_text, guess_columns
+from failuretwin.data_knowledge.readers.csv_log import CORRECTION, read_column_map
+from failuretwin.data_knowledge.readers.lerobot import LeRobotAngles, is_lerobot, lerobot_map_text
+from failuretwin.data_knowledge.readers.matlab import RECOVERY_ERROR, RECOVERY_WORST
+from failuretwin.data_knowledge.readers.raw_sessions import As
+from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, class_name
@@ -31,8 +31,8 @@ from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser, Diagnoser, diagnoser_from_text
 from failuretwin.inference.explanation import with_reading_doubt
-from failuretwin.inference.log_correction import CorrectionTable, LogCorrection
 from failuretwin.inference.posterior import check_diagnosable
+from failuretwin.inference.set_ups.log_correction import CorrectionTable, LogCorrection
 
 if TYPE_CHECKING:
     import xarray as xr

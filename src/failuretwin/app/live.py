@@ -31,7 +31,7 @@ from failuretwin.connection.links.ros_link import (
 )
 from failuretwin.connection.links.ros_topics import RosTopics, load_topics
 from failuretwin.core.errors import InputError, counted
-from failuretwin.data_knowledge.bag_messages import BagTopics
+from failuretwin.data_knowledge.readers.bag_messages import BagTopics
 from failuretwin.decision.streaming.monitor import FaultMonitor, Fit
 from failuretwin.decision.test_motions.probing import Prober
 from failuretwin.digital_model.robot import Robot

@@ -22,8 +22,8 @@ from failuretwin.decision.maintenance.remaining_life import (
 from failuretwin.decision.results import read_results
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.wear_limits import WearLimits, wear_unit
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.together.wear_limits import WearLimits, wear_unit
 
 
 def write_template(path: Path) -> None:

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from failuretwin.app.check_report import told_size
-from failuretwin.app.plots import clean, new_figure
-from failuretwin.app.tables import Table, figures_table
+from failuretwin.app.reports.check_report import told_size
+from failuretwin.app.reports.plots import clean, new_figure
+from failuretwin.app.reports.tables import Table, figures_table
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.store import filling
@@ -54,7 +54,7 @@ def smallest_of(asking: Checking, path: Path | None) -> IsolabilityReport:
         return of_motions(asking, random_motions(asking, RANDOM_S))
     if holds_motions(path, asking.known.robot):
         return of_motions(asking, read_motions(path, asking.known.robot))
-    from failuretwin.data_knowledge.read import read_runs
+    from failuretwin.data_knowledge.readers.read import read_runs
 
     runs = read_runs(path, asking.known.robot)
     some = np.unique(np.linspace(0, runs.sizes["run"] - 1, MOST_RUNS).astype(np.int64))

@@ -26,7 +26,7 @@ from failuretwin.core.errors import FailureTwinError, InputError, OutputError, c
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.data_knowledge.read import ReadOptions, read_runs
+from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import SUFFIXES, replacing
 from failuretwin.decision.evaluation import Truths
 from failuretwin.decision.learned.feature_encoder import FeatureEncoder, signals_of

@@ -21,9 +21,9 @@ import numpy as np
 from failuretwin.core.config import fingerprint
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.foreign import read_text, reading
-from failuretwin.data_knowledge.file_claims import check_npz
+from failuretwin.data_knowledge.readers.file_claims import check_npz
 from failuretwin.data_knowledge.store import check_writable, replacing
-from failuretwin.inference.life_filter import LifeFilter
+from failuretwin.inference.together.life_filter import LifeFilter
 
 LINES, STATE = ".history.jsonl", ".history.npz"
 SIZE = "size"

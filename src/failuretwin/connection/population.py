@@ -51,7 +51,7 @@ from failuretwin.digital_model.nonidealities import (
 )
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling
-from failuretwin.inference.habits import SCATTER_SPREAD
+from failuretwin.inference.together.habits import SCATTER_SPREAD
 
 CLASS_ROBOTS = 3.0
 """Robots that the deviation of the class counts for; assumed."""

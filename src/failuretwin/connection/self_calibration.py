@@ -26,7 +26,7 @@ from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.read import RunsLike, as_runs
+from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import (
     HealthyLike,
@@ -39,16 +39,26 @@ from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import poses_in_range
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.diagnoser import BayesDiagnoser
-from failuretwin.inference.evidence import Evidence
-from failuretwin.inference.fault_course import FaultCourse
-from failuretwin.inference.folder_posterior import Advance, FolderPosterior, folder_posterior
-from failuretwin.inference.mixed_runs import of_second_robot, two_robots
+from failuretwin.inference.faults.priors import Priors
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.posterior import log_prior
-from failuretwin.inference.priors import Priors
-from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.set_ups import FAULT_OF_EVERY_RUN
-from failuretwin.inference.shared_posterior import FAR
-from failuretwin.inference.shared_unknowns import ORIGIN, REGISTRATION, SCALE, TURN, registered
+from failuretwin.inference.set_ups.set_ups import FAULT_OF_EVERY_RUN
+from failuretwin.inference.theta.shared_posterior import FAR
+from failuretwin.inference.theta.shared_unknowns import (
+    ORIGIN,
+    REGISTRATION,
+    SCALE,
+    TURN,
+    registered,
+)
+from failuretwin.inference.together.fault_course import FaultCourse
+from failuretwin.inference.together.folder_posterior import (
+    Advance,
+    FolderPosterior,
+    folder_posterior,
+)
+from failuretwin.inference.together.mixed_runs import of_second_robot, two_robots
 
 LATE_LOSSES = 4.0
 """How many times as often a movement that starts late loses its command, where nobody has counted:

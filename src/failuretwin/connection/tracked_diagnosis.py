@@ -28,12 +28,12 @@ from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.diagnoser import BayesDiagnoser
-from failuretwin.inference.evidence import Evidence, SettledEvidence
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.life_filter import LifeFilter
-from failuretwin.inference.mixed_runs import of_second_robot, two_robots
-from failuretwin.inference.shared_likelihood import has_score
-from failuretwin.inference.wear_limits import WearLimits, wear_unit
+from failuretwin.inference.observation.evidence import Evidence, SettledEvidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.theta.shared_likelihood import has_score
+from failuretwin.inference.together.life_filter import LifeFilter
+from failuretwin.inference.together.mixed_runs import of_second_robot, two_robots
+from failuretwin.inference.together.wear_limits import WearLimits, wear_unit
 
 if TYPE_CHECKING:
     import xarray as xr

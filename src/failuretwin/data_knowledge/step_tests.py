@@ -15,7 +15,7 @@ import numpy as np
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import files_below
 from failuretwin.core.types import MS_PER_S, BoolArray, FloatArray, ServoUnits, frozen_array
-from failuretwin.data_knowledge.csv_log import load_csv, numbers
+from failuretwin.data_knowledge.readers.csv_log import load_csv, numbers
 from failuretwin.digital_model.robot import Robot
 
 # What keeps a step of a step test from telling of a healthy motor.

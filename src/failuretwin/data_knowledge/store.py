@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from failuretwin.core.errors import InputError, OutputError, reason
 from failuretwin.core.foreign import reading
 from failuretwin.core.runs import check_duration, check_runs, time_step
-from failuretwin.data_knowledge.file_claims import check_netcdf, check_zarr
+from failuretwin.data_knowledge.readers.file_claims import check_netcdf, check_zarr
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -18,7 +18,7 @@ from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import truth_of
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.data_knowledge.read import RunsLike, as_runs
+from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
 from failuretwin.decision import proportions, scoring_rules
 from failuretwin.decision.results import Record, Results, read_results, some_names
 

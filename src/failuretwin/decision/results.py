@@ -15,7 +15,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import as_cell, check_memory, reading, stored_bytes
 from failuretwin.core.hypothesis import Diagnosis, Interval
 from failuretwin.data_knowledge.store import replacing
-from failuretwin.inference.fault_course import FaultCourse
+from failuretwin.inference.together.fault_course import FaultCourse
 
 SUM_ERROR = 1e-6
 """Tolerance of the sum of probabilities."""

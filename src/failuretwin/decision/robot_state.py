@@ -44,9 +44,9 @@ from failuretwin.inference.explanation import (
     plain_name,
     undecided_step,
 )
-from failuretwin.inference.fault_course import FaultCourse
 from failuretwin.inference.posterior import log_prior
-from failuretwin.inference.set_ups import FAULT_OF_EVERY_RUN
+from failuretwin.inference.set_ups.set_ups import FAULT_OF_EVERY_RUN
+from failuretwin.inference.together.fault_course import FaultCourse
 
 SUSPECT = 0.05
 """Motors of an open state are listed from this probability on."""

@@ -16,10 +16,10 @@ import numpy as np
 
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
 from failuretwin.inference.explanation import percent
-from failuretwin.inference.healthy_mixture import FOREIGN
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.seen_runs import SeenRuns
 from failuretwin.inference.set_up_weighing import SetUpWeighing
+from failuretwin.inference.together.healthy_mixture import FOREIGN
 
 MISFIT = 0.05
 """Probability below which a calibration is said to be of another robot."""

@@ -21,22 +21,22 @@ from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis, paper_hypotheses, parse_hypotheses
 from failuretwin.core.runs import check_motors, check_runs, truth_of
 from failuretwin.core.types import BoolArray
-from failuretwin.data_knowledge.read import RunsLike, as_runs
+from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
 from failuretwin.digital_model.arm_classes import class_name as arm_class_of
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.sensors import Encoders
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.inference.evidence import TransientSamples
 from failuretwin.inference.explanation import worded
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.faults.priors import Priors
+from failuretwin.inference.observation.evidence import TransientSamples
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.sensors import SensorStack, parse_sensing, sensing_of
 from failuretwin.inference.posterior import (
     check_diagnosable,
     shows_in_transients,
 )
-from failuretwin.inference.priors import Priors
 from failuretwin.inference.seen_runs import SeenRuns, mixed
-from failuretwin.inference.sensors import SensorStack, parse_sensing, sensing_of
 
 if TYPE_CHECKING:
     import xarray as xr

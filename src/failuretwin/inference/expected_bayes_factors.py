@@ -30,19 +30,19 @@ from failuretwin.failure_behavior.fault import FaultValue
 from failuretwin.failure_behavior.injection import Injection, replayed
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.evidence import Evidence, SettledEvidence, TransientSamples
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.joint_likelihood import JointLikelihood, movement_likelihoods
-from failuretwin.inference.marginal import change_points, movement_log_likelihoods
-from failuretwin.inference.missed_movements import log_densities
+from failuretwin.inference.faults.marginal import change_points, movement_log_likelihoods
+from failuretwin.inference.faults.missed_movements import log_densities
+from failuretwin.inference.faults.priors import Priors
+from failuretwin.inference.movements.joint_likelihood import JointLikelihood, movement_likelihoods
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import Evidence, SettledEvidence, TransientSamples
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.readings import measured_samples
 from failuretwin.inference.posterior import (
     check_diagnosable,
     fault_model_of,
     motor_of,
 )
-from failuretwin.inference.priors import Priors
-from failuretwin.inference.readings import measured_samples
-from failuretwin.inference.run_likelihood import RunLikelihood
 
 if TYPE_CHECKING:
     import xarray as xr

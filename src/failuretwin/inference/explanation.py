@@ -31,7 +31,7 @@ from failuretwin.inference.advice import (
     next_steps,
     rests_on_one_movement,
 )
-from failuretwin.inference.wrong_setup import NOWHERE
+from failuretwin.inference.set_ups.wrong_setup import NOWHERE
 
 TELLING_NATS = 1.0
 """Evidence of a movement worth telling [nats]: it changes the odds by a factor of 2.7."""

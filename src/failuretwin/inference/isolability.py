@@ -38,8 +38,8 @@ from failuretwin.failure_behavior.mode import FaultMode, SizedMode
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.expected_bayes_factors import ExpectedLogBayesFactor
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.priors import Priors
+from failuretwin.inference.faults.priors import Priors
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -13,8 +13,8 @@ from __future__ import annotations
 import numpy as np
 
 from failuretwin.core.types import FloatArray
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.posterior import Posterior
-from failuretwin.inference.run_likelihood import RunLikelihood
 
 FITS = 0.3
 """Misfit up to which a set-up explains runs, as a share of that of a tool that may be anywhere.

@@ -28,31 +28,34 @@ from failuretwin.digital_model.arm_classes import class_name
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import FaultMode, Signature
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.double_faults import double_fault_likelihood
-from failuretwin.inference.evidence import SettledEvidence
 from failuretwin.inference.explanation import lost_command_lines, with_joint_names, worded
-from failuretwin.inference.fault_models import (
+from failuretwin.inference.faults.double_faults import double_fault_likelihood
+from failuretwin.inference.faults.fault_models import (
     growing_offset_model,
     offset_model,
     redrawn_offset_model,
     transient_model,
 )
-from failuretwin.inference.fault_sizes import LOCAL_STEPS, SizePrior
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.log_quality import LogQuality, commands_beyond, unused_movements
-from failuretwin.inference.marginal import (
+from failuretwin.inference.faults.fault_sizes import LOCAL_STEPS, SizePrior
+from failuretwin.inference.faults.marginal import (
     Estimate,
     FaultModel,
     MarginalLikelihood,
     marginal_likelihood,
 )
-from failuretwin.inference.missed_movements import missed_movements_likelihood
-from failuretwin.inference.priors import Priors
-from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.stuck import stuck_model
-from failuretwin.inference.two_joint_likelihood import two_joint_likelihood
-from failuretwin.inference.unknown import unknown_likelihood
-from failuretwin.inference.wrong_setup import NOWHERE, nowhere_near
+from failuretwin.inference.faults.missed_movements import missed_movements_likelihood
+from failuretwin.inference.faults.priors import Priors
+from failuretwin.inference.faults.stuck import stuck_model
+from failuretwin.inference.faults.unknown import unknown_likelihood
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.movements.two_joint_likelihood import two_joint_likelihood
+from failuretwin.inference.observation.evidence import SettledEvidence, unused_movements
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.log_quality import (
+    LogQuality,
+    commands_beyond,
+)
+from failuretwin.inference.set_ups.wrong_setup import NOWHERE, nowhere_near
 
 # From a hypothesis to what runs say of it.
 

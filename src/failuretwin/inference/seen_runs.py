@@ -17,24 +17,24 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import as_floats
-from failuretwin.inference.clock import clock_posterior
-from failuretwin.inference.evidence import Evidence, TransientSamples
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.log_correction import LogCorrection
+from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import FITS, run_misfit
-from failuretwin.inference.posterior import Posterior
-from failuretwin.inference.priors import Priors
-from failuretwin.inference.rounding import (
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import Evidence, TransientSamples
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.rounding import (
     Rounding,
     command_rounding,
     rounded,
     told_of,
     tool_rounding,
 )
-from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.posterior import Posterior
 from failuretwin.inference.set_up_posterior import SetUpPosterior
 from failuretwin.inference.set_up_weighing import ANOTHER, SetUpWeighing
-from failuretwin.inference.set_ups import (
+from failuretwin.inference.set_ups.clock import clock_posterior
+from failuretwin.inference.set_ups.log_correction import LogCorrection
+from failuretwin.inference.set_ups.set_ups import (
     FEWEST_TO_TURN,
     SetUp,
     clocks_apart,
@@ -42,7 +42,11 @@ from failuretwin.inference.set_ups import (
     shifted,
     turned,
 )
-from failuretwin.inference.shared_posterior import ALLOWED_FOR, set_up_in_doubt, shared_posterior
+from failuretwin.inference.theta.shared_posterior import (
+    ALLOWED_FOR,
+    set_up_in_doubt,
+    shared_posterior,
+)
 
 if TYPE_CHECKING:
     import xarray as xr

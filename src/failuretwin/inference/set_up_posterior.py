@@ -14,9 +14,9 @@ import numpy as np
 
 from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import FloatArray
-from failuretwin.inference.log_correction import LogCorrection
 from failuretwin.inference.misfit import FITS
-from failuretwin.inference.set_ups import SetUp
+from failuretwin.inference.set_ups.log_correction import LogCorrection
+from failuretwin.inference.set_ups.set_ups import SetUp
 
 DOUBT, MAY_BE = 1.0 / 9.0, 0.03
 """A zero that is probable by this second share where set-ups are as likely wrong as right is never

@@ -21,16 +21,16 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
-from failuretwin.inference.log_correction import LogCorrection
+from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import highest_and_outlier
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.posterior import log_prior, marginal_likelihoods
-from failuretwin.inference.priors import Priors
-from failuretwin.inference.run_likelihood import RunLikelihood
 from failuretwin.inference.set_up_posterior import SetUpPosterior, WeighedSetUp, with_doubt
-from failuretwin.inference.set_ups import FEWEST_TO_TURN, SetUp, mistakes, turned, zero_off
-from failuretwin.inference.shared_posterior import Mixture
-from failuretwin.inference.shared_unknowns import layout_of
-from failuretwin.inference.shared_weighing import SharedWeighing
+from failuretwin.inference.set_ups.log_correction import LogCorrection
+from failuretwin.inference.set_ups.set_ups import FEWEST_TO_TURN, SetUp, mistakes, turned, zero_off
+from failuretwin.inference.theta.shared_posterior import Mixture
+from failuretwin.inference.theta.shared_unknowns import layout_of
+from failuretwin.inference.theta.shared_weighing import SharedWeighing
 
 FEW = 8
 """Runs that set-ups are weighed by, evenly spread: five name what shows."""

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from failuretwin.digital_model.calibrated_robot import load_calibration
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 
 @pytest.fixture(scope="session")

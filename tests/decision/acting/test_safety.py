@@ -16,7 +16,7 @@ from failuretwin.decision.acting.task import Target
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.inverse_kinematics import usable_limits
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 FINER = 7
 """An outside look at ways, with so many poses between those that the gate looks at."""

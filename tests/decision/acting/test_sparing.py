@@ -13,7 +13,7 @@ from failuretwin.app.acting import spared_of
 from failuretwin.decision.acting.belief import NoBelief
 from failuretwin.decision.acting.planner import Standing, turned_round
 from failuretwin.decision.acting.sparing import sparing_lines, wear_weights
-from failuretwin.inference.wear_limits import WearLimits, wear_unit
+from failuretwin.inference.together.wear_limits import WearLimits, wear_unit
 
 
 def history(path, rows, robot="armpi_fpv"):

@@ -13,9 +13,9 @@ from failuretwin.core.alarm import CLEAR, RAISED, Alarm, Episode
 from failuretwin.core.runs import concatenate, run_set
 from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.decision.streaming.set_up_watch import RUN, SetUpWatch, StreamRuns
-from failuretwin.inference.log_correction import LogCorrection
 from failuretwin.inference.seen_runs import set_up_finding
-from failuretwin.inference.set_ups import mistakes
+from failuretwin.inference.set_ups.log_correction import LogCorrection
+from failuretwin.inference.set_ups.set_ups import mistakes
 
 NONE = LogCorrection.none(4)
 I4 = np.eye(4)

@@ -12,7 +12,7 @@ from failuretwin.connection.links.replay import (
     PacedSource,
     session_events,
 )
-from failuretwin.data_knowledge.raw_sessions import read_session
+from failuretwin.data_knowledge.readers.raw_sessions import read_session
 from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.decision.streaming.trouble import FrozenSensorDetector, TwoPlaces, UntoldMotion
 

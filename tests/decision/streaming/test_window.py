@@ -8,7 +8,7 @@ import numpy as np
 
 from failuretwin.decision.streaming.window import MovementWindow
 from failuretwin.digital_model.arm_classes import generic_imperfections
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 
 def test_a_window_takes_the_outcomes_of_another_robot(twin):

@@ -9,7 +9,7 @@ from failuretwin.decision.test_motions.design import Designer
 from failuretwin.decision.test_motions.health_check import checking
 from failuretwin.decision.test_motions.outlook import Outlook, of_priors
 from failuretwin.digital_model.calibrated_robot import load_calibration
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 
 @pytest.fixture(scope="session")

@@ -18,7 +18,7 @@ from failuretwin.digital_model.clearance import segment_distance
 from failuretwin.failure_behavior.fault import STEP
 from failuretwin.failure_behavior.injection import Injection
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 COUNT_RAD = np.deg2rad(0.24)
 

@@ -161,8 +161,8 @@ def check(
 
     Movements are chosen to tell most; each passes the gate of `act`. See docs/check.md.
     """
-    from failuretwin.app import check_report as said
-    from failuretwin.app.tables import show
+    from failuretwin.app.reports import check_report as said
+    from failuretwin.app.reports.tables import show
     from failuretwin.app.terminal import tell
     from failuretwin.decision.test_motions.motions import write_motions
 
@@ -231,8 +231,8 @@ def _check_logs(
     results: Sequence[CheckResult], model: Robot, json_file: Path | None, report: Path | None
 ) -> None:
     """Say what logs of checks say that were recorded elsewhere."""
-    from failuretwin.app import check_report as said
-    from failuretwin.app.tables import show
+    from failuretwin.app.reports import check_report as said
+    from failuretwin.app.reports.tables import show
 
     for result in results:
         lines = said.check_lines(result, model, 0.0)
@@ -265,9 +265,9 @@ def design(
     seed: int,
 ) -> None:
     """Choose movements that tell most, and say which faults they show, beside random ones."""
-    from failuretwin.app.check_report import motion_lines
+    from failuretwin.app.reports.check_report import motion_lines
+    from failuretwin.app.reports.tables import show
     from failuretwin.app.smallest import smallest_beside_random
-    from failuretwin.app.tables import show
     from failuretwin.decision.test_motions.motions import write_motions
 
     asking = motion.checking(safety, calibration, robot, seed)
@@ -306,10 +306,10 @@ def isolability(
     seed: int,
 ) -> None:
     """Say the smallest fault of each motor and mode that motions of a robot can show."""
-    from failuretwin.app.check_report import write_records
-    from failuretwin.app.reports import group_lines
+    from failuretwin.app.reports.check_report import write_records
+    from failuretwin.app.reports.reports import group_lines
+    from failuretwin.app.reports.tables import show
     from failuretwin.app.smallest import save_picture, size_table, smallest_of, smallest_record
-    from failuretwin.app.tables import show
 
     asking = MotionOptions(hypotheses).checking(SafetyOptions(), calibration, robot, seed)
     found = smallest_of(asking, motions)

@@ -52,7 +52,7 @@ def import_(
     del seed  # nothing here is drawn by chance
     from failuretwin.app.inputs import read_inputs
     from failuretwin.core.errors import InputError
-    from failuretwin.data_knowledge.matlab import check_export_suffix, export_runs
+    from failuretwin.data_knowledge.readers.matlab import check_export_suffix, export_runs
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.twin import DigitalTwin
 
@@ -144,7 +144,7 @@ def simulate(
     To .zarr any number of runs can be written; if that is interrupted, the same command goes on
     with what is missing. Up to a few thousand can be written to .nc.
     """
-    from failuretwin.app.tables import progress_bar
+    from failuretwin.app.reports.tables import progress_bar
     from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
     from failuretwin.data_knowledge.generate import Plan
     from failuretwin.data_knowledge.resumable import produce
@@ -213,7 +213,7 @@ def robot() -> None:
 @link_options
 def check(urdf: Path, base: str | None, tool: str | None, sensor_noise: float) -> None:
     """Say whether a URDF can be used, which motors move the tool, and what is missing."""
-    from failuretwin.app.reports import print_report
+    from failuretwin.app.reports.reports import print_report
     from failuretwin.digital_model.urdf.check import check_urdf
 
     report = check_urdf(urdf, base, tool, 1e-3 * sensor_noise)
@@ -298,7 +298,7 @@ def fit_(logs: tuple[Path, ...], out: Path, reading: LogOptions, robot: str, see
     from datetime import UTC, datetime
 
     from failuretwin.app.inputs import read_inputs
-    from failuretwin.app.registration_report import print_registration
+    from failuretwin.app.reports.registration_report import print_registration
     from failuretwin.connection.registration.fit import fit_registration
     from failuretwin.core.errors import InputError
     from failuretwin.data_knowledge.store import replacing

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from failuretwin.decision.robot_state import RobotState
     from failuretwin.digital_model.twin import DigitalTwin
     from failuretwin.inference.diagnoser import BayesDiagnoser
-    from failuretwin.inference.fault_course import FaultCourse
-    from failuretwin.inference.priors import Priors
+    from failuretwin.inference.faults.priors import Priors
+    from failuretwin.inference.together.fault_course import FaultCourse
 
 
 @click.command()
@@ -132,7 +132,6 @@ def diagnose(
     """
     del seed  # nothing here is drawn by chance
 
-    from failuretwin.app import reports
     from failuretwin.app.inputs import (
         chosen_diagnoser,
         expected_name,
@@ -141,15 +140,16 @@ def diagnose(
         warn_mismatch,
         with_doubts,
     )
-    from failuretwin.app.tables import progress_bar, show
+    from failuretwin.app.reports import reports
+    from failuretwin.app.reports.tables import progress_bar, show
     from failuretwin.connection import tracked_diagnosis as tracking
     from failuretwin.decision.evaluation import Judged
     from failuretwin.decision.robot_state import course_of, robot_state
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
     from failuretwin.inference.diagnoser import BayesDiagnoser
-    from failuretwin.inference.priors import priors_of
-    from failuretwin.inference.sensors import TOOL_ALONE, sensing_of
+    from failuretwin.inference.faults.priors import priors_of
+    from failuretwin.inference.observation.sensors import TOOL_ALONE, sensing_of
 
     model = load_robot(robot)
     known = load_calibration(calibration, model)
@@ -214,7 +214,7 @@ def _learned_lines(
     course: list[str], learned: SelfCalibration | None, tracked: Tracked | None
 ) -> list[str]:
     """Return the course of the robot and what runs that were weighed together taught of it."""
-    from failuretwin.app.reports import tracking_line
+    from failuretwin.app.reports.reports import tracking_line
 
     lines = [*course, *(f"self-calibrated: {line}" for line in _taught(learned))]
     lines += [] if tracked is None else [tracking_line(tracked)]
@@ -224,7 +224,7 @@ def _learned_lines(
 def _check_tool(sensing: tuple[str, ...]) -> None:
     """Refuse to weigh runs together that do not show the tool's position."""
     from failuretwin.core.errors import InputError
-    from failuretwin.inference.sensors import TOOL_ALONE
+    from failuretwin.inference.observation.sensors import TOOL_ALONE
 
     if sensing != TOOL_ALONE:
         raise InputError(
@@ -364,8 +364,8 @@ def _write_page(
     folder: Path,
 ) -> None:
     """Write the technician's page, with what was learned where runs were weighed together."""
-    from failuretwin.app.taught_report import taught_section
-    from failuretwin.app.technician_page import write_report
+    from failuretwin.app.reports.taught_report import taught_section
+    from failuretwin.app.reports.technician_page import write_report
 
     sections = [] if learned is None else [taught_section(learned, twin.robot)]
     write_report(runs, diagnoses, twin, state, folder, sections)
@@ -383,10 +383,10 @@ def _learn_together(
         calibration: What the robot is taken to be like; None: what its kind is like.
         out: Where the calibration goes; None: nowhere.
     """
-    from failuretwin.app.tables import progress_bar
+    from failuretwin.app.reports.tables import progress_bar
     from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
     from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
-    from failuretwin.inference.folder_posterior import PASSES
+    from failuretwin.inference.together.folder_posterior import PASSES
 
     robot = bayes.twin.robot
     if out is not None:

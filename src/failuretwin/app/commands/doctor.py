@@ -20,7 +20,7 @@ from failuretwin.app.terminal import tell
 if TYPE_CHECKING:
     from failuretwin.inference.seen_runs import SeenRuns
     from failuretwin.inference.set_up_posterior import SetUpPosterior
-    from failuretwin.inference.set_ups import SetUp
+    from failuretwin.inference.set_ups.set_ups import SetUp
 
 SHOWN = 5
 """So many kinds of remarks on logs are listed."""

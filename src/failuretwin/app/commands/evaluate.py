@@ -46,10 +46,14 @@ def evaluate(
     """Score the results of `diagnose --json` against the truth."""
     import numpy as np
 
-    from failuretwin.app.plots import write_reliability
-    from failuretwin.app.reports import print_comparison, print_evaluation, write_latex
+    from failuretwin.app.reports.plots import write_reliability
+    from failuretwin.app.reports.reports import (
+        print_comparison,
+        print_evaluation,
+        write_latex,
+    )
     from failuretwin.core.errors import InputError
-    from failuretwin.data_knowledge.read import ReadOptions, read_runs
+    from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
     from failuretwin.decision import evaluation
     from failuretwin.decision.results import read_results
 

@@ -62,8 +62,8 @@ def calibrate(
     folders that hold some) add servo loops and speed limits.
     """
     del seed  # nothing here depends on chance
-    from failuretwin.app.calibration_report import print_calibration
     from failuretwin.app.inputs import read_inputs
+    from failuretwin.app.reports.calibration_report import print_calibration
     from failuretwin.connection.calibration import step_parameters
     from failuretwin.connection.calibration.calibrate import calibrate as learn
     from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
@@ -92,7 +92,7 @@ def calibrate(
     if wrong:
         tell(f"warning: {wrong}", err=True)
     if report is not None:
-        from failuretwin.app.calibration_report import write_calibration_page
+        from failuretwin.app.reports.calibration_report import write_calibration_page
         from failuretwin.data_knowledge.store import filling
 
         with filling(report) as folder:
@@ -128,7 +128,7 @@ def _pool(calibrations: tuple[Path, ...], out: Path, name: str | None, robot: st
     """Write the population that some calibrated robots come from."""
     from dataclasses import replace
 
-    from failuretwin.app.calibration_report import print_population
+    from failuretwin.app.reports.calibration_report import print_population
     from failuretwin.connection.calibration.result import save_calibration
     from failuretwin.connection.population import Population
     from failuretwin.digital_model.robot import load_robot
@@ -185,7 +185,7 @@ def train(
     probabilities are calibrated on simulated runs of the physics engine.
     """
     from failuretwin.app.inputs import check_learning
-    from failuretwin.app.tables import progress_bar
+    from failuretwin.app.reports.tables import progress_bar
     from failuretwin.data_knowledge.store import check_writable
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
@@ -250,9 +250,9 @@ def study(
     """
     from failuretwin.app import study as paper
     from failuretwin.app.inputs import check_learning
-    from failuretwin.app.plots import figure_class
-    from failuretwin.app.study_page import write_study_page
-    from failuretwin.app.tables import progress_bar
+    from failuretwin.app.reports.plots import figure_class
+    from failuretwin.app.reports.study_page import write_study_page
+    from failuretwin.app.reports.tables import progress_bar
     from failuretwin.core.errors import InputError
     from failuretwin.digital_model.robot import load_robot
 

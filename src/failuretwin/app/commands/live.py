@@ -99,8 +99,8 @@ def watch(
 
     from failuretwin.app.live import connect, fit_of, topics_of, watch_until_end
     from failuretwin.app.probing import commanded
+    from failuretwin.app.reports.tables import console
     from failuretwin.app.shadow import Shadow
-    from failuretwin.app.tables import console
     from failuretwin.connection.links.recorder import Recorder
     from failuretwin.connection.links.statuses import statuses
     from failuretwin.decision.streaming.monitor import monitor

@@ -39,7 +39,7 @@ def reach(
 
     Poses that touch the floor or the arm's own links do not count.
     """
-    from failuretwin.app.reach_report import (
+    from failuretwin.app.reports.reach_report import (
         by_motor_lines,
         held_of,
         map_lines,

@@ -54,13 +54,13 @@ from failuretwin.connection.calibration.timing_fit import (
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.read import RunsLike, as_runs
+from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
 from failuretwin.digital_model.arm_classes import class_of
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.digital_model.robot import Robot, load_robot, shown_unit
-from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.isolability import fault_probabilities
-from failuretwin.inference.sensors import TOOL_ALONE, sensing_of
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.sensors import TOOL_ALONE, sensing_of
 
 if TYPE_CHECKING:
     import xarray as xr

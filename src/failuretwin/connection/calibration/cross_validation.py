@@ -35,7 +35,7 @@ from failuretwin.digital_model.nonidealities import Timing
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.inference.healthy_model import PATH_NOISE_M, HealthyModel
+from failuretwin.inference.observation.healthy_model import PATH_NOISE_M, HealthyModel
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -15,9 +15,9 @@ from failuretwin.digital_model.profile import SensorProfile
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.sensors import Encoders
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.inference.evidence import Evidence, SettledEvidence
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.sensors import TOOL_ALONE
+from failuretwin.inference.observation.evidence import Evidence, SettledEvidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.sensors import TOOL_ALONE
 
 if TYPE_CHECKING:
     import xarray as xr

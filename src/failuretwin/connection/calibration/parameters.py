@@ -24,7 +24,7 @@ from failuretwin.digital_model.arm_classes import class_of
 from failuretwin.digital_model.nonidealities import LostCommand, Range, Readings, Schedule, Timing
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import largest_load
-from failuretwin.inference.habits import HEAVIEST
+from failuretwin.inference.together.habits import HEAVIEST
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -23,8 +23,8 @@ from failuretwin.core.numerics import Covariance
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model.profile import SensorProfile
 from failuretwin.digital_model.sensors import SENSORS, Encoders, Sensor, Tool, sensor_of
-from failuretwin.inference.evidence import rest_begin
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.evidence import rest_begin
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -23,14 +23,15 @@ from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, largest_load
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.inference.habits import Habits
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.priors import Priors
-from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.runs_together import RunsTogether
-from failuretwin.inference.shared_belief import Belief
-from failuretwin.inference.shared_unknowns import REGISTRATION, SetupPrior, SharedLayout
-from failuretwin.inference.shared_weighing import SharedWeighing
+from failuretwin.inference.faults.priors import Priors
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.set_ups.setup_prior import SetupPrior
+from failuretwin.inference.theta.shared_belief import Belief
+from failuretwin.inference.theta.shared_unknowns import REGISTRATION, SharedLayout
+from failuretwin.inference.theta.shared_weighing import SharedWeighing
+from failuretwin.inference.together.habits import Habits
+from failuretwin.inference.together.runs_together import RunsTogether
 
 FEWEST_MOVEMENTS = 6
 """Settled movements below which nothing can be fitted."""

@@ -19,8 +19,8 @@ from failuretwin.connection.calibration.servo_loops import (
 )
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import files_below
-from failuretwin.data_knowledge.matlab import find_matlab_files
-from failuretwin.data_knowledge.raw_sessions import SESSION_FILES
+from failuretwin.data_knowledge.readers.matlab import find_matlab_files
+from failuretwin.data_knowledge.readers.raw_sessions import SESSION_FILES
 from failuretwin.data_knowledge.step_tests import StepTest, find_step_tests, read_step_test
 from failuretwin.digital_model.calibrated_robot import CalibratedLoop, with_loops
 from failuretwin.digital_model.profile import Motor

@@ -21,7 +21,7 @@ from failuretwin.digital_model.disturbances import lagged
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, sag
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.inference.readings import measured_samples
+from failuretwin.inference.observation.readings import measured_samples
 
 if TYPE_CHECKING:
     import xarray as xr

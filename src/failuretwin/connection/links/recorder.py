@@ -17,7 +17,7 @@ from failuretwin.connection.links.ros_codec import Outgoing, RosCodec
 from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.connection.links.ros_writer import DiagnosticsWriter, RosWriter
 from failuretwin.core.errors import InputError, OutputError, needs_extra
-from failuretwin.data_knowledge.bag_messages import GOAL_TOPIC, NS_PER_S
+from failuretwin.data_knowledge.readers.bag_messages import GOAL_TOPIC, NS_PER_S
 from failuretwin.digital_model.robot import Robot
 
 RECORDED = RosTopics(

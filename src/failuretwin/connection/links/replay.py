@@ -15,9 +15,9 @@ from failuretwin.connection.links.ros_reader import SampledCommands, goal_readin
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import GOAL_VARIABLE
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.bags import BagTopics, is_bag, read_bag
-from failuretwin.data_knowledge.raw_sessions import RawSession, find_sessions, read_session
-from failuretwin.data_knowledge.timed_log import Samples, Targets, TimedLog
+from failuretwin.data_knowledge.readers.bags import BagTopics, is_bag, read_bag
+from failuretwin.data_knowledge.readers.raw_sessions import RawSession, find_sessions, read_session
+from failuretwin.data_knowledge.readers.timed_log import Samples, Targets, TimedLog
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 

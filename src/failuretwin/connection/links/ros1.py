@@ -23,7 +23,7 @@ from xmlrpc.client import Transport as HttpTransport
 from failuretwin.connection.links.ros_codec import Outgoing, RosCodec, kind_in
 from failuretwin.connection.links.ros_link import Take, Transport, wait_for_listener
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.bag_messages import Kind
+from failuretwin.data_knowledge.readers.bag_messages import Kind
 
 # Import of rospy. Debian installs it for its own interpreter, next to its own numpy. A virtual
 # environment must not see that whole folder, so an import hook admits the modules of ROS alone.

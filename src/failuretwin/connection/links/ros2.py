@@ -22,7 +22,7 @@ from typing import Any
 from failuretwin.connection.links.ros_codec import Outgoing, RosCodec
 from failuretwin.connection.links.ros_link import Take, Transport, wait_for_listener
 from failuretwin.core.errors import InputError, needs_extra
-from failuretwin.data_knowledge.bag_messages import NS_PER_S
+from failuretwin.data_knowledge.readers.bag_messages import NS_PER_S
 
 ROUTER_PORT = 7447
 """Default port of the router of rmw_zenoh."""

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from failuretwin.core.errors import InputError, needs_extra
-from failuretwin.data_knowledge.bag_file import MONITORING_DEFINITION, message_fields
-from failuretwin.data_knowledge.bag_messages import Kind, kind_of
+from failuretwin.data_knowledge.readers.bag_file import MONITORING_DEFINITION, message_fields
+from failuretwin.data_knowledge.readers.bag_messages import Kind, kind_of
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

@@ -24,7 +24,7 @@ from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.connection.links.ros_writer import DiagnosticsWriter, RosWriter
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.bag_messages import Kind
+from failuretwin.data_knowledge.readers.bag_messages import Kind
 from failuretwin.digital_model.robot import Robot
 
 Decode = Callable[[], tuple[Any, Kind]]

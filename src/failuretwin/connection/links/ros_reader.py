@@ -10,8 +10,8 @@ from failuretwin.connection.links.base import CommandSent, Event, Reading
 from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.bag_file import BagMessage
-from failuretwin.data_knowledge.bag_messages import (
+from failuretwin.data_knowledge.readers.bag_file import BagMessage
+from failuretwin.data_knowledge.readers.bag_messages import (
     KINDS,
     NS_PER_S,
     Kind,
@@ -19,7 +19,7 @@ from failuretwin.data_knowledge.bag_messages import (
     joint_rows,
     tool_rows,
 )
-from failuretwin.data_knowledge.bags import Track, motor_track
+from failuretwin.data_knowledge.readers.bags import Track, motor_track
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.bag_messages import (
+from failuretwin.data_knowledge.readers.bag_messages import (
     MONITORING,
     Kind,
     Role,

@@ -13,7 +13,7 @@ from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.connection.links.statuses import RateLimiter, Status, statuses
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import MS_PER_S, FloatArray
-from failuretwin.data_knowledge.bag_messages import NS_PER_S, Kind, kind_of_type
+from failuretwin.data_knowledge.readers.bag_messages import NS_PER_S, Kind, kind_of_type
 from failuretwin.digital_model.robot import Robot
 
 DIAGNOSTICS_TYPE = "diagnostic_msgs/DiagnosticArray"

@@ -10,7 +10,7 @@ from typing import Any
 from failuretwin.connection.links.ros_codec import Outgoing
 from failuretwin.connection.links.ros_link import Take, Transport
 from failuretwin.core.errors import InputError, needs_extra
-from failuretwin.data_knowledge.bag_messages import kind_of_type
+from failuretwin.data_knowledge.readers.bag_messages import kind_of_type
 
 BRIDGE_PORT = 9090
 """Default port of rosbridge servers."""

@@ -25,14 +25,14 @@ from failuretwin.connection.registration.search import Registered, search
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import check_motors
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.read import RunsLike, as_runs
+from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
 from failuretwin.digital_model.geometry import roll_pitch_yaw
 from failuretwin.digital_model.profile import Profile
 from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.twin import DigitalTwin
-from failuretwin.inference.registration import align
-from failuretwin.inference.set_ups import MOST_RAD, UNIT_FACTOR, extent
-from failuretwin.inference.wrong_setup import NEAR, wrong_setup
+from failuretwin.inference.set_ups.registration import align
+from failuretwin.inference.set_ups.set_ups import MOST_RAD, UNIT_FACTOR, extent
+from failuretwin.inference.set_ups.wrong_setup import NEAR, wrong_setup
 
 Z_95 = 1.959963984540054
 LEARNED = 0.5

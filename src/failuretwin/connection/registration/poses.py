@@ -11,8 +11,8 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.runs import truth_of
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.digital_model.robot import Robot
-from failuretwin.inference.evidence import Evidence
-from failuretwin.inference.settings import InferenceSettings
+from failuretwin.inference.observation.evidence import Evidence
+from failuretwin.inference.observation.settings import InferenceSettings
 
 if TYPE_CHECKING:
     import xarray as xr

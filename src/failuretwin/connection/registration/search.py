@@ -20,9 +20,9 @@ from failuretwin.connection.registration.poses import Poses
 from failuretwin.connection.registration.robust import Posterior, fit
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.geometry import with_tool
-from failuretwin.inference.registration import Frame, align
-from failuretwin.inference.set_ups import extent
-from failuretwin.inference.wrong_setup import NEAR
+from failuretwin.inference.set_ups.registration import Frame, align
+from failuretwin.inference.set_ups.set_ups import extent
+from failuretwin.inference.set_ups.wrong_setup import NEAR
 
 COARSE_POSES = 80
 """So many poses are looked at while senses are searched for."""

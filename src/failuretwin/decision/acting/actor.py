@@ -28,7 +28,7 @@ from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, Target, Ta
 from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.digital_model.inverse_kinematics import angle_between
 from failuretwin.failure_behavior.mode import Reaction
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 SMALLEST_NEWS_RAD = 0.02
 """A held angle that is believed to lie so far from where it was planned with calls for a new plan

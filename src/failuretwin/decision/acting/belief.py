@@ -23,7 +23,7 @@ from failuretwin.decision.acting.drifting import followed
 from failuretwin.decision.acting.judging import Judgement
 from failuretwin.failure_behavior.mode import Reaction, Signature
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 GROWTH = 1.2
 """The spread of a size that is remembered grows by this factor with each movement [-]."""

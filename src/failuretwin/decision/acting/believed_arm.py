@@ -23,7 +23,7 @@ from failuretwin.digital_model.settling import sag
 from failuretwin.failure_behavior.fault import Arrival
 from failuretwin.failure_behavior.mode import FaultMode, Reaction, Signature
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 UNMOVED_RAD = 1e-9
 """Commands nearer than this are the same [rad]."""

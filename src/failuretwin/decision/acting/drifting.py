@@ -15,7 +15,7 @@ import numpy as np
 
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.believed_arm import HALF_90, BelievedArm, BelievedFault, Seen
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 LEAST_MOVEMENTS = 3
 """Of fewer movements no line is drawn."""

@@ -16,12 +16,12 @@ from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.believed_arm import BelievedFault, Seen
 from failuretwin.failure_behavior.mode import Reaction, Signature
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.evidence import SettledEvidence
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.faults.priors import MONITORING, Priors
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import SettledEvidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import LEVELS, Posterior, compute_posterior
-from failuretwin.inference.priors import MONITORING, Priors
-from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.shared_posterior import shared_posterior
+from failuretwin.inference.theta.shared_posterior import shared_posterior
 
 ACTED_ON = (
     *("stuck", "steady_state_error", "encoder_bias", "encoder_scale"),

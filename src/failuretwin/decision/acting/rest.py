@@ -9,8 +9,8 @@ import numpy as np
 
 from failuretwin.connection.links.base import Reading
 from failuretwin.core.types import FloatArray
-from failuretwin.inference.evidence import SETTLING_S
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.evidence import SETTLING_S
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 QUIET_S = 0.5
 """The tool is at rest once it has been still for so long [s]."""

@@ -29,7 +29,7 @@ from failuretwin.digital_model.calibrated_robot import (
     RobotLike,
     calibrated,
 )
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 DIAGNOSE, FEEDBACK, OPEN = STRATEGIES = ("diagnose", "feedback", "open")
 """With a diagnosis, with the nominal Jacobian alone, or one movement a target."""

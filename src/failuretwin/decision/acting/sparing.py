@@ -19,8 +19,8 @@ from failuretwin.connection.life_history import read_rows
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.planner import Planner, Standing, turned_round
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.wear_limits import WearLimits, wear_unit
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.together.wear_limits import WearLimits, wear_unit
 
 HALF_90 = 1.645
 """Half of a 90 % interval in standard deviations."""

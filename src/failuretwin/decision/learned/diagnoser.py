@@ -20,7 +20,7 @@ from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.movements import find_movements
 from failuretwin.core.runs import check_motors, check_runs, truth_of
 from failuretwin.core.types import FloatArray, IntArray
-from failuretwin.data_knowledge.read import RunsLike, as_runs
+from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
 from failuretwin.decision.learned.feature_encoder import (
     POINTS,
     SHARED,
@@ -41,8 +41,8 @@ from failuretwin.decision.learned.networks import (
 )
 from failuretwin.digital_model.arm_classes import class_name
 from failuretwin.inference.explanation import worded
-from failuretwin.inference.log_quality import LogQuality, drop_invalid, log_quality
-from failuretwin.inference.settings import InferenceSettings
+from failuretwin.inference.observation.log_quality import LogQuality, drop_invalid, log_quality
+from failuretwin.inference.observation.settings import InferenceSettings
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -25,7 +25,7 @@ from failuretwin import __version__
 from failuretwin.core.config import fingerprint, from_table
 from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.core.foreign import reading
-from failuretwin.data_knowledge.file_claims import check_npz
+from failuretwin.data_knowledge.readers.file_claims import check_npz
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision.learned.diagnoser import LearnedDiagnoser, network_shape
 from failuretwin.decision.learned.feature_encoder import (

@@ -25,7 +25,7 @@ from failuretwin.core.alarm import ALL_CLEAR, CLEAR, RAISED, SUSPECTED, Alarm, E
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.nonidealities import Imperfections
-from failuretwin.inference.fault_filter import S_PER_H
+from failuretwin.inference.together.fault_filter import S_PER_H
 
 UNUSED = 3.0
 """The bound over what simulated healthy robots reach (303 h: 1.0 false alarms in 100 h where the

@@ -18,7 +18,7 @@ from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.foreign import reading
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.file_claims import check_npz
+from failuretwin.data_knowledge.readers.file_claims import check_npz
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision.streaming.fleet import MOVEMENTS, StreamingFleet
 from failuretwin.digital_model.calibrated_robot import RobotLike

@@ -34,7 +34,9 @@ from failuretwin.digital_model.calibrated_robot import RobotLike
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.explanation import worded
-from failuretwin.inference.log_quality import LogQuality
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.log_quality import LogQuality
+from failuretwin.inference.observation.rounding import Rounding, rounded
 from failuretwin.inference.posterior import (
     Posterior,
     StreamPosition,
@@ -42,8 +44,6 @@ from failuretwin.inference.posterior import (
     log_prior,
     shows_in_transients,
 )
-from failuretwin.inference.rounding import Rounding, rounded
-from failuretwin.inference.run_likelihood import RunLikelihood
 
 MOVEMENTS = 5
 """Movements that are remembered, the present one included: as many as a run of the paper has."""

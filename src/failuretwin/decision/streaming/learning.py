@@ -16,9 +16,9 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements
 from failuretwin.digital_model.nonidealities import Imperfections, Variation
 from failuretwin.inference.diagnoser import BayesDiagnoser
-from failuretwin.inference.evidence import SettledEvidence
-from failuretwin.inference.healthy_model import HealthyModel
-from failuretwin.inference.shared_unknowns import SetupPrior
+from failuretwin.inference.observation.evidence import SettledEvidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.set_ups.setup_prior import SetupPrior
 
 RUN = 5
 """Movements of a run that is learned from at first: as many as a run of the paper has."""

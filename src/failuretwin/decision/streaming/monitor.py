@@ -27,15 +27,15 @@ from failuretwin.decision.streaming.trouble import DEAD, rests_throughout
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike
 from failuretwin.inference.diagnoser import BayesDiagnoser
-from failuretwin.inference.evidence import SettledEvidence
-from failuretwin.inference.fault_filter import RATES, FaultFilter, FaultRates
-from failuretwin.inference.healthy_density import healthy_log_density
-from failuretwin.inference.healthy_mixture import FOREIGN, HealthyMixture
-from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.misfit import FITS, misfit
+from failuretwin.inference.movements.healthy_density import healthy_log_density
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import SettledEvidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.rounding import rounded, told_of
 from failuretwin.inference.posterior import StreamPosition
-from failuretwin.inference.rounding import rounded, told_of
-from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.together.fault_filter import RATES, FaultFilter, FaultRates
+from failuretwin.inference.together.healthy_mixture import FOREIGN, HealthyMixture
 
 WORTH_LEARNING = 0.01
 """Probability that the calibration that was given is not this robot's from which it learns."""

@@ -20,14 +20,14 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.polyline import TURN_RAD
 from failuretwin.core.runs import concatenate, time_step
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.timed_log import Samples, TimedLog, timed_run
+from failuretwin.data_knowledge.readers.timed_log import Samples, TimedLog, timed_run
 from failuretwin.decision.streaming.trouble import rests_throughout
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.explanation import plain_name
-from failuretwin.inference.rounding import Rounding, tool_rounding
+from failuretwin.inference.observation.rounding import Rounding, tool_rounding
 from failuretwin.inference.seen_runs import SURE, TOLD, set_up_finding, set_up_remark
 from failuretwin.inference.set_up_posterior import SetUpPosterior
 from failuretwin.inference.set_up_weighing import FEW

@@ -17,13 +17,13 @@ from failuretwin.core.movements import (
 from failuretwin.core.polyline import TURN_RAD
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.decision.streaming.window import MovementWindow, SampleBuffer
-from failuretwin.inference.evidence import (
+from failuretwin.inference.observation.evidence import (
     JUST_AFTER_S,
     SETTLING_S,
     estimate_rest,
     rest_begin,
 )
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 Items = tuple[IntArray, IntArray]
 """Robots and their movements, (item,) each."""

@@ -10,8 +10,8 @@ import numpy as np
 
 from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.inference.evidence import SettledEvidence
-from failuretwin.inference.log_quality import (
+from failuretwin.inference.observation.evidence import SettledEvidence
+from failuretwin.inference.observation.log_quality import (
     FROZEN_S,
     NEAR_ZERO_M,
     NEARLY_STILL_S,
@@ -19,7 +19,7 @@ from failuretwin.inference.log_quality import (
     LogQuality,
     should_move,
 )
-from failuretwin.inference.settings import InferenceSettings
+from failuretwin.inference.observation.settings import InferenceSettings
 
 DEAD = LogQuality(
     fatal="the tool stands still though motors are told to move: the sensor or the arm is dead"

@@ -11,13 +11,17 @@ import numpy as np
 from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.inference.evidence import MOST_READINGS, SettledEvidence, TransientSamples
-from failuretwin.inference.healthy_model import Explanation, HealthyModel
-from failuretwin.inference.joint_likelihood import (
+from failuretwin.inference.movements.joint_likelihood import (
     MovementLikelihoods,
     joint_likelihoods,
     movement_likelihoods,
 )
+from failuretwin.inference.observation.evidence import (
+    MOST_READINGS,
+    SettledEvidence,
+    TransientSamples,
+)
+from failuretwin.inference.observation.healthy_model import Explanation, HealthyModel
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,8 @@ from failuretwin.decision.acting.rest import QUIET_S
 from failuretwin.decision.acting.safety import SafetyGate, Way
 from failuretwin.decision.test_motions.outlook import Asked, Outlook, of_posterior
 from failuretwin.digital_model.inverse_kinematics import usable_limits
-from failuretwin.inference.evidence import SETTLING_S
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.evidence import SETTLING_S
+from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
 
 POOL = 1024

@@ -33,15 +33,15 @@ from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.decision.test_motions.motions import Motions
 from failuretwin.failure_behavior.mode import Range, Signature
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.evidence import SettledEvidence
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.faults.priors import Priors, visible_sizes
 from failuretwin.inference.isolability import IsolabilityReport
-from failuretwin.inference.log_quality import LogQuality
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import SettledEvidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.log_quality import LogQuality
+from failuretwin.inference.observation.settings import ERROR_STEPS, WIDEST_ERROR
 from failuretwin.inference.posterior import Posterior, log_prior
-from failuretwin.inference.priors import Priors, visible_sizes
-from failuretwin.inference.run_likelihood import RunLikelihood
-from failuretwin.inference.settings import ERROR_STEPS, WIDEST_ERROR
-from failuretwin.inference.shared_posterior import set_up_in_doubt, shared_posterior
+from failuretwin.inference.theta.shared_posterior import set_up_in_doubt, shared_posterior
 
 HEALTHY_TO_FAULTY = 2.0
 """Odds that an arm is healthy that nobody suspects; assumed."""

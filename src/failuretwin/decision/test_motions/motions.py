@@ -19,7 +19,7 @@ import numpy as np
 from failuretwin.connection.links.base import CommandSent, Order
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.bags import read_targets
+from failuretwin.data_knowledge.readers.bags import read_targets
 from failuretwin.data_knowledge.store import replacing
 from failuretwin.decision.test_motions.design import Movement
 from failuretwin.digital_model.robot import Robot

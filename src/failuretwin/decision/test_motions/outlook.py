@@ -28,10 +28,10 @@ from failuretwin.digital_model.settling import sag
 from failuretwin.failure_behavior.fault import Arrival
 from failuretwin.failure_behavior.mode import FaultMode, Signature
 from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.command_loss import OUTLIER_RATE
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.faults.priors import Priors
+from failuretwin.inference.observation.command_loss import OUTLIER_RATE
+from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior, log_prior
-from failuretwin.inference.priors import Priors
 
 SIZES = 3
 """Sizes of each fault that are laid beside each other."""

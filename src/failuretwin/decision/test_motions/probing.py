@@ -31,7 +31,7 @@ from failuretwin.decision.streaming.alarm_rule import NAMED
 from failuretwin.decision.streaming.monitor import Believed, FaultMonitor
 from failuretwin.decision.test_motions.design import Designer
 from failuretwin.decision.test_motions.outlook import Outlook, of_belief
-from failuretwin.inference.healthy_model import HealthyModel
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 IDLE_S = 10.0
 """Nobody has commanded an arm for so long that is asked [s]."""

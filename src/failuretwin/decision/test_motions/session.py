@@ -29,10 +29,10 @@ from failuretwin.digital_model.calibrated_robot import (
     calibrated,
 )
 from failuretwin.inference.diagnoser import BayesDiagnoser
-from failuretwin.inference.evidence import Evidence
-from failuretwin.inference.healthy_model import HealthyModel
 from failuretwin.inference.isolability import IsolabilityReport, isolability
-from failuretwin.inference.run_likelihood import RunLikelihood
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.evidence import Evidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class Checking:
         Raises:
             InputError: If they cannot be read.
         """
-        from failuretwin.data_knowledge.read import read_runs
+        from failuretwin.data_knowledge.readers.read import read_runs
 
         runs = read_runs(list(paths), self.known.robot)
         priors = checking(self.model, self.hypotheses)

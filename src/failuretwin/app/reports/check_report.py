@@ -1,0 +1,220 @@
+"""A health check and a design as lines, tables and JSON; what a robot's earlier checks found."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from failuretwin.app.reports.tables import Table, figures_table
+from failuretwin.app.reports.technician_page import Section, write_page
+from failuretwin.core.errors import InputError, counted
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.data_knowledge.store import filling, replacing
+from failuretwin.decision.robot_state import robot_state
+from failuretwin.decision.test_motions.health_check import OPEN, CheckResult
+from failuretwin.decision.test_motions.motions import Motions
+from failuretwin.digital_model.robot import Robot
+from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.explanation import size_words
+from failuretwin.inference.isolability import IsolabilityReport
+
+ERROR = "steady_state_error"
+CHANGED = 3.0
+"""A zero or a play that differs from that of the check before by so many standard deviations has
+changed."""
+LIMIT = "green rules out what the last column says; smaller errors may be there"
+"""Said of a green light."""
+LIKELY = 0.05
+"""Motors are named where it is open from this probability on."""
+
+
+def check_lines(result: CheckResult, robot: Robot, seconds: float) -> list[str | Table]:
+    """Return what a check found: the light, and what every motor showed."""
+    diagnosis = result.diagnosis
+    head = f"{result.light.upper()}: {diagnosis.verdict}"
+    if result.light == OPEN and not diagnosis.undecided:
+        names = [name for name, p in result.by_motor.items() if p >= LIKELY]
+        head += f". Ask {' and '.join(names)} further: --further 6" if names else ""
+    made = counted(result.movements, "movement") + " seen at rest"
+    made += f", {seconds:.0f} s planned" if seconds else ""
+    if result.further:
+        made += f", {counted(result.further, 'further movement')}"
+    low = ["" if not diagnosis.quality else "the log: " + "; ".join(diagnosis.quality)]
+    said = [] if result.shown is None else [LIMIT]
+    return [head, made, *filter(None, low), motor_table(result, robot), *said]
+
+
+def closing_lines(result: CheckResult, robot: Robot) -> list[str]:
+    """Return how a check ends: state of the robot, how surely, what to do; as on its page."""
+    state = robot_state([result.diagnosis], robot)
+    return [state.line, f"what to do: {state.step}"]
+
+
+def write_check_page(results: Sequence[CheckResult], robot: Robot, folder: Path) -> None:
+    """Write the technician's page of checks into a folder.
+
+    Args:
+        results: Of one check, or of the logs of several.
+        robot: The robot.
+        folder: Where `index.html` goes.
+    """
+    diagnoses = [result.diagnosis for result in results]
+    measured = [
+        Section("What the check measured", tables=[motor_table(result, robot)])
+        for result in results
+        if len(results) == 1
+    ]
+    with filling(folder) as partial:
+        state = robot_state(diagnoses, robot)
+        write_page(diagnoses, state, robot, partial / "index.html", sections=measured)
+
+
+def shown_cell(found: IsolabilityReport, motor: str, robot: Robot) -> str:
+    """Return from which size on motions show errors of a motor."""
+    sizes = [
+        told_size(name, size, found.largest[name], robot)
+        for name, size in found.isolated.items()
+        if Hypothesis.parse(name).faults[0].motor == motor
+    ]
+    return ", ".join(sizes)
+
+
+def shown_from(found: IsolabilityReport, motor: str) -> float | None:
+    """Return the smallest random error of a motor that motions show [rad or m]; None: none."""
+    return found.isolated.get(f"{motor}:{ERROR}")
+
+
+def told_size(name: str, size: float | None, largest: float, robot: Robot) -> str:
+    """Return a size in the unit that people read; where none is found, that the largest is not."""
+    fault = Hypothesis.parse(name).faults[0]
+    unit = robot.own_unit(fault.motor, MODES[fault.mode].unit)
+    told = size_words(fault, largest if size is None else size, unit).strip(" ()+")
+    told = told.removeprefix("by about ").removeprefix("by ").removeprefix("of ").lstrip("+")
+    return f"not even {told}" if size is None else told
+
+
+def motor_table(result: CheckResult, robot: Robot) -> Table:
+    """Return what each motor showed, zeros and play in degrees, of slides in millimetres."""
+    found, shown, rows = result.offsets, result.shown, []
+    for k, name in enumerate(robot.motor_names):
+        factor, unit = (1e3, "mm") if robot.slides[k] else (180.0 / np.pi, "deg")
+        rows.append([
+            name,
+            f"{result.by_motor.get(name, 0.0):.1%}",
+            *(f"{factor * value[k]:+.2f} +- {factor * deviation[k]:.2f} {unit}"
+              for value, deviation in ((found.zero, found.zero_sd), (found.play, found.play_sd))),
+            *([] if shown is None else [shown_cell(shown, name, robot)]),
+        ])  # fmt: skip
+    heads = ["motor", "faulty", "zero off by", "play"]
+    return figures_table([*heads, *([] if shown is None else ["shows errors from"])], rows)
+
+
+def check_record(result: CheckResult, robot: Robot, seconds: float) -> dict[str, Any]:
+    """Return a check as a JSON object: its diagnosis, as of `diagnose --json`, and more."""
+    found, shown = result.offsets, result.shown
+    return {
+        **result.diagnosis.to_record(),
+        "robot": robot.name,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "light": result.light,
+        "motor": result.motor or None,
+        "movements": result.movements,
+        "further": result.further,
+        "seconds": seconds,
+        "motors": [
+            {
+                "motor": name,
+                "probability": result.by_motor.get(name, 0.0),
+                "zero": float(found.zero[k]),
+                "zero_deviation": float(found.zero_sd[k]),
+                "play": float(found.play[k]),
+                "play_deviation": float(found.play_sd[k]),
+                "unit": "m" if robot.slides[k] else "rad",
+                "shown_from": None if shown is None else shown_from(shown, name),
+            }
+            for k, name in enumerate(robot.motor_names)
+        ],
+    }
+
+
+def write_records(records: Sequence[dict[str, Any]], path: Path) -> None:
+    """Write JSON objects, a line each.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    with replacing(path) as partial:
+        text = "".join(json.dumps(record) + "\n" for record in records)
+        partial.write_text(text, encoding="utf-8")
+
+
+# Checks that are kept: the same motions again, and what has changed since.
+
+
+def kept_checks(path: Path) -> list[dict[str, Any]]:
+    """Return the checks of a kept file, the oldest first.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    try:
+        checks = json.loads(path.read_text(encoding="utf-8"))["checks"]
+        _ = checks[-1]["date"], checks[-1]["motors"][0]["zero"]
+        return list(checks)
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise InputError(
+            f"{path}: cannot be read as kept checks ({error}). Expected what `check --keep` wrote."
+        ) from error
+
+
+def keep_check(path: Path, motions: Motions, checks: Sequence[dict[str, Any]]) -> None:
+    """Keep motions, and the checks that were made by them, the oldest first.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    write_records([{"motions": motions.record(), "checks": checks}], path)
+
+
+def changes(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    """Return what has changed since a check of the same motions, a line each."""
+    lines = []
+    for old, new in zip(before["motors"], now["motors"], strict=True):
+        for what in ("zero", "play"):
+            moved = new[what] - old[what]
+            spread = float(np.hypot(new[f"{what}_deviation"], old[f"{what}_deviation"]))
+            if abs(moved) > CHANGED * spread:
+                factor, unit = (1e3, "mm") if new["unit"] == "m" else (180.0 / np.pi, "deg")
+                lines.append(
+                    f"since {before['date'][:10]}: {what} of {new['motor']} changed by "
+                    f"{factor * moved:+.2f} {unit} ({abs(moved) / spread:.1f} deviations)"
+                )
+    return lines or [
+        f"since {before['date'][:10]}: no zero and no play changed by more than {CHANGED:.0f} "
+        "deviations"
+    ]
+
+
+# Designs.
+
+
+def motion_lines(motions: Motions, robot: Robot) -> list[str | Table]:
+    """Return what is told to the motors, a row a movement, angles in degrees."""
+    factor = np.where(robot.slides, 1e3, 180.0 / np.pi)
+    rows = [
+        [f"{k + 1}", f"{begin:.1f}", f"{ramp:.2f}", *(f"{x:.1f}" for x in factor * target)]
+        for k, (begin, ramp, target) in enumerate(
+            zip(motions.start_s, motions.ramp_s, motions.target, strict=True)
+        )
+    ]
+    units = ["mm" if slides else "deg" for slides in robot.slides]
+    heads = [f"{name} [{unit}]" for name, unit in zip(robot.motor_names, units, strict=True)]
+    return [
+        f"{counted(len(rows), 'movement')} in {motions.duration_s:.1f} s",
+        figures_table(["", "at [s]", "ramp [s]", *heads], rows),
+    ]

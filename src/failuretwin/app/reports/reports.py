@@ -1,0 +1,438 @@
+"""What `diagnose`, `evaluate` and `robot check` show: their answers as sentences and tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from failuretwin.app.reports.tables import Table, figures_table, latex, show
+from failuretwin.connection.tracked_diagnosis import Tracked
+from failuretwin.core.errors import counted
+from failuretwin.core.hypothesis import Diagnosis, Hypothesis
+from failuretwin.core.types import as_floats
+from failuretwin.data_knowledge.store import replacing
+from failuretwin.decision import proportions, scoring_rules
+from failuretwin.decision.evaluation import (
+    Calibration,
+    Comparison,
+    Evaluation,
+    Judged,
+    as_unknown_line,
+    score_line,
+)
+from failuretwin.decision.robot_state import RobotState
+from failuretwin.digital_model.kinematics import has_range
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.urdf.file import UrdfJoint
+from failuretwin.digital_model.urdf.report import JointReport, UrdfReport
+from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.explanation import joint_names_in, plain_name, size_words
+from failuretwin.inference.isolability import IsolabilityReport, isolability
+from failuretwin.inference.together.fault_course import FaultCourse
+from failuretwin.inference.together.wear_limits import wear_unit
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+MAX_EXPLAINED = 3
+"""So few runs are explained in full on the screen; for more there are --report and --json."""
+
+
+def print_diagnoses(diagnoses: Sequence[Diagnosis]) -> None:
+    """Print a row a run."""
+    known = any(d.truth is not None for d in diagnoses)
+    headings = ("run", *(["truth", ""] if known else []), "verdict", "log")
+    show(Table(headings, [_diagnosis_row(d, known) for d in diagnoses]))
+    for d in diagnoses if len(diagnoses) <= MAX_EXPLAINED else ():
+        lines = (*d.explanation, *(f"the log: {remark}" for remark in d.quality))
+        show(f"\n{d.run}", *(f"  - {line}" for line in lines))
+    if len(diagnoses) > MAX_EXPLAINED:
+        shared = [
+            line for line in diagnoses[0].quality if all(line in d.quality for d in diagnoses)
+        ]
+        show(*(f"\nevery log: {line}" for line in shared))
+    show(f"\n{diagnoses[0].method}")
+
+
+def _diagnosis_row(d: Diagnosis, known: bool) -> list[str]:
+    count = len(d.quality)
+    quality = counted(count, "remark") if count else ""
+    return [d.run, *([d.truth or "", _mark(d)] if known else []), d.verdict, quality]
+
+
+def _mark(diagnosis: Diagnosis) -> str:
+    """Return whether a verdict is right; empty where there is none or the truth is not known."""
+    if diagnosis.truth is None or diagnosis.diagnosis is None:
+        return ""
+    truth = proportions.judged_truth(diagnosis.truth, diagnosis.posterior)
+    return "right" if truth == diagnosis.diagnosis else "WRONG"
+
+
+def state_lines(state: RobotState, together: bool) -> list[str]:
+    """Return the state over several runs and what to do, as the page says them, a line each.
+
+    Of one run its diagnosis says both, and of runs that were weighed together `course_lines`.
+    """
+    if together or state.runs < 2:
+        return []
+    return ["", f"over all runs: {state.line}", f"what to do: {state.step}"]
+
+
+def course_lines(course: FaultCourse | None, state: RobotState, robot: Robot) -> list[str]:
+    """Return what runs say together of their robot, and what to do; None: each was judged alone."""
+    if course is None:
+        return []
+    told = [f"over all runs: {joint_names_in(line, robot)}" for line in course.verdict]
+    return [*told, f"what to do: {state.step}"]
+
+
+def print_scores(judged: Judged) -> None:
+    """Print how good the diagnoses are, if the truth of any run is known."""
+    if not judged.diagnoses:
+        return
+    show(f"\n{score_line(judged)}")
+    if judged.as_unknown:
+        show(as_unknown_line(judged))
+    show("", class_table(judged.scores), "", _confusion_table(judged.scores))
+
+
+def class_table(scores: proportions.Scores) -> Table:
+    """Return precision, recall and F1 of each class."""
+    return figures_table(
+        ("class", "runs", "precision", "recall", "F1"),
+        [
+            (row.name, str(row.runs), *(f"{v:.3f}" for v in (row.precision, row.recall, row.f1)))
+            for row in scores.by_class()
+        ],
+    )
+
+
+def _confusion_table(scores: proportions.Scores) -> Table:
+    return figures_table(
+        ("truth", *(f"({i})" for i in range(len(scores.classes)))),
+        [
+            (f"({i}) {name}", *(str(count) if count else "." for count in row))
+            for i, (name, row) in enumerate(zip(scores.classes, scores.confusion, strict=True))
+        ],
+        "confusion matrix: a row for each truth, a column for each diagnosis",
+    )
+
+
+# What `evaluate` adds.
+
+
+def print_evaluation(evaluation: Evaluation, truth_given: bool) -> None:
+    """Print every score; without a run set given, no true onset or magnitude can be known."""
+    print_scores(evaluation.judged)
+    show(f"\nall {evaluation.runs_and_protocol}", summary_table(evaluation))
+    if evaluation.calibration is not None:
+        show("", _reliability_table(evaluation.calibration.equal))
+    if evaluation.coverage:
+        show("", coverage_table(evaluation.coverage))
+    elif truth_given:
+        show("\ncoverage of intervals: the truth names no onset or magnitude of a fault found")
+    else:
+        show("\ncoverage of intervals: needs true onsets and magnitudes, give --truth RUNS")
+
+
+def summary_table(evaluation: Evaluation) -> Table:
+    """Return name and value of each score of all runs together."""
+    scores, alarms = evaluation.scores, evaluation.alarms
+    false_alarms = _percent(alarms.false_alarms) + _abstained(alarms.healthy_abstained)
+    rows = [
+        ("accuracy", _percent(proportions.Share(scores.right, scores.runs))),
+        ("macro-F1", f"{scores.macro_f1:.3f}, mean over the classes that were true of any run"),
+        ("false-alarm rate", false_alarms),
+        ("missed-detection rate", _percent(alarms.missed) + _abstained(alarms.faulty_abstained)),
+        ("log score", f"{scores.log_score:.3f} nats a run"),
+        ("Brier score", f"{evaluation.brier:.3f} (0 is perfect, 2 the worst)"),
+    ]
+    if evaluation.calibration is not None:
+        rows += _calibration_rows(evaluation.calibration)
+    return Table(("Score", evaluation.runs_and_protocol), rows, header=False)
+
+
+def _percent(share: proportions.Share) -> str:
+    """Return a share and its Wilson interval in per cent; a dash for a share of nothing."""
+    if not share.total:
+        return "-"
+    low, high = share.interval
+    return (
+        f"{100 * share.value:.1f} % (95 % interval {100 * low:.1f} to {100 * high:.1f} %), "
+        f"{share.count} of {share.total} runs"
+    )
+
+
+def _abstained(count: int) -> str:
+    return f", {count} without a verdict, which is no alarm" if count else ""
+
+
+def _calibration_rows(calibration: Calibration) -> list[tuple[str, str]]:
+    equal, adaptive = calibration.equal, calibration.adaptive
+    typical, high = np.quantile(calibration.by_chance, [0.5, 0.95])
+    return [
+        ("calibration error", f"{equal.error:.3f} in {len(equal.count)} bins of equal width"),
+        ("  by chance alone", f"{typical:.3f}, in 1 of 20 cases above {high:.3f}"),
+        ("  adaptive", f"{adaptive.error:.3f} in {len(adaptive.count)} bins of about equal counts"),
+    ]
+
+
+def _reliability_table(bins: scoring_rules.Reliability) -> Table:
+    rows = []
+    for i in np.flatnonzero(bins.count):
+        right = proportions.Share(int(bins.right[i]), int(bins.count[i]))
+        low, high = right.interval
+        edges = f"{bins.edges[i]:.1f} to {bins.edges[i + 1]:.1f}"
+        ratios = f"{bins.confidence[i]:.3f}", f"{right.value:.3f}", f"{low:.3f} to {high:.3f}"
+        rows.append((edges, str(right.total), *ratios))
+    return figures_table(
+        ("confidence", "runs", "mean", "right", "95 % interval"),
+        rows,
+        "reliability: how often a verdict of such confidence is right",
+    )
+
+
+def coverage_table(coverage: Sequence[proportions.Coverage]) -> Table:
+    """Return a row for each quantity of each fault mode."""
+    rows = []
+    for row in coverage:
+        low, high = row.inside.interval
+        share = f"{100 * row.inside.value:.1f} %", f"{100 * low:.1f} to {100 * high:.1f} %"
+        counts = (str(count) for count in (row.below, row.above, row.points))
+        rows.append((f"{row.quantity} of {row.mode}", str(row.inside.total), *share, *counts))
+    return figures_table(
+        ("interval", "runs", "inside", "95 % interval", "below", "above", "points"),
+        rows,
+        "coverage of the 90 % intervals, over runs whose fault was found",
+    )
+
+
+def print_comparison(comparison: Comparison) -> None:
+    """Print how two methods differ on the same runs."""
+    show(f"\n{counted(comparison.runs, 'run')}, each by A and by B")
+    show(*(f"{name}: {value}" for name, value in comparison_rows(comparison)))
+
+
+def comparison_rows(comparison: Comparison) -> list[tuple[str, str]]:
+    """Return name and value of whatever says how two methods differ."""
+    split, (a, b) = comparison.split, comparison.as_unknown
+    right = (
+        f"both {split.both}, only A {split.first_only}, only B {split.second_only}, neither "
+        f"{split.neither}; exact McNemar p = {split.p:.3g}"
+    )
+    rows = [("A", comparison.first), ("B", comparison.second), ("right", right)]
+    if a or b:
+        unknown = f"by A {a} runs, by B {b}: their truth is not among its hypotheses"
+        rows.append(("judged as unknown", unknown))
+    gain = comparison.gain
+    if gain.first_impossible or gain.second_impossible or gain.both_impossible:
+        impossible = (
+            f"only by A in {gain.first_impossible} runs, only by B in {gain.second_impossible}, by "
+            f"both in {gain.both_impossible}"
+        )
+        rows.append(("truth given no probability", impossible))
+        rows.append(("log score, A minus B, all runs", f"{gain.mean:+.3f} nats a run"))
+    if gain.runs:
+        low, high = gain.interval
+        better = "A is better" if high < 0.0 else "B is better" if low > 0.0 else "not settled"
+        mean = (
+            f"{gain.finite_mean:+.3f} nats a run (95 % bootstrap interval {low:+.3f} to "
+            f"{high:+.3f}): {better}"
+        )
+        rows.append((f"log score, A minus B, {gain.runs} runs", mean))
+    return rows
+
+
+def write_latex(evaluation: Evaluation, comparison: Comparison | None, path: Path) -> None:
+    """Write all scores, those of each class, coverage and the comparison, as tables for a paper."""
+    summary, classes = summary_table(evaluation), class_table(evaluation.scores)
+    if count := sum(evaluation.judged.as_unknown.values()):
+        unknown = f"{count} runs, whose truth is not among the hypotheses"
+        summary = replace(summary, rows=[*summary.rows, ("judged as unknown", unknown)])
+    dashes = [["--" if cell == "nan" else cell for cell in row] for row in classes.rows]
+    tables = [summary, figures_table(("Class", "Runs", "Precision", "Recall", "F1"), dashes)]
+    if evaluation.coverage:
+        rows = [row[:4] for row in coverage_table(evaluation.coverage).rows]
+        tables.append(figures_table(("90 % interval", "Runs", "Inside", "95 % interval"), rows))
+    if comparison is not None:
+        tables.append(Table(("Compared", "on the same runs"), comparison_rows(comparison)))
+    text = "\n".join([r"% \usepackage{booktabs}", *map(latex, tables)])
+    with replacing(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+# What the motion of the runs at hand could not tell, in a line or two.
+
+MAX_MOTIONS = 3
+"""Motions that are looked at, spread evenly over the runs."""
+MAX_COMPARED = 16
+"""More hypotheses take longer to tell apart than to diagnose; then the user is left to ask."""
+
+
+def isolability_summary(runs: xr.Dataset, diagnoser: BayesDiagnoser) -> list[str]:
+    """Return which faults such motions cannot tell apart, and the smallest that they show."""
+    single = [h for h in diagnoser.hypothesis_set if h.known and len(h.faults) <= 1]
+    left_out = _left_out_lines([h for h in diagnoser.hypothesis_set if h not in single])
+    if not any(h.faults for h in single):
+        return left_out
+    if len(single) > MAX_COMPARED:
+        return [
+            f"which of these {len(single)} hypotheses such motions tell apart may take longer to "
+            f"work out than the diagnosis (done for up to {MAX_COMPARED}): call "
+            "failuretwin.isolability in Python (docs/isolability.md), or name fewer with "
+            "--hypotheses",
+            *left_out,
+        ]
+    command = as_floats(runs["command"].values)
+    moving = np.flatnonzero(np.ptp(command, axis=1).any(axis=1))
+    some = moving[np.unique(np.linspace(0, len(moving) - 1, MAX_MOTIONS).astype(int))]
+    found = isolability(
+        diagnoser.twin,
+        command[some],
+        as_floats(runs["time"].values),
+        imperfections=diagnoser.imperfections,
+        hypotheses=single,
+        priors=diagnoser.priors,
+        onset_s=diagnoser.priors.onset.known_s or 0.0,
+    )
+    robot = diagnoser.twin.robot
+    lines = group_lines(found, robot) + size_lines(found, robot)
+    return [joint_names_in(line, robot) for line in lines] + left_out
+
+
+def _left_out_lines(others: Sequence[Hypothesis]) -> list[str]:
+    """Return the hypotheses that nothing is said of here: pairs of faults, and `unknown`."""
+    pairs = sum(len(h.faults) > 1 for h in others)
+    names = [f"{counted(pairs, 'pair')} of faults"] * (pairs > 0)
+    names += [str(h) for h in others if not h.known]
+    said = "what motions tell apart is said of single faults only, not of "
+    return [said + " and ".join(names)] * bool(names)
+
+
+def group_lines(found: IsolabilityReport, robot: Robot) -> list[str]:
+    """Return the groups, with the sizes at which their faults look alike."""
+    if not found.groups:
+        return []
+    groups = (
+        " or ".join(_name(n, robot, found.typical.get(n)) for n in group) for group in found.groups
+    )
+    sized = any(name in found.typical for group in found.groups for name in group)
+    when = " when faults are as large as this" if sized else ""
+    return [f"cannot be told apart by such motions{when}: {'; '.join(groups)}"]
+
+
+def size_lines(found: IsolabilityReport, robot: Robot) -> list[str]:
+    """Return the smallest sizes that are found, and what is known of faults never found."""
+    hidden = [name for name, size in found.isolated.items() if size is None]
+    lines = {
+        "smallest faults that such motions show": found.isolated,
+        "not shown for certain, even when as large as this": {n: found.largest[n] for n in hidden},
+        "of these, that something is wrong shows from this size on": {
+            n: found.detected[n] for n in hidden
+        },
+    }
+    return [
+        f"{what}: {', '.join(_name(name, robot, size) for name, size in sizes.items() if size)}"
+        for what, sizes in lines.items()
+        if any(sizes.values())
+    ]
+
+
+def _name(hypothesis: str, robot: Robot, size: float | None = None) -> str:
+    """Return a hypothesis as a person would say it, with the size of its fault if it has one."""
+    parsed = Hypothesis.parse(hypothesis)
+    if size is None:
+        return plain_name(parsed)
+    fault = parsed.faults[0]
+    unit = robot.own_unit(fault.motor, MODES[fault.mode].unit)
+    return plain_name(parsed) + size_words(fault, size, unit).replace("+", "")  # either sign
+
+
+# What `robot check` prints: the joints of a URDF and what was found.
+
+
+def print_report(report: UrdfReport) -> None:
+    """Print the chain, its joints and all findings that are no errors."""
+    if report.joints:
+        headings = ("joint", "type", "limits", "speed", "effort", "link mass", "motor")
+        show(_summary(report), Table(headings, [_joint_row(joint) for joint in report.joints]))
+    for severity in ("warning", "note"):
+        show(*(f"\n{severity}: {message}" for message in report.having(severity)))
+
+
+def _summary(report: UrdfReport) -> str:
+    count = len(report.motors)
+    return (
+        f"{report.name or report.source.name}: from {report.base_link} to {report.tool_link}, "
+        f"{counted(count, 'motor')} can move the tool point\n"
+        f"the tool gets {report.reach:.3f} m away from the base's origin; "
+        f"what moves weighs {report.moving_mass:.3f} kg\n"
+    )
+
+
+def _joint_row(report: JointReport) -> tuple[str, ...]:
+    joint = report.joint
+    moving = joint.type not in ("fixed", "floating", "planar")
+    slides = joint.type == "prismatic"
+    scale, unit = (1e3, "mm") if slides else (180.0 / math.pi, "deg")
+    return (
+        joint.name,
+        joint.type,
+        _limits(joint, scale, unit) if moving else "",
+        _with_unit(joint.velocity, scale, f"{unit}/s") if moving else "",
+        _with_unit(joint.effort, 1.0, "N" if slides else "N m") if moving else "",
+        _with_unit(report.mass, 1.0, "kg") if moving or report.mass is not None else "",
+        report.motor or f"- ({report.reason})",
+    )
+
+
+def _limits(joint: UrdfJoint, scale: float, unit: str) -> str:
+    if joint.type == "continuous":
+        return "endless"
+    if not has_range(joint.low, joint.high):
+        return "?"
+    return f"{scale * joint.low:.4g} to {scale * joint.high:.4g} {unit}"
+
+
+def _with_unit(value: float | None, scale: float, unit: str) -> str:
+    return "?" if value is None or math.isnan(value) else f"{scale * value:.4g} {unit}"
+
+
+# What `diagnose --track` says of wear.
+
+
+def tracking_line(tracked: Tracked) -> str:
+    """Return what was learned of the runs, in one line."""
+    life, history = tracked.life, tracked.history
+    parts = [f"{len(tracked.rows)} runs learned", f"{life.arrived} in all"]
+    if tracked.known:
+        parts.append(f"{tracked.known} known already")
+    told = f"tracked: {', '.join(parts)}; {_largest_changes(tracked)}"
+    if life.alarm:
+        told += f"; learning is stopped: {life.alarm}"
+    if tracked.mixed:
+        told += f"; {tracked.mixed}"
+    return told if history.path is None else f"{told}; history: {history.path}"
+
+
+def _largest_changes(tracked: Tracked) -> str:
+    """Return the largest changes of bias and of sag, with their deviations."""
+    life = tracked.life
+    unit = wear_unit(life.model).reshape(3, -1)
+    share = np.divide(unit[0], unit[1], out=np.zeros_like(unit[0]), where=unit[1] > 0.0)
+    in_angle = np.stack([np.ones_like(share), share])  # of a compliance: at the largest load
+    (before, _), (after, doubt) = (one.offsets for one in (tracked.history.life, life))
+    moved, doubt = in_angle * (after - before)[:2], in_angle * doubt[:2]
+    told = []
+    for kind, change, deviation in zip(("bias", "sag"), moved, doubt, strict=True):
+        worst = int(np.argmax(np.abs(change)))
+        degrees, error = np.rad2deg(change[worst]), np.rad2deg(deviation[worst])
+        motor = life.model.motor_names[worst]
+        told.append(f"{kind} of {motor} {degrees:+.2f} deg (deviation {error:.2f})")
+    return f"largest changes: {', '.join(told)}"

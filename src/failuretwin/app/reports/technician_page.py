@@ -1,0 +1,201 @@
+"""The technician's page: state of the robot, which motor, how surely, what to do; the rest folded.
+
+One file that holds all it shows. Its size is bounded: pictures and details of a few runs, chosen so
+that every state is among them, and a row for each of the others.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from failuretwin import __version__
+from failuretwin.app.reports.arm_sketch import Mark, arm_sketch
+from failuretwin.app.reports.plots import plain, plot_runs, render_page
+from failuretwin.app.reports.tables import Table
+from failuretwin.core.hypothesis import FAULTY_STATE, HEALTHY_STATE, OPEN_STATE, Diagnosis
+from failuretwin.data_knowledge.store import filling
+from failuretwin.decision.evaluation import Judged, as_unknown_line, score_line
+from failuretwin.decision.proportions import judged_truth
+from failuretwin.decision.robot_state import RobotState, state_of_run
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.twin import DigitalTwin
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+MOST_PICTURES = 16
+"""Runs that get a picture and details."""
+MOST_PICTURE_BYTES = 3_000_000
+"""Size of all pictures together in the page [byte]."""
+MOST_ROWS = 2000
+"""Runs that get a row."""
+SHOWN = {
+    HEALTHY_STATE: ("#2e7d4f", "✓"),
+    FAULTY_STATE: ("#c8402f", "!"),
+    OPEN_STATE: ("#8a6500", "?"),
+}
+"""Colour and sign of each state; shapes are in the template."""
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A run in the table of runs.
+
+    Attributes:
+        number: Its place among the runs, from 1.
+        diagnosis: What was said of it.
+        kind: Its state.
+        truth: What was the case, in plain words; empty: not known.
+        wrong: Whether the verdict is another.
+        picture: PNG file in base64; empty: none.
+        told: Whether it has details below.
+    """
+
+    number: int
+    diagnosis: Diagnosis
+    kind: str
+    truth: str
+    wrong: bool
+    picture: str
+    told: bool
+
+
+@dataclass(frozen=True)
+class Section:
+    """What else a page tells, between its motors and its runs.
+
+    Attributes:
+        title: Its heading.
+        lines: Sentences.
+        tables: Shown below them.
+        folded: Tables below those by what they tell, shown when asked for.
+    """
+
+    title: str
+    lines: Sequence[str] = ()
+    tables: Sequence[Table] = ()
+    folded: Mapping[str, Table] = field(default_factory=dict)
+
+
+def chosen_runs(diagnoses: Sequence[Diagnosis], robot: Robot, most: int) -> list[int]:
+    """Return the runs that are shown in full, in their order.
+
+    Runs are grouped by state, faulty motors and whether their verdict is known to be wrong, and
+    taken in turn from each group, the surest first; a right one of every state comes before any
+    that is wrong.
+
+    Args:
+        diagnoses: Of all runs.
+        robot: The robot.
+        most: So many at most.
+    """
+    groups: dict[tuple[bool, str, tuple[str, ...]], list[int]] = {}
+    for i, diagnosis in enumerate(diagnoses):
+        state = state_of_run(diagnosis, robot.motor_names)
+        motors = state.motors if state.kind == FAULTY_STATE else ()
+        groups.setdefault((_truth_cell(diagnosis)[1], state.kind, motors), []).append(i)
+    groups = {key: groups[key] for key in sorted(groups, key=lambda key: key[0])}
+    for members in groups.values():
+        members.sort(key=lambda i: -(diagnoses[i].probability or 0.0))
+    turns = max(map(len, groups.values()), default=0)
+    ordered = [g[turn] for turn in range(turns) for g in groups.values() if turn < len(g)]
+    return sorted(ordered[:most])
+
+
+def write_report(
+    runs: xr.Dataset,
+    diagnoses: Sequence[Diagnosis],
+    twin: DigitalTwin,
+    state: RobotState,
+    folder: Path,
+    sections: Sequence[Section] = (),
+) -> None:
+    """Write the page of diagnosed runs into a folder, with the pictures that it holds as files.
+
+    Args:
+        runs: The runs.
+        diagnoses: Of each, in their order.
+        twin: The twin of their robot.
+        state: Of the robot over all of them.
+        folder: Where `index.html` goes.
+        sections: What else is told.
+    """
+    chosen = chosen_runs(diagnoses, twin.robot, MOST_PICTURES)
+    with filling(folder) as partial:
+        pictures = plot_runs(runs, diagnoses, twin, partial, chosen)
+        write_page(diagnoses, state, twin.robot, partial / "index.html", pictures, sections)
+
+
+def write_page(
+    diagnoses: Sequence[Diagnosis],
+    state: RobotState,
+    robot: Robot,
+    path: Path,
+    pictures: Mapping[int, Path | None] | None = None,
+    sections: Sequence[Section] = (),
+) -> None:
+    """Write the page of some runs.
+
+    Args:
+        diagnoses: Of each run.
+        state: Of the robot over all of them.
+        robot: The robot.
+        path: The file.
+        pictures: PNG files of some runs, by index; these runs are shown in full. None: of none,
+            and the first ones are shown in full.
+        sections: What else is told.
+    """
+    judged = Judged.of(diagnoses)
+    rows = _rows(diagnoses, pictures or dict.fromkeys(range(MOST_PICTURES)), robot)
+    values: dict[str, Any] = {
+        "state": state,
+        "sketch": arm_sketch(robot, _marks(state)),
+        "shown": SHOWN,
+        "rows": rows[:MOST_ROWS],
+        "told": [row for row in rows if row.told],
+        "count": len(diagnoses),
+        "robot": robot.name,
+        "sections": sections,
+        "method": diagnoses[0].method,
+        "protocol": diagnoses[0].protocol,
+        "version": __version__,
+        "known": any(d.truth is not None for d in diagnoses),
+        "score": score_line(judged),
+        "as_unknown": as_unknown_line(judged),
+        "plain": plain,
+    }
+    path.write_text(render_page("diagnoses.html.j2", values), encoding="utf-8")
+
+
+def _marks(state: RobotState) -> dict[str, Mark]:
+    """Return how the sketch marks the motors that the state names."""
+    if state.state.kind == HEALTHY_STATE:
+        return {}
+    joints = {row.motor: row.joint for row in state.motors}
+    return {motor: Mark(*SHOWN[state.state.kind], joints[motor]) for motor in state.state.motors}
+
+
+def _rows(
+    diagnoses: Sequence[Diagnosis], pictures: Mapping[int, Path | None], robot: Robot
+) -> list[_Row]:
+    rows, spent = [], 0
+    for i, diagnosis in enumerate(diagnoses):
+        file = pictures.get(i)
+        held = "" if file is None else base64.b64encode(file.read_bytes()).decode("ascii")
+        held = held if spent + len(held) <= MOST_PICTURE_BYTES else ""
+        spent += len(held)
+        kind = state_of_run(diagnosis, robot.motor_names).kind
+        rows.append(_Row(i + 1, diagnosis, kind, *_truth_cell(diagnosis), held, i in pictures))
+    return rows
+
+
+def _truth_cell(diagnosis: Diagnosis) -> tuple[str, bool]:
+    """Return the truth of a run in plain words, and whether the verdict is another."""
+    if diagnosis.truth is None:
+        return "", False
+    truth = judged_truth(diagnosis.truth, diagnosis.posterior)
+    return plain(diagnosis.truth), truth != diagnosis.diagnosis

@@ -1,0 +1,317 @@
+"""Recorded ROS data as runs: ROS 1 bags, ROS 2 bags and MCAP files, read without ROS.
+
+Angles are taken in the sense of the robot's commands, tool positions in its base frame.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from failuretwin.core.errors import InputError
+from failuretwin.core.runs import GOAL_VARIABLE
+from failuretwin.core.types import FloatArray, IntArray, as_floats
+from failuretwin.data_knowledge.readers.bag_file import (
+    BagMessage,
+    BagTopic,
+    is_bag,
+    read_messages,
+    read_topics,
+)
+from failuretwin.data_knowledge.readers.bag_messages import (
+    NS_PER_S,
+    ROLES,
+    BagTopics,
+    JointRows,
+    Role,
+    ToolRows,
+    check_understood,
+    fitting_topics,
+    joint_rows,
+    nothing_for,
+    only_topic,
+    require_kind,
+    tool_rows,
+)
+from failuretwin.data_knowledge.readers.timed_log import Samples, Targets, TimedLog
+from failuretwin.digital_model.robot import Robot
+
+__all__ = ["BagTopics", "Track", "is_bag", "motor_track", "read_bag", "read_targets"]
+
+CLOCK_GAP_NS = 3600 * NS_PER_S
+"""A silence of this length [ns] means that the stamps come from more than one clock."""
+
+
+def read_bag(path: Path, robot: Robot, topics: BagTopics | None = None) -> list[TimedLog]:
+    """Read a ROS 1 bag (.bag), a ROS 2 bag (folder or .db3) or an MCAP file.
+
+    Args:
+        path: The file or folder.
+        robot: The robot it is of. Joints that it does not have are ignored.
+        topics: Which topics to read; by default those whose type and name fit.
+
+    Returns:
+        One log, named after the file; its time counts from its first stamp.
+
+    Raises:
+        InputError: If it cannot be read, holds nothing that is understood, leaves a choice between
+            topics, or lacks a joint.
+    """
+    named = topics or BagTopics()
+    found = read_topics(path)
+    check_understood(found, path)
+    fitting = {role: fitting_topics(role, getattr(named, role), found, path) for role in ROLES}
+    messages = read_messages(path, sorted({t.name for fit in fitting.values() for t in fit}))
+    recording = _Recording(path, robot, messages)
+    tool = recording.tool(fitting["tool"])
+    position = recording.motors("position", fitting["position"], needed=tool is None)
+    command = recording.motors("command", fitting["command"], needed=True)
+    if command is None:
+        raise nothing_for("command", found, path)
+    goal = recording.motors("goal", fitting["goal"], needed=False)
+    _check_commanded(command, robot)
+    if tool is None:
+        if position is None:
+            raise nothing_for("tool", found, path)
+        _check_whole(position)
+    zero_ns = _first_stamp([t for t in (command, tool, position) if t is not None], path)
+    return [
+        TimedLog(
+            name=path.name if path.is_dir() else path.stem,
+            command=_command(command, position, zero_ns),
+            tool=None if tool is None else Samples(_seconds(tool.stamp_ns, zero_ns), tool.value),
+            position=None if position is None else _samples(position, zero_ns),
+            sensors={} if goal is None else {GOAL_VARIABLE: _samples(goal, zero_ns)},
+        )
+    ]
+
+
+def read_targets(path: Path, robot: Robot) -> Targets | None:
+    """Read targets from a bag that holds commands alone, such as `failuretwin design` writes.
+
+    Args:
+        path: The file or folder.
+        robot: The robot it is of.
+
+    Returns:
+        The targets, their times from the first; None: it holds readings too, or no targets.
+
+    Raises:
+        InputError: If it cannot be read, or lacks a joint.
+    """
+    found = read_topics(path)
+    fitting = {role: fitting_topics(role, None, found, path) for role in ROLES}
+    if fitting["tool"] or fitting["position"] or not fitting["command"]:
+        return None
+    messages = read_messages(path, [topic.name for topic in fitting["command"]])
+    command = _Recording(path, robot, messages).motors("command", fitting["command"], needed=True)
+    if command is None or command.duration is None:
+        return None
+    _check_commanded(command, robot)
+    told = _command(command, None, int(command.stamp_ns[0]))
+    return told if isinstance(told, Targets) else None
+
+
+@dataclass(frozen=True)
+class Track:
+    """What one topic says of the robot, sorted by time.
+
+    Attributes:
+        where: File and topic, for error texts.
+        stamp_ns: (row,) [ns].
+        value: Angles (row, motor) [rad] or tool positions (row, axis) [m]; NaN where unknown.
+        duration: For targets: the time to get there, (row, motor) [s].
+    """
+
+    where: str
+    stamp_ns: IntArray
+    value: FloatArray
+    duration: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class _Recording:
+    """A recording of a robot, with the messages of all topics that may be needed."""
+
+    path: Path
+    robot: Robot
+    messages: dict[str, list[BagMessage]]
+
+    def tool(self, fitting: Sequence[BagTopic]) -> Track | None:
+        topic = only_topic("tool", fitting, self.path)
+        if topic is None:
+            return None
+        rows: ToolRows = tool_rows(self.messages[topic.name], require_kind(topic.fields))
+        return Track(self._where(topic), rows.stamp_ns, rows.value)
+
+    def motors(self, role: Role, fitting: Sequence[BagTopic], *, needed: bool) -> Track | None:
+        """Return what the topic for a role says; topics of other joints only do not count."""
+        read = {topic.name: self._joints(role, topic) for topic in fitting}
+        ours = [topic for topic in fitting if _names_a_motor(read[topic.name].names, self.robot)]
+        # If none is ours but one is needed, the first is refused for the joints that it names.
+        topic = only_topic(role, ours or (fitting[:1] if needed else []), self.path)
+        if topic is None:
+            return None
+        return motor_track(read[topic.name], self.robot, self._where(topic))
+
+    def _joints(self, role: Role, topic: BagTopic) -> JointRows:
+        messages, kind = self.messages[topic.name], require_kind(topic.fields)
+        return joint_rows(messages, kind, self._where(topic), command=role == "command")
+
+    def _where(self, topic: BagTopic) -> str:
+        return f"{self.path}: topic {topic.name}"
+
+
+def motor_track(rows: JointRows, robot: Robot, where: str) -> Track:
+    """Return the angles of the robot's motors, leaving out rows that say nothing of them."""
+    columns = _motor_columns(rows.names, robot, where, in_counts=rows.in_counts)
+    angle = rows.value[:, columns]
+    if rows.in_counts:
+        units = robot.servo_units
+        # A reading out of range is a glitch; a command out of range is one for the end stop.
+        sound = np.isfinite(angle) if rows.duration is not None else units.valid(angle)
+        angle = np.where(sound, units.to_rad(angle), np.nan)
+    said = np.asarray(np.isfinite(angle).any(axis=1))
+    duration = None if rows.duration is None else rows.duration[said][:, columns]
+    return Track(where, rows.stamp_ns[said], angle[said], duration)
+
+
+def _names_a_motor(names: Sequence[str], robot: Robot) -> bool:
+    """Return whether any of the names can stand for a motor of the robot."""
+    return any(set(scheme) & set(names) for scheme in _schemes(robot, in_counts=False).values())
+
+
+def _motor_columns(names: Sequence[str], robot: Robot, where: str, *, in_counts: bool) -> list[int]:
+    """Return the column of each motor among `names`, in chain order.
+
+    All motors are named in one way: by joint, by motor, by log column, or by the number that the
+    log column ends in. The same name may mean two motors in two ways (the log column ``motor_1``
+    of the ArmPi is not its motor 1), so the ways are never mixed and their order matters: values
+    in counts come from the servo bus, angles from a driver that knows joints.
+
+    Args:
+        names: Names of the columns.
+        robot: The robot.
+        where: Name of the file and topic for error texts.
+        in_counts: Whether the values are servo counts.
+
+    Raises:
+        InputError: If a motor is missing.
+    """
+    schemes = _schemes(robot, in_counts=in_counts)
+    column = {name: index for index, name in enumerate(names)}
+    for wanted in schemes.values():
+        if all(name in column for name in wanted):
+            return [column[name] for name in wanted]
+    best = max(schemes.values(), key=lambda wanted: sum(name in column for name in wanted))
+    missing = [name for name in best if name not in column]
+    ways = "; ".join(f"{kind} {', '.join(wanted)}" for kind, wanted in schemes.items())
+    raise InputError(
+        f"{where}: values for {', '.join(missing)} are missing; it names "
+        f"{', '.join(names) or 'no joint at all'}. Expected all motors of {robot.name!r} by one of "
+        f"these: {ways}."
+    )
+
+
+def _schemes(robot: Robot, *, in_counts: bool) -> dict[str, list[str]]:
+    """Return the names of the motors in each way of naming them all, the likeliest first."""
+    bus: dict[str, list[str]] = {}
+    if all(motor.log_column for motor in robot.motors):
+        bus["log columns"] = [motor.log_column for motor in robot.motors]
+        numbers = [re.search(r"\d+$", motor.log_column) for motor in robot.motors]
+        bus["servo numbers"] = [match.group() for match in numbers if match]
+        if len(bus["servo numbers"]) < len(robot.motors):
+            del bus["servo numbers"]
+    arm = {"joints": [motor.joint for motor in robot.motors], "motors": robot.motor_names}
+    return bus | arm if in_counts else arm | bus
+
+
+def _check_commanded(command: Track, robot: Robot) -> None:
+    """Raise an InputError if a motor is named in commands but never given a value."""
+    never = np.flatnonzero(~np.isfinite(command.value).any(axis=0))
+    if len(never):
+        names = ", ".join(robot.motor_names[k] for k in never)
+        raise InputError(f"{command.where}: no command holds a value for {names}. Record them.")
+
+
+def _check_whole(position: Track) -> None:
+    """Raise an InputError if no row of readings suffices to compute the tool path from."""
+    if not np.isfinite(position.value).all(axis=1).any():
+        raise InputError(
+            f"{position.where}: no message holds sound readings of all motors, which the tool path "
+            "is computed from. Record one message for all of them, or the tool's position."
+        )
+
+
+def _first_stamp(tracks: Sequence[Track], path: Path) -> int:
+    """Return the earliest stamp [ns], once it is sure that all stamps are of one clock.
+
+    Raises:
+        InputError: If a silence within the recording is too long for one clock.
+    """
+    stamps = np.sort(np.concatenate([track.stamp_ns for track in tracks]))
+    steps = np.diff(stamps)
+    if len(steps) and steps.max() > CLOCK_GAP_NS:
+        spans = "; ".join(
+            f"{track.where.removeprefix(f'{path}: ')} from {track.stamp_ns[0] / NS_PER_S:.3f} to "
+            f"{track.stamp_ns[-1] / NS_PER_S:.3f} s"
+            for track in tracks
+            if len(track.stamp_ns)
+        )
+        raise InputError(
+            f"{path}: its stamps lie {steps.max() / CLOCK_GAP_NS:.1f} hours apart: {spans}. "
+            "Expected one run by one clock. Set the clocks before recording, or cut the recording."
+        )
+    return int(stamps[0])
+
+
+def _seconds(stamp_ns: IntArray, zero_ns: int) -> FloatArray:
+    # Subtracted as whole numbers: today's epoch in float64 seconds is only good to 0.2 us.
+    return as_floats((stamp_ns - zero_ns) / NS_PER_S)
+
+
+def _samples(track: Track, zero_ns: int) -> Samples:
+    return Samples(_seconds(track.stamp_ns, zero_ns), track.value)
+
+
+def _command(command: Track, position: Track | None, zero_ns: int) -> Samples | Targets:
+    if command.duration is None:
+        return _samples(command, zero_ns)
+    rows = slice(int(_starts_with_known_pose(command, position)), None)
+    target, duration = command.value[rows], command.duration[rows]
+    known = np.isfinite(target)
+    # A motor that a message leaves out stays where it was sent, for as long as the others move.
+    longest = np.nanmax(np.where(known, duration, np.nan), axis=1, keepdims=True)
+    return Targets(
+        time=_seconds(command.stamp_ns[rows], zero_ns),
+        target=_held(target),
+        duration=np.where(known, duration, longest),
+    )
+
+
+def _starts_with_known_pose(command: Track, position: Track | None) -> bool:
+    """Return whether the first target only repeats where the readings say that the arm stands.
+
+    Planners begin a trajectory with the pose it starts from. It is no movement, and readings tell
+    the pose better: the two differ a little, which would look like a jump of the reference.
+    """
+    if command.duration is None or position is None:
+        return False
+    if len(command.stamp_ns) < 2 or len(position.stamp_ns) == 0:
+        return False
+    at_once = bool(np.nanmax(command.duration[0]) == 0.0)
+    followed = command.stamp_ns[1] - command.stamp_ns[0] == 1
+    return at_once and bool(followed) and bool(position.stamp_ns[0] <= command.stamp_ns[0])
+
+
+def _held(target: FloatArray) -> FloatArray:
+    """Return targets (row, motor) with each NaN replaced by the one before, or else the next."""
+    rows = np.arange(len(target))[:, None]
+    known = np.isfinite(target)
+    before = np.maximum.accumulate(np.where(known, rows, -1), axis=0)
+    first = np.argmax(known, axis=0)
+    return np.take_along_axis(target, np.where(before < 0, first, before), axis=0)

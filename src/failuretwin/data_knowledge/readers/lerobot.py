@@ -1,0 +1,302 @@
+"""LeRobot data sets (v2.1 and v3): what the motors were told and read, frame by frame.
+
+A data set is a folder with ``meta/info.json`` and parquet files below ``data/``: one for each
+episode (v2.1) or several episodes in each (v3); a column ``episode_index`` tells them apart in
+both. ``action`` is what the motors were told, ``observation.state`` what they read. It holds no
+tool path: that is the forward kinematics of the readings.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from failuretwin.core.errors import InputError, needs_extra, unknown_name
+from failuretwin.core.foreign import check_size, read_text, reading
+from failuretwin.core.types import FloatArray, IntArray, as_floats
+from failuretwin.data_knowledge.readers.timed_log import Samples, TimedLog
+from failuretwin.digital_model.robot import Robot
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+INFO_FILE = Path("meta") / "info.json"
+ACTION, STATE, EPISODE, FRAME = "action", "observation.state", "episode_index", "frame_index"
+DEG, RAD, NORMALISED = "deg", "rad", "normalised"
+NUMBER_BYTES = 40
+"""What a number of a list takes while it is read [bytes]."""
+FULL_SCALE = 100.0
+"""Ends of a normalised joint's range: -100 and 100."""
+NAME_PREFIX, NAME_SUFFIX = "main_", ".pos"
+"""What recorders put around the name of a joint: ``main_elbow_flex``, ``elbow_flex.pos``."""
+
+
+@dataclass(frozen=True)
+class LeRobotAngles:
+    """What the numbers of a LeRobot data set are, commands and readings alike.
+
+    Attributes:
+        unit: deg, rad or normalised: -100 to 100 over the range that the arm was calibrated with.
+        joints: Names of the channels in chain order; empty: those called like the robot's joints.
+        low: For normalised numbers: what -100 stands for, for each motor [deg].
+        high: What 100 stands for, for each motor [deg].
+        sign: 1 or -1 for each motor, where the data set turns the other way; empty: all 1.
+        zero: Angle of each motor in the data set that the robot calls 0 [deg]; empty: all 0.
+    """
+
+    unit: str = DEG
+    joints: tuple[str, ...] = ()
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
+    sign: tuple[float, ...] = ()
+    zero: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.unit not in (DEG, RAD, NORMALISED):
+            raise unknown_name("unit", self.unit, (DEG, RAD, NORMALISED))
+        if self.unit == NORMALISED and not (self.low and self.high):
+            raise InputError(
+                "normalised angles need low and high: the angles [deg] that -100 and 100 stand for."
+            )
+
+    def to_rad(self, values: FloatArray) -> FloatArray:
+        """Return angles in the robot's sense [rad] of `values` (frame, motor)."""
+        angle = values if self.unit == RAD else np.deg2rad(values)
+        if self.unit == NORMALISED:
+            low, high = np.deg2rad(self.low), np.deg2rad(self.high)
+            angle = low + (values + FULL_SCALE) / (2.0 * FULL_SCALE) * (high - low)
+        return as_floats((angle - np.deg2rad(self.zero or 0.0)) * np.asarray(self.sign or 1.0))
+
+
+def is_lerobot(path: Path) -> bool:
+    """Return whether a path is the folder of a LeRobot data set."""
+    return (path / INFO_FILE).is_file()
+
+
+def read_lerobot(path: Path, robot: Robot, angles: LeRobotAngles | None = None) -> list[TimedLog]:
+    """Read the episodes of a LeRobot data set, one log each.
+
+    Args:
+        path: Its folder.
+        robot: The robot it is of; channels of joints that it does not have are left out.
+        angles: What the numbers are; None: degrees, unless they cannot be.
+
+    Raises:
+        InputError: If pyarrow is missing, the data set cannot be read, lacks a joint, or holds
+            angles that cannot be degrees and nobody said what else.
+    """
+    known = angles or LeRobotAngles()
+    _check_count(known, robot, path)
+    frames = _all_frames(path, known, robot)
+    unit, reason = _likely_unit(frames)
+    if angles is None and unit != DEG:
+        raise InputError(
+            f"{path}: its angles are not degrees, it seems: {reason}. Say what they are: add "
+            "--columns MAP.toml; if that file does not exist, a guess is written there for you to "
+            "check."
+        )
+    rate_hz = _rate(_info(path), path)
+    numbers = np.unique(frames.episode)
+    return [_episode(frames, int(number), rate_hz, known, path) for number in numbers]
+
+
+def lerobot_version(path: Path) -> str:
+    """Return the version of the format that a data set says it has, such as ``v3.0``."""
+    return str(_info(path).get("codebase_version", "of unknown version"))
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """Frames of all episodes: numbers (frame,), values as recorded (frame, motor)."""
+
+    episode: IntArray
+    frame: IntArray
+    action: FloatArray
+    state: FloatArray
+
+
+def _info(path: Path) -> dict[str, Any]:
+    with reading(path / INFO_FILE, "JSON"):
+        info = json.loads(read_text(path / INFO_FILE, "JSON"))
+    if not isinstance(info, dict) or not isinstance(info.get("features"), dict):
+        raise InputError(f"{path / INFO_FILE}: has no features. Expected a LeRobot data set.")
+    return info
+
+
+def _rate(info: Mapping[str, Any], path: Path) -> float:
+    rate = info.get("fps")
+    if isinstance(rate, int | float) and rate > 0:
+        return float(rate)
+    raise InputError(f"{path / INFO_FILE}: fps is {rate!r}, expected frames a second.")
+
+
+def _check_count(known: LeRobotAngles, robot: Robot, path: Path) -> None:
+    count = len(robot.motors)
+    for name in ("joints", "low", "high", "sign", "zero"):
+        got = len(getattr(known, name))
+        if got not in (0, count):
+            raise InputError(
+                f"{path}: {name} of the map has {got} entries, expected {count}, one for each "
+                f"motor of {robot.name!r} ({', '.join(robot.motor_names)})."
+            )
+
+
+def _channels(
+    info: Mapping[str, Any], feature: str, known: LeRobotAngles, robot: Robot, path: Path
+) -> list[int]:
+    """Return which channel of a feature belongs to each motor."""
+    names = channel_names(info, feature)
+    if not names:
+        raise InputError(
+            f"{path}: {INFO_FILE} names no channels of {feature!r}. Expected one for each joint."
+        )
+    plain = [name.removesuffix(NAME_SUFFIX).removeprefix(NAME_PREFIX) for name in names]
+    found = []
+    for wanted in known.joints or [motor.joint for motor in robot.motors]:
+        hits = [i for i, both in enumerate(zip(names, plain, strict=True)) if wanted in both]
+        if len(hits) != 1:
+            how_often = "no channel" if not hits else f"{len(hits)} channels"
+            raise InputError(
+                f"{path}: {feature!r} has {how_often} called {wanted!r}. It has: "
+                f"{', '.join(names)}. Name those of {', '.join(robot.motor_names)} in this order "
+                "as joints in the [lerobot] table of a map (--columns)."
+            )
+        found += hits
+    return found
+
+
+def channel_names(info: Mapping[str, Any], feature: str) -> list[str]:
+    """Return the names of a feature's channels; older data sets keep them as ``{"motors": []}``."""
+    entry = info["features"].get(feature)
+    names = entry.get("names") if isinstance(entry, dict) else None
+    if isinstance(names, dict):
+        names = next(iter(names.values()), None)
+    return [str(name) for name in names] if isinstance(names, list) else []
+
+
+def _data_files(path: Path) -> list[Path]:
+    files = sorted((path / "data").rglob("*.parquet"))
+    if not files:
+        raise InputError(
+            f"{path}: no parquet files below data/. Fetch the whole data set, not its meta alone."
+        )
+    return files
+
+
+def _all_frames(path: Path, known: LeRobotAngles, robot: Robot) -> _Frames:
+    info = _info(path)
+    picks = [_channels(info, feature, known, robot, path) for feature in (ACTION, STATE)]
+    parts = [_frames(file, picks) for file in _data_files(path)]
+    frames = _Frames(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    if len(frames.episode) == 0:
+        raise InputError(f"{path}: holds no frames. Record at least one episode.")
+    return frames
+
+
+def _frames(
+    file: Path, picks: Sequence[Sequence[int]]
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """Return number of episode and frame (frame,), action and state (frame, motor) of a file."""
+    with needs_extra("LeRobot data sets need pyarrow", "lerobot"):
+        import pyarrow.parquet as pq
+
+    wanted = [EPISODE, FRAME, ACTION, STATE]
+    with reading(file, "parquet", "Fetch the data set again."):
+        with pq.ParquetFile(file) as stored:
+            there = stored.schema_arrow.names
+            for column in wanted:
+                if column not in there:
+                    raise InputError(f"{file}: {unknown_name('column', column, there)}")
+            _check_claims(stored.metadata, len(picks[0]), file)
+            table = stored.read(columns=wanted)
+        episode, frame = (np.asarray(table[name], dtype=np.int64) for name in wanted[:2])
+        values = [_matrix(table, n, p, file) for n, p in zip((ACTION, STATE), picks, strict=True)]
+    return episode, frame, values[0], values[1]
+
+
+def _check_claims(said: pq.FileMetaData, motors: int, file: Path) -> None:
+    """Raise InputError if the rows of a parquet file are more than it can mean."""
+    groups = [said.row_group(i) for i in range(said.num_row_groups)]
+    values = sum(g.column(i).num_values for g in groups for i in range(g.num_columns))
+    check_size(NUMBER_BYTES * max(values, said.num_rows * motors), file, "its numbers")
+
+
+def _matrix(table: pa.Table, name: str, pick: Sequence[int], file: Path) -> FloatArray:
+    rows = table[name].to_pylist()
+    width = max(pick) + 1
+    if any(row is None or len(row) < width for row in rows):
+        raise InputError(f"{file}: {name!r} has rows of fewer numbers than {INFO_FILE} names.")
+    return np.array([[row[i] for i in pick] for row in rows], dtype=np.float64).reshape(
+        len(rows), len(pick)
+    )
+
+
+def _likely_unit(frames: _Frames) -> tuple[str, str]:
+    """Return the unit of the values, which the data set itself never says, and why."""
+    values = np.concatenate([frames.action, frames.state])
+    size = float(np.nanmax(np.abs(values)))
+    if size == FULL_SCALE:
+        return NORMALISED, "the largest is exactly 100, as where they are clipped to -100..100"
+    if size <= 2.0 * np.pi:
+        return RAD, f"none is larger than {size:.2f}"
+    return DEG, ""
+
+
+def _episode(
+    frames: _Frames, number: int, rate_hz: float, known: LeRobotAngles, path: Path
+) -> TimedLog:
+    """Return one episode, without the readings of frames whose command is at the end of its range.
+
+    Normalised commands are clipped there, and where such a motor rests is up to its end stop, or to
+    the arm folded upon itself, and not to its servo.
+    """
+    rows = np.flatnonzero(frames.episode == number)
+    rows = rows[np.argsort(frames.frame[rows], kind="stable")]
+    time = as_floats((frames.frame[rows] - frames.frame[rows[0]]) / rate_hz)
+    action, state = frames.action[rows], frames.state[rows]
+    if known.unit == NORMALISED:
+        free = np.all(np.abs(action) < FULL_SCALE, axis=1, keepdims=True)
+        state = np.where(free, state, np.nan)
+    return TimedLog(
+        name=f"{path.resolve().name}/episode_{number:06d}",
+        command=Samples(time, known.to_rad(action)),
+        position=Samples(time, known.to_rad(state)),
+    )
+
+
+def lerobot_map_text(path: Path, robot: Robot) -> str:
+    """Return a commented map for a data set, ready to be corrected.
+
+    The range of a normalised joint is that of the robot's URDF: recorders take that range by
+    moving each joint from end to end by hand.
+    """
+    unit, _ = _likely_unit(_all_frames(path, LeRobotAngles(), robot))
+    limits = np.rad2deg([(joint.low, joint.high) for joint in robot.chain.joints])
+    low, high = ([round(float(v), 1) for v in np.clip(ends, -180.0, 180.0)] for ends in limits.T)
+    channels = ", ".join(channel_names(_info(path), STATE))
+    motors = ", ".join(f"{motor.name} ({motor.joint})" for motor in robot.motors)
+    ends = "" if unit == NORMALISED else "# "
+    return "\n".join(
+        [
+            f"# Map for the LeRobot data set {path.name}. A GUESS: check every line.",
+            f"# Channels of the data set: {channels}",
+            f"# Motors of {robot.name}, in this order: {motors}",
+            "[lerobot]",
+            f'unit = "{unit}"     # deg, rad, or normalised (-100 to 100, the older default)',
+            "# joints = []   # channels in the order of the motors, where names do not tell",
+            "# What -100 and 100 stand for [deg], from the middle of each joint's range. Here: the",
+            "# limits of the URDF. Better: range_min and range_max of the arm's own calibration",
+            "# file; half their difference times 360/4096, below and above zero.",
+            f"{ends}low = {low}",
+            f"{ends}high = {high}",
+            "# sign = []     # 1 or -1 for each motor, where the data set turns the other way",
+            "# zero = []     # angle of the data set that the robot calls 0 [deg]",
+            "",
+        ]
+    )

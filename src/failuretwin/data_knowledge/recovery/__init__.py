@@ -1,0 +1,1 @@
+"""Recovery of the commands of published runs from their tool paths."""

@@ -1,0 +1,1 @@
+"""What each movement says of the angles of the motors."""

@@ -1,0 +1,1 @@
+"""Wrong set-ups of a log, and what undoes each."""

@@ -1,0 +1,1 @@
+"""Runs of one robot judged together: folders, lives, streams."""

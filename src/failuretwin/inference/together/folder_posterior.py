@@ -1,0 +1,146 @@
+"""What the runs of a folder say together: of each run's hypothesis, and of what they share.
+
+Every run is judged with what all others say (`RunsTogether`), some times over.
+
+Section: docs/inference.md#folders
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.types import FloatArray
+from failuretwin.inference.faults.priors import Priors
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.posterior import Posterior
+from failuretwin.inference.theta.shared_belief import Belief
+from failuretwin.inference.theta.shared_likelihood import Normal
+from failuretwin.inference.theta.shared_posterior import set_up_in_doubt
+from failuretwin.inference.theta.shared_unknowns import REGISTRATION
+from failuretwin.inference.theta.shared_weighing import SharedWeighing
+from failuretwin.inference.together.runs_together import CHUNK_RUNS, RunsTogether
+
+PASSES, MOST_PASSES, MOVED = 4, 12, 0.2
+"""Times that every run is judged, and at most: until a pass moves theta by no more than this share
+of its deviation."""
+DAMPING = 0.7
+"""Share of a new site that is taken, from the second pass on."""
+Advance = Callable[[int], None]
+"""Told how many passes over the runs have just been done, of `PASSES`; more are not told."""
+
+
+@dataclass(frozen=True)
+class FolderPosterior:
+    """What some runs say together.
+
+    Attributes:
+        model: The healthy robot with the offsets, scatter and rates that were learned.
+        place: Where the sensor stands, (theta,).
+        mean: Posterior mean of theta about the model that was given, (theta,).
+        covariance: Posterior covariance, (theta, theta).
+        prior_deviation: What theta was believed to differ by, (theta,): more than that of others of
+            the kind where the set-up is in doubt.
+        usual_deviation: What theta of others of the kind differs by, (theta,).
+        sites: What each run says of theta, in units of `prior_deviation`.
+        taught: By how much each run has narrowed theta, 1/2 log det (I + Lambda_i V),
+            (run,) [nats].
+        posteriors: Of some of the runs each, in their order.
+    """
+
+    model: HealthyModel
+    place: FloatArray
+    mean: FloatArray
+    covariance: FloatArray
+    prior_deviation: FloatArray
+    usual_deviation: FloatArray
+    sites: Normal
+    taught: FloatArray
+    posteriors: Sequence[Posterior]
+
+    @property
+    def moved(self) -> bool:
+        """Whether the sensor may stand elsewhere than the profile says."""
+        frame = slice(0, REGISTRATION)
+        return bool((self.prior_deviation[frame] > 1.5 * self.usual_deviation[frame]).any())
+
+    @property
+    def deviation(self) -> FloatArray:
+        """Standard deviation of theta, (theta,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def folder_posterior(
+    likelihood: RunLikelihood,
+    hypotheses: Sequence[Hypothesis],
+    priors: Priors,
+    advance: Advance = lambda passes: None,
+) -> FolderPosterior:
+    """Weigh every hypothesis by each run, with what all runs say of what they share.
+
+    Args:
+        likelihood: The runs; the doubt of their model is the prior of theta.
+        hypotheses: What may be the case.
+        priors: Beliefs about faults and set-ups.
+        advance: Told of progress.
+    """
+    together, usual = begun(SharedWeighing(likelihood, hypotheses, priors))
+    rows, moved, asked = np.arange(together.runs), np.inf, None
+    for done in range(MOST_PASSES):
+        last = done == MOST_PASSES - 1 or (done >= PASSES - 1 and moved <= MOVED)
+        found = together.judge(rows, asked=None if last else asked)
+        advance(int(done < PASSES))
+        if last:
+            break
+        before, asked = together.here, np.concatenate([each.likely for each in found])
+        together.learn(found, 1.0 if done == 0 else DAMPING)
+        (_,), (covariance,) = together.belief.moments
+        spread = together.unit * np.sqrt(np.diag(covariance))
+        moved = float(np.abs((together.here - before) / spread).max())
+    (mean,), (covariance,) = together.belief.moments
+    unit, sites = together.unit, together.sites
+    taught = 0.5 * np.linalg.slogdet(np.eye(len(unit)) + sites.precision @ covariance)[1]
+    mean, covariance = mean * unit, covariance * np.outer(unit, unit)
+    place = mean.copy()
+    place[REGISTRATION:] = 0.0
+    posteriors = [each.posterior() for each in found]
+    at = together.at(mean)
+    return FolderPosterior(at, place, mean, covariance, unit, usual, sites, taught, posteriors)
+
+
+def begun(weighing: SharedWeighing) -> tuple[RunsTogether, FloatArray]:
+    """Return runs of which nothing was judged yet, and what others of their kind differ by.
+
+    What arms of the kind are like is the prior of theta. The frame of the sensor is known; if the
+    runs say that it may not be, it is known or anywhere near, by the odds of the set-up.
+    """
+    told = [part for part in weighing.parts if not part.name]
+    usual = unit = told[0].deviation
+    in_doubt = doubted(weighing)
+    if in_doubt:
+        unit, odds = weighing.broad, weighing.priors.setup.doubt
+        moved = float(np.log(odds) - np.log1p(-odds))
+        told += [
+            replace(p, log_weight=p.log_weight + moved, deviation=_in_doubt(p.deviation, unit))
+            for p in told
+        ]
+    together = RunsTogether.of(weighing, Belief.of(told, unit), unit)
+    if in_doubt:
+        together.here = weighing.register_together()[0]
+    return together, usual
+
+
+def doubted(weighing: SharedWeighing) -> bool:
+    """Return whether some of the runs, evenly spread, say that the set-up may be off."""
+    runs = len(weighing.nowhere)
+    some = np.unique(np.linspace(0, runs - 1, CHUNK_RUNS // 2).astype(np.int64))
+    return set_up_in_doubt(weighing.likelihood[some], weighing.hypotheses, weighing.priors)
+
+
+def _in_doubt(deviation: FloatArray, broad: FloatArray) -> FloatArray:
+    """Return the deviations of theta with a frame that may be anywhere near, (theta,)."""
+    return np.concatenate([broad[:REGISTRATION], deviation[REGISTRATION:]])
