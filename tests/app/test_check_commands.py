@@ -142,7 +142,7 @@ def test_a_design_beside_random_movements(failuretwin):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("check", "--on", "ros2"), "expected emulated, ros1 or rosbridge"),
+        (("check", "--on", "ros3"), "expected emulated, ros1"),
         (("check", "--seconds", 0.2), "no safe movement"),
         (("check", "--fault", "motor_9:stuck"), "motor_9"),
         (("check", "--write", "motions.txt"), "expected .json, .csv, .mcap, .bag"),

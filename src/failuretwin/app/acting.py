@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -93,37 +91,7 @@ def commander_of(
     return RosCommander(known.robot, topics_of(topics), transport)
 
 
-# What is told.
-
-
-def record(number: int, result: TargetResult) -> dict[str, Any]:
-    """Return what became of a target as a JSON object."""
-    directed = result.target.direction is not None and not math.isnan(result.error_rad)
-    error_rad = result.error_rad if directed else None
-    return {
-        "target": number,
-        "position": list(result.target.position),
-        "reached": result.reached,
-        "error_m": None if math.isnan(result.error_m) else result.error_m,
-        "error_rad": error_rad,
-        "movements": result.movements,
-        "reachable": result.reachable,
-        "believed": result.believed or None,
-        "why": result.why,
-    }
-
-
-def write_results(results: Sequence[TargetResult], path: Path) -> None:
-    """Write an object a line, a line a target.
-
-    Raises:
-        OutputError: If it cannot be written.
-    """
-    from failuretwin.data_knowledge.store import replacing
-
-    lines = [json.dumps(record(i + 1, result)) for i, result in enumerate(results)]
-    with replacing(path) as partial:
-        partial.write_text("\n".join(lines) + "\n")
+# Words for results.
 
 
 def table_lines(results: Sequence[TargetResult]) -> list[str]:
@@ -131,8 +99,8 @@ def table_lines(results: Sequence[TargetResult]) -> list[str]:
     lines = []
     for number, result in enumerate(results, start=1):
         error = "not seen" if math.isnan(result.error_m) else f"{1e3 * result.error_m:5.1f} mm"
-        if result.target.direction is not None and not math.isnan(result.error_rad):
-            error += f" {math.degrees(result.error_rad):4.1f} deg"
+        if result.direction_error_rad is not None:
+            error += f" {math.degrees(result.direction_error_rad):4.1f} deg"
         state = "reached" if result.reached else result.why
         lines.append(f"{number:4d}  {error:>9s}  {result.movements:2d} movements  {state}")
     reached = sum(result.reached for result in results)

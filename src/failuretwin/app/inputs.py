@@ -23,7 +23,7 @@ from failuretwin.data_knowledge.readers.lerobot import LeRobotAngles, is_lerobot
 from failuretwin.data_knowledge.readers.matlab import RECOVERY_ERROR, RECOVERY_WORST
 from failuretwin.data_knowledge.readers.raw_sessions import As
 from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
-from failuretwin.data_knowledge.store import replacing
+from failuretwin.data_knowledge.store import write_text
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, class_name
 from failuretwin.digital_model.robot import Robot
@@ -140,8 +140,7 @@ def _with_map(
         text = lerobot_map_text(log, robot)
     else:
         text = column_map_text(guess_columns(log, robot), log.name, robot)
-    with replacing(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+    write_text(text, path)
     tell(text)
     raise InputError(
         f"{path} did not exist. The guess above has been written there and nothing was read: check "

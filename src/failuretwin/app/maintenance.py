@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 from failuretwin.connection.life_history import read_rows
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.store import replacing
+from failuretwin.data_knowledge.store import write_records, write_text
 from failuretwin.decision.maintenance.expected_cost import TEMPLATE, advise, load_costs
 from failuretwin.decision.maintenance.remaining_life import (
     LEAST_RUNS,
@@ -34,8 +33,7 @@ def write_template(path: Path) -> None:
     """
     if path.exists():
         raise OutputError(f"{path}: is there already. Choose another name.")
-    with replacing(path) as partial:
-        partial.write_text(TEMPLATE)
+    write_text(TEMPLATE, path)
 
 
 def results_report(
@@ -56,13 +54,14 @@ def results_report(
     lines += [f"  {option!s:24s} {option.cost:10.4g}" for option in advice.options]
     lines.append(advice.verdict)
     if json_file is not None:
-        _write(json_file, {
+        record = {
             "run": diagnosis.run,
             "advice": str(advice.best),
             "expected_cost": {str(option): option.cost for option in advice.options},
             "hinges_on": advice.hinge or None,
             "hinge_probability": advice.hinge_probability if advice.hinge else None,
-        })  # fmt: skip
+        }
+        write_records([record], json_file)
     return lines
 
 
@@ -91,7 +90,7 @@ def life_report(
         records.append(_record(name, life))
     lines.append("how real arms wear is not known; shapes and limit are assumed (docs/acting.md)")
     if json_file is not None:
-        _write(json_file, {"motors": records})
+        write_records([{"motors": records}], json_file)
     return lines
 
 
@@ -147,8 +146,3 @@ def _record(name: str, life: RemainingLife) -> dict[str, Any]:
         "verdict": life.verdict,
         "time_of_event": [v if np.isfinite(v) else None for v in life.runs[::20].tolist()],
     }
-
-
-def _write(path: Path, value: dict[str, Any]) -> None:
-    with replacing(path) as partial:
-        partial.write_text(json.dumps(value) + "\n")

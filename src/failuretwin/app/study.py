@@ -27,7 +27,7 @@ from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.runs import check_motors, truth_of
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
-from failuretwin.data_knowledge.store import SUFFIXES, replacing
+from failuretwin.data_knowledge.store import SUFFIXES, replacing, write_text
 from failuretwin.decision.evaluation import Truths
 from failuretwin.decision.learned.feature_encoder import FeatureEncoder, signals_of
 from failuretwin.digital_model.robot import Robot
@@ -277,8 +277,7 @@ def train(plan: StudyPlan, folder: Path, classes: int, job: Job) -> None:
             np.add.at(confusion, (truth, diagnosis), 1)
     counts = tuple(map(tuple, confusion.tolist()))
     result = Training(job, accuracies, counts, time.perf_counter() - start)
-    with replacing(_file(folder, job)) as file:
-        file.write_text(json.dumps(asdict(result), indent=1), encoding="utf-8")
+    write_text(json.dumps(asdict(result), indent=1), _file(folder, job))
 
 
 def _standardised_sets(path: Path, rng: np.random.Generator) -> dict[str, tuple[Any, Any]]:
@@ -342,8 +341,7 @@ def run_study(
         except OSError as error:
             raise OutputError(f"{folder}: cannot be made ({reason(error)}).") from error
         make_arrays(plan, robot, test, folder / WORK)
-        with replacing(stored) as new:
-            new.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+        write_text(json.dumps(manifest, indent=1), stored)
     return run_all(plan, folder / WORK, len(class_names(robot)), on_progress)
 
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
 import socket
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from failuretwin.core.errors import InputError, OutputError, reason
 from failuretwin.core.foreign import reading
@@ -177,6 +178,25 @@ def replacing(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             shutil.rmtree(partial) if partial.is_dir() else partial.unlink(missing_ok=True)
+
+
+def write_text(text: str, path: Path) -> None:
+    """Write a text file (UTF-8), atomically.
+
+    Raises:
+        OutputError: If it cannot be written; `path` is as before.
+    """
+    with replacing(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+def write_records(records: Iterable[Mapping[str, Any]], path: Path) -> None:
+    """Write JSON objects, one a line, atomically.
+
+    Raises:
+        OutputError: If they cannot be written; `path` is as before.
+    """
+    write_text("".join(json.dumps(record) + "\n" for record in records), path)
 
 
 @contextmanager

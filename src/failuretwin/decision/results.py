@@ -14,7 +14,7 @@ from failuretwin.core.config import from_table
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import as_cell, check_memory, reading, stored_bytes
 from failuretwin.core.hypothesis import Diagnosis, Interval
-from failuretwin.data_knowledge.store import replacing
+from failuretwin.data_knowledge.store import replacing, write_records
 from failuretwin.inference.together.fault_course import FaultCourse
 
 SUM_ERROR = 1e-6
@@ -81,10 +81,8 @@ def write_json_lines(
 
     `course` adds the fault course over all runs to each; None: diagnosed independently.
     """
-    records = [diagnosis.to_record() | told for diagnosis, told in _with_course(diagnoses, course)]
-    with replacing(path) as partial:
-        text = "".join(json.dumps(record) + "\n" for record in records)
-        partial.write_text(text, encoding="utf-8")
+    told = _with_course(diagnoses, course)
+    write_records((diagnosis.to_record() | extra for diagnosis, extra in told), path)
 
 
 def _with_course(

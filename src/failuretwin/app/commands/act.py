@@ -85,7 +85,8 @@ def act(
     What is wrong with the arm is found out on the way, told, and worked round. Every order passes a
     gate: limits, speed, floor, the arm's own links. Stop with Ctrl-C, or `failuretwin stop`.
     """
-    from failuretwin.app.acting import spared_of, table_lines, write_results
+    from failuretwin.app.acting import spared_of, table_lines
+    from failuretwin.data_knowledge.store import write_records
     from failuretwin.decision.acting.outcome import ActingSettings
     from failuretwin.decision.acting.session import Acting
     from failuretwin.decision.acting.task import read_task
@@ -112,7 +113,8 @@ def act(
     for line in table_lines(results):
         tell(line)
     if json_file is not None:
-        write_results(results, json_file)
+        numbered = enumerate(results, start=1)
+        write_records(({"target": k} | result.record() for k, result in numbered), json_file)
 
 
 @click.command()

@@ -164,6 +164,7 @@ def check(
     from failuretwin.app.reports import check_report as said
     from failuretwin.app.reports.tables import show
     from failuretwin.app.terminal import tell
+    from failuretwin.data_knowledge.store import write_records
     from failuretwin.decision.test_motions.motions import write_motions
 
     _refuse_what_does_nothing(logs, written, motions, keep)
@@ -194,7 +195,7 @@ def check(
         said.keep_check(keep, planned, [*before, record])
         show(*(said.changes(before[-1], record) if before else [f"kept in {keep}"]))
     if json_file is not None:
-        said.write_records([record], json_file)
+        write_records([record], json_file)
     if report is not None:
         said.write_check_page([result], model, report)
     show(*said.closing_lines(result, model))
@@ -233,12 +234,13 @@ def _check_logs(
     """Say what logs of checks say that were recorded elsewhere."""
     from failuretwin.app.reports import check_report as said
     from failuretwin.app.reports.tables import show
+    from failuretwin.data_knowledge.store import write_records
 
     for result in results:
         lines = said.check_lines(result, model, 0.0)
         show(result.diagnosis.run, *lines, *said.closing_lines(result, model), "")
     if json_file is not None:
-        said.write_records([said.check_record(r, model, 0.0) for r in results], json_file)
+        write_records([said.check_record(r, model, 0.0) for r in results], json_file)
     if report is not None:
         said.write_check_page(results, model, report)
 
@@ -306,10 +308,10 @@ def isolability(
     seed: int,
 ) -> None:
     """Say the smallest fault of each motor and mode that motions of a robot can show."""
-    from failuretwin.app.reports.check_report import write_records
     from failuretwin.app.reports.reports import group_lines
     from failuretwin.app.reports.tables import show
     from failuretwin.app.smallest import save_picture, size_table, smallest_of, smallest_record
+    from failuretwin.data_knowledge.store import write_records
 
     asking = MotionOptions(hypotheses).checking(SafetyOptions(), calibration, robot, seed)
     found = smallest_of(asking, motions)

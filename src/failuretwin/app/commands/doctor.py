@@ -139,12 +139,11 @@ def _in_runs(named: Sequence[str], count: int) -> str:
 
 def _write(undo: SetUp | None, columns: Path | None, out: Path) -> None:
     """Write what undoes a wrong set-up, beside the column map that the log was read with."""
-    from failuretwin.data_knowledge.store import replacing
+    from failuretwin.data_knowledge.store import write_text
 
     if undo is None or not undo.what:
         tell("nothing to put right, so nothing is written")
         return
     map_text = "" if columns is None else columns.read_text(encoding="utf-8").rstrip() + "\n\n"
-    with replacing(out) as partial:
-        partial.write_text(map_text + undo.correction.text(undo.what), "utf-8")
+    write_text(map_text + undo.correction.text(undo.what), out)
     tell(f"written to {out}: what undoes it; once you believe it, use it with --columns {out}")

@@ -44,8 +44,8 @@ def reach(
         held_of,
         map_lines,
         save_map,
-        write_json,
     )
+    from failuretwin.data_knowledge.store import write_records
     from failuretwin.decision.acting.reach import reach as reach_of
     from failuretwin.decision.acting.reach import reach_by_motor, workspace
     from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
@@ -65,6 +65,6 @@ def reach(
     for line in lines:
         tell(line)
     if json_file is not None:
-        write_json(records, json_file)
+        write_records(records, json_file)
     if report is not None:
         save_map(maps, report)

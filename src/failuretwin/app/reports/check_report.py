@@ -14,7 +14,7 @@ from failuretwin.app.reports.tables import Table, figures_table
 from failuretwin.app.reports.technician_page import Section, write_page
 from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.data_knowledge.store import filling, replacing
+from failuretwin.data_knowledge.store import filling, write_records
 from failuretwin.decision.robot_state import robot_state
 from failuretwin.decision.test_motions.health_check import OPEN, CheckResult
 from failuretwin.decision.test_motions.motions import Motions
@@ -140,17 +140,6 @@ def check_record(result: CheckResult, robot: Robot, seconds: float) -> dict[str,
             for k, name in enumerate(robot.motor_names)
         ],
     }
-
-
-def write_records(records: Sequence[dict[str, Any]], path: Path) -> None:
-    """Write JSON objects, a line each.
-
-    Raises:
-        OutputError: If it cannot be written.
-    """
-    with replacing(path) as partial:
-        text = "".join(json.dumps(record) + "\n" for record in records)
-        partial.write_text(text, encoding="utf-8")
 
 
 # Checks that are kept: the same motions again, and what has changed since.

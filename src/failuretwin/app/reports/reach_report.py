@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,7 +11,7 @@ from failuretwin.app.emulation import number_of
 from failuretwin.app.reports.plots import clean, new_figure
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.data_knowledge.store import filling, replacing
+from failuretwin.data_knowledge.store import filling
 from failuretwin.decision.acting.reach import MotorReach, Reach
 from failuretwin.digital_model.robot import Robot
 
@@ -65,16 +63,6 @@ def map_lines(found: Reach, *, per_point: bool) -> list[str]:
     where = f"{found.motor} held at {np.rad2deg(found.angle):.0f} deg"
     lines.append(f"{count} of {len(found.points)} points can be reached with {where}")
     return lines
-
-
-def write_json(records: Sequence[dict[str, Any]], path: Path) -> None:
-    """Write an object a line.
-
-    Raises:
-        OutputError: If it cannot be written.
-    """
-    with replacing(path) as partial:
-        partial.write_text("".join(json.dumps(record) + "\n" for record in records))
 
 
 def save_map(maps: Sequence[Reach], folder: Path) -> None:

@@ -15,7 +15,7 @@ from failuretwin.connection.tracked_diagnosis import Tracked
 from failuretwin.core.errors import counted
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.types import as_floats
-from failuretwin.data_knowledge.store import replacing
+from failuretwin.data_knowledge.store import write_text
 from failuretwin.decision import proportions, scoring_rules
 from failuretwin.decision.evaluation import (
     Calibration,
@@ -263,8 +263,7 @@ def write_latex(evaluation: Evaluation, comparison: Comparison | None, path: Pat
     if comparison is not None:
         tables.append(Table(("Compared", "on the same runs"), comparison_rows(comparison)))
     text = "\n".join([r"% \usepackage{booktabs}", *map(latex, tables)])
-    with replacing(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+    write_text(text, path)
 
 
 # What the motion of the runs at hand could not tell, in a line or two.

@@ -25,7 +25,7 @@ from failuretwin.app.study import (
 )
 from failuretwin.core.runs import AXES
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.store import replacing
+from failuretwin.data_knowledge.store import write_text
 from failuretwin.decision.proportions import class_ratios
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
@@ -214,8 +214,7 @@ def write_study_page(
         "pictures": _pictures(trainings, plan, robot, test),
         "minutes": sum(training.seconds for training in trainings) / 60.0,
     }
-    with replacing(path) as partial:
-        partial.write_text(plots.render_page("study.html.j2", values), encoding="utf-8")
+    write_text(plots.render_page("study.html.j2", values), path)
 
 
 def _table_2(trainings: Sequence[Training], test: Exam) -> Table:

@@ -11,7 +11,7 @@ import numpy as np
 from failuretwin import __version__
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.store import check_writable, replacing
+from failuretwin.data_knowledge.store import check_writable, write_text
 from failuretwin.digital_model.calibrated_robot import (
     CALIBRATION_TABLE,
     CalibratedLoop,
@@ -172,8 +172,7 @@ def save_calibration(calibration: Calibration, robot: Robot, path: str | Path) -
         "# says how. Angles in rad in the sense of the logs, times in s.\n"
         f"{tomli_w.dumps({**table, CALIBRATION_TABLE: {**origin, **record}})}"
     )
-    with replacing(Path(path)) as partial:
-        partial.write_text(text, encoding="utf-8")
+    write_text(text, Path(path))
 
 
 def check_calibration_file(path: Path) -> None:

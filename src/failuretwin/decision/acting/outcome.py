@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 from failuretwin.decision.acting.task import Target
 
@@ -62,3 +64,22 @@ class TargetResult:
     reachable: bool
     believed: str
     why: str = ""
+
+    @property
+    def direction_error_rad(self) -> float | None:
+        """Angle to the approach direction [rad]; None if none is asked for or it is not known."""
+        unknown = self.target.direction is None or math.isnan(self.error_rad)
+        return None if unknown else self.error_rad
+
+    def record(self) -> dict[str, Any]:
+        """Return the result as a JSON object; unknown errors are null."""
+        return {
+            "position": list(self.target.position),
+            "reached": self.reached,
+            "error_m": None if math.isnan(self.error_m) else self.error_m,
+            "error_rad": self.direction_error_rad,
+            "movements": self.movements,
+            "reachable": self.reachable,
+            "believed": self.believed or None,
+            "why": self.why,
+        }

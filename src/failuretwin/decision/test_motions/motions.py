@@ -20,7 +20,7 @@ from failuretwin.connection.links.base import CommandSent, Order
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.bags import read_targets
-from failuretwin.data_knowledge.store import replacing
+from failuretwin.data_knowledge.store import write_text
 from failuretwin.decision.test_motions.design import Movement
 from failuretwin.digital_model.robot import Robot
 
@@ -259,8 +259,7 @@ def write_motions(motions: Motions, robot: Robot, path: Path) -> None:
         _write_commands(motions, robot, path)
         return
     text = json.dumps(motions.record()) + "\n" if path.suffix == ".json" else _csv(motions)
-    with replacing(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+    write_text(text, path)
 
 
 def _write_commands(motions: Motions, robot: Robot, path: Path) -> None:
