@@ -115,15 +115,13 @@ def test_a_full_disk_costs_no_diagnosis_and_is_got_over(
         put(sink, 0.0, 40.0)
         with full_disk():
             put(sink, 40.0, 80.0)
-            assert "live-2.mcap: cannot be written" in sink.trouble
-            assert [file.name for file in tmp_path.iterdir()] == ["live.mcap"]
+            assert "live.mcap: cannot be written" in sink.trouble
         put(sink, 80.0, 90.0)  # it goes on within ten seconds
         assert sink.trouble == ""
         put(sink, 90.0, 120.0)
-    diagnosed = set()
-    for name in ("live.mcap", "live-2.mcap"):
-        messages = read_messages(tmp_path / name, ["/diagnostics"])["/diagnostics"]
-        diagnosed |= {m.content.header.stamp.sec for m in messages}
+    assert [file.name for file in tmp_path.iterdir()] == ["live.mcap"]
+    messages = read_messages(tmp_path / "live.mcap", ["/diagnostics"])["/diagnostics"]
+    diagnosed = {m.content.header.stamp.sec for m in messages}
     with Recorder(tmp_path / "sound.mcap", armpi) as sink:
         now[0] = -10.0
         put(sink, 0.0, 120.0)
@@ -159,3 +157,9 @@ def test_a_recorder_that_is_killed_leaves_all_but_the_last_seconds(armpi, measur
             newest = message.log_time / 1e9
     assert 40.0 < newest < 60.0
     sink.__exit__()
+
+
+def test_a_recording_that_begins_on_a_full_disk_is_an_error_and_leaves_no_file(armpi, tmp_path):
+    with full_disk(), pytest.raises(OutputError, match="cannot be written"):
+        Recorder(tmp_path / "live.mcap", armpi)
+    assert not list(tmp_path.iterdir())

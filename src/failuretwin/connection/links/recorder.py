@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import time
-from collections import deque
 from collections.abc import Sequence
-from contextlib import suppress
-from itertools import count
 from pathlib import Path
-from typing import BinaryIO, Self
+from typing import BinaryIO, Self, cast
 
 from failuretwin import __version__
 from failuretwin.connection.links.base import Answer, CommandSent, Item
@@ -34,89 +30,55 @@ PROBABILITY_TOPIC = "/failuretwin/probability"
 CHUNK_BYTES = 16_384
 """Size at which messages go to the disk: a few seconds of a robot."""
 RETRY_S = 5.0
-"""Time between two attempts to continue when the disk is full [s]."""
-KEPT = 10_000
-"""Maximum number of diagnoses kept while the disk is full; nearly three hours at one a second."""
+"""Time between two attempts to write when the disk is full [s]."""
+MOST_WAITING_BYTES = 10_000_000
+"""Most memory for diagnoses while the disk is full: about three hours at one a second."""
 
 
-class McapFile:
-    """MCAP file of ROS 2 messages that is being written.
+class _PatientFile:
+    """File that keeps in memory what the disk does not take yet.
 
     Args:
         path: The file; it must not exist.
 
     Raises:
-        InputError: If mcap or rosbags is not installed, or the file exists.
-        OSError: If it cannot be written.
+        InputError: If it exists.
+        OSError: If it cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
-        with needs_extra("recording needs mcap and rosbags", "live"):
-            from mcap.writer import Writer
-        self.path = path
-        self._codec = RosCodec(2)
-        self._channels: dict[str, int] = {}
-        self._file = _create(path)
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)
-        self._saved = 0
         try:
-            self._writer.start(profile="ros2", library=f"failuretwin {__version__}")
-            self._save()
-        except OSError:
-            with suppress(OSError):
-                self._file.close()
-            path.unlink()
-            raise
+            self._file = path.open("xb", buffering=0)
+        except FileExistsError as error:
+            raise _exists(path) from error
+        self._written = 0
+        self._waiting = bytearray()
 
-    def write(self, message: Outgoing, time_ns: int) -> bool:
-        """Write a message and return whether all messages so far are on the disk.
+    def write(self, data: bytes) -> None:
+        """Take bytes; the disk gets them with the next `save`."""
+        self._waiting += data
+        self._written += len(data)
 
-        Raises:
-            OSError: If the disk is full or gone; `abandon` the file then.
-        """
-        if message.topic not in self._channels:
-            self._channels[message.topic] = self._register(message)
-        channel, content = self._channels[message.topic], self._codec.encode(message)
-        self._writer.add_message(channel, time_ns, content, time_ns)
-        return self._file.tell() > self._saved and self._save()
+    def tell(self) -> int:
+        """Return the number of bytes taken."""
+        return self._written
+
+    def flush(self) -> None:
+        """Do nothing: `save` writes."""
+
+    @property
+    def waiting(self) -> int:
+        """Number of bytes that are not on the disk."""
+        return len(self._waiting)
+
+    def save(self) -> None:
+        """Write the waiting bytes; raises OSError and keeps them if the disk is full or gone."""
+        while self._waiting:
+            del self._waiting[: self._file.write(self._waiting)]
 
     def close(self) -> None:
-        """Finish the file; raises OSError if the disk is full or gone."""
-        self._writer.finish()  # type: ignore[no-untyped-call]
+        """Close the file."""
         self._file.close()
-
-    def abandon(self) -> None:
-        """Cut off a half-written chunk and finish the file without an index.
-
-        Raises:
-            OSError: If the disk has no room even for that; may be tried again.
-        """
-        from mcap.writer import IndexType, Writer
-
-        with suppress(OSError):
-            self._file.close()
-        os.truncate(self.path, self._saved)
-        bare = {"index_types": IndexType.NONE, "use_statistics": False}
-        with self.path.open("ab") as file:
-            Writer(file, **bare).finish()  # type: ignore[arg-type, no-untyped-call]
-
-    def _save(self) -> bool:
-        self._file.flush()
-        self._saved = self._file.tell()
-        return True
-
-    def _register(self, message: Outgoing) -> int:
-        name = self._codec.full_name(message.type)
-        definition, _ = self._codec.definition(message.type)
-        schema = self._writer.register_schema(name, "ros2msg", definition.encode())
-        return self._writer.register_channel(message.topic, "cdr", schema)
-
-
-def _create(path: Path) -> BinaryIO:
-    try:
-        return path.open("xb")
-    except FileExistsError as error:
-        raise _exists(path) from error
 
 
 def _exists(path: Path) -> InputError:
@@ -155,9 +117,8 @@ def write_bag(path: Path, robot: Robot, commands: Sequence[CommandSent]) -> None
 class Recorder:
     """Sink that records readings, commands and answers as MCAP.
 
-    If the disk is full or gone, the recorder finishes the file without an index and tries every
-    few seconds to start a new part: ``live.mcap``, ``live-2.mcap`` and so on. The new part begins
-    with the diagnoses that could not be saved.
+    If the disk is full or gone, diagnoses wait in memory, readings and commands are dropped, and
+    the recorder tries every few seconds to write again.
 
     Args:
         path: The file; it must not exist.
@@ -169,76 +130,68 @@ class Recorder:
     """
 
     def __init__(self, path: Path, robot: Robot) -> None:
+        with needs_extra("recording needs mcap and rosbags", "live"):
+            from mcap.writer import Writer
         if path.suffix != ".mcap":
             raise InputError(f"{path}: recordings are MCAP. Give a name that ends in .mcap.")
         self.trouble = ""
         self._path = path
-        self._writer = RosWriter(robot, RECORDED)
+        self._codec = RosCodec(2)
+        self._robot_writer = RosWriter(robot, RECORDED)
         self._diagnostics = DiagnosticsWriter(robot, RECORDED.diagnostics)
-        self._unsaved: deque[tuple[Outgoing, int]] = deque(maxlen=KEPT)
+        self._channels: dict[str, int] = {}
         self._retry_s = 0.0
-        self._broken: McapFile | None = None
         try:
-            self._file: McapFile | None = McapFile(path)
+            self._file = _PatientFile(path)
         except OSError as error:
             raise OutputError(f"{path}: cannot be written ({error.strerror}).") from error
+        self._mcap = Writer(cast(BinaryIO, self._file), chunk_size=CHUNK_BYTES)
+        self._mcap.start(profile="ros2", library=f"failuretwin {__version__}")
+        self._save()
+        if self.trouble:
+            self._file.close()
+            path.unlink()
+            raise OutputError(f"{self.trouble}.")
 
     def put(self, item: Item) -> None:
         """Record an item, if the disk allows it."""
-        time_ns = round(item.time * NS_PER_S)
-        diagnostics = [(message, time_ns) for message in self._diagnostics.messages(item)]
-        self._unsaved.extend(diagnostics)
-        if self._file is None:
-            self._start_part()
-            return
-        others = [*self._writer.messages(item), *_probabilities(item)]
-        self._write([*diagnostics, *((message, time_ns) for message in others)])
+        messages = self._diagnostics.messages(item)
+        if not self.trouble:
+            messages += [*self._robot_writer.messages(item), *_probabilities(item)]
+        if self._file.waiting < MOST_WAITING_BYTES:
+            for message in messages:
+                self._write(message, round(item.time * NS_PER_S))
+        if time.monotonic() >= self._retry_s:
+            self._save()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._file is None:
-            self._retry_s = 0.0
-            self._start_part()
-        if self._file is not None:
-            try:
-                self._file.close()
-            except OSError as error:
-                self._give_up(error)
+        self._mcap.finish()  # type: ignore[no-untyped-call]
+        self._save()
+        self._file.close()
 
-    def _write(self, messages: list[tuple[Outgoing, int]]) -> None:
+    def _write(self, message: Outgoing, time_ns: int) -> None:
+        if message.topic not in self._channels:
+            self._channels[message.topic] = self._register(message)
+        content = self._codec.encode(message)
+        self._mcap.add_message(self._channels[message.topic], time_ns, content, time_ns)
+
+    def _register(self, message: Outgoing) -> int:
+        name = self._codec.full_name(message.type)
+        definition, _ = self._codec.definition(message.type)
+        schema = self._mcap.register_schema(name, "ros2msg", definition.encode())
+        return self._mcap.register_channel(message.topic, "cdr", schema)
+
+    def _save(self) -> None:
         try:
-            for message, time_ns in messages:
-                if self._file is not None and self._file.write(message, time_ns):
-                    self._unsaved.clear()
+            self._file.save()
         except OSError as error:
-            self._give_up(error)
-
-    def _give_up(self, error: OSError) -> None:
-        self._broken, self._file = self._file, None
-        self._wait(self._path, error)
-
-    def _wait(self, path: Path, error: OSError) -> None:
-        self.trouble = f"{path}: cannot be written ({error.strerror})"
-        self._retry_s = time.monotonic() + RETRY_S
-
-    def _start_part(self) -> None:
-        """Start a new part if an attempt is due, with the diagnoses that are not saved yet."""
-        if time.monotonic() < self._retry_s:
-            return
-        parts = (self._path.with_stem(f"{self._path.stem}-{number}") for number in count(2))
-        path = next(part for part in parts if not part.exists())
-        try:
-            if self._broken is not None:
-                self._broken.abandon()
-                self._broken = None
-            self._file = McapFile(path)
-        except OSError as error:
-            self._wait(path, error)
-            return
-        self.trouble = ""
-        self._write(list(self._unsaved))
+            self.trouble = f"{self._path}: cannot be written ({error.strerror})"
+            self._retry_s = time.monotonic() + RETRY_S
+        else:
+            self.trouble, self._retry_s = "", 0.0
 
 
 def _probabilities(item: Item) -> list[Outgoing]:
