@@ -296,9 +296,10 @@ def _parameters(found: FolderPosterior, believed: Imperfections, robot: Robot) -
             known = bool(spread < IDENTIFIED * prior) or abs(off) > FAR
             if not known:
                 note = "the runs do not tell it from what such robots differ by"
-            low, high = values[i] - 1.96 * spread, values[i] + 1.96 * spread
-            value = float(values[i])
-            told.append(Parameter(name, motor, UNITS[name], value, low, high, known, note, off))
+            value, deviation = float(values[i]), float(spread)
+            told.append(
+                Parameter.normal(name, motor, UNITS[name], value, deviation, known, note, off)
+            )
     return told
 
 

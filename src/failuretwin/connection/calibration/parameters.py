@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from scipy.stats import beta, binom
 
 from failuretwin.connection.calibration.observations import Observations
-from failuretwin.connection.calibration.result import Parameter
+from failuretwin.connection.calibration.result import Z_95, Parameter
 from failuretwin.connection.calibration.settling_fit import (
     DOF_PRIOR_SPREAD,
     SettlingPosterior,
@@ -171,7 +171,6 @@ def spread_of(values: FloatArray) -> Range:
 
 # Fits told as parameters: value, interval, and whether the logs say it at all.
 
-Z_95 = 1.959963984540054
 LEARNED = 0.3
 """A parameter is identified if the logs bring its deviation below this share of the prior's."""
 LOAD_FLOOR_NM = 1e-6
@@ -200,16 +199,20 @@ def settling_parameters(fit: SettlingPosterior, robot: Robot, payload: float) ->
     for group, (name, unit) in enumerate(units.items()):
         for k, motor in enumerate(robot.motor_names):
             at = group * fit.motors + k
-            value, half = float(fit.mode[at]), Z_95 * float(fit.deviation[at])
-            learned = bool(fit.deviation[at] < LEARNED * fit.prior_deviation[at])
+            value, deviation = float(fit.mode[at]), float(fit.deviation[at])
+            learned = bool(deviation < LEARNED * fit.prior_deviation[at])
             note = "" if learned else f"the logs do not say; it takes {ADVICE[name]}"
             if name == "compliance" and load[k] < LOAD_FLOOR_NM:
                 learned, note = False, UNLOADED
-            low, high = value - half, value + half
-            if name == "scatter":
-                value, low, high = (float(np.exp(x)) for x in (value, low, high))
-            found.append(Parameter(name, motor, unit, value, low, high, learned, note))
+            figure = Parameter.normal(name, motor, unit, value, deviation, learned, note)
+            found.append(_of_logarithm(figure) if name == "scatter" else figure)
     return [*found, _tails(fit, robot)]
+
+
+def _of_logarithm(figure: Parameter) -> Parameter:
+    """Return a figure from that of its logarithm."""
+    value, low, high = np.exp([figure.value, figure.low, figure.high]).tolist()
+    return replace(figure, value=value, low=low, high=high)
 
 
 def spring_remarks(settling: Sequence[Parameter]) -> list[str]:

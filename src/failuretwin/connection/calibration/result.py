@@ -23,6 +23,9 @@ from failuretwin.digital_model.geometry import SensorFrame
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
 
+Z_95 = 1.959963984540054
+"""Half the 95 % interval of a normal distribution, in standard deviations."""
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -50,6 +53,22 @@ class Parameter:
     identified: bool = True
     note: str = ""
     deviations: float | None = None
+
+    @classmethod
+    def normal(
+        cls,
+        name: str,
+        motor: str,
+        unit: str,
+        value: float,
+        deviation: float,
+        identified: bool = True,
+        note: str = "",
+        deviations: float | None = None,
+    ) -> Parameter:
+        """Return a parameter with a normal posterior, given its standard deviation."""
+        low, high = value - Z_95 * deviation, value + Z_95 * deviation
+        return cls(name, motor, unit, value, low, high, identified, note, deviations)
 
 
 @dataclass(frozen=True)

@@ -188,17 +188,17 @@ def _parameters(
     sensor: Sensor, estimate: FloatArray, deviation: FloatArray, noise: tuple[float, float]
 ) -> tuple[Parameter, ...]:
     factor, unit = UNITS[sensor.kind]
-    found = []
-    for k, (value, sd) in enumerate(zip(estimate, deviation, strict=True)):
-        constant = k < sensor.dims
-        name = f"constant error {k + 1}" if constant else f"turn {k + 1 - sensor.dims}"
-        scale, of = (factor, unit) if constant else (DEG, "deg")
-        low, high = float(value - 1.96 * sd), float(value + 1.96 * sd)
-        told = (scale * float(value), scale * low, scale * high)
-        found.append(Parameter(f"{sensor.kind}: {name}", "", of, told[0], told[1], told[2]))
+    constant = [(f"constant error {k + 1}", factor, unit) for k in range(sensor.dims)]
+    turns = [(f"turn {k + 1}", DEG, "deg") for k in range(len(estimate) - sensor.dims)]
+    found = [
+        Parameter.normal(f"{sensor.kind}: {name}", "", shown, scale * float(value), scale * sd)
+        for (name, scale, shown), value, sd in zip(
+            [*constant, *turns], estimate, deviation.tolist(), strict=True
+        )
+    ]
     size, doubt = (factor * value for value in noise)
-    low, high = max(size - 1.96 * doubt, 0.0), size + 1.96 * doubt
-    return (*found, Parameter(f"{sensor.kind}: noise", "", unit, size, low, high))
+    scatter = Parameter.normal(f"{sensor.kind}: noise", "", unit, size, doubt)
+    return (*found, replace(scatter, low=max(scatter.low, 0.0)))
 
 
 MEDIAN_SPREAD = float(np.sqrt(np.pi / 2.0))

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import t as student
 
-from failuretwin.connection.calibration.parameters import LEARNED, Z_95
-from failuretwin.connection.calibration.result import Calibration, LeftOut, Parameter
+from failuretwin.connection.calibration.parameters import LEARNED
+from failuretwin.connection.calibration.result import Z_95, Calibration, LeftOut, Parameter
 from failuretwin.connection.calibration.servo_loops import (
     PRIOR_DEVIATION,
     SharedFit,

@@ -12,13 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from failuretwin.connection.calibration.result import Parameter
-from failuretwin.connection.registration.arm import (
-    AXIS_SPREADS,
-    BASE_RAD,
-    Arm,
-    Fitted,
-    rotation,
-)
+from failuretwin.connection.registration.arm import Arm, Fitted
 from failuretwin.connection.registration.poses import Poses, settled_poses
 from failuretwin.connection.registration.robust import Posterior, fit
 from failuretwin.connection.registration.search import Registered, search
@@ -26,7 +20,6 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.runs import check_motors
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
-from failuretwin.digital_model.geometry import roll_pitch_yaw
 from failuretwin.digital_model.profile import Profile
 from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.twin import DigitalTwin
@@ -34,7 +27,6 @@ from failuretwin.inference.set_ups.registration import align
 from failuretwin.inference.set_ups.set_ups import MOST_RAD, UNIT_FACTOR, extent
 from failuretwin.inference.set_ups.wrong_setup import NEAR, wrong_setup
 
-Z_95 = 1.959963984540054
 LEARNED = 0.5
 """A number is identified if poses bring its deviation below this share of the prior's."""
 NOT_TOLD = 0.7
@@ -223,95 +215,85 @@ def _profile(robot: Robot, fitted: Fitted, noise: float, source: str) -> Profile
     )
 
 
-def _parameters(found: Posterior) -> tuple[Parameter, ...]:
-    fitted, names = found.fitted, found.fitted.arm.robot.motor_names
-    values = _stated(fitted)
-    rows = []
-    deviations = found.deviation
-    deviations[ANGLES] = _angle_deviation(found)
-    for unknown, value, deviation in zip(fitted.unknowns, values, deviations, strict=True):
-        if unknown.name.startswith("axis "):
-            continue
-        half = Z_95 * float(deviation)
-        motor = "" if unknown.motor is None else names[unknown.motor]
-        learned = bool(deviation < LEARNED * unknown.spread)
-        note = "" if learned else "the poses do not say; it stays where the URDF puts it"
-        rows.append(
-            Parameter(
-                unknown.name, motor, unknown.unit, value, value - half, value + half, learned, note
-            )
-        )
-    return (*rows, *_axis_parameters(found))
-
-
-ANGLES = slice(3, 6)
-"""Where the turn of the base stands among the unknowns."""
-TURN_RAD = 1e-5
-
-
-def _angle_deviation(found: Posterior) -> FloatArray:
-    """Return the standard deviation of the base's roll, pitch and yaw, (3,) [rad]."""
-    R = found.fitted.turn
-    here = np.array(roll_pitch_yaw(R))
-    turned = [np.array(roll_pitch_yaw(rotation(TURN_RAD * way) @ R)) for way in np.eye(3)]
-    slope = np.stack([(one - here + np.pi) % (2.0 * np.pi) - np.pi for one in turned], axis=1)
-    slope /= TURN_RAD
-    covariance = found.covariance[ANGLES, ANGLES] * BASE_RAD**2
-    return np.asarray(np.sqrt(np.diag(slope @ covariance @ slope.T)))
-
-
-def _stated(fitted: Fitted) -> list[float]:
-    """Return the numbers as people read them: places rather than changes."""
-    places = [*fitted.base_xyz_rpy, *fitted.tool_xyz]
-    found = places[:]
-    rest = zip(fitted.unknowns[len(places) :], fitted.values[len(places) :], strict=True)
-    for unknown, value in rest:
-        if unknown.name == "zero" and unknown.motor is not None:
-            found.append(fitted.zero(unknown.motor))
-        else:
-            found.append(fitted.scale if unknown.name == "sensor scale" else float(value))
-    return found
-
-
 AXIS_NUMBERS = (
     ("axis shift x", "m"),
     ("axis shift y", "m"),
     ("axis tilt x", "rad"),
     ("axis tilt y", "rad"),
 )
+STEP = 1e-5
+"""Step of the derivatives of the stated numbers, in prior standard deviations."""
 
 
-def _axis_parameters(found: Posterior) -> list[Parameter]:
-    """Return how each axis is moved across itself, in its own frame."""
-    fitted, rows = found.fitted, []
-    for j, motor in enumerate(fitted.arm.robot.motor_names):
-        at = fitted.unknowns.of_axis(j)
-        if not at:
+def _parameters(found: Posterior) -> tuple[Parameter, ...]:
+    """Return the stated numbers with their intervals (delta method)."""
+    slopes, names = _slopes(found.fitted), found.fitted.arm.robot.motor_names
+    deviations = np.sqrt(np.einsum("nu,uv,nv->n", slopes, found.covariance, slopes))
+    priors = np.linalg.norm(slopes, axis=1)
+    rows = []
+    for number, deviation, prior in zip(_stated(found.fitted), deviations, priors, strict=True):
+        if prior < 1e-9:  # fixed: no unknown moves it
             continue
-        ways = fitted.arm.lines[j]
-        spread = np.array(AXIS_SPREADS)
-        deviation = spread * np.sqrt(np.diag(ways @ found.covariance[np.ix_(at, at)] @ ways.T))
-        prior = spread * np.linalg.norm(ways, axis=1)
-        for (name, unit), value, half, believed in zip(
-            AXIS_NUMBERS, fitted.moved(j), Z_95 * deviation, prior, strict=True
-        ):
-            if believed < 1e-9:
-                continue
-            learned = bool(half < Z_95 * LEARNED * believed)
-            note = "" if learned else "the poses do not say; it stays where the URDF puts it"
-            rows.append(
-                Parameter(
-                    name,
-                    motor,
-                    unit,
-                    float(value),
-                    float(value - half),
-                    float(value + half),
-                    learned,
-                    note,
-                )
+        learned = bool(deviation < LEARNED * prior)
+        rows.append(
+            Parameter.normal(
+                number.name,
+                "" if number.motor is None else names[number.motor],
+                number.unit,
+                number.value,
+                float(deviation),
+                learned,
+                "" if learned else "the poses do not say; it stays where the URDF puts it",
             )
-    return rows
+        )
+    return tuple(rows)
+
+
+@dataclass(frozen=True)
+class _Number:
+    """A number as people read it: a place rather than a change, an axis by shift and tilt."""
+
+    name: str
+    motor: int | None
+    unit: str
+    value: float
+
+
+def _stated(fitted: Fitted) -> list[_Number]:
+    """Return the numbers of an arm, then shift and tilt of each axis in its own frame."""
+    places = iter((*fitted.base_xyz_rpy, *fitted.tool_xyz))
+    numbers = []
+    for unknown, value in zip(fitted.unknowns, fitted.values.tolist(), strict=True):
+        if unknown.name.startswith("axis "):
+            continue
+        stated = next(places, value)
+        if unknown.name == "zero" and unknown.motor is not None:
+            stated = fitted.zero(unknown.motor)
+        elif unknown.name == "sensor scale":
+            stated = fitted.scale
+        numbers.append(_Number(unknown.name, unknown.motor, unknown.unit, stated))
+    for j in range(fitted.arm.motors):
+        axis = zip(AXIS_NUMBERS, fitted.moved(j).tolist(), strict=True)
+        numbers += [_Number(name, j, unit, value) for (name, unit), value in axis]
+    return numbers
+
+
+def _slopes(fitted: Fitted) -> FloatArray:
+    """Return the derivatives of the stated numbers by the unknowns, (number, unknown).
+
+    Unknowns are in their prior standard deviations. Angles differ by less than half a turn.
+    """
+    angular = np.array([number.unit == "rad" for number in _stated(fitted)])
+    columns = []
+    for step in np.diag(STEP * fitted.unknowns.spread):
+        ahead, behind = (
+            np.array([n.value for n in _stated(replace(fitted, values=fitted.values + move))])
+            for move in (step, -step)
+        )
+        change = ahead - behind
+        change[angular] = (change[angular] + np.pi) % (2.0 * np.pi) - np.pi
+        columns.append(change / (2.0 * STEP))
+    return np.stack(columns, axis=1)
 
 
 def _not_told(found: Posterior) -> list[str]:
