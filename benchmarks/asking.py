@@ -31,10 +31,9 @@ from dataclasses import dataclass
 import numpy as np
 from acting_world import TrueFault, World, home_of
 
-from failuretwin.app.emulation import emulated_faults
+from failuretwin.app.arms import emulation_with
 from failuretwin.app.shadow import Shadow
 from failuretwin.connection.commanded_arm import OperatedArm, Shifts
-from failuretwin.connection.emulated_arm import Emulation
 from failuretwin.connection.links.base import Order
 from failuretwin.core.alarm import CLEAR, RAISED, SUSPECTED
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
@@ -339,10 +338,7 @@ class Watched:
 
 def watched(known: CalibratedRobot, fault: str, probes: int, seed: int) -> Watched:
     """Watch an emulated arm at work for two shifts, asking it in the second break."""
-    own = emulated_faults([fault] if fault else [], known.robot)
-    emulation = Emulation(
-        known.robot, known.imperfections, own.schedule, seed, own.modes, own.start
-    )
+    emulation = emulation_with([fault] if fault else [], known, seed)
     arm = OperatedArm(emulation, Shifts(break_s=BREAK_S))
     watch = monitor(known.twin, known.imperfections)
     prober = Prober(watch, SafetyGate(known.robot), arm, ProbeRules(probes), seed)

@@ -10,7 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from failuretwin.app.acting import emulated_arm
+    from failuretwin.app.arms import emulated_arm
     from failuretwin.app.reports.plots import run_figure
     from failuretwin.connection.calibration.calibrate import calibrate
     from failuretwin.connection.calibration.result import Calibration, save_calibration
@@ -99,7 +99,7 @@ _HOME = {
     "check": "decision.test_motions.session",
     "compare": "decision.evaluation",
     "diagnose": "inference.diagnoser",
-    "emulated_arm": "app.acting",
+    "emulated_arm": "app.arms",
     "evaluate": "decision.evaluation",
     "isolability": "inference.isolability",
     "iterate": "data_knowledge.generate",

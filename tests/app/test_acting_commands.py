@@ -7,9 +7,8 @@ import pytest
 
 import failuretwin as ft
 from failuretwin import DigitalTwin, InputError
-from failuretwin.app.acting import spared_of
-from failuretwin.app.emulation import emulated_faults
-from failuretwin.app.reports.reach_report import held_of
+from failuretwin.app.arms import emulation_with, held_of, spared_of
+from failuretwin.digital_model.calibrated_robot import calibrated
 from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS
 from failuretwin.inference.observation.healthy_model import HealthyModel
 
@@ -120,16 +119,17 @@ def test_advice_needs_the_users_costs(failuretwin, tmp_path):
 
 
 def test_faults_of_an_emulated_arm(armpi):
-    found = emulated_faults(["motor_3:stuck=-0.4@20", "motor_2:encoder_bias=-0.1"], armpi)
+    known = calibrated("armpi_fpv")
+    found = emulation_with(["motor_3:stuck=-0.4@20", "motor_2:encoder_bias=-0.1"], known, 0)
     assert found.start[2] == -0.4
     assert found.schedule[0].start_s == 20.0
     assert found.schedule[1].start_s == 0.0
     assert found.modes["encoder_bias"].magnitude == (-0.1, -0.1)
     assert not found.modes["encoder_bias"].both_signs
     with pytest.raises(InputError, match="expected a number"):
-        emulated_faults(["motor_1:drift=x"], armpi)
+        emulation_with(["motor_1:drift=x"], known, 0)
     with pytest.raises(InputError, match="one size of each mode"):
-        emulated_faults(["motor_1:slow=0.5", "motor_2:slow=0.4"], armpi)
+        emulation_with(["motor_1:slow=0.5", "motor_2:slow=0.4"], known, 0)
     model = HealthyModel.of(DigitalTwin(armpi), NO_IMPERFECTIONS)
     assert spared_of(["motor_2=0.5", "motor_4"], None, model, print).tolist() == [
         0.0,

@@ -1,130 +1,25 @@
-"""From what stands on the command line to sources and sinks."""
+"""Watching a robot: until its source ends or the time is over, in a live view or line by line."""
 
 from __future__ import annotations
 
 import math
-import re
-import sys
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.live import Live
 
-from failuretwin.app.commands.options import LiveOptions
-from failuretwin.app.emulation import emulation_of
 from failuretwin.app.live_view import View
 from failuretwin.app.shadow import SILENCE_S, Changes, Shadow
 from failuretwin.app.terminal import tell
-from failuretwin.connection.links.base import Event, LinkCounts, Sink, Source, source_from_text
-from failuretwin.connection.links.networks import NETWORKS, is_network, open_transport
-from failuretwin.connection.links.replay import Pace
-from failuretwin.connection.links.ros_link import (
-    RosCommander,
-    RosSource,
-    diagnostics_sink,
-    robot_sink,
-)
-from failuretwin.connection.links.ros_topics import RosTopics, load_topics
-from failuretwin.core.errors import InputError, counted
-from failuretwin.data_knowledge.readers.bag_messages import BagTopics
+from failuretwin.connection.links.base import Event, LinkCounts, Sink, Source
+from failuretwin.core.errors import counted
 from failuretwin.decision.streaming.monitor import FaultMonitor, Fit
 from failuretwin.decision.test_motions.probing import Prober
-from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.calibration_fit import MISFIT
 from failuretwin.inference.explanation import percent
-
-if TYPE_CHECKING:
-    from failuretwin.connection.emulated_arm import Emulation
-
-EMULATED = "emulated"
-SOURCES = (
-    f"{EMULATED}, {NETWORKS}, a log (raw session, bag, .mcap), or a source of your own, "
-    "MODULE:CLASS"
-)
-OWN_CLASS = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(:.*)?")
-"""How the class of a source of one's own is named, see `source_from_text`."""
-
-
-def emulated_robot(
-    emulation: Emulation, pace: Pace, duration_s: float, zero_s: float = 0.0
-) -> Source:
-    """Return an emulated robot; it works for `duration_s` and its clock starts at `zero_s` [s]."""
-    from failuretwin.connection.emulated_arm import emulated
-
-    return emulated(emulation, pace, duration_s, zero_s)
-
-
-def topics_of(path: Path | None) -> RosTopics:
-    """Return the topics in a file; without one, those of the data set's authors."""
-    return RosTopics() if path is None else load_topics(path)
-
-
-def connect(
-    text: str, robot: Robot, live: LiveOptions, seed: int, stack: ExitStack, commands: bool = False
-) -> tuple[Source, list[Sink]]:
-    """Return what a SOURCE on the command line stands for, and where its network publishes.
-
-    The text is one of `SOURCES`; the stack closes everything in the end. With `commands` a source
-    on a network takes orders too: it is a `Commander`.
-
-    Raises:
-        InputError: If it does not exist, cannot be reached, is none of these, or is told what only
-            an emulated robot does.
-    """
-    topics, pace = topics_of(live.topics), Pace(live.speed)
-    if text == EMULATED:
-        emulation = emulation_of(robot, live, seed)
-        source = emulated_robot(emulation, pace, live.seconds or math.inf)
-        return stack.enter_context(source), []
-    if live.faults:
-        raise InputError(
-            f"--fault is of an emulated robot, but the source is {text!r}. Leave it out, or watch "
-            f"{EMULATED!r}."
-        )
-    if is_network(text):
-        transport = stack.enter_context(open_transport(text))
-        link = (RosCommander if commands else RosSource)(robot, topics, transport)
-        return link, [diagnostics_sink(robot, topics, transport)]
-    from failuretwin.connection.links.replay import replay
-
-    path = Path(text)
-    if OWN_CLASS.fullmatch(text) and not path.exists():
-        sys.path.insert(0, "")  # the user's module may lie in the folder that the user is in
-        return stack.enter_context(source_from_text(text, robot)), []
-    if not path.exists():
-        raise missing(text)
-    recorded = BagTopics(topics.command, topics.tool or None, topics.position or None)
-    named = None if topics == RosTopics() else recorded
-    return stack.enter_context(replay(path, robot, pace, named)), []
-
-
-def missing(text: str) -> InputError:
-    """Return the error of a SOURCE that is no link and no file."""
-    return InputError(f"source {text!r} does not exist. Expected {SOURCES}.")
-
-
-def emulated_sink(target: str, robot: Robot, live: LiveOptions, stack: ExitStack) -> Sink:
-    """Return where an emulated robot speaks: a network, or a recording.
-
-    The stack closes it in the end.
-
-    Raises:
-        InputError: If it cannot be reached or written.
-    """
-    if is_network(target):
-        transport = stack.enter_context(open_transport(target))
-        return robot_sink(robot, topics_of(live.topics), transport)
-    from failuretwin.connection.links.recorder import Recorder
-
-    return stack.enter_context(Recorder(Path(target), robot))
-
-
-# Watching until the source ends or the user has seen enough.
 
 REFRESH_S = 0.25
 """Time between two drawings [s]."""

@@ -9,7 +9,7 @@ import pytest
 from small_world import SmallWorld, carry_out, task_of
 
 from failuretwin import InputError
-from failuretwin.app.acting import spared_of
+from failuretwin.app.arms import spared_of
 from failuretwin.decision.acting.belief import NoBelief
 from failuretwin.decision.acting.planner import Standing, turned_round
 from failuretwin.decision.acting.sparing import sparing_lines, wear_weights

@@ -85,7 +85,8 @@ def act(
     What is wrong with the arm is found out on the way, told, and worked round. Every order passes a
     gate: limits, speed, floor, the arm's own links. Stop with Ctrl-C, or `failuretwin stop`.
     """
-    from failuretwin.app.acting import spared_of, table_lines
+    from failuretwin.app.arms import spared_of
+    from failuretwin.app.reports.acting_report import table_lines
     from failuretwin.data_knowledge.store import write_records
     from failuretwin.decision.acting.outcome import ActingSettings
     from failuretwin.decision.acting.session import Acting
@@ -130,8 +131,7 @@ def stop(place: str, topics: Path | None, robot: str, seed: int) -> None:
     """
     import numpy as np
 
-    from failuretwin.app.acting import commander_of
-    from failuretwin.app.live import EMULATED
+    from failuretwin.app.arms import EMULATED, commander_of
     from failuretwin.connection.links.base import Order
     from failuretwin.core.errors import InputError
     from failuretwin.decision.acting.work import where_it_stands

@@ -37,13 +37,13 @@ class ArmOptions:
         Raises:
             InputError: If there is no such place.
         """
-        from failuretwin.app.acting import is_real
+        from failuretwin.app.arms import is_real
 
         return not is_real(self.place) or self.move
 
     def commander(self, known: CalibratedRobot, seed: int, stack: ExitStack) -> Commander:
         """Return the arm; it is left alone again when the stack closes."""
-        from failuretwin.app.acting import commander_of
+        from failuretwin.app.arms import commander_of
 
         return commander_of(self.place, known, self.faults, seed, self.topics, stack)
 
@@ -104,7 +104,7 @@ class ProbeOptions:
 
     def rules(self, place: str, wait_s: float) -> ProbeRules:
         """Return when the arm at a place is asked; commands may come so late [s]."""
-        from failuretwin.app.live import EMULATED
+        from failuretwin.app.arms import EMULATED
         from failuretwin.decision.test_motions.probing import ProbeRules
 
         return ProbeRules(self.probes, self.idle + wait_s, self.move or place == EMULATED)

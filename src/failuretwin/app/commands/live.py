@@ -1,4 +1,4 @@
-"""`failuretwin watch`: a robot is listened to and diagnosed at every sample."""
+"""`failuretwin watch` and `emulate`: a robot diagnosed at every sample, and one to try it on."""
 
 from __future__ import annotations
 
@@ -29,10 +29,8 @@ from failuretwin.app.commands.options import (
 from failuretwin.app.terminal import tell
 
 if TYPE_CHECKING:
-    from failuretwin.connection.links.base import Sink, Source
+    from failuretwin.connection.links.base import Source
     from failuretwin.digital_model.nonidealities import Imperfections
-    from failuretwin.digital_model.robot import Robot
-    from failuretwin.failure_behavior.injection import ScheduledFault
 
 
 PROBING = ("idle", "move", "speed_share", "floor", "radius")
@@ -97,8 +95,8 @@ def watch(
     """
     from contextlib import ExitStack
 
-    from failuretwin.app.live import connect, fit_of, topics_of, watch_until_end
-    from failuretwin.app.probing import commanded
+    from failuretwin.app.arms import connect, connect_commander, topics_of
+    from failuretwin.app.live import fit_of, watch_until_end
     from failuretwin.app.reports.tables import console
     from failuretwin.app.shadow import Shadow
     from failuretwin.connection.links.recorder import Recorder
@@ -123,7 +121,7 @@ def watch(
         link: Source
         prober = None
         if probe.probes:
-            commander, sinks = commanded(source, model, live, seed, stack)
+            commander, sinks = connect_commander(source, model, live, seed, stack)
             link, rules = commander, probe.rules(source, wait_s)
             prober = Prober(diagnoser, safety.gate(known.robot), commander, rules, seed)
             sinks.append(prober)
@@ -176,13 +174,6 @@ def _limit(known: Imperfections, motors: Sequence[str], budget: float) -> str:
     )
 
 
-# `failuretwin emulate`: a robot that exists only as physics, on a network or in a file.
-
-FILE_S, AFTER_S = 60.0, 20.0
-"""Length of what is written to a file unless told otherwise, and how long it goes on at least after
-the last fault has begun or been repaired [s]."""
-
-
 @click.command()
 @click.option(
     "--to",
@@ -219,79 +210,8 @@ def emulate(
 
     Needs no robot. Watch it with `failuretwin watch ros1`.
     """
-    if obey:
-        _obey(target, live, calibration, robot, seed)
-    else:
-        _play(target, live, calibration, robot, seed)
-
-
-def _obey(target: str, live: LiveOptions, calibration: str | None, robot: str, seed: int) -> None:
-    """Play a robot that does what it is told."""
-    from failuretwin.connection.links.networks import is_network
-    from failuretwin.core.errors import InputError
-
-    if not is_network(target):
-        raise InputError(f"--obey needs a network to obey, but --to is {target!r}.")
-    from failuretwin.app.obeying import obey_commands
+    from failuretwin.app import emulating
     from failuretwin.digital_model.robot import load_robot
 
-    obey_commands(target, load_robot(robot), live, calibration, seed, tell)
-
-
-def _play(target: str, live: LiveOptions, calibration: str | None, robot: str, seed: int) -> None:
-    """Play a robot that moves at random."""
-    from contextlib import ExitStack
-
-    from failuretwin.app.emulation import emulated_faults, emulation_of
-    from failuretwin.app.live import emulated_robot, emulated_sink
-    from failuretwin.connection.links.networks import NETWORKS, is_network
-    from failuretwin.connection.links.replay import AS_FAST_AS_POSSIBLE, Pace
-    from failuretwin.core.errors import InputError
-    from failuretwin.digital_model.robot import load_robot
-
-    model = load_robot(robot)
-    schedule = emulated_faults(live.faults, model).schedule
-    zero, on_network = time.time(), is_network(target)
-    if not on_network and Path(target).suffix != ".mcap":
-        raise InputError(f"--to is {target!r}, expected {NETWORKS} or a file that ends in .mcap.")
-    length = live.seconds or (math.inf if on_network else _file_length(schedule))
-    pace = Pace(live.speed if on_network else AS_FAST_AS_POSSIBLE)
-    source = emulated_robot(emulation_of(model, live, seed, calibration), pace, length, zero)
-    with ExitStack() as stack:
-        sink = emulated_sink(target, model, live, stack)
-        stack.enter_context(source)
-        _pass_on(source, sink, schedule, zero, model)
-    if sink.trouble:
-        raise InputError(sink.trouble)
-    if source.ended and not on_network:
-        tell(f"{length:g} s written to {target}")
-
-
-def _pass_on(
-    source: Source, sink: Sink, schedule: Sequence[ScheduledFault], zero: float, robot: Robot
-) -> None:
-    """Say what a robot says, and tell the user of its faults, until it ends."""
-    from failuretwin.failure_behavior.injection import state_at
-
-    state, trouble = "", ""
-    try:
-        while not source.ended:
-            event = source.poll(1.0)
-            if event is None:
-                continue
-            sink.put(event)
-            if sink.trouble != trouble:
-                trouble = sink.trouble
-                tell(trouble or "going on")
-            now = state_at(schedule, event.time - zero, robot.motor_names)
-            if now != state:
-                tell(f"{event.time - zero:8.1f} s  {now}")
-                state = now
-    except KeyboardInterrupt:
-        tell("stopped")
-
-
-def _file_length(schedule: Sequence[ScheduledFault]) -> float:
-    """Return how much of a life goes into a file [s]: all that is on the schedule, and more."""
-    times = [t for one in schedule for t in (one.start_s, one.end_s) if math.isfinite(t)]
-    return max([FILE_S, *(t + AFTER_S for t in times)])
+    emulate_on = emulating.obey if obey else emulating.play
+    emulate_on(target, load_robot(robot), live, calibration, seed)

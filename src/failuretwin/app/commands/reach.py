@@ -39,12 +39,8 @@ def reach(
 
     Poses that touch the floor or the arm's own links do not count.
     """
-    from failuretwin.app.reports.reach_report import (
-        by_motor_lines,
-        held_of,
-        map_lines,
-        save_map,
-    )
+    from failuretwin.app.arms import held_of
+    from failuretwin.app.reports.acting_report import by_motor_lines, map_lines, save_map
     from failuretwin.data_knowledge.store import write_records
     from failuretwin.decision.acting.reach import reach as reach_of
     from failuretwin.decision.acting.reach import reach_by_motor, workspace

@@ -1,37 +1,36 @@
-"""What an arm can still reach, as a table, JSON and a picture."""
+"""Results of `act` as lines; what an arm can still reach as a table and a picture."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from failuretwin.app.emulation import number_of
 from failuretwin.app.reports.plots import clean, new_figure
-from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.data_knowledge.store import filling
+from failuretwin.decision.acting.outcome import TargetResult
 from failuretwin.decision.acting.reach import MotorReach, Reach
-from failuretwin.digital_model.robot import Robot
 
 NEVER = 0.85
-"""Of an error, a correction leaves so much at most for feedback alone to get there in time."""
+"""Share of an error that a correction leaves, above which feedback alone does not converge in
+time."""
 
 
-def held_of(text: str, robot: Robot) -> tuple[str, float]:
-    """Return motor and angle [rad], or position [m], of ``MOTOR:stuck=SIZE``.
-
-    Raises:
-        InputError: If it is not of that form or names no motor of the robot.
-    """
-    name, _, size = text.partition("=")
-    fault = Hypothesis.parse(name, robot.motor_names).faults
-    if len(fault) != 1 or fault[0].mode != "stuck" or not size:
-        raise InputError(
-            f"--fault is {text!r}, expected MOTOR:stuck=SIZE, such as motor_3:stuck=-0.35."
-        )
-    return fault[0].motor, number_of(size, f"--fault {text!r}: size")
+def table_lines(results: Sequence[TargetResult]) -> list[str]:
+    """Return a line for each target, and one for all."""
+    lines = []
+    for number, result in enumerate(results, start=1):
+        error = "not seen" if math.isnan(result.error_m) else f"{1e3 * result.error_m:5.1f} mm"
+        if result.direction_error_rad is not None:
+            error += f" {math.degrees(result.direction_error_rad):4.1f} deg"
+        state = "reached" if result.reached else result.why
+        lines.append(f"{number:4d}  {error:>9s}  {result.movements:2d} movements  {state}")
+    reached = sum(result.reached for result in results)
+    moves = sum(result.movements for result in results)
+    lines.append(f"{reached} of {len(results)} targets reached in {moves} movements")
+    return lines
 
 
 def by_motor_lines(motors: Sequence[MotorReach]) -> list[str]:

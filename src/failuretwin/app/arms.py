@@ -1,0 +1,328 @@
+"""Arms as the command line names them: emulated ones, those on a ROS network, logs to replay."""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from failuretwin.connection.links.base import Commander, Sink, Source, source_from_text
+from failuretwin.connection.links.networks import NETWORKS, is_network, open_transport
+from failuretwin.connection.links.replay import Pace
+from failuretwin.connection.links.ros_link import RosCommander, RosSource, diagnostics_sink
+from failuretwin.connection.links.ros_topics import RosTopics, load_topics
+from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.types import FloatArray
+from failuretwin.data_knowledge.readers.bag_messages import BagTopics
+from failuretwin.decision.acting.sparing import stopped_learning, wear_weights
+from failuretwin.digital_model.calibrated_robot import (
+    CalibratedRobot,
+    RobotLike,
+    calibrated,
+    load_calibration,
+)
+from failuretwin.digital_model.robot import Robot
+from failuretwin.failure_behavior.injection import ScheduledFault
+from failuretwin.failure_behavior.mode import FaultMode, SizedMode
+from failuretwin.failure_behavior.modes import SteadyStateError, Stuck
+from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.observation.healthy_model import HealthyModel
+
+if TYPE_CHECKING:
+    from failuretwin.app.commands.options import LiveOptions
+    from failuretwin.connection.emulated_arm import Emulation
+
+EMULATED = "emulated"
+PLACES = f"{EMULATED}, {NETWORKS}"
+SOURCES = f"{PLACES}, a log (raw session, bag, .mcap), or a source of your own, MODULE:CLASS"
+OWN_CLASS = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(:.*)?")
+"""Name of a source class of the user, see `source_from_text`."""
+
+# Emulated arms.
+
+
+def emulated_arm(
+    robot: RobotLike = "armpi_fpv", faults: Sequence[str] = (), seed: int = 0
+) -> Commander:
+    """Return an emulated arm (rigid-body physics) that takes orders, as `act` uses it.
+
+    Args:
+        robot: The robot: name, profile or calibrated robot.
+        faults: Faults of the arm, such as ``motor_3:stuck=-0.4`` or
+            ``motor_2:encoder_bias=0.1@20``: MOTOR:MODE[=SIZE][@START[-END]], the size in the unit
+            of the mode [rad], times in seconds.
+        seed: Seed of all random draws.
+
+    Raises:
+        InputError: If a fault cannot be read, or mujoco is missing.
+    """
+    from failuretwin.connection.commanded_arm import CommandedArm
+
+    return CommandedArm(emulation_with(faults, calibrated(robot), seed))
+
+
+def emulation_of(
+    robot: Robot, live: LiveOptions, seed: int, calibration: str | None = None
+) -> Emulation:
+    """Return the settings of an emulated arm with the faults of the command line.
+
+    Args:
+        robot: The robot, without faults.
+        live: Its faults.
+        seed: Seed of all random draws.
+        calibration: Its healthy behaviour; None: the known one of this robot.
+
+    Raises:
+        InputError: If a fault or the imperfections cannot be read.
+    """
+    own = "none" if robot.imperfections_file is None else robot.name
+    return emulation_with(live.faults, load_calibration(calibration or own, robot), seed)
+
+
+def emulation_with(faults: Sequence[str], known: CalibratedRobot, seed: int) -> Emulation:
+    """Return the settings of an emulated arm with faults.
+
+    Args:
+        faults: MOTOR:MODE[=SIZE][@START[-END]], the size in the unit of the mode; for a stuck motor
+            its position. Without a start a fault is present from the beginning.
+        known: The robot and its healthy behaviour.
+        seed: Seed of all random draws.
+
+    Raises:
+        InputError: If a fault cannot be read, its mode takes no size, or one mode has two sizes.
+    """
+    from failuretwin.connection.emulated_arm import Emulation
+
+    motors = known.robot.motor_names
+    start = known.robot.resting_pose.tolist()
+    schedule, modes, sizes = [], dict(MODES), dict[str, float]()
+    for text in faults:
+        name, _, when = text.partition("@")
+        kind, _, size = name.partition("=")
+        scheduled = ScheduledFault.parse(f"{kind}@{when or '0'}", motors)
+        schedule.append(scheduled)
+        if not size:
+            continue
+        value = number_of(size, f"fault {text!r}: size")
+        mode = modes[scheduled.fault.mode]
+        if isinstance(mode, Stuck):
+            start[motors.index(scheduled.fault.motor)] = value
+        elif sizes.setdefault(mode.mode, value) == value:
+            modes[mode.mode] = _of_size(mode, value, text)
+        else:
+            raise InputError(
+                f"fault {text!r}: mode {mode.mode!r} has the size {sizes[mode.mode]:g} "
+                "already. An emulated arm has one size of each mode; give the same."
+            )
+    return Emulation(known.robot, known.imperfections, tuple(schedule), seed, modes, tuple(start))
+
+
+def _of_size(mode: FaultMode, size: float, text: str) -> FaultMode:
+    if isinstance(mode, SteadyStateError):
+        return replace(mode, magnitude=(size, size))
+    if not isinstance(mode, SizedMode):
+        raise InputError(f"fault {text!r}: mode {mode.mode!r} has no size to choose. Leave it out.")
+    signs: dict[str, Any] = {"both_signs": False} if mode.signed else {}
+    return replace(mode, magnitude=(size, size), **signs)
+
+
+# Arms that `act` and `check` command.
+
+
+def is_real(place: str) -> bool:
+    """Return whether a place on the command line is a real arm; nothing is connected.
+
+    Raises:
+        InputError: If it is none of `PLACES`.
+    """
+    if place != EMULATED and not is_network(place):
+        raise InputError(f"--on is {place!r}, expected {PLACES}.")
+    return place != EMULATED
+
+
+def commander_of(
+    place: str,
+    known: CalibratedRobot,
+    faults: Sequence[str],
+    seed: int,
+    topics: Path | None,
+    stack: ExitStack,
+) -> Commander:
+    """Return the arm at a place on the command line; the stack closes it.
+
+    Raises:
+        InputError: If it cannot be reached or is none of `PLACES`.
+    """
+    if not is_real(place):
+        return stack.enter_context(emulated_arm(known, faults, seed))
+    if faults:
+        raise InputError(
+            f"--fault is of an emulated arm, but --on is {place!r}. Leave it out, or act on "
+            f"{EMULATED!r}."
+        )
+    transport = stack.enter_context(open_transport(place))
+    return RosCommander(known.robot, topics_of(topics), transport)
+
+
+# Arms that `watch` listens to.
+
+
+def topics_of(path: Path | None) -> RosTopics:
+    """Return the topics in a file; without one, those of the data set's authors."""
+    return RosTopics() if path is None else load_topics(path)
+
+
+def connect(
+    text: str, robot: Robot, live: LiveOptions, seed: int, stack: ExitStack
+) -> tuple[Source, list[Sink]]:
+    """Return the source that a SOURCE on the command line names, and the sinks of its network.
+
+    Args:
+        text: One of `SOURCES`.
+        robot: The robot.
+        live: Topics, faults, pace and length.
+        seed: Seed of all random draws.
+        stack: Closes everything in the end.
+
+    Raises:
+        InputError: If it does not exist, cannot be reached, is none of these, or gets options that
+            only an emulated robot has.
+    """
+    if text == EMULATED:
+        from failuretwin.connection.emulated_arm import emulated
+
+        emulation, length = emulation_of(robot, live, seed), live.seconds or math.inf
+        return stack.enter_context(emulated(emulation, Pace(live.speed), length)), []
+    return _connected(text, robot, live, stack, takes_orders=False)
+
+
+def connect_commander(
+    text: str, robot: Robot, live: LiveOptions, seed: int, stack: ExitStack
+) -> tuple[Commander, list[Sink]]:
+    """Return the arm that a SOURCE names, to watch and command it; arguments as in `connect`.
+
+    An emulated arm is at work: an operator commands it in shifts.
+
+    Raises:
+        InputError: If it takes no orders, or as `connect` does.
+    """
+    if text == EMULATED:
+        from failuretwin.connection.commanded_arm import OperatedArm, Shifts
+
+        shifts = Shifts(duration_s=live.seconds or math.inf)
+        emulation = emulation_of(robot, live, seed)
+        return stack.enter_context(OperatedArm(emulation, shifts, Pace(live.speed))), []
+    link, sinks = _connected(text, robot, live, stack, takes_orders=True)
+    if not (hasattr(link, "send") and hasattr(link, "standing")):
+        raise _only_listens(text)
+    return cast(Commander, link), sinks
+
+
+def _only_listens(text: str) -> InputError:
+    return InputError(
+        f"source {text!r} can only be listened to, but --probe orders movements. Expected "
+        f"{PLACES}, or MODULE:CLASS of a Commander; or leave --probe out."
+    )
+
+
+def _connected(
+    text: str, robot: Robot, live: LiveOptions, stack: ExitStack, *, takes_orders: bool
+) -> tuple[Source, list[Sink]]:
+    """Return a source that is no emulated robot, and the sinks of its network."""
+    if live.faults:
+        raise InputError(
+            f"--fault is of an emulated robot, but the source is {text!r}. Leave it out, or watch "
+            f"{EMULATED!r}."
+        )
+    topics = topics_of(live.topics)
+    if is_network(text):
+        transport = stack.enter_context(open_transport(text))
+        ros_link = RosCommander if takes_orders else RosSource
+        return ros_link(robot, topics, transport), [diagnostics_sink(robot, topics, transport)]
+    path = Path(text)
+    if OWN_CLASS.fullmatch(text) and not path.exists():
+        sys.path.insert(0, "")  # the user's module may lie in the current folder
+        return stack.enter_context(source_from_text(text, robot)), []
+    if not path.exists():
+        raise InputError(f"source {text!r} does not exist. Expected {SOURCES}.")
+    if takes_orders:
+        raise _only_listens(text)
+    from failuretwin.connection.links.replay import replay
+
+    recorded = BagTopics(topics.command, topics.tool or None, topics.position or None)
+    named = None if topics == RosTopics() else recorded
+    return stack.enter_context(replay(path, robot, Pace(live.speed), named)), []
+
+
+# Motors and numbers in option texts.
+
+
+def number_of(value: str, what: str) -> float:
+    """Return the finite number that a text holds.
+
+    Raises:
+        InputError: If it holds none; the message begins with `what`.
+    """
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError(f"{what} is {value!r}, expected a number.")
+    return number
+
+
+def held_of(text: str, robot: Robot) -> tuple[str, float]:
+    """Return motor and angle [rad] or position [m] in ``MOTOR:stuck=SIZE``.
+
+    Raises:
+        InputError: If it is not of that form or names no motor of the robot.
+    """
+    name, _, size = text.partition("=")
+    fault = Hypothesis.parse(name, robot.motor_names).faults
+    if len(fault) != 1 or fault[0].mode != "stuck" or not size:
+        raise InputError(
+            f"--fault is {text!r}, expected MOTOR:stuck=SIZE, such as motor_3:stuck=-0.35."
+        )
+    return fault[0].motor, number_of(size, f"--fault {text!r}: size")
+
+
+def spared_of(
+    texts: Sequence[str], history: Path | None, model: HealthyModel, tell: Callable[[str], None]
+) -> FloatArray | None:
+    """Return the weights of motors to spare, (motor,); None if no motor is spared.
+
+    Args:
+        texts: MOTOR or MOTOR=WEIGHT; replaces the weight from the history for this motor.
+        history: CAL.history.jsonl; None: no history.
+        model: The robot.
+        tell: Called with the wear found in the history.
+
+    Raises:
+        InputError: If a motor is unknown, a weight is no number, or the history cannot be read.
+    """
+    names = model.motor_names
+    weight = np.zeros(len(names))
+    if history is not None:
+        weight = wear_weights(history, model)
+        worn = [f"{names[k]} {weight[k]:.0%}" for k in np.flatnonzero(weight)]
+        tell(f"worn, of what is allowed: {', '.join(worn) or 'no motor beyond doubt'}")
+        alarm = stopped_learning(history, model.twin.robot.name)
+        if alarm:
+            tell(f"that is from before the history stopped to learn: {alarm}")
+    for text in texts:
+        name, _, share = text.partition("=")
+        Hypothesis.parse(f"{name}:stuck", names)
+        value = number_of(share or "1", f"--spare {text!r}: the weight")
+        if value < 0.0:
+            raise InputError(f"--spare {text!r}: the weight is below 0. Leave the motor out.")
+        weight[names.index(name)] = value
+    return weight if weight.any() else None
