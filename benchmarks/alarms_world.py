@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.core.movements import Movements
+from failuretwin.core.movements import Movements, stack_movements
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.decision.streaming.tracking import REST_S
 from failuretwin.digital_model.disturbances import (
@@ -24,7 +24,7 @@ from failuretwin.digital_model.disturbances import (
 from failuretwin.digital_model.nonidealities import Imperfections, vary
 from failuretwin.digital_model.settling import sag
 from failuretwin.digital_model.twin import SAG_ROUNDS, DigitalTwin
-from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
+from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.inference.observation.evidence import JUST_AFTER_S, SETTLING_S, SettledEvidence
 from failuretwin.inference.observation.sensors import SensorStack
 from failuretwin.inference.observation.settings import InferenceSettings

@@ -18,13 +18,12 @@ import numpy as np
 from failuretwin import DigitalTwin
 from failuretwin.connection.emulated_arm import EmulatedArm, Emulation
 from failuretwin.connection.links.base import CommandSent, Reading
-from failuretwin.core.movements import Movements
+from failuretwin.core.movements import Movements, stack_movements
 from failuretwin.core.runs import RunTable, Truth
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.failure_behavior.fault import STEP, Course, FaultValue
 from failuretwin.failure_behavior.injection import ScheduledFault
 from failuretwin.failure_behavior.modes import OFFSET, SteadyStateError
-from failuretwin.failure_behavior.random_movements import stack_movements
 from failuretwin.inference.expected_bayes_factors import expected_log_bayes_factors
 
 ERROR = SteadyStateError.mode

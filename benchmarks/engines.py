@@ -9,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 
 from failuretwin import DigitalTwin, load_robot
-from failuretwin.core.movements import Movements
+from failuretwin.core.movements import Movements, stack_movements
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.nonidealities import Schedule
 from failuretwin.digital_model.physics.engine import PhysicsEngine
 from failuretwin.digital_model.twin import Drive
-from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
+from failuretwin.failure_behavior.random_movements import RandomMovements
 
 RUNS = 300
 TIME = as_floats(np.arange(1001) * 0.01)

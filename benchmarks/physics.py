@@ -12,12 +12,13 @@ import time
 import numpy as np
 
 from failuretwin import load_robot
+from failuretwin.core.movements import stack_movements
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.nonidealities import Schedule
 from failuretwin.digital_model.physics.engine import STEP_S, PhysicsEngine
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import Drive
-from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
+from failuretwin.failure_behavior.random_movements import RandomMovements
 
 RUNS = 3600
 SAMPLED_RUNS = 384

@@ -11,18 +11,13 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.data_knowledge.generate import Plan, simulate_runs
+from failuretwin.data_knowledge.recovery.plane_arm import plane_arm
+from failuretwin.data_knowledge.recovery.ramp_fit import PathPart, fit
 from failuretwin.data_knowledge.recovery.recovery import (
     path_error,
     published_time,
     published_time_bases,
     recover_movements,
-)
-from failuretwin.data_knowledge.recovery.recovery_inverse_kinematics import plane_arm
-from failuretwin.data_knowledge.recovery.recovery_ramps import (
-    Free,
-    PathPart,
-    Ramps,
-    fit_ramps,
 )
 from failuretwin.digital_model.calibrated_robot import load_calibration
 
@@ -288,29 +283,23 @@ def test_whole_poses_are_all_and_only_those_that_reach(armpi, twin):
 def test_poses_with_a_given_last_motor_reach_their_point(armpi, twin):
     arm = plane_arm(armpi)
     wanted = np.array([0.4, 0.3, -0.5, 0.2])
-    poses = arm.poses_with_last(twin.path(wanted), np.linspace(-0.3, 0.7, 11))
+    poses = arm.poses(twin.path(wanted), np.linspace(-0.3, 0.7, 11))
     np.testing.assert_allclose(twin.path(poses), np.tile(twin.path(wanted), (len(poses), 1)))
     assert np.linalg.norm(poses - wanted, axis=1).min() < 1e-9
 
 
 def test_fit_of_a_ramp_finds_all_that_is_free(twin):
     rng = np.random.default_rng(2)
-    wanted = Ramps(
-        *rng.uniform(-0.8, 0.8, (2, 1, 4)), np.array([[0.6, 0.8, 1.0, 0.7]]), np.array([0.2])
-    )
+    initial, target = rng.uniform(-0.8, 0.8, (2, 1, 4))
+    ramp, start = np.array([[[0.6, 0.8, 1.0, 0.7]]]), np.array([[0.2]])
+    wanted = Movements(initial, target[:, None], ramp, start)
     time = np.linspace(0.0, 1.5, 60)
     part = PathPart(time, twin.path(wanted.reference(time))[0])
-    guess = replace(
-        wanted,
-        target=wanted.target + 0.01,
-        duration=wanted.duration + 0.02,
-        start=wanted.start + 0.01,
-    )
-    free = Free(*(np.full(4, is_free) for is_free in (False, True, True)))
-    found = fit_ramps(guess, free, part, twin, steps=60)
+    guess = Movements(initial, wanted.target + 0.01, ramp + 0.02, start + 0.01)
+    found = fit(guess, part, twin, np.repeat([False, True, True], 4), steps=60)
     np.testing.assert_allclose(found.target, wanted.target, atol=1e-9)
-    np.testing.assert_allclose(found.duration, wanted.duration, atol=1e-9)
-    np.testing.assert_allclose(found.start, wanted.start, atol=1e-9)
+    np.testing.assert_allclose(found.ramp_duration, ramp, atol=1e-9)
+    np.testing.assert_allclose(found.start, start, atol=1e-9)
 
 
 def test_another_kind_of_arm_asks_for_approximate(armpi, simulated):

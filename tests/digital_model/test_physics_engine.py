@@ -10,13 +10,14 @@ from scipy.integrate import solve_ivp
 
 from failuretwin import load_robot
 from failuretwin.core.errors import InputError
+from failuretwin.core.movements import stack_movements
 from failuretwin.digital_model.nonidealities import Schedule
 from failuretwin.digital_model.physics import engine
 from failuretwin.digital_model.physics.engine import PhysicsEngine
 from failuretwin.digital_model.physics.motors import load_parameters
 from failuretwin.digital_model.robot import bundled_robots
 from failuretwin.digital_model.twin import Drive
-from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
+from failuretwin.failure_behavior.random_movements import RandomMovements
 
 mujoco = pytest.importorskip("mujoco")
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from failuretwin.core.movements import stack_movements
 from failuretwin.digital_model.nonidealities import Schedule
-from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
+from failuretwin.failure_behavior.random_movements import RandomMovements
 
 RANGE_DEG = np.array([80.0, 50.0, 50.0, 50.0])
 """Targets in the paper lie within plus or minus this, by motor."""

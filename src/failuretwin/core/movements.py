@@ -6,6 +6,7 @@ then a plateau until the next movement. Angles are in the log's sense.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated
@@ -106,6 +107,17 @@ class Movements(ArrayStruct):
             times[:, knot] = last = np.where(missing, last, times[:, knot])
             values[:, knot] = held = np.where(missing, held, values[:, knot])
         return times, values
+
+
+def stack_movements(parts: Sequence[Movements]) -> Movements:
+    """Return the movements of all `parts` along the run axis, padded to the largest count."""
+    first, runs = parts[0], [len(part.start) for part in parts]
+    count = max(part.start.shape[1] for part in parts)
+    stacked = Movements.empty(run=sum(runs), movement=count, motor=first.initial.shape[1])
+    for part, end in zip(parts, np.cumsum(runs), strict=True):
+        place = slice(end - len(part.start), end), slice(0, part.start.shape[1])
+        stacked.put(place, part)
+    return stacked
 
 
 def find_movements(command: FloatArray, time: FloatArray) -> Movements:

@@ -27,7 +27,7 @@ from failuretwin.core.hypothesis import (
     paper_hypotheses,
     parse_hypotheses,
 )
-from failuretwin.core.movements import Movements
+from failuretwin.core.movements import Movements, stack_movements
 from failuretwin.core.runs import RunTable, Truth
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.simulated_sensors import SIMULATED, simulated_sensors
@@ -50,7 +50,7 @@ from failuretwin.digital_model.twin import DigitalTwin, Drive, Engine, ServoEngi
 from failuretwin.failure_behavior.fault import FaultValue
 from failuretwin.failure_behavior.injection import Injection
 from failuretwin.failure_behavior.mode import FaultMode
-from failuretwin.failure_behavior.random_movements import RandomMovements, stack_movements
+from failuretwin.failure_behavior.random_movements import RandomMovements
 from failuretwin.failure_behavior.registry import MODES
 
 if TYPE_CHECKING:

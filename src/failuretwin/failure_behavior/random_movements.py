@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,13 +74,3 @@ class RandomMovements:
 def _cap_speed(initial: FloatArray, target: FloatArray, ramp: FloatArray) -> FloatArray:
     travel = np.abs(np.diff(target, axis=0, prepend=initial[None]))
     return np.maximum(ramp, travel / SPEED_CAP_RAD_S)
-
-
-def stack_movements(parts: Sequence[Movements]) -> Movements:
-    """Return the movements of all `parts` along the run axis; their counts must be equal."""
-    return Movements(
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("initial", "target", "ramp_duration", "start")
-        )
-    )

@@ -14,7 +14,7 @@ import numpy as np
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.foreign import check_memory, files_below
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.core.movements import Movements
+from failuretwin.core.movements import Movements, stack_movements
 from failuretwin.core.runs import RunTable, Truth, padded_bytes
 from failuretwin.core.types import MS_PER_S, FloatArray, as_floats
 from failuretwin.data_knowledge.readers.csv_log import load_csv, numbers
@@ -253,7 +253,7 @@ def session_runs(
         measured=np.stack([_lengthen(run.measured, length, hold=False) for run in runs]),
         measured_rate_hz=READING_RATE_HZ,
         duration=np.array([(len(run.command) - 1) * step for run in runs]),
-        movements=_stack_movements([run.movements for run in runs]),
+        movements=stack_movements([run.movements for run in runs]),
         truth=None if label is None else _truth(label, runs, robot),
         position=np.stack([_lengthen(run.position, length, hold=False) for run in runs]),
     )
@@ -387,21 +387,6 @@ def _lengthen(values: FloatArray, length: int, *, hold: bool) -> FloatArray:
     """Return `values` (time, ...) with `length` samples, the last held or NaN appended."""
     fill = values[-1] if hold else np.full(values.shape[1:], np.nan)
     return np.concatenate([values, np.broadcast_to(fill, (length - len(values), len(fill)))])
-
-
-def _stack_movements(parts: list[Movements]) -> Movements:
-    count = max(part.start.shape[1] for part in parts)
-
-    def stacked(name: str) -> FloatArray:
-        padded = []
-        for part in parts:
-            value = getattr(part, name)
-            shape = (1, count - value.shape[1], *value.shape[2:])
-            padded.append(np.concatenate([value, np.full(shape, np.nan)], axis=1))
-        return np.concatenate(padded)
-
-    initial = np.concatenate([part.initial for part in parts])
-    return Movements(initial, stacked("target"), stacked("ramp_duration"), stacked("start"))
 
 
 def _truth(label: int, runs: list[_Run], robot: Robot) -> Truth:
