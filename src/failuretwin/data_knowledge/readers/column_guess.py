@@ -1,14 +1,16 @@
-"""What the columns of a CSV file are, from their names and numbers.
+"""Column maps guessed from the names and numbers of a CSV file.
 
-Where the names tell all of it, the file is read so. Where they leave anything open, a guess is
-written for the user to check, and never used unseen.
+A file whose column names leave nothing open is read without a map. Otherwise a guess is written for
+the user to check; an unchecked guess is never used.
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,38 +53,24 @@ LARGEST_RAD, LARGEST_M = 2.0 * np.pi, 10.0
 
 @dataclass(frozen=True)
 class Guess:
-    """What the columns of a file seem to be; empty where nothing fits.
+    """Column map guessed from a CSV file.
 
     Attributes:
-        time: Column of the times, and its unit.
-        command: Columns of the commands in chain order, and their unit.
-        position: Columns of the motor readings in chain order, and their unit.
-        duration: Columns of the times to reach targets, and their unit.
-        tool: Columns x, y, z, and their unit.
-        run: Column that tells runs apart.
-        separator: Between columns.
+        columns: The map; columns without a candidate are empty.
         names: Names of all columns.
-        doubts: What the names leave open; empty where they tell all.
-        slide_unit: Of commands and readings of motors that slide.
+        doubts: Open questions; empty where the names answer all of them.
     """
 
-    time: tuple[str, str] = ("", "s")
-    command: tuple[tuple[str, ...], str] = ((), "rad")
-    position: tuple[tuple[str, ...], str] = ((), "rad")
-    duration: tuple[tuple[str, ...], str] = ((), "s")
-    tool: tuple[tuple[str, ...], str] = ((), "m")
-    run: str = ""
-    separator: str = ","
-    names: tuple[str, ...] = field(default=())
-    doubts: tuple[str, ...] = ()
-    slide_unit: str = "m"
+    columns: ColumnMap
+    names: tuple[str, ...]
+    doubts: tuple[str, ...]
 
 
 def told_columns(path: Path, robot: Robot) -> ColumnMap:
-    """Return what the columns of a CSV file are, where their names leave nothing open.
+    """Return the column map of a CSV file whose column names leave nothing open.
 
     Raises:
-        InputError: If they do; it names what, and the candidates.
+        InputError: If they leave anything open; the text lists what, and the candidates.
     """
     guess = guess_columns(path, robot)
     if guess.doubts:
@@ -91,62 +79,123 @@ def told_columns(path: Path, robot: Robot) -> ColumnMap:
             f"{'; '.join(guess.doubts)}. Add --columns MAP.toml: if that file does not exist yet, "
             "a guess is written there for you to check."
         )
-    durations, tool, position = guess.duration, guess.tool[0], guess.position[0]
-    return ColumnMap(
-        time=TimeColumn(*guess.time),
-        command=CommandColumns(
-            guess.command[0],
-            "target" if durations[0] else "sampled",
-            guess.command[1],
-            durations[0],
-            durations[1],
-            slide_unit=guess.slide_unit,
-        ),
-        tool=ToolColumns((tool[0], tool[1], tool[2]), guess.tool[1]) if tool else None,
-        position=AngleColumns(position, guess.position[1], slide_unit=guess.slide_unit)
-        if position
-        else None,
-        run=guess.run or None,
-        separator=guess.separator,
-    )
+    return guess.columns
 
 
 def guess_columns(path: Path, robot: Robot) -> Guess:
-    """Return what the columns of a CSV file seem to be, from its header and numbers."""
+    """Return the column map of a CSV file as its header and numbers suggest it."""
     separator = _separator(path)
-    table = load_csv(path, separator)
-    words = {str(name): _words(str(name)) for name in table}
-    found = _candidates(words, robot)
-    time = next(iter(found.time), "") or _increasing(table)
-    command, position, tool = (_firsts(f) for f in (found.command, found.position, found.tool))
-    duration = _firsts(found.duration)
+    table = _Table(load_csv(path, separator))
+    found = _candidates(table.words, robot)
+    command, position, tool = map(_firsts, (found.command, found.position, found.tool))
+    durations, time = _firsts(found.duration), next(iter(found.time), "") or table.increasing()
     turning = [_of_kind(columns, robot, False) for columns in (command, position)]
     sliding = [_of_kind(columns, robot, True) for columns in (command, position)]
-    return Guess(
-        time=(time, _time_unit(table, time, words)),
-        command=(command, _angle_unit(table, turning[0], words, robot)),
-        position=(position, _angle_unit(table, turning[1], words, robot)),
-        slide_unit=_length_unit(table, sliding[0] or sliding[1], words),
-        duration=(duration, _duration_unit(table, duration, words)),
-        tool=(tool, _length_unit(table, tool, words)),
-        run=next(iter(found.run), ""),
-        separator=separator,
-        names=tuple(words),
-        doubts=(
-            *_choices(found, robot),
-            *_lacking(found, words),
-            *(
-                doubt
-                for columns in turning
-                for doubt in _unsaid(table, columns, words, ANGLE_NAMES, LARGEST_RAD)
-            ),
-            *(
-                doubt
-                for columns in (*sliding, tool)
-                for doubt in _unsaid(table, columns, words, LENGTH_NAMES, LARGEST_M)
-            ),
+    slide_unit = table.length_unit(sliding[0] or sliding[1])
+    units = [table.angle_unit(columns, robot) for columns in turning]
+    columns = ColumnMap(
+        time=TimeColumn(time, table.time_unit(time)),
+        command=CommandColumns(
+            command,
+            "target" if durations else "sampled",
+            units[0],
+            durations,
+            table.duration_unit(durations),
+            slide_unit=slide_unit,
         ),
+        tool=ToolColumns((tool[0], tool[1], tool[2]), table.length_unit(tool)) if tool else None,
+        position=AngleColumns(position, units[1], slide_unit=slide_unit) if position else None,
+        run=next(iter(found.run), None),
+        separator=separator,
     )
+    doubts = [*_choices(found, robot), *_lacking(found, table.words)]
+    doubts += [d for c in turning for d in table.unsaid(c, ANGLE_NAMES, LARGEST_RAD)]
+    doubts += [d for c in (*sliding, tool) for d in table.unsaid(c, LENGTH_NAMES, LARGEST_M)]
+    return Guess(columns, tuple(table.words), tuple(doubts))
+
+
+@dataclass(frozen=True)
+class _Table:
+    """A CSV file with every cell as text."""
+
+    cells: pd.DataFrame
+
+    @cached_property
+    def words(self) -> dict[str, set[str]]:
+        """Words of each column's name."""
+        return {str(name): _words(str(name)) for name in self.cells}
+
+    def values(self, columns: Sequence[str]) -> FloatArray:
+        """Return columns as numbers, (row, column); NaN for text."""
+        import pandas as pd
+
+        part = self.cells[list(columns)].apply(pd.to_numeric, errors="coerce")
+        return part.to_numpy(dtype=np.float64)
+
+    def largest(self, columns: Sequence[str]) -> float:
+        """Return the largest magnitude in some columns."""
+        return float(np.nanmax(np.abs(self.values(columns)), initial=0.0))
+
+    def increasing(self) -> str:
+        """Return the first column whose numbers only grow, or an empty text."""
+        for name in self.words:
+            values = self.values([name])[:, 0]
+            if len(values) > 1 and np.all(np.diff(values) > 0):
+                return name
+        return ""
+
+    def named_unit(self, columns: Sequence[str], names: Mapping[str, Sequence[str]]) -> str | None:
+        """Return the unit that the names of the columns state, if they do."""
+        for unit, said in names.items():
+            if columns and all(self.words[column] & set(said) for column in columns):
+                return unit
+        return None
+
+    def unsaid(
+        self, columns: Sequence[str], names: Mapping[str, Sequence[str]], largest: float
+    ) -> list[str]:
+        """Return a doubt where columns cannot be in SI units and name no other unit."""
+        if not columns or self.named_unit(columns, names) or self.largest(columns) <= largest:
+            return []
+        units, size = " or ".join(f"_{unit}" for unit in names), self.largest(columns)
+        return [f"the unit of {columns[0]}, whose numbers reach {size:g} (its name has no {units})"]
+
+    def time_unit(self, column: str) -> str:
+        """Return the unit of the times: stated, or by their size and step."""
+        if not column:
+            return "s"
+        named, values = self.named_unit([column], TIME_NAMES), self.values([column])[:, 0]
+        if named or not np.isfinite(values).any():
+            return named or "iso"
+        for limit, unit in ((1e17, "ns"), (1e14, "us"), (1e11, "ms")):
+            if self.largest([column]) > limit:
+                return unit
+        step = float(np.nanmedian(np.diff(values))) if len(values) > 1 else 0.0
+        return "ms" if step >= 2.0 else "s"
+
+    def duration_unit(self, columns: Sequence[str]) -> str:
+        """Return the unit of the times to reach targets."""
+        named = self.named_unit(columns, TIME_NAMES)
+        if named or not columns:
+            return named or "s"
+        return "ms" if np.nanmedian(self.values(columns)) > 50.0 else "s"
+
+    def angle_unit(self, columns: Sequence[str], robot: Robot) -> str:
+        """Return the unit of angles: stated, or by their size."""
+        named = self.named_unit(columns, ANGLE_NAMES)
+        if named or not columns:
+            return named or "rad"
+        size = float(np.nanmedian(np.abs(self.values(columns))))
+        if robot.profile.servo_units is not None and size > 180.0:
+            return SERVO
+        return "deg" if self.largest(columns) > LARGEST_RAD else "rad"
+
+    def length_unit(self, columns: Sequence[str]) -> str:
+        """Return the unit of lengths: stated, or by their size."""
+        named = self.named_unit(columns, LENGTH_NAMES)
+        if named or not columns:
+            return named or "m"
+        return "mm" if self.largest(columns) > LARGEST_M else "m"
 
 
 @dataclass(frozen=True)
@@ -197,15 +246,6 @@ def _words(name: str) -> set[str]:
     """Return the words and numbers in a column's name, in lower case."""
     spaced = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)
     return set(re.findall(r"[a-z]+|\d+", spaced.lower()))
-
-
-def _increasing(table: pd.DataFrame) -> str:
-    """Return the first column whose numbers only grow."""
-    for name in table:
-        values = _values(table, [str(name)])[:, 0]
-        if len(values) > 1 and np.all(np.diff(values) > 0):
-            return str(name)
-    return ""
 
 
 def _by_motor(words: Mapping[str, set[str]], robot: Robot) -> list[list[str]]:
@@ -281,13 +321,6 @@ def _tool_candidates(words: Mapping[str, set[str]]) -> list[list[str]]:
     return [[name for name, found in named.items() if axis in found] for axis in "xyz"]
 
 
-def _values(table: pd.DataFrame, columns: Sequence[str]) -> FloatArray:
-    import pandas as pd
-
-    part = table[list(columns)].apply(pd.to_numeric, errors="coerce")
-    return part.to_numpy(dtype=np.float64)
-
-
 def _lacking(found: _Candidates, words: Mapping[str, set[str]]) -> list[str]:
     """Return a doubt for each part of a log that no column was found for."""
     doubts, command = [], _firsts(found.command)
@@ -300,152 +333,64 @@ def _lacking(found: _Candidates, words: Mapping[str, set[str]]) -> list[str]:
     return [f"{doubt}, of {', '.join(words)}" for doubt in doubts]
 
 
-def _unsaid(
-    table: pd.DataFrame,
-    columns: Sequence[str],
-    words: Mapping[str, set[str]],
-    names: Mapping[str, Sequence[str]],
-    largest: float,
-) -> list[str]:
-    """Return a doubt where columns cannot be in SI units and do not say what else they are in."""
-    if not columns or _named_unit(columns, words, names):
-        return []
-    size = float(np.nanmax(np.abs(_values(table, columns)), initial=0.0))
-    if size <= largest:
-        return []
-    units = " or ".join(f"_{unit}" for unit in names)
-    return [f"the unit of {columns[0]}, whose numbers reach {size:g} (its name has no {units})"]
-
-
-def _named_unit(
-    columns: Sequence[str], words: Mapping[str, set[str]], names: Mapping[str, Sequence[str]]
-) -> str | None:
-    """Return the unit that the names of the columns state, if they do."""
-    for unit, said in names.items():
-        if columns and all(words[column] & set(said) for column in columns):
-            return unit
-    return None
-
-
-def _time_unit(table: pd.DataFrame, column: str, words: Mapping[str, set[str]]) -> str:
-    if not column:
-        return "s"
-    named = _named_unit([column], words, TIME_NAMES)
-    values = _values(table, [column])[:, 0]
-    if named or not np.isfinite(values).any():
-        return named or "iso"
-    size = float(np.nanmax(np.abs(values)))
-    for limit, unit in ((1e17, "ns"), (1e14, "us"), (1e11, "ms")):
-        if size > limit:
-            return unit
-    step = float(np.nanmedian(np.diff(values))) if len(values) > 1 else 0.0
-    return "ms" if step >= 2.0 else "s"
-
-
-def _duration_unit(
-    table: pd.DataFrame, columns: Sequence[str], words: Mapping[str, set[str]]
-) -> str:
-    named = _named_unit(columns, words, TIME_NAMES)
-    if named or not columns:
-        return named or "s"
-    return "ms" if np.nanmedian(_values(table, columns)) > 50.0 else "s"
-
-
-def _angle_unit(
-    table: pd.DataFrame, columns: Sequence[str], words: Mapping[str, set[str]], robot: Robot
-) -> str:
-    named = _named_unit(columns, words, ANGLE_NAMES)
-    if named or not columns:
-        return named or "rad"
-    size = float(np.nanmedian(np.abs(_values(table, columns))))
-    if robot.profile.servo_units is not None and size > 180.0:
-        return SERVO
-    return "deg" if float(np.nanmax(np.abs(_values(table, columns)))) > LARGEST_RAD else "rad"
-
-
-def _length_unit(table: pd.DataFrame, columns: Sequence[str], words: Mapping[str, set[str]]) -> str:
-    named = _named_unit(columns, words, LENGTH_NAMES)
-    if named or not columns:
-        return named or "m"
-    return "mm" if float(np.nanmax(np.abs(_values(table, columns)))) > LARGEST_M else "m"
-
-
 def column_map_text(guess: Guess, source: str, robot: Robot) -> str:
     """Return a commented column map that holds the guess, ready to be corrected.
 
     Args:
-        guess: What the columns seem to be.
-        source: Name of the file it was made from.
+        guess: The guess.
+        source: Name of its file.
         robot: The robot, whose motors the comments name.
     """
+    columns, time, command = guess.columns, guess.columns.time, guess.columns.command
     motors = ", ".join(f"{motor.name} ({motor.joint})" for motor in robot.motors)
     each = [1] * len(robot.motors)
+    tool = columns.tool or ToolColumns(("tool_x", "tool_y", "tool_z"))
+    position = columns.position or AngleColumns(("q1", "q2"))
+    no_tool, no_position = ("" if part else "# " for part in (columns.tool, columns.position))
+    durations = [
+        f"duration_columns = {_toml(command.duration_columns)}",
+        f"duration_unit = {_toml(command.duration_unit)}",
+    ]
+    no_durations = [
+        "# For targets: duration_columns and duration_unit, or one duration_s for all movements."
+    ]
     parts = [
         f"# Column map for {source}: which column is what. A GUESS: check every line.",
         f"# Columns of the file: {', '.join(guess.names)}",
         f"# Motors of {robot.name}, in this order: {motors}",
-        f"separator = {_quote(guess.separator)}",
+        f"separator = {_toml(columns.separator)}",
         "# run tells several runs in one file apart; leave it out where a file is one run.",
-        f"run = {_quote(guess.run)}" if guess.run else '# run = "trial"',
+        f"run = {_toml(columns.run)}" if columns.run else '# run = "trial"',
         "",
         "[time]",
-        f"column = {_quote(guess.time[0] or 'FILL IN')}",
-        f"unit = {_quote(guess.time[1])}        # s, ms, us, ns, or iso (2026-01-31T12:00:00.25)",
+        f"column = {_toml(time.column or 'FILL IN')}",
+        f"unit = {_toml(time.unit)}        # s, ms, us, ns, or iso (2026-01-31T12:00:00.25)",
         "",
         "[command]          # what the motors were told",
-        f"columns = {_list(guess.command[0] or ['FILL IN'] * len(robot.motors))}",
-        f'kind = "{"target" if guess.duration[0] else "sampled"}"'
+        f"columns = {_toml(command.columns or ['FILL IN'] * len(robot.motors))}",
+        f"kind = {_toml(command.kind)}"
         "   # sampled (the reference at every row) or target (where to go)",
-        f"unit = {_quote(guess.command[1])}      # rad, deg, or servo (counts of the profile)",
-        *([f"slide_unit = {_quote(guess.slide_unit)}"] if robot.slides.any() else []),
-        *_duration_lines(guess),
+        f"unit = {_toml(command.unit)}      # rad, deg, or servo (counts of the profile)",
+        *([f"slide_unit = {_toml(command.slide_unit)}"] if robot.slides.any() else []),
+        *(durations if command.duration_columns else no_durations),
         f"# sign = {[-1, *each[1:]]}   # where the log turns the other way: here the first",
         f"# zero = {[0 for _ in each]}   # value that the robot calls 0, in the unit above",
         "",
-        *_tool_lines(guess),
-        *_position_lines(guess),
-    ]
-    return "\n".join(parts) + "\n"
-
-
-def _duration_lines(guess: Guess) -> list[str]:
-    columns, unit = guess.duration
-    if columns:
-        return [f"duration_columns = {_list(columns)}", f"duration_unit = {_quote(unit)}"]
-    return [
-        "# For targets: duration_columns and duration_unit, or one duration_s for all movements."
-    ]
-
-
-def _tool_lines(guess: Guess) -> list[str]:
-    columns, unit = guess.tool
-    lead = "" if columns else "# "
-    return [
-        f"{lead}[tool]             # measured tool position in the base frame",
-        f"{lead}columns = {_list(columns or ('tool_x', 'tool_y', 'tool_z'))}",
-        f"{lead}unit = {_quote(unit)}         # m, cm or mm",
+        f"{no_tool}[tool]             # measured tool position in the base frame",
+        f"{no_tool}columns = {_toml(tool.columns)}",
+        f"{no_tool}unit = {_toml(tool.unit)}         # m, cm or mm",
         "",
-    ]
-
-
-def _position_lines(guess: Guess) -> list[str]:
-    columns, unit = guess.position
-    lead = "" if columns else "# "
-    return [
-        f"{lead}[position]         # motor readings; only needed where there is no [tool]",
-        f"{lead}columns = {_list(columns or ('q1', 'q2'))}",
-        f"{lead}unit = {_quote(unit)}",
+        f"{no_position}[position]         # motor readings; only needed where there is no [tool]",
+        f"{no_position}columns = {_toml(position.columns)}",
+        f"{no_position}unit = {_toml(position.unit)}",
         "",
         "# [[sensors]]        # other sensors, SI units: accelerometer, gyroscope, wire, ...",
         '# variable = "accelerometer"',
         '# columns = ["ax", "ay", "az"]',
     ]
+    return "\n".join(parts) + "\n"
 
 
-def _quote(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("\t", "\\t")
-    return f'"{escaped}"'
-
-
-def _list(names: Sequence[str]) -> str:
-    return "[" + ", ".join(_quote(name) for name in names) + "]"
+def _toml(value: str | Sequence[str]) -> str:
+    """Return a text or a list of texts as TOML, whose escapes are those of JSON."""
+    return json.dumps(value, ensure_ascii=False)
