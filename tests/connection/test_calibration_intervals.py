@@ -20,8 +20,6 @@ from failuretwin.core.hypothesis import HEALTHY
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.nonidealities import Timing
 
-LAGS_S = np.linspace(0.0, 0.08, 11)
-
 COUNT = np.deg2rad(0.24)
 
 
@@ -135,12 +133,13 @@ def test_doubt_about_the_lag_is_doubt_about_the_delay():
     """Delays that fall as the lag rises are as unsure as the lag is, and as their own spread."""
     rng, runs = np.random.default_rng(0), 60
     best, own = rng.normal(0.04, 0.008, runs), rng.normal(0.01, 0.003, runs)
-    costs = (LAGS_S[:, None] - best) ** 2
-    values = np.stack([own - LAGS_S[:, None], np.zeros((len(LAGS_S), runs))], axis=2)
-    delay, shortening, lag = joint_doubt(values, costs, rng)
+    lags = best.mean() + 0.004 * np.array([[-1.0], [0.0], [1.0]])
+    costs = (lags - best) ** 2
+    values = np.stack([own - lags, np.zeros((3, runs))], axis=2)
+    delay, shortening, lag = joint_doubt(values, costs, 0.004)
     half = stats.t.ppf(0.975, runs - 1) / np.sqrt(runs)
-    assert lag == pytest.approx(half * np.std(best, ddof=1), rel=0.1)
-    assert delay == pytest.approx(half * np.std(own - best, ddof=1), rel=0.1)
+    assert lag == pytest.approx(half * np.std(best, ddof=1), rel=1e-9)
+    assert delay == pytest.approx(half * np.std(own - best, ddof=1), rel=1e-9)
     assert shortening == pytest.approx(0.0, abs=1e-12)
 
 

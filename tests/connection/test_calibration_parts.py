@@ -407,7 +407,7 @@ def ramps(armpi, lag, rate, read):
 @pytest.mark.parametrize("tool", [False, True])
 def test_timing_comes_back_from_clean_motion(armpi, twin, lag, tool):
     clean = ramps(armpi, lag, 100.0, twin.path if tool else np.array)
-    fit = fit_timing(clean, armpi, np.random.default_rng(0))
+    fit = fit_timing(clean, armpi)
     assert fit.lag == pytest.approx(lag, abs=0.002)
     np.testing.assert_allclose(fit.delay, DELAY, atol=0.002)
     np.testing.assert_allclose(fit.shortening, SHORTENING, atol=0.003)
@@ -415,7 +415,7 @@ def test_timing_comes_back_from_clean_motion(armpi, twin, lag, tool):
 
 def test_timing_comes_back_from_whole_counts_ten_times_a_second(armpi):
     rounded = ramps(armpi, 0.03, 10.0, lambda angle: np.rint(angle / COUNT) * COUNT)
-    fit = fit_timing(rounded, armpi, np.random.default_rng(0))
+    fit = fit_timing(rounded, armpi)
     assert fit.lag == pytest.approx(0.03, abs=0.005)
     np.testing.assert_allclose(fit.delay, DELAY, atol=0.006)
     np.testing.assert_allclose(fit.shortening, SHORTENING, atol=0.008)
@@ -426,7 +426,7 @@ def test_timing_comes_back_from_whole_counts_ten_times_a_second(armpi):
 def test_two_runs_tell_no_timing(armpi):
     clean = ramps(armpi, 0.03, 100.0, np.array)
     few = replace(clean, used=clean.used & (np.arange(6) < 2)[:, None])
-    assert fit_timing(few, armpi, np.random.default_rng(0)) is None
+    assert fit_timing(few, armpi) is None
 
 
 # What the robot might be instead

@@ -97,9 +97,6 @@ def exclude_suspect_runs(
     return found
 
 
-BOOTSTRAP_SEED = 0
-
-
 def fit_calibration(
     runs: xr.Dataset,
     robot: Robot,
@@ -147,8 +144,7 @@ def fit_calibration(
     losses = loss_rates(
         part.observations, part.sorted.lost, late.punctual, late.delayed, robot.motor_names
     )
-    rng = np.random.default_rng(BOOTSTRAP_SEED)
-    timing = fit_timing(transients(kept, movements, late, part, part.settling, robot), robot, rng)
+    timing = fit_timing(transients(kept, movements, late, part, part.settling, robot), robot)
     gaps = gap_starts(kept, movements, late.late)
     glitches = glitch_rates(kept) if part.observations.of_motors else None
     imperfections = Imperfections(

@@ -1,9 +1,8 @@
 """Delay, lag and early ramp ends from the motion between the plateaus, for all runs at once.
 
-Each run has a delay and a ramp shortening of its own; the lag is that of the robot. For each lag
-tried, Gauss-Newton with robust weights finds the other two for every run; the lag with the least
-cost wins, and runs drawn again and again (bootstrap) say how sure all three are together: a lag
-that is too short makes every delay too long.
+Each run r has a delay and a ramp shortening x_r of its own; the lag T is that of the robot. The
+estimate minimises the profile cost C(T) = sum_r min_x c_r(x, T) with Cauchy's robust loss; for each
+lag, Gauss-Newton with robust weights finds x_r of every run.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import numpy as np
 from failuretwin.connection.calibration.settling_fit import SettlingFit
 from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.runs import measured_rate
-from failuretwin.core.types import BoolArray, FloatArray, as_floats
+from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.digital_model.disturbances import lagged
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling, sag
@@ -26,15 +25,15 @@ from failuretwin.inference.observation.readings import measured_samples
 if TYPE_CHECKING:
     import xarray as xr
 
-LAGS_S = np.linspace(0.0, 0.08, 11)
-"""Lags tried [s]; a spline through their costs refines the choice. Steps of 10 ms and more are too
-coarse: they pull the lag of clean motion by 0.3 ms."""
+LONGEST_LAG_S = 0.08
+"""Longest lag looked for [s]."""
+LAG_STEP_S = 0.004
+"""Step of the derivatives by the lag [s]."""
 DELAY_STEP_S, SHARE_STEP = 0.005, 0.01
 """Steps of the numerical derivatives by delay [s] and by shortening [-]."""
 ROUNDS = 6
 SCALE_RAD, SCALE_M = 0.008, 0.0015
 """Residuals beyond this count less: two counts of a motor, 1.5 mm of the tool."""
-DRAWS = 400
 BOUNDS = ((-0.15, 0.4), (-0.3, 0.5))
 """Delay [s] and shortening [-] stay within these."""
 
@@ -61,6 +60,16 @@ class Transients:
     used: BoolArray
     time: FloatArray
 
+    def __getitem__(self, runs: IntArray) -> Transients:
+        """Return some of the runs."""
+        return replace(
+            self,
+            movements=self.movements[runs],
+            yielding=self.yielding[runs],
+            reading=self.reading[runs],
+            used=self.used[runs],
+        )
+
 
 @dataclass(frozen=True)
 class TimingFit:
@@ -81,85 +90,65 @@ class TimingFit:
     residual: float
 
 
-def fit_timing(transients: Transients, robot: Robot, rng: np.random.Generator) -> TimingFit | None:
+def fit_timing(transients: Transients, robot: Robot) -> TimingFit | None:
     """Fit the timing of a healthy robot; None if fewer than three runs show ramps.
 
     Args:
         transients: Readings on the ramps.
         robot: The robot.
-        rng: For the bootstrap.
     """
+    from scipy.optimize import minimize_scalar
+
     telling = np.flatnonzero(transients.used.sum(axis=1) >= 12)
     if len(telling) < 3:
         return None
-    transients = _some(transients, telling)
-    runs = len(telling)
-    costs = np.empty((len(LAGS_S), runs))
-    values = np.empty((len(LAGS_S), runs, 2))
-    start = np.zeros((runs, 2))
-    for i, lag in enumerate(LAGS_S):
-        values[i], costs[i] = _fit_runs(transients, robot, float(lag), start)
-        start = values[i]
-    lag = _least(costs.sum(axis=1))
-    found, _ = _fit_runs(transients, robot, lag, values[int(np.argmin(np.abs(LAGS_S - lag)))])
-    left = _residual(transients, robot, found, lag)
-    left = np.abs(left[transients.used]).ravel()
+    ramps = transients[telling]
+    start, _ = _fit_runs(ramps, robot, 0.5 * LONGEST_LAG_S, np.zeros((len(telling), 2)))
+
+    def cost(lag: float) -> float:
+        return float(_fit_runs(ramps, robot, lag, start)[1].sum())
+
+    bounds, tolerance = (0.0, LONGEST_LAG_S), {"xatol": 1e-4}
+    lag = float(minimize_scalar(cost, bounds=bounds, method="bounded", options=tolerance).x)
+    found, _ = _fit_runs(ramps, robot, lag, start)
+    middle = np.clip(lag, LAG_STEP_S, LONGEST_LAG_S - LAG_STEP_S)
+    fits = [_fit_runs(ramps, robot, middle + k * LAG_STEP_S, found) for k in (-1.0, 0.0, 1.0)]
+    values, costs = (np.stack(part) for part in zip(*fits, strict=True))
+    residual = np.abs(_residual(ramps, robot, found, lag)[ramps.used])
     return TimingFit(
         delay=found[:, 0],
         shortening=found[:, 1],
         lag=lag,
-        doubt=joint_doubt(values, costs, rng),
-        residual=float(1.4826 * np.nanmedian(left)),
+        doubt=joint_doubt(values, costs, LAG_STEP_S),
+        residual=float(1.4826 * np.nanmedian(residual)),
     )
 
 
-def joint_doubt(
-    values: FloatArray, costs: FloatArray, rng: np.random.Generator
-) -> tuple[float, float, float]:
-    """Return half 95 % intervals of mean delay, mean shortening and lag, from runs drawn again.
+def joint_doubt(values: FloatArray, costs: FloatArray, step: float) -> tuple[float, float, float]:
+    """Return half 95 % intervals of mean delay, mean shortening and lag.
 
-    The spread of such draws is too small by the share (n - 1)/n of a variance of n runs, and is
-    itself not known well from few: hence the quantile of Student's t.
+    Sandwich estimate with runs as clusters: of n runs, run r moves the lag by
+    T_r = -n (c_r' - mean c') / C'' and the mean of x by x_r - mean x + T_r d(mean x)/dT; the
+    quantile is that of Student's t with n - 1 degrees of freedom.
 
     Args:
-        values: Delay and shortening at `LAGS_S`, (lag, run, 2).
-        costs: Their costs, (lag, run).
-        rng: For the draws.
+        values: x, delay and shortening, below, at and above the lag found, (3, run, 2).
+        costs: c, their costs, (3, run).
+        step: Difference of these lags [s].
     """
-    from scipy.interpolate import CubicSpline
     from scipy.stats import t
 
     runs = costs.shape[1]
-    chosen = rng.integers(runs, size=(DRAWS, runs))
-    lags = np.array([_least(costs[:, some].sum(axis=1)) for some in chosen])
-    at_lag = CubicSpline(LAGS_S, values)(lags)
-    means = [found[some].mean(axis=0) for found, some in zip(at_lag, chosen, strict=True)]
-    spread = np.std(np.column_stack([means, lags]), axis=0) * np.sqrt(runs / (runs - 1.0))
-    delay, shortening, lag = (t.ppf(0.975, runs - 1) * spread).tolist()
+    slope = (costs[2] - costs[0]) / (2.0 * step)
+    curvature = float(np.sum(costs[2] - 2.0 * costs[1] + costs[0])) / step**2
+    curvature = max(curvature, float(np.abs(slope).sum()) / LONGEST_LAG_S)
+    lag_shift = -runs * (slope - slope.mean()) / max(curvature, 1e-300)
+    drift = (values[2] - values[0]).mean(axis=0) / (2.0 * step)
+    mean_shift = values[1] - values[1].mean(axis=0) + lag_shift[:, None] * drift
+    shifts = np.column_stack([mean_shift, lag_shift])
+    deviation = np.sqrt(np.sum(shifts**2, axis=0) / (runs * (runs - 1.0)))
+    delay, shortening, lag = (t.ppf(0.975, runs - 1) * deviation).tolist()
     return delay, shortening, lag
-
-
-def _some(transients: Transients, runs: np.ndarray) -> Transients:
-    m = transients.movements
-    return replace(
-        transients,
-        movements=Movements(m.initial[runs], m.target[runs], m.ramp_duration[runs], m.start[runs]),
-        yielding=transients.yielding[runs],
-        reading=transients.reading[runs],
-        used=transients.used[runs],
-    )
-
-
-def _least(costs: FloatArray) -> float:
-    """Return the lag [s] at the least of a cubic spline through costs at `LAGS_S`.
-
-    The costs bend too unevenly for a parabola: through three of them it is off by up to 3 ms.
-    """
-    from scipy.interpolate import CubicSpline
-
-    spline = CubicSpline(LAGS_S, costs)
-    lags = np.append(spline.derivative().roots(extrapolate=False), LAGS_S[[0, -1]])
-    return float(lags[np.argmin(spline(lags))])
 
 
 def _fit_runs(
