@@ -108,8 +108,10 @@ def fit_timing(transients: Transients, robot: Robot) -> TimingFit | None:
     def cost(lag: float) -> float:
         return float(_fit_runs(ramps, robot, lag, start)[1].sum())
 
-    bounds, tolerance = (0.0, LONGEST_LAG_S), {"xatol": 1e-4}
-    lag = float(minimize_scalar(cost, bounds=bounds, method="bounded", options=tolerance).x)
+    least = minimize_scalar(
+        cost, bounds=(0.0, LONGEST_LAG_S), method="bounded", options={"xatol": 1e-4}
+    )
+    lag = float(least.x)
     found, _ = _fit_runs(ramps, robot, lag, start)
     middle = np.clip(lag, LAG_STEP_S, LONGEST_LAG_S - LAG_STEP_S)
     fits = [_fit_runs(ramps, robot, middle + k * LAG_STEP_S, found) for k in (-1.0, 0.0, 1.0)]
