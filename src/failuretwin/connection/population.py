@@ -24,12 +24,13 @@ Section: docs/self_calibration.md#a-population-of-your-own-robots
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
-from failuretwin.connection.calibration.result import Calibration, Parameter
+from failuretwin.connection.calibration.result import SETTLING_UNITS, Calibration, Parameter
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, class_of, generic_imperfections
@@ -43,7 +44,6 @@ from failuretwin.digital_model.nonidealities import (
     SETTLING_LISTS,
     Imperfections,
     LostCommand,
-    Range,
     Readings,
     Schedule,
     Timing,
@@ -65,7 +65,6 @@ MOST_DOF = 50.0
 """Degrees of freedom from which tails count as normal."""
 LEAST = 1e-12
 """Deviation that stands for none at all."""
-UNITS = {"bias": "rad", "compliance": "rad/(N m)", "friction": "rad", "scatter": "rad"}
 
 
 @dataclass(frozen=True)
@@ -235,6 +234,7 @@ def _fitted(known: Sequence[CalibratedRobot], robot: Robot) -> Population:
         payload=float(np.mean([settling.payload for settling in settlings])),
     )
     profile = [m.imperfections for m in known if m.robot.motors == robot.motors]
+    readings = [one.readings for one in each if one.readings is not None]
     imperfections = Imperfections(
         name=name,
         source=source,
@@ -242,7 +242,7 @@ def _fitted(known: Sequence[CalibratedRobot], robot: Robot) -> Population:
         timing=_timing([one.timing for one in profile]),
         lost_commands=_losses(each, usual),
         schedule=_schedule([one.schedule for one in each]),
-        readings=_readings([one.readings for one in each if one.readings is not None]),
+        readings=_typical(readings) if readings else None,
         variation=_variation(figures, each, usual, class_of(robot).session_rad),
     )
     return Population(imperfections, tuple(_parameters(figures, imperfections, robot)), names)
@@ -332,16 +332,14 @@ def _parameters(
         spread = pooled.deviation
         if name == "bias" and found.variation is not None:
             spread = np.asarray(found.variation.bias)
-        ends = [pooled.mean, pooled.mean - 1.96 * spread, pooled.mean + 1.96 * spread]
-        value, low, high = np.exp(ends) if name == "scatter" else np.array(ends)
-        for i, motor in enumerate(robot.motor_names):
-            told = bool(pooled.told[i])
-            note = "" if told else _untold(pooled.between[i])
-            yield Parameter(
-                *(name, motor, UNITS[name]),
-                *(float(value[i]), float(low[i]), float(high[i])),
-                *(told, note),
+        for motor, mean, deviation, known, between in zip(
+            robot.motor_names, pooled.mean, spread, pooled.told, pooled.between, strict=True
+        ):
+            note = "" if known else _untold(between)
+            figure = Parameter.normal(
+                name, motor, SETTLING_UNITS[name], float(mean), float(deviation), bool(known), note
             )
+            yield figure.exponential if name == "scatter" else figure
 
 
 def _untold(between: float) -> str:
@@ -381,50 +379,36 @@ def _rate_deviation(each: Sequence[Imperfections], usual: Imperfections) -> floa
     return float(found.deviation[0])
 
 
-def _median(ranges: Sequence[Range]) -> Range:
-    """Return the median of the low ends and that of the high ones; zeros without any."""
-    if not ranges:
-        return 0.0, 0.0
-    low, high = np.median(np.array(ranges), axis=0)
-    return float(low), float(high)
-
-
 def _timing(each: Sequence[Timing]) -> Timing:
     """Return the timing of robots whose logs tell it, on top of the servo loops of the profile."""
-    told = [timing for timing in each if timing != Timing()]
-    late = [timing for timing in told if timing.late_rate > 0.0]
-    return Timing(
-        delay_s=_median([timing.delay_s for timing in told]),
-        lag_s=_median([timing.lag_s for timing in told]),
-        ramp_shortening=_median([timing.ramp_shortening for timing in told]),
-        late_rate=float(np.mean([timing.late_rate for timing in told])) if told else 0.0,
-        late_s=_median([timing.late_s for timing in late]),
-        gap_start_s=_median([timing.gap_start_s for timing in late]),
-    )
+    known = [timing for timing in each if timing != Timing()]
+    if not known:
+        return Timing()
+    late = _typical([timing for timing in known if timing.late_rate > 0.0] or known)
+    return replace(_typical(known), late_s=late.late_s, gap_start_s=late.gap_start_s)
 
 
 def _schedule(each: Sequence[Schedule]) -> Schedule:
-    told = [schedule for schedule in each if schedule != Schedule()]
-    if not told:
-        return Schedule()
-    return Schedule(
-        first_start_s=_median([schedule.first_start_s for schedule in told]),
-        period_s=_median([schedule.period_s for schedule in told]),
-        whole_counts=all(schedule.whole_counts for schedule in told),
-    )
+    return _typical([schedule for schedule in each if schedule != Schedule()] or [Schedule()])
 
 
-def _readings(each: Sequence[Readings]) -> Readings | None:
-    """Return the sensor of robots that tell of theirs."""
-    if not each:
-        return None
-    glitches = [readings.glitch_rate for readings in each if readings.glitch_rate]
-    return replace(
-        each[0],
-        rate_hz=float(np.median([readings.rate_hz for readings in each])),
-        jitter_s=float(np.median([readings.jitter_s for readings in each])),
-        whole_counts=all(readings.whole_counts for readings in each),
-        glitch_rate=_listed(np.mean(glitches, axis=0)) if glitches else (),
-        noise_m=float(np.median([readings.noise_m for readings in each])),
-        drawn_out=all(readings.drawn_out for readings in each),
-    )
+Table = TypeVar("Table", Timing, Schedule, Readings)
+
+
+def _typical(tables: Sequence[Table]) -> Table:
+    """Return the typical table: means of rates, medians of other numbers, flags that all have."""
+    values = {
+        field.name: _middle(field.name, [getattr(table, field.name) for table in tables])
+        for field in fields(tables[0])
+    }
+    return replace(tables[0], **values)
+
+
+def _middle(name: str, values: Sequence[Any]) -> Any:
+    if isinstance(values[0], bool):
+        return all(values)
+    known = [value for value in values if value != ()]
+    if not known:
+        return ()
+    middle = (np.mean if name.endswith("_rate") else np.median)(np.array(known), axis=0)
+    return middle.tolist() if middle.ndim == 0 else _listed(middle)

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from failuretwin.connection.calibration.observations import session_names
 from failuretwin.connection.calibration.parameters import readings_of, schedule_of, timing_of
-from failuretwin.connection.calibration.result import Calibration, Parameter
+from failuretwin.connection.calibration.result import SETTLING_UNITS, Calibration, Parameter
 from failuretwin.connection.calibration.timing_fit import gap_starts, lateness
 from failuretwin.connection.population import Population
 from failuretwin.core.errors import InputError, counted
@@ -75,7 +75,6 @@ ODD = {
     "friction": "a fault that is there in every run looks like this",
 }
 """What it may mean that one is."""
-UNITS = {"bias": "rad", "compliance": "rad/(N m)", "friction": "rad"}
 
 
 @dataclass(frozen=True)
@@ -285,7 +284,7 @@ def _parameters(found: FolderPosterior, believed: Imperfections, robot: Robot) -
     if len(found.mean) == REGISTRATION:
         return []
     motors, told = robot.motor_names, []
-    for k, name in enumerate(UNITS):
+    for k, name in enumerate(ODD):
         values = np.asarray(getattr(found.model.settling, name))
         expected = np.asarray(getattr(believed.settling, name))
         for i, motor in enumerate(motors):
@@ -298,7 +297,9 @@ def _parameters(found: FolderPosterior, believed: Imperfections, robot: Robot) -
                 note = "the runs do not tell it from what such robots differ by"
             value, deviation = float(values[i]), float(spread)
             told.append(
-                Parameter.normal(name, motor, UNITS[name], value, deviation, known, note, off)
+                Parameter.normal(
+                    name, motor, SETTLING_UNITS[name], value, deviation, known, note, off
+                )
             )
     return told
 

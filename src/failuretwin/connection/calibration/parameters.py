@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from scipy.stats import beta, binom
 
 from failuretwin.connection.calibration.observations import Observations
-from failuretwin.connection.calibration.result import Z_95, Parameter
+from failuretwin.connection.calibration.result import SETTLING_UNITS, Z_95, Parameter
 from failuretwin.connection.calibration.settling_fit import (
     DOF_PRIOR_SPREAD,
     SettlingPosterior,
@@ -195,8 +195,7 @@ def settling_parameters(fit: SettlingPosterior, robot: Robot, payload: float) ->
     """Return bias, compliance, friction and scatter of each motor, and the tails."""
     load = largest_load(robot, payload)
     found = []
-    units = {"bias": "rad", "compliance": "rad/(N m)", "friction": "rad", "scatter": "rad"}
-    for group, (name, unit) in enumerate(units.items()):
+    for group, (name, unit) in enumerate(SETTLING_UNITS.items()):
         for k, motor in enumerate(robot.motor_names):
             at = group * fit.motors + k
             value, deviation = float(fit.mode[at]), float(fit.deviation[at])
@@ -205,14 +204,8 @@ def settling_parameters(fit: SettlingPosterior, robot: Robot, payload: float) ->
             if name == "compliance" and load[k] < LOAD_FLOOR_NM:
                 learned, note = False, UNLOADED
             figure = Parameter.normal(name, motor, unit, value, deviation, learned, note)
-            found.append(_of_logarithm(figure) if name == "scatter" else figure)
+            found.append(figure.exponential if name == "scatter" else figure)
     return [*found, _tails(fit, robot)]
-
-
-def _of_logarithm(figure: Parameter) -> Parameter:
-    """Return a figure from that of its logarithm."""
-    value, low, high = np.exp([figure.value, figure.low, figure.high]).tolist()
-    return replace(figure, value=value, low=low, high=high)
 
 
 def spring_remarks(settling: Sequence[Parameter]) -> list[str]:

@@ -23,6 +23,13 @@ from failuretwin.digital_model.geometry import SensorFrame
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
 
+SETTLING_UNITS = {
+    "bias": "rad",
+    "compliance": "rad/(N m)",
+    "friction": "rad",
+    "scatter": "rad",
+}
+"""Units of the parameters of `Settling` that each motor has."""
 Z_95 = 1.959963984540054
 """Half the 95 % interval of a normal distribution, in standard deviations."""
 
@@ -69,6 +76,12 @@ class Parameter:
         """Return a parameter with a normal posterior, given its standard deviation."""
         low, high = value - Z_95 * deviation, value + Z_95 * deviation
         return cls(name, motor, unit, value, low, high, identified, note, deviations)
+
+    @property
+    def exponential(self) -> Parameter:
+        """The parameter of which this is the logarithm."""
+        value, low, high = np.exp([self.value, self.low, self.high]).tolist()
+        return replace(self, value=value, low=low, high=high)
 
 
 @dataclass(frozen=True)
