@@ -23,7 +23,7 @@ import json
 import time
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,12 +34,7 @@ from failuretwin.connection.links.base import Order
 from failuretwin.core.hypothesis import Fault, Hypothesis, single_faults
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.decision.acting.actor import Actor
-from failuretwin.decision.acting.belief import (
-    Belief,
-    BeliefSettings,
-    LatchedBelief,
-    NoBelief,
-)
+from failuretwin.decision.acting.belief import CAP, LATCH, Belief
 from failuretwin.decision.acting.believed_arm import BelievedFault, Seen
 from failuretwin.decision.acting.judging import ACTED_ON, Judge, Judgement
 from failuretwin.decision.acting.outcome import ActingSettings, TargetResult
@@ -63,14 +58,12 @@ Row = dict[str, Any]
 
 
 @dataclass
-class Told:
+class Told(Belief):
     """An oracle's belief: the true fault, from its onset on."""
 
-    world: World
-    arm: int
-    believed: BelievedFault | None = None
-    window: Sequence[Seen] = ()
-    confirmed: bool = True
+    world: World = field(kw_only=True)
+    arm: int = field(kw_only=True)
+    lead: float = CAP
 
     def add(self, seen: Seen) -> None:
         """Look up what is the matter."""
@@ -93,11 +86,6 @@ class Told:
     def take(self, seen: Seen, judgement: Judgement | None) -> str:
         """Learn nothing: all is known."""
         return ""
-
-    def stands_at(self, angle: float, spread: float) -> None:
-        """Remember where the motor rests."""
-        if self.believed is not None:
-            self.believed = replace(self.believed, angle=angle, spread=spread)
 
 
 @dataclass(frozen=True)
@@ -147,11 +135,9 @@ class Loop:
 
     def _belief(self, arm: int) -> Belief:
         if self.strategy == "oracle":
-            return Told(self.world, arm)
-        if self.strategy != "diagnose":
-            return NoBelief()
-        settings = BeliefSettings() if self.new_diagnoses else BeliefSettings(latch=NEVER)
-        return LatchedBelief(self.model, settings, self.wrong[arm] if self.wrong else None)
+            return Told(self.model, world=self.world, arm=arm)
+        believed = self.wrong[arm] if self.wrong and self.strategy == "diagnose" else None
+        return Belief(self.model, believed, latch=LATCH if self.new_diagnoses else NEVER)
 
     def run(self) -> Loop:
         """Work until every task is over."""
@@ -178,9 +164,8 @@ class Loop:
         points = self.world.move([order or Order(still[i], rest) for i, order in enumerate(orders)])
         began = time.process_time()
         for i in works:
-            self.actors[i].see(points[i], start, self.world.time_s)
-        working = [self.actors[i] for i in works]
-        says = self.judge([a.window for a in working], [a.belief.believed for a in working])
+            self.actors[i].add(points[i], start, self.world.time_s)
+        says = self._judgements([self.actors[i].belief for i in works])
         self.judged_s += time.process_time() - began
         aims = {i: self.actors[i].target.point for i in works}
         for i, judgement in zip(works, says, strict=True):
@@ -191,6 +176,12 @@ class Loop:
             error[i] = np.linalg.norm(self.world.tool[i] - aims[i])
         self._report(error)
         return True
+
+    def _judgements(self, beliefs: Sequence[Belief]) -> Sequence[Judgement | None]:
+        """Return the judgement of each arm; None without a diagnosis."""
+        if self.strategy != "diagnose":
+            return [None] * len(beliefs)
+        return self.judge([b.window for b in beliefs], [b.believed for b in beliefs])
 
     def _is_right(self, arm: int, believed: BelievedFault) -> bool:
         fault, stopped = self.trial.faults[arm], np.isfinite(self.world.held[arm])

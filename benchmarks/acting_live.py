@@ -19,7 +19,6 @@ from failuretwin.connection.links.base import Event
 from failuretwin.core.hypothesis import Fault
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.actor import Actor
-from failuretwin.decision.acting.judging import Judge
 from failuretwin.decision.acting.outcome import ActingSettings
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.session import Acting
@@ -63,8 +62,7 @@ def rows_of(known: CalibratedRobot, motor: int, seed: int, strategy: str) -> lis
     acting = Acting(known, SafetyGate(robot), strategy, ActingSettings())
     standing = first_standing(arm)
     arm.actor = actor = acting.actor(task, standing)
-    judge = Judge(acting.model) if strategy == "diagnose" else None
-    Work(actor, judge, acting.gate, arm, standing, lambda _: None).carry_out()
+    Work(actor, acting.gate, arm, standing, lambda _: None).carry_out()
     arm.note()
     held, rows = float(arm.ends[-1][1][motor]), []
     for (at, angle), result in zip(arm.ends, actor.results, strict=True):

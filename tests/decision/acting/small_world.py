@@ -8,6 +8,7 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Fault
 from failuretwin.decision.acting.actor import Actor
+from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault
 from failuretwin.decision.acting.judging import Judge
 from failuretwin.decision.acting.outcome import ActingSettings
@@ -80,12 +81,16 @@ class SmallWorld:
         return self.model.twin.path(pose)
 
 
-def carry_out(world, belief, task, settings=None, steps=200, each=None, spared=None):
-    """Return the actor after the task; `each` is called with the number of every movement."""
-    robot = world.model.twin.robot
-    planner = Planner(SafetyGate(robot), spared)
-    actor = Actor(planner, world.model, task, belief, world.command, settings or ActingSettings())
-    judge = Judge(world.model)
+def carry_out(world, belief, task, settings=None, steps=200, each=None, spared=None, judged=True):
+    """Return the actor after the task; a belief of None: the arm is taken for healthy.
+
+    `each` is called with the number of every movement; with `judged` the belief learns.
+    """
+    model, robot = world.model, world.model.twin.robot
+    planner, settings = Planner(SafetyGate(robot), spared), settings or ActingSettings()
+    judge = Judge(model) if judged and belief is not None else None
+    belief = belief or Belief(model)
+    actor = Actor(planner, model, task, belief, world.command, settings, judge)
     for number in range(steps):
         order = actor.next()
         if order is None:
@@ -95,5 +100,4 @@ def carry_out(world, belief, task, settings=None, steps=200, each=None, spared=N
         start = world.time_s
         point = world.move(order)
         actor.see(point, start, world.time_s)
-        actor.learn(judge([actor.window], [actor.belief.believed])[0])
     return actor

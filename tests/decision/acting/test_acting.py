@@ -7,7 +7,7 @@ import pytest
 from small_world import SmallWorld, believed, carry_out, task_of
 
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.decision.acting.belief import LatchedBelief, NoBelief
+from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm
 from failuretwin.decision.acting.outcome import ActingSettings
 from failuretwin.failure_behavior.mode import Reaction
@@ -23,7 +23,7 @@ def moves(actor):
 
 
 def test_a_healthy_arm_is_left_alone(model, armpi):
-    actor = carry_out(SmallWorld(model, 1), LatchedBelief(model), task_of(armpi, 10))
+    actor = carry_out(SmallWorld(model, 1), Belief(model), task_of(armpi, 10))
     assert reached(actor) == 10
     assert actor.belief.believed is None
     assert moves(actor) <= 15
@@ -32,8 +32,8 @@ def test_a_healthy_arm_is_left_alone(model, armpi):
 def test_a_stuck_motor_is_planned_round(model, armpi):
     truth = believed(armpi, 2, "stuck", -0.2, -0.2)
     task = task_of(armpi, 8, 3)
-    ours = carry_out(SmallWorld(model, 2, truth), LatchedBelief(model), task)
-    alone = carry_out(SmallWorld(model, 2, truth), NoBelief(), task)
+    ours = carry_out(SmallWorld(model, 2, truth), Belief(model), task)
+    alone = carry_out(SmallWorld(model, 2, truth), None, task)
     assert str(ours.belief.believed.fault) == "motor_3:stuck"
     assert ours.belief.believed.angle == pytest.approx(-0.2, abs=0.02)
     assert reached(ours) > reached(alone)
@@ -45,7 +45,7 @@ def test_a_stuck_motor_is_planned_round(model, armpi):
 def test_a_stuck_motor_is_told_to_stay_where_it_stands(model, armpi):
     truth = believed(armpi, 1, "stuck", 0.3, 0.3)
     world = SmallWorld(model, 2, truth)
-    belief = LatchedBelief(model, believed=truth)
+    belief = Belief(model, believed=truth)
     carry_out(world, belief, task_of(armpi, 3, 3), ActingSettings(probe_every=100))
     told = [order.target[1] for _, order in world.orders]
     at_rest = np.abs(np.array(told) - 0.3) < np.deg2rad(0.24)
@@ -54,7 +54,7 @@ def test_a_stuck_motor_is_told_to_stay_where_it_stands(model, armpi):
 
 def test_what_is_out_of_reach_is_said_and_tried_once(model, armpi):
     truth = believed(armpi, 0, "stuck", 1.2, 1.2)
-    belief = LatchedBelief(model, believed=truth, lead=8.0)
+    belief = Belief(model, believed=truth, lead=8.0)
     actor = carry_out(SmallWorld(model, 2, truth), belief, task_of(armpi, 5, 1))
     given_up = [result for result in actor.results if not result.reached]
     assert len(given_up) >= 4
@@ -72,7 +72,7 @@ def test_a_repair_is_noticed_by_probing(model, armpi):
 
     actor = carry_out(
         world,
-        LatchedBelief(model),
+        Belief(model),
         task_of(armpi, 30, 4),
         ActingSettings(probe_every=4),
         each=repair,
@@ -85,7 +85,7 @@ def test_a_repair_is_noticed_by_probing(model, armpi):
 
 def test_evidence_is_not_forgotten_by_the_reaction(model, armpi):
     truth = believed(armpi, 3, "stuck", 0.4, 0.4)
-    actor = carry_out(SmallWorld(model, 5, truth), LatchedBelief(model), task_of(armpi, 25, 6))
+    actor = carry_out(SmallWorld(model, 5, truth), Belief(model), task_of(armpi, 25, 6))
     said = [text for text in actor.said if "let go" in text or "given up" in text]
     assert said == []
     assert str(actor.belief.believed.fault) == "motor_4:stuck"
@@ -95,7 +95,7 @@ def test_evidence_is_not_forgotten_by_the_reaction(model, armpi):
 def test_a_wrong_belief_costs_a_healthy_arm_nothing(model, armpi, wrong):
     motor, mode = wrong
     angle = 0.5 if mode == "stuck" else np.nan
-    belief = LatchedBelief(model, believed=believed(armpi, motor, mode, angle, angle))
+    belief = Belief(model, believed=believed(armpi, motor, mode, angle, angle))
     actor = carry_out(SmallWorld(model, 7), belief, task_of(armpi, 8, 2))
     assert reached(actor) == 8
     assert moves(actor) <= 16
@@ -103,7 +103,7 @@ def test_a_wrong_belief_costs_a_healthy_arm_nothing(model, armpi, wrong):
 
 def test_the_belief_in_another_stuck_motor_is_replaced(model, armpi):
     truth = believed(armpi, 3, "stuck", 0.3, 0.3)
-    belief = LatchedBelief(model, believed=believed(armpi, 1, "stuck", 0.2, 0.2))
+    belief = Belief(model, believed=believed(armpi, 1, "stuck", 0.2, 0.2))
     actor = carry_out(SmallWorld(model, 7, truth), belief, task_of(armpi, 10, 2))
     assert str(actor.belief.believed.fault) == "motor_4:stuck"
     assert reached(actor) >= 8
@@ -112,8 +112,8 @@ def test_the_belief_in_another_stuck_motor_is_replaced(model, armpi):
 def test_random_errors_are_parked_and_not_renamed_stuck(model, armpi):
     truth = believed(armpi, 1, "steady_state_error")
     task = task_of(armpi, 10, 8)
-    ours = carry_out(SmallWorld(model, 3, truth), LatchedBelief(model), task)
-    alone = carry_out(SmallWorld(model, 3, truth), NoBelief(), task)
+    ours = carry_out(SmallWorld(model, 3, truth), Belief(model), task)
+    alone = carry_out(SmallWorld(model, 3, truth), None, task)
     assert reached(ours) > reached(alone) + 2
     assert str(ours.belief.believed.fault) == "motor_2:steady_state_error"
     assert not any("motor_2:stuck" in text for text in ours.said)
@@ -123,8 +123,8 @@ def test_random_errors_are_parked_and_not_renamed_stuck(model, armpi):
 def test_constant_errors_are_taken_off_the_commands(model, armpi, mode, size):
     truth = believed(armpi, 1, mode, size)
     task = task_of(armpi, 12, 9)
-    ours = carry_out(SmallWorld(model, 3, truth), LatchedBelief(model), task)
-    alone = carry_out(SmallWorld(model, 3, truth), NoBelief(), task)
+    ours = carry_out(SmallWorld(model, 3, truth), Belief(model), task)
+    alone = carry_out(SmallWorld(model, 3, truth), None, task)
     assert str(ours.belief.believed.fault) == f"motor_2:{mode}"
     assert ours.belief.believed.size == pytest.approx(size, abs=0.05)
     assert moves(ours) < moves(alone)
@@ -137,7 +137,7 @@ def test_a_constant_error_is_taken_off_before_it_is_told_from_one_drawn_anew(mod
     first = []
     for seed in range(5):
         world = SmallWorld(model, seed, truth)
-        actor = carry_out(world, LatchedBelief(model), task_of(armpi, 3, seed))
+        actor = carry_out(world, Belief(model), task_of(armpi, 3, seed))
         taken = [text for text in actor.said if text.startswith("taken for")]
         assert taken
         assert "motor_3" in taken[0]
@@ -149,7 +149,7 @@ def test_a_constant_error_is_taken_off_before_it_is_told_from_one_drawn_anew(mod
 
 def test_a_lost_command_is_sent_again_not_corrected_twice(model, armpi):
     world = SmallWorld(model, 3, lost={3})
-    actor = carry_out(world, NoBelief(), task_of(armpi, 5, 9))
+    actor = carry_out(world, None, task_of(armpi, 5, 9))
     assert reached(actor) == 5
     again = [text for text in actor.said if "sent again" in text]
     assert len(again) == 1
@@ -161,8 +161,8 @@ def test_a_drift_is_followed_and_taken_off_ahead(model, armpi):
     truth = believed(armpi, 1, "drift", 0.015)
     task = task_of(armpi, 14, 9)
     world = SmallWorld(model, 1, truth)
-    ours = carry_out(world, LatchedBelief(model), task)
-    alone = carry_out(SmallWorld(model, 1, truth), NoBelief(), task)
+    ours = carry_out(world, Belief(model), task)
+    alone = carry_out(SmallWorld(model, 1, truth), None, task)
     drift = ours.belief.believed
     assert str(drift.fault) == "motor_2:drift"
     assert drift.size == pytest.approx(0.015, rel=0.2)
@@ -176,7 +176,7 @@ def test_a_drift_is_followed_and_taken_off_ahead(model, armpi):
 def test_commands_that_get_lost_again_are_sent_again(model, armpi):
     world = SmallWorld(model, 3, lost={3, 4})
     twice = ActingSettings(most_repeats=2)
-    actor = carry_out(world, NoBelief(), task_of(armpi, 5, 9), twice)
+    actor = carry_out(world, None, task_of(armpi, 5, 9), twice)
     orders = [order.target for _, order in world.orders]
     again = [bool(np.array_equal(order, orders[2])) for order in orders[3:]]
     assert again.index(False) == 2
@@ -186,7 +186,7 @@ def test_commands_that_get_lost_again_are_sent_again(model, armpi):
 def test_open_loop_moves_once_for_each_target(model, armpi):
     truth = believed(armpi, 1, "stuck", 0.5, 0.5)
     world = SmallWorld(model, 3, truth)
-    actor = carry_out(world, NoBelief(), task_of(armpi, 6, 9), ActingSettings(feedback=False))
+    actor = carry_out(world, None, task_of(armpi, 6, 9), ActingSettings(feedback=False))
     assert [result.movements for result in actor.results] == [1] * 6
 
 
@@ -240,6 +240,6 @@ def test_every_mode_says_what_is_to_be_done():
 
 
 def test_a_belief_can_name_faults_that_are_weighed_only(model):
-    judge_of = LatchedBelief(model)
+    judge_of = Belief(model)
     assert judge_of.window == []
     assert Hypothesis.parse("motor_2:stuck", model.motor_names).faults[0].mode in MODES

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_world import SmallWorld, believed, carry_out, task_of
 
-from failuretwin.decision.acting.belief import LatchedBelief, NoBelief
+from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm, Seen
 from failuretwin.decision.acting.judging import Judge
 from failuretwin.decision.acting.parking import parking_place
@@ -36,8 +36,8 @@ def test_it_is_found_parked_and_told_before_it_is_moved(model, armpi):
     truth = believed(armpi, 2, "intermittent", 0.5)
     task = task_of(armpi, 16, 3)
     world, other = SmallWorld(model, 1, truth), SmallWorld(model, 1, truth)
-    ours = carry_out(world, LatchedBelief(model), task)
-    alone = carry_out(other, NoBelief(), task)
+    ours = carry_out(world, Belief(model), task)
+    alone = carry_out(other, None, task)
     assert str(ours.belief.believed.fault) == "motor_3:intermittent"
     assert reached(ours) >= reached(alone)
     assert moves(ours) < moves(alone)
@@ -49,7 +49,7 @@ def test_it_is_found_parked_and_told_before_it_is_moved(model, armpi):
 
 def test_a_target_that_needs_the_parked_motor_gets_it(model, armpi):
     truth = believed(armpi, 0, "intermittent", 0.4)
-    belief = LatchedBelief(model, believed=truth, lead=8.0)
+    belief = Belief(model, believed=truth, lead=8.0)
     actor = carry_out(SmallWorld(model, 2, truth), belief, task_of(armpi, 8, 3))
     assert reached(actor) == 8  # with motor 1 at rest nine targets of ten are out of reach
 
@@ -57,7 +57,7 @@ def test_a_target_that_needs_the_parked_motor_gets_it(model, armpi):
 @pytest.mark.parametrize("seed", range(4))
 def test_a_healthy_arm_is_not_taken_for_one(model, armpi, seed):
     lossy = SmallWorld(model, seed, lost={3, 9}, losers=[0])
-    actor = carry_out(lossy, LatchedBelief(model), task_of(armpi, 10, seed))
+    actor = carry_out(lossy, Belief(model), task_of(armpi, 10, seed))
     assert actor.belief.believed is None
     assert reached(actor) == 10
 
@@ -65,7 +65,7 @@ def test_a_healthy_arm_is_not_taken_for_one(model, armpi, seed):
 def test_a_parked_motor_that_stops_elsewhere_is_taken_for_stuck(model, armpi):
     start = believed(armpi, 1, "intermittent", 0.4)
     world = SmallWorld(model, 5, believed(armpi, 1, "stuck", 0.9, 0.9))
-    actor = carry_out(world, LatchedBelief(model, believed=start), task_of(armpi, 8, 5))
+    actor = carry_out(world, Belief(model, believed=start), task_of(armpi, 8, 5))
     assert str(actor.belief.believed.fault) == "motor_2:stuck"
     assert actor.belief.believed.angle == pytest.approx(0.9, abs=0.03)
 

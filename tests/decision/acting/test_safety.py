@@ -8,7 +8,7 @@ from small_world import SmallWorld, believed, carry_out, task_of
 
 from failuretwin import InputError, load_robot
 from failuretwin.connection.links.base import Order
-from failuretwin.decision.acting.belief import LatchedBelief
+from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm
 from failuretwin.decision.acting.planner import Planner, Standing
 from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
@@ -127,7 +127,7 @@ def test_no_order_of_the_loop_is_outside(model, armpi, seed):
         return believed(armpi, motor, mode, size, size if mode == "stuck" else np.nan)
 
     world = SmallWorld(model, seed, drawn(), lost={4, 9})
-    carry_out(world, LatchedBelief(model, believed=drawn()), task_of(armpi, 5, seed), steps=25)
+    carry_out(world, Belief(model, believed=drawn()), task_of(armpi, 5, seed), steps=25)
     gate = SafetyGate(armpi)
     assert len(world.orders) > 4
     # A gate knows what was ordered, not that it was lost: ways go from order to order.

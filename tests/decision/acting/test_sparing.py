@@ -10,7 +10,6 @@ from small_world import SmallWorld, carry_out, task_of
 
 from failuretwin import InputError
 from failuretwin.app.arms import spared_of
-from failuretwin.decision.acting.belief import NoBelief
 from failuretwin.decision.acting.planner import Standing, turned_round
 from failuretwin.decision.acting.sparing import sparing_lines, wear_weights
 from failuretwin.inference.together.wear_limits import WearLimits, wear_unit
@@ -80,8 +79,8 @@ def test_a_spared_motor_does_less_at_no_loss(model, armpi, motor):
     spared = np.zeros(4)
     spared[motor] = 1.0
     task = task_of(armpi, 25, 11)
-    actor = carry_out(SmallWorld(model, 4), NoBelief(), task, spared=spared)
-    plain = carry_out(SmallWorld(model, 4), NoBelief(), task)
+    actor = carry_out(SmallWorld(model, 4), None, task, spared=spared)
+    plain = carry_out(SmallWorld(model, 4), None, task)
     reached = [sum(result.reached for result in each.results) for each in (actor, plain)]
     assert reached[0] >= reached[1] - 1
     assert len(actor.ways) == 25

@@ -16,7 +16,7 @@ from failuretwin.connection.links.base import CommandSent, LinkCounts, Order, Re
 from failuretwin.core.errors import InputError
 from failuretwin.decision.acting import work as work_module
 from failuretwin.decision.acting.actor import Actor
-from failuretwin.decision.acting.belief import LatchedBelief, NoBelief
+from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.judging import Judge
 from failuretwin.decision.acting.planner import Planner
 from failuretwin.decision.acting.rest import RestWatch
@@ -26,11 +26,11 @@ from failuretwin.decision.acting.work import Halted, Work, first_standing, where
 from failuretwin.failure_behavior.injection import ScheduledFault
 
 
-def work_of(model, commander, task, belief=None, judge=None, gate=None):
+def work_of(model, commander, task, judge=None, gate=None):
     gate = gate or SafetyGate(model.twin.robot)
     standing, said = first_standing(commander), []
-    actor = Actor(Planner(gate), model, task, belief or NoBelief(), standing)
-    return Work(actor, judge, gate, commander, standing, said.append), said
+    actor = Actor(Planner(gate), model, task, Belief(model), standing, judge=judge)
+    return Work(actor, gate, commander, standing, said.append), said
 
 
 class Fake:
@@ -151,7 +151,7 @@ def test_an_emulated_arm_with_a_stuck_motor(model, armpi):
     pytest.importorskip("mujoco")
     schedule = (ScheduledFault(Fault("motor_3", "stuck"), 6.0),)
     arm = CommandedArm(Emulation(armpi, model.imperfections, schedule, 2))
-    work, said = work_of(model, arm, task_of(armpi, 7, 5), LatchedBelief(model), Judge(model))
+    work, said = work_of(model, arm, task_of(armpi, 7, 5), Judge(model))
     work.carry_out()
     assert str(work.actor.belief.believed.fault) == "motor_3:stuck"
     assert sum(result.reached for result in work.actor.results) >= 5

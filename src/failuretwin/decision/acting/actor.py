@@ -18,7 +18,7 @@ from failuretwin.connection.links.base import Order
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault, Seen
-from failuretwin.decision.acting.judging import Judgement
+from failuretwin.decision.acting.judging import Judge, Judgement
 from failuretwin.decision.acting.outcome import USUAL, ActingSettings, TargetResult
 from failuretwin.decision.acting.parking import parking_place
 from failuretwin.decision.acting.planner import Plan, Planner, Standing
@@ -65,6 +65,7 @@ class Actor:
         belief: What the arm is taken to be.
         command: What the motors were told last, (motor,) [rad].
         settings: How it is carried out.
+        judge: Weighs movements in `see`; None: nothing is diagnosed there.
     """
 
     def __init__(
@@ -75,8 +76,9 @@ class Actor:
         belief: Belief,
         command: FloatArray,
         settings: ActingSettings = USUAL,
+        judge: Judge | None = None,
     ) -> None:
-        self._planner, self._model, self._task = planner, model, task
+        self._planner, self.model, self._task, self._judge = planner, model, task, judge
         self.belief, self._settings = belief, settings
         self.results: list[TargetResult] = []
         self.said: list[str] = []
@@ -106,16 +108,11 @@ class Actor:
     def arm(self) -> BelievedArm:
         """The arm as it is worked with: as it is believed to be, or as if it were healthy."""
         fault = None if self._attempt.as_healthy else self.belief.believed
-        return BelievedArm(self._model, fault)
-
-    @property
-    def window(self) -> Sequence[Seen]:
-        """Movements that are to be weighed before `learn`."""
-        return self.belief.window
+        return BelievedArm(self.model, fault)
 
     def standing(self) -> Standing:
         """Return where the arm stands as far as is believed."""
-        arm = BelievedArm(self._model, self.belief.believed)
+        arm = BelievedArm(self.model, self.belief.believed)
         pose = arm.settle(self._command, self._previous, self._time_s)
         travel = self._command - self._previous
         return Standing(pose, self._command, self._time_s + self._pace_s, travel)
@@ -123,6 +120,12 @@ class Actor:
     # What was seen.
 
     def see(self, point: FloatArray | None, start_s: float, rest_s: float) -> None:
+        """Add a movement, judge it and learn from it; see `add`."""
+        self.add(point, start_s, rest_s)
+        judge, belief = self._judge, self.belief
+        self.learn(None if judge is None else judge([belief.window], [belief.believed])[0])
+
+    def add(self, point: FloatArray | None, start_s: float, rest_s: float) -> None:
         """Take where the tool came to rest after the last order.
 
         Args:
@@ -143,7 +146,7 @@ class Actor:
         """Learn from the movement that was seen, and conclude the target if it is time to.
 
         Args:
-            judgement: What the movements of `window` say; None: they were not weighed.
+            judgement: What the movements of `belief.window` say; None: they were not weighed.
         """
         seen = self._seen
         if seen is None or self.done:
@@ -253,7 +256,7 @@ class Actor:
             return None
         gate = self._planner.gate
         asked = (judgement.posterior, self._command, len(self.results), judgement.row)
-        order = next_movement(self._model, gate, *asked)
+        order = next_movement(self.model, gate, *asked)
         if order is None:
             return None
         self._questions -= 1
@@ -296,7 +299,7 @@ class Actor:
         place = parking_place(self._planner.gate, believed.motor, left, stands)
         if place.reached:
             self.belief.stands_at(place.angle, 0.0)
-            self._say(place.told(self._model.motor_names[believed.motor]))
+            self._say(place.told(self.model.motor_names[believed.motor]))
 
     def _out_of_reach(self, plan: Plan, at: Standing) -> Plan:
         """Return what to do where the motor that rests keeps the tool from its target."""
@@ -333,7 +336,7 @@ class Actor:
             lost = [] if seen.point is None else lost_command(self.arm, seen)
             if lost or seen.point is None:
                 attempt.repeats += 1
-                names = ", ".join(self._model.motor_names[k] for k in lost)
+                names = ", ".join(self.model.motor_names[k] for k in lost)
                 why = f"the command of {names} seems lost" if lost else "the tool was not seen"
                 self._say(f"{why}: sent again")
                 return self._again(lost)
@@ -369,7 +372,7 @@ class Actor:
         arm = self.arm
         pose = arm.most_probable_pose(seen)
         angle = float(pose[believed.motor])
-        self.belief.stands_at(angle, float(self._model.scatter[believed.motor]))
+        self.belief.stands_at(angle, float(self.model.scatter[believed.motor]))
         at = Standing(pose, self._command, self._time_s)
         plan = self._planner.plan(self.target, self.arm, at)
         if not plan.reachable or plan.order is None:
@@ -437,7 +440,7 @@ class Actor:
         believed = self.belief.believed
         if believed is None:
             return
-        self._say(told(believed, self._model.twin.robot))
+        self._say(told(believed, self.model.twin.robot))
         if not believed.rests:
             return
         left = self._task.targets[len(self.results) :]

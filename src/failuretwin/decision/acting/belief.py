@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -26,118 +25,56 @@ from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.observation.healthy_model import HealthyModel
 
 GROWTH = 1.2
-"""The spread of a size that is remembered grows by this factor with each movement [-]."""
-
-
-@dataclass(frozen=True)
-class BeliefSettings:
-    """When a fault is taken up and when it is let go of.
-
-    Attributes:
-        latch: Probability from which a fault is believed.
-        until_told_apart: A constant error is believed from this probability on if an error of its
-            motor is as probable as `latch`.
-        movements: Latest movements that are weighed together.
-        least_movements: No fault is believed after fewer.
-        start_lead: Log Bayes factor with which a belief begins.
-        cap: Highest lead: a repair must show within a few movements.
-        let_go: Lead below which a belief is let go.
-    """
-
-    latch: float = 0.9
-    until_told_apart: float = 0.3
-    movements: int = 5
-    least_movements: int = 2
-    start_lead: float = 4.0
-    cap: float = 8.0
-    let_go: float = -5.0
-
-
-class Belief(Protocol):
-    """Says what the arm is taken to be."""
-
-    @property
-    def believed(self) -> BelievedFault | None:
-        """The fault that it is taken to have; None: none."""
-        ...
-
-    @property
-    def window(self) -> Sequence[Seen]:
-        """Movements that are to be weighed; empty: none need be."""
-        ...
-
-    @property
-    def confirmed(self) -> bool:
-        """Whether movements have confirmed it as far as they can."""
-        ...
-
-    def add(self, seen: Seen) -> None:
-        """Remember a movement, before it is weighed."""
-        ...
-
-    def take(self, seen: Seen, judgement: Judgement | None) -> str:
-        """Learn from a movement that was added; return in words what changed, or nothing."""
-        ...
-
-    def stands_at(self, angle: float, spread: float) -> None:
-        """Learn where the faulty motor rests [rad]; a NaN: it moves."""
-        ...
+"""Growth of the spread of a remembered size with each movement [-]."""
+LATCH = 0.9
+"""Probability from which a fault is believed."""
+UNTIL_TOLD_APART = 0.3
+"""A constant error is believed from this probability on if any error of its motor is as probable
+as `LATCH`."""
+WINDOW = 5
+"""Latest movements that are weighed together."""
+LEAST_MOVEMENTS = 2
+"""Movements that must have been seen before a fault is believed."""
+START_LEAD = 4.0
+"""Log Bayes factor of a new belief."""
+CAP = 8.0
+"""Largest log Bayes factor: a repair must show within a few movements."""
+LET_GO = -5.0
+"""Log Bayes factor below which a belief is dropped."""
 
 
 @dataclass
-class NoBelief:
-    """Takes the arm for healthy, whatever happens."""
-
-    believed: BelievedFault | None = None
-    window: Sequence[Seen] = ()
-    confirmed: bool = False
-
-    def add(self, seen: Seen) -> None:
-        """Remember nothing."""
-
-    def take(self, seen: Seen, judgement: Judgement | None) -> str:
-        """Learn nothing."""
-        return ""
-
-    def stands_at(self, angle: float, spread: float) -> None:
-        """Learn nothing."""
-
-
-@dataclass
-class LatchedBelief:
+class Belief:
     """Believes a fault once it is probable, until movements speak against it.
 
     Attributes:
         model: The healthy robot.
-        settings: When it takes up and lets go.
-        believed: The fault that the arm is taken to have.
+        believed: The fault that the arm is taken to have; None: healthy.
         history: Movements since the last repair that was noticed.
-        lead: Log Bayes factor of the belief against healthy, capped.
+        lead: Log Bayes factor of the belief against healthy, at most `CAP`.
+        latch: Probability from which a fault is believed.
     """
 
     model: HealthyModel
-    settings: BeliefSettings = BeliefSettings()
     believed: BelievedFault | None = None
     history: list[Seen] = field(default_factory=list)
-    lead: float = 0.0
-
-    def __post_init__(self) -> None:
-        self.lead = self.settings.start_lead
+    lead: float = START_LEAD
+    latch: float = LATCH
 
     @property
     def window(self) -> Sequence[Seen]:
         """The latest movements that were seen at rest."""
-        return self.history[-self.settings.movements :]
+        return self.history[-WINDOW:]
 
     @property
     def confirmed(self) -> bool:
         """Whether movements have confirmed it as far as they can."""
-        return self.lead >= self.settings.cap
+        return self.lead >= CAP
 
     def add(self, seen: Seen) -> None:
         """Remember a movement, before it is weighed."""
         self.history.append(seen)
-        del self.history[: -2 * self.settings.movements]
+        del self.history[: -2 * WINDOW]
 
     def take(self, seen: Seen, judgement: Judgement | None) -> str:
         """Learn from a movement that was added; return in words what changed."""
@@ -161,21 +98,16 @@ class LatchedBelief:
 
     def _taken_up(self, judgement: Judgement) -> str:
         best, sure = judgement.best, judgement.probability(judgement.best)
-        if sure < self.settings.latch:
+        if sure < self.latch:
             best, sure = judgement.until_told_apart
-            if judgement.probability(best) < self.settings.until_told_apart:
+            if judgement.probability(best) < UNTIL_TOLD_APART:
                 return ""
         enough = sum(seen.point is not None for seen in self.window)
-        if not (
-            best.known
-            and best.faults
-            and sure >= self.settings.latch
-            and enough >= self.settings.least_movements
-        ):
+        if not (best.known and best.faults and sure >= self.latch and enough >= LEAST_MOVEMENTS):
             return ""
         self._believe(best, judgement)
         said = f"taken for {best}, {judgement.probability(best):.0%} sure"
-        if judgement.probability(best) < self.settings.latch:
+        if judgement.probability(best) < self.latch:
             said += f", {sure:.0%} with what looks alike at first"
         return said
 
@@ -192,7 +124,7 @@ class LatchedBelief:
             angle=size if held else np.nan,
             probability=judgement.probability(hypothesis),
         )
-        self.lead = self.settings.start_lead
+        self.lead = START_LEAD
 
     def _follow_size(self, judgement: Judgement) -> None:
         """Take over what the latest movements say of the size where that is sharper."""
@@ -219,8 +151,8 @@ class LatchedBelief:
         """Let go of a belief that the arm contradicts; return so in words."""
         arm, healthy = BelievedArm(self.model, self.believed), BelievedArm(self.model)
         gain = arm.log_density(seen) - healthy.log_density(seen)
-        self.lead = min(self.settings.cap, self.lead + gain)
-        if self.lead >= self.settings.let_go:
+        self.lead = min(CAP, self.lead + gain)
+        if self.lead >= LET_GO:
             return ""
         said = f"let go of {self._name}: the arm does not do what it predicts"
         self._let_go()
@@ -235,10 +167,10 @@ class LatchedBelief:
         if other == believed.fault or (other.motor == believed.fault.motor and believed.rests):
             return ""  # a motor that is not told to move is not stuck by that
         ahead = judgement.log_evidence(best) - judgement.log_evidence(HEALTHY)
-        if ahead - self._own_lead() < -self.settings.let_go:
+        if ahead - self._own_lead() < -LET_GO:
             return ""
         said = f"{self._name} given up: {best} explains far better what the arm does"
-        self.believed, self.lead = None, self.settings.start_lead
+        self.believed, self.lead = None, START_LEAD
         taken = self._taken_up(judgement)
         return f"{said}; {taken}" if taken else said
 
@@ -256,5 +188,5 @@ class LatchedBelief:
         return "" if self.believed is None else str(self.believed.fault)
 
     def _let_go(self) -> None:
-        self.believed, self.lead = None, self.settings.start_lead
+        self.believed, self.lead = None, START_LEAD
         del self.history[:-1]

@@ -14,7 +14,7 @@ from failuretwin.connection.links.base import Commander
 from failuretwin.core.errors import unknown_name
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.actor import Actor
-from failuretwin.decision.acting.belief import Belief, LatchedBelief, NoBelief
+from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm
 from failuretwin.decision.acting.judging import Judge
 from failuretwin.decision.acting.outcome import ActingSettings, TargetResult
@@ -72,9 +72,9 @@ class Acting:
     def actor(self, task: Task, standing: FloatArray) -> Actor:
         """Return what carries out a task on an arm that stands somewhere, (motor,) [rad]."""
         model = self.model
-        belief: Belief = LatchedBelief(model) if self.strategy == DIAGNOSE else NoBelief()
+        judge = Judge(model) if self.strategy == DIAGNOSE else None
         settings = replace(self.settings, feedback=self.strategy != OPEN)
-        return Actor(self.planner, model, task, belief, standing, settings)
+        return Actor(self.planner, model, task, Belief(model), standing, settings, judge)
 
     def work(
         self, task: Task, commander: Commander, tell: Callable[[str], None]
@@ -82,8 +82,7 @@ class Acting:
         """Carry a task out on an arm and return what became of each target."""
         standing = first_standing(commander)
         actor = self.actor(task, standing)
-        judge = Judge(self.model) if self.strategy == DIAGNOSE else None
-        Work(actor, judge, self.gate, commander, standing, tell).carry_out()
+        Work(actor, self.gate, commander, standing, tell).carry_out()
         if self.spared is not None:
             for line in sparing_lines(self.known.robot.motor_names, self.spared, actor.ways):
                 tell(line)

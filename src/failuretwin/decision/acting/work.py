@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -12,12 +12,11 @@ import numpy as np
 from failuretwin.connection.links.base import Commander, CommandSent, Event, Order, Reading
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm, Seen
-from failuretwin.decision.acting.judging import Judge, Judgement
 from failuretwin.decision.acting.planner import Standing
 from failuretwin.decision.acting.rest import RestWatch
 from failuretwin.decision.acting.safety import SafetyGate, UnsafeOrderError
+from failuretwin.inference.observation.healthy_model import HealthyModel
 
 FIRST_WAIT_S = 10.0
 """Longest wait for the first reading, by our clock [s]."""
@@ -35,30 +34,18 @@ class Halted(InputError):  # noqa: N818 - it is no error of the user
 
 
 class Worker(Protocol):
-    """Says what to order next, by what was seen: an `Actor`, a `HealthCheck`, a `Question`."""
+    """Source of orders that depend on what was seen: an `Actor` or an `OrderSequence`."""
 
-    @property
-    def arm(self) -> BelievedArm:
-        """The arm as it is worked with."""
-        ...
-
-    @property
-    def belief(self) -> Belief:
-        """What the arm is taken to be."""
-        ...
-
-    @property
-    def window(self) -> Sequence[Seen]:
-        """Movements that are to be weighed before `learn`."""
-        ...
+    model: HealthyModel
+    """The healthy arm."""
 
     @property
     def said(self) -> Sequence[str]:
-        """What is to be told so far."""
+        """Messages so far."""
         ...
 
     def standing(self) -> Standing:
-        """Return where the arm stands as far as is believed."""
+        """Return the believed position of the arm."""
         ...
 
     def next(self) -> Order | None:
@@ -69,9 +56,46 @@ class Worker(Protocol):
         """Take where the tool came to rest after the last order, (3,) [m]; None: not seen."""
         ...
 
-    def learn(self, judgement: Judgement | None) -> None:
-        """Learn from the movement that was seen."""
-        ...
+
+@dataclass
+class OrderSequence:
+    """Orders from an iterator for an arm that is taken for healthy.
+
+    Attributes:
+        model: The healthy arm.
+        command: Last command, (motor,) [rad].
+        orders: The orders; advanced after the movement before was seen.
+        said: Messages so far.
+        seen: Movements so far.
+    """
+
+    model: HealthyModel
+    command: FloatArray
+    orders: Iterator[Order]
+    said: list[str] = field(default_factory=list)
+    seen: list[Seen] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._previous = self.command
+        self._order: Order | None = None
+
+    def standing(self) -> Standing:
+        """Return the position of the arm if it is healthy."""
+        pose = BelievedArm(self.model).settle(self.command, self._previous, 0.0)
+        return Standing(pose, self.command, 0.0)
+
+    def next(self) -> Order | None:
+        """Return the next order; None: there is none."""
+        self._order = next(self.orders, None)
+        if self._order is not None:
+            self._previous, self.command = self.command, self._order.target
+        return self._order
+
+    def see(self, point: FloatArray | None, start_s: float, rest_s: float) -> None:
+        """Add where the tool came to rest after the last order, (3,) [m]; None: not seen."""
+        assert self._order is not None
+        told = (self.command, self._previous, self._order.duration)
+        self.seen.append(Seen(*told, start_s, rest_s, point))
 
 
 @dataclass
@@ -80,7 +104,6 @@ class Work:
 
     Attributes:
         actor: Says what to do next.
-        judge: Weighs movements; None: nothing is diagnosed.
         gate: Looks at each order again before it is sent.
         commander: The arm.
         standing: What its motors were told last, (motor,) [rad].
@@ -89,7 +112,6 @@ class Work:
     """
 
     actor: Worker
-    judge: Judge | None
     gate: SafetyGate
     commander: Commander
     standing: FloatArray
@@ -116,14 +138,8 @@ class Work:
             start = self._now
             point = self._rest(order, start)
             self.actor.see(point, start, self._now)
-            self.actor.learn(self._judgement())
             self._report()
         self._report()
-
-    def _judgement(self) -> Judgement | None:
-        if self.judge is None:
-            return None
-        return self.judge([self.actor.window], [self.actor.belief.believed])[0]
 
     def _report(self) -> None:
         for text in self.actor.said[self._told :]:
@@ -157,9 +173,9 @@ class Work:
     def _rest(self, order: Order, start: float) -> FloatArray | None:
         """Return where the tool comes to rest after an order, (3,) [m]; None: it is not seen to."""
         actor, ramp = self.actor, float(order.duration.max())
-        expected = actor.arm.model.twin.path(actor.standing().pose)
+        expected = actor.model.twin.path(actor.standing().pose)
         travel = 0.0 if self._point is None else float(np.linalg.norm(expected - self._point))
-        watch = RestWatch(actor.arm.model, start, ramp, self._point, travel)
+        watch = RestWatch(actor.model, start, ramp, self._point, travel)
         while self._now - start < ramp + PATIENCE_S:
             event = self._next_event()
             if not isinstance(event, Reading):

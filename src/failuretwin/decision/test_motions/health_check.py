@@ -7,7 +7,7 @@ Section: docs/check.md#result-of-a-check
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,12 +23,10 @@ from failuretwin.core.hypothesis import (
     motor_probabilities,
 )
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.belief import Belief, NoBelief
-from failuretwin.decision.acting.believed_arm import BelievedArm, Seen
+from failuretwin.decision.acting.believed_arm import Seen
 from failuretwin.decision.acting.judging import settled_evidence_of, shown_faults
-from failuretwin.decision.acting.planner import Standing
 from failuretwin.decision.acting.safety import SafetyGate
-from failuretwin.decision.acting.work import Work, first_standing
+from failuretwin.decision.acting.work import OrderSequence, Work, first_standing
 from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.decision.test_motions.motions import Motions
 from failuretwin.failure_behavior.mode import Range, Signature
@@ -207,17 +205,16 @@ def result_of(likelihood: RunLikelihood, diagnosis: Diagnosis, further: int = 0)
 
 @dataclass
 class HealthCheck:
-    """Makes planned movements on an arm, then further ones while they leave it open what is wrong.
+    """Makes planned movements on an arm, then further ones while the result is open.
 
     Attributes:
         model: The healthy arm.
-        gate: What is safe.
-        motions: What is planned.
-        hypotheses: What may be the case.
+        gate: Safety limits.
+        motions: Planned movements.
+        hypotheses: Hypotheses of the check.
         priors: Beliefs about faults.
-        further: Movements that may be added at most.
+        further: Maximum number of further movements.
         seed: Seed of the poses that are tried for those.
-        said: What is to be told.
         window: Movements as they were seen.
     """
 
@@ -228,79 +225,48 @@ class HealthCheck:
     priors: Priors
     further: int = 0
     seed: int = 0
-    said: list[str] = field(default_factory=list)
     window: list[Seen] = field(default_factory=list)
-    belief: Belief = field(default_factory=NoBelief)
-
-    def __post_init__(self) -> None:
-        self._orders = self.motions.orders
-        self._command = self._previous = self.motions.start
-        self._order: Order | None = None
-        self._added = 0
+    _added: int = field(default=0, init=False)
 
     def work(self, commander: Commander, tell: Callable[[str], None]) -> CheckResult:
-        """Carry the check out on an arm and return what it found."""
+        """Carry the check out on an arm and return the result."""
         standing = first_standing(commander)
-        self._command = self._previous = standing
+        said: list[str] = []
+        orders = self._orders(standing, said)
+        sequence = OrderSequence(self.model, standing, orders, said, self.window)
+        Work(sequence, self.gate, commander, standing, tell).carry_out()
+        return self.result
+
+    def _orders(self, standing: FloatArray, said: list[str]) -> Iterator[Order]:
+        """Yield the way to the start, the planned movements and the further ones."""
         travel = self.motions.start - standing
         if np.abs(travel).max() > 1e-6:
             ramp = np.full(len(standing), self.gate.least_duration(travel))
-            self._orders.insert(0, Order(self.motions.start, ramp))
-        Work(self, None, self.gate, commander, standing, tell).carry_out()
-        return self.result
-
-    # What `Work` asks.
-
-    @property
-    def arm(self) -> BelievedArm:
-        """The arm as it is worked with."""
-        return BelievedArm(self.model)
-
-    def standing(self) -> Standing:
-        """Return where the arm stands if it is healthy."""
-        pose = self.arm.settle(self._command, self._previous, 0.0)
-        return Standing(pose, self._command, 0.0)
-
-    def next(self) -> Order | None:
-        """Return the next order; None: the check is over."""
-        order = self._orders.pop(0) if self._orders else self._further_order()
-        if order is not None:
-            self._previous, self._command, self._order = self._command, order.target, order
-        return order
-
-    def see(self, point: FloatArray | None, start_s: float, rest_s: float) -> None:
-        """Take where the tool came to rest, (3,) [m]; None: it was not seen at rest."""
-        assert self._order is not None
-        told = (self._command, self._previous, self._order.duration)
-        self.window.append(Seen(*told, start_s, rest_s, point))
-
-    def learn(self, judgement: object) -> None:
-        """Learn nothing: all movements are judged together."""
-
-    def _further_order(self) -> Order | None:
-        if self._added >= self.further or self.result.light != OPEN:
-            return None
-        found = next_movement(self.model, self.gate, self.posterior, self._command, self.seed)
-        if found is None:
-            return None
-        self._added += 1
-        self.said.append(f"still open: further movement {self._added}")
-        return found
-
-    # What was found.
+            yield Order(self.motions.start, ramp)
+        yield from self.motions.orders
+        for number in range(1, self.further + 1):
+            if self.result.light != OPEN:
+                return
+            at = self.window[-1].command
+            order = next_movement(self.model, self.gate, self.posterior, at, self.seed)
+            if order is None:
+                return
+            self._added = number
+            said.append(f"still open: further movement {number}")
+            yield order
 
     @property
     def likelihood(self) -> RunLikelihood:
-        """What all movements say."""
+        """Likelihood of all movements."""
         return RunLikelihood(settled_evidence_of([self.window]), self.model)
 
     @property
     def posterior(self) -> Posterior:
-        """Of all hypotheses, by all movements."""
+        """Posterior of all hypotheses given all movements."""
         return judged(self.likelihood, self.hypotheses, self.priors)
 
     @property
     def result(self) -> CheckResult:
-        """What the check found."""
+        """Result of the check."""
         diagnosis = self.posterior.to_diagnosis(0, "check", LogQuality())
         return result_of(self.likelihood, diagnosis, self._added)

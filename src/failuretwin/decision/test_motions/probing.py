@@ -10,8 +10,8 @@ Section: docs/live.md#probe-movements
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -21,17 +21,13 @@ from failuretwin.connection.links.stream_time import StreamClock
 from failuretwin.core.alarm import CLEAR, RAISED
 from failuretwin.core.errors import InputError, counted
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.belief import Belief, NoBelief
-from failuretwin.decision.acting.believed_arm import BelievedArm, Seen
-from failuretwin.decision.acting.planner import Standing
 from failuretwin.decision.acting.rest import RestWatch
 from failuretwin.decision.acting.safety import SafetyGate, UnsafeOrderError
-from failuretwin.decision.acting.work import Work
+from failuretwin.decision.acting.work import OrderSequence, Work
 from failuretwin.decision.streaming.alarm_rule import NAMED
 from failuretwin.decision.streaming.monitor import Believed, FaultMonitor
 from failuretwin.decision.test_motions.design import Designer
 from failuretwin.decision.test_motions.outlook import Outlook, of_belief
-from failuretwin.inference.observation.healthy_model import HealthyModel
 
 IDLE_S = 10.0
 """Nobody has commanded an arm for so long that is asked [s]."""
@@ -61,58 +57,6 @@ class ProbeRules:
                 f"{self.most} movements after {self.idle_s:g} s of rest make no sense. Expected "
                 "0 or more of each."
             )
-
-
-@dataclass
-class Question:
-    """Asks one arm by one movement after the other, each with the way back.
-
-    Attributes:
-        model: The healthy arm.
-        home: What its motors were told by others, (motor,) [rad].
-        choose: Returns the next movement and the way back; None: there is nothing to ask.
-        said: What is to be told.
-    """
-
-    model: HealthyModel
-    home: FloatArray
-    choose: Callable[[], tuple[Order, Order] | None]
-    said: list[str] = field(default_factory=list)
-    belief: Belief = field(default_factory=NoBelief)
-    window: Sequence[Seen] = ()
-    asked: int = 0
-
-    def __post_init__(self) -> None:
-        self._command = self._previous = self.home
-        self._back: Order | None = None
-
-    @property
-    def arm(self) -> BelievedArm:
-        """The arm as it is worked with."""
-        return BelievedArm(self.model)
-
-    def standing(self) -> Standing:
-        """Return where the arm stands if it is healthy."""
-        pose = self.arm.settle(self._command, self._previous, 0.0)
-        return Standing(pose, self._command, 0.0)
-
-    def next(self) -> Order | None:
-        """Return the next order; None: the arm is back and nothing is left to ask."""
-        order, self._back = self._back, None
-        if order is None:
-            chosen = self.choose()
-            if chosen is None:
-                return None
-            order, self._back = chosen
-            self.asked += 1
-        self._previous, self._command = self._command, order.target
-        return order
-
-    def see(self, point: FloatArray | None, start_s: float, rest_s: float) -> None:
-        """Take nothing: the watch hears the same readings."""
-
-    def learn(self, judgement: object) -> None:
-        """Learn nothing: the watch does."""
 
 
 class Prober:
@@ -204,11 +148,12 @@ class Prober:
         if home is None or answer is None:
             return
         tell(f"{answer.alarm.cause} is suspected and the arm stands still: it is asked")
-        question = Question(self._monitor.believed.model, home, lambda: self._choose(home))
+        orders, left = self._orders(home), self._left
         if not self._rules.moves:
-            tell(_would(question.next()))
+            tell(_would(next(orders, None)))
             return
-        work = Work(question, None, self._gate, self._commander, home, tell, hear)
+        sequence = OrderSequence(self._monitor.believed.model, home, orders)
+        work = Work(sequence, self._gate, self._commander, home, tell, hear)
         self._asking = True
         try:
             work.carry_out()
@@ -220,8 +165,14 @@ class Prober:
             if not np.array_equal(work.standing, home):
                 tell("the arm was not sent back to where it was")
         if not self._over:
-            made = f"asked by {counted(question.asked, 'movement')}, the arm is back where it was"
-            tell(made if question.asked else NOTHING_SAFE)
+            asked = left - self._left
+            made = f"asked by {counted(asked, 'movement')}, the arm is back where it was"
+            tell(made if asked else NOTHING_SAFE)
+
+    def _orders(self, home: FloatArray) -> Iterator[Order]:
+        """Yield movements that ask, each with the way back."""
+        while (chosen := self._choose(home)) is not None:
+            yield from chosen
 
     def _choose(self, home: FloatArray) -> tuple[Order, Order] | None:
         """Return the movement that tells most and the way back; None: it is settled, or unsafe."""
