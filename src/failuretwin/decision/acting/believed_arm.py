@@ -119,8 +119,12 @@ class BelievedFault:
     @property
     def inverted(self) -> bool:
         """Whether a known offset is taken off its commands."""
-        offset = self.reaction in (Reaction.INVERT, Reaction.SPARE)
-        return offset and bool(np.isfinite(self.size))
+        offset = self.mode.signature in (Signature.OFFSET, Signature.GROWING_OFFSET)
+        return offset and not self.set_aside and bool(np.isfinite(self.size))
+
+    def age_s(self, time_s: FloatArray | float) -> FloatArray:
+        """Return the time since the fault began [s], 0 before."""
+        return np.maximum(np.asarray(time_s) - self.since_s, 0.0)
 
 
 @dataclass(frozen=True)
@@ -161,13 +165,15 @@ class BelievedArm:
             mask[self.fault.motor] = faulty
         return mask
 
-    def settle(self, command: FloatArray, previous: FloatArray, time_s: float) -> FloatArray:
-        """Return the pose that a command leads to, (motor,) [rad].
+    def settle(
+        self, command: FloatArray, previous: FloatArray, time_s: FloatArray | float
+    ) -> FloatArray:
+        """Return the poses that commands lead to, (..., motor) [rad].
 
         Args:
-            command: What the motors are told, (motor,) [rad].
-            previous: What they were told before, (motor,) [rad].
-            time_s: When they arrive [s]; counts for faults that grow.
+            command: Commands, (..., motor) [rad].
+            previous: Commands before them, (..., motor) [rad].
+            time_s: Times of arrival, (...) [s]; they count for faults that grow.
         """
         travel = command - previous
         direction = np.where(np.abs(travel) > UNMOVED_RAD, np.sign(travel), 0.0)
@@ -177,16 +183,15 @@ class BelievedArm:
         pose = self.model.settle(base, direction, self.held)
         if fault is None or not fault.inverted:
             return pose
-        k, load = fault.motor, 0.0
+        k, load = fault.motor, np.zeros(pose.shape[:-1])
         if fault.mode.needs_compliance:
             settling = self.model.settling
-            give = sag(self.robot, pose, np.asarray(settling.compliance), settling.payload)
-            load = float(give[k])
-        since = max(time_s - fault.since_s, 0.0)
-        told = (previous[k], command[k], direction[k], since, load)
-        arrival = Arrival(*(np.array(value) for value in told))
+            give = np.asarray(settling.compliance)
+            load = sag(self.robot, pose, give, settling.payload)[..., k]
+        told, age_s = (previous, command, direction), fault.age_s(time_s)
+        arrival = Arrival(*(np.asarray(each[..., k]) for each in told), since_onset=age_s, sag=load)
         found = pose.copy()
-        found[k] += float(fault.mode.settled_offset(np.array(fault.size), arrival))
+        found[..., k] += fault.mode.settled_offset(np.array(fault.size), arrival)
         return found
 
     def command_for(self, pose: FloatArray, previous: FloatArray, time_s: float) -> FloatArray:
@@ -298,20 +303,20 @@ class BelievedArm:
         sure, odd = np.log1p(-OUTLIER_RATE), np.log(OUTLIER_RATE)
         return float(np.logaddexp(sure + found, odd + self.model.anywhere_log_density))
 
-    def scatter(self, command: FloatArray, time_s: float) -> FloatArray:
-        """Return by how much each motor settles beside `settle`, (motor,) [rad]."""
-        scatter, fault = self.model.scatter.copy(), self.fault
+    def scatter(self, command: FloatArray, time_s: FloatArray | float) -> FloatArray:
+        """Return the standard deviation of each motor around `settle`, (..., motor) [rad]."""
+        scatter, fault = np.broadcast_to(self.model.scatter, command.shape).copy(), self.fault
         if fault is None:
             return scatter
         k, mode = fault.motor, fault.mode
         if fault.rests:
-            scatter[k] = np.hypot(fault.spread / HALF_90, self.model.held_scatter[k])
+            scatter[..., k] = np.hypot(fault.spread / HALF_90, self.model.held_scatter[k])
         elif mode.signature is Signature.REDRAWN_OFFSET:
-            scatter[k] = np.hypot(scatter[k], fault.likely_size)
+            scatter[..., k] = np.hypot(scatter[..., k], fault.likely_size)
         elif fault.inverted:
-            per_unit = {"rad": 1.0, "rad/s": max(time_s - fault.since_s, 0.0)}
-            angle = fault.spread / HALF_90 * per_unit.get(mode.unit, abs(float(command[k])))
-            scatter[k] = np.hypot(scatter[k], angle)
+            per_unit = {"rad": np.ones(()), "rad/s": fault.age_s(time_s)}
+            angle = fault.spread / HALF_90 * per_unit.get(mode.unit, np.abs(command[..., k]))
+            scatter[..., k] = np.hypot(scatter[..., k], angle)
         return scatter
 
     def most_probable_pose(self, seen: Seen) -> FloatArray:

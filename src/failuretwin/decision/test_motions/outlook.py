@@ -19,14 +19,13 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import Weighted
 from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault
 from failuretwin.decision.streaming.monitor import Believed
 from failuretwin.decision.test_motions.information import (
     expected_information,
     pairwise_distance,
 )
-from failuretwin.digital_model.settling import sag
-from failuretwin.failure_behavior.fault import Arrival
-from failuretwin.failure_behavior.mode import FaultMode, Signature
+from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.observation.command_loss import OUTLIER_RATE
@@ -40,8 +39,6 @@ HELD = 4
 told to be first, half way, or last but one, from then on."""
 NEGLIGIBLE = 1e-3
 """Hypotheses that are less probable are left out."""
-UNMOVED_RAD = 1e-9
-"""Commands nearer than this are the same [rad]."""
 
 
 @dataclass(frozen=True)
@@ -61,10 +58,14 @@ class Member:
     share: float
     first: int = 0
 
-    @property
-    def mode(self) -> FaultMode | None:
-        """The mode of its fault; None: healthy."""
-        return None if self.hypothesis.is_healthy else MODES[self.hypothesis.faults[0].mode]
+    def fault(self, model: HealthyModel) -> BelievedFault | None:
+        """Return its fault on a robot; None: healthy."""
+        if self.hypothesis.is_healthy:
+            return None
+        fault = self.hypothesis.faults[0]
+        held = MODES[fault.mode].signature is Signature.HELD
+        motor, angle = model.motor_names.index(fault.motor), self.size if held else np.nan
+        return BelievedFault(fault, motor, self.size, angle=angle)
 
 
 def of_priors(
@@ -185,12 +186,6 @@ class Asked:
     def __getitem__(self, some: IntArray) -> Asked:
         return Asked(self.command[some], self.previous[some], self.since_s[some], self.number[some])
 
-    @property
-    def direction(self) -> FloatArray:
-        """Sign of the travel of each motor, (movement, motor)."""
-        travel = self.command - self.previous
-        return np.where(np.abs(travel) > UNMOVED_RAD, np.sign(travel), 0.0)
-
 
 @dataclass(frozen=True)
 class Outlook:
@@ -236,11 +231,11 @@ class Outlook:
         angles = np.stack([np.median(told, axis=0), *told[list(begin[1:])]])
         members, count = list(self.members), 0
         for at, member in enumerate(members):
-            if member.mode is None or not np.isnan(member.size):
+            fault = member.fault(self.model)
+            if fault is None or not np.isnan(member.size):
                 continue
-            k = self.model.motor_names.index(member.hypothesis.faults[0].motor)
             way = count % HELD
-            members[at] = replace(member, size=float(angles[way, k]), first=begin[way])
+            members[at] = replace(member, size=float(angles[way, fault.motor]), first=begin[way])
             count += 1
         return Outlook(self.model, members)
 
@@ -250,16 +245,13 @@ class Outlook:
         Returns:
             (movement, member, channel) [m] and (movement, member, channel, channel) [m2].
         """
-        command = asked.command
-        healthy = self.model.settle(command, asked.direction, self.model.none_held)
+        healthy = BelievedArm(self.model).settle(asked.command, asked.previous, asked.since_s)
         pose = np.repeat(healthy[:, None], len(self.members), axis=1)
         scatter = np.broadcast_to(self.model.scatter, pose.shape).copy()
         for at, member in enumerate(self.members):
             struck = np.flatnonzero(asked.number >= member.first)
-            if member.mode is not None and len(struck):
-                pose[struck, at], scatter[struck, at] = self._struck(
-                    member, asked[struck], pose[struck, at], scatter[struck, at]
-                )
+            if not member.hypothesis.is_healthy and len(struck):
+                pose[struck, at], scatter[struck, at] = self._faulty(member, asked[struck])
         mean, jacobian = self.model.sensors.expected(pose)
         root = jacobian * scatter[..., None, :]
         noise = self.model.path_noise**2 * np.eye(mean.shape[-1])
@@ -274,40 +266,15 @@ class Outlook:
         """Return what distances (..., member, member) tell about the hypothesis, (...) [nats]."""
         return expected_information(nats, self.log_share, self.kind)
 
-    def _struck(
-        self, member: Member, asked: Asked, pose: FloatArray, scatter: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return where motors settle with a fault, and how they scatter, (movement, motor) [rad].
-
-        Args:
-            member: The fault.
-            asked: Movements that it spoils.
-            pose: Where they settle without it.
-            scatter: How they scatter without it.
-        """
-        mode, size = member.mode, member.size
-        k = self.model.motor_names.index(member.hypothesis.faults[0].motor)
-        if mode is None or np.isnan(size):
-            return pose, scatter
-        pose, scatter = pose.copy(), scatter.copy()
-        missed = asked.previous[:, k] - asked.command[:, k]
-        if mode.signature is Signature.HELD:
-            held = np.arange(scatter.shape[1]) == k
-            pose = self.model.settle(np.where(held, size, asked.command), asked.direction, held)
-            scatter[:, k] = self.model.held_scatter[k]
-        elif mode.signature is Signature.REDRAWN_OFFSET:
-            scatter[:, k] = np.hypot(scatter[:, k], size)
-        elif mode.signature is Signature.MISSED:
-            pose[:, k] += size * missed
-            scatter[:, k] = np.hypot(scatter[:, k], np.sqrt(size * (1.0 - size)) * missed)
-        else:
-            load = self._load(pose, k) if mode.needs_compliance else np.zeros(len(pose))
-            told = (asked.previous[:, k], asked.command[:, k], asked.direction[:, k])
-            pose[:, k] += mode.settled_offset(np.array(size), Arrival(*told, asked.since_s, load))
+    def _faulty(self, member: Member, asked: Asked) -> tuple[FloatArray, FloatArray]:
+        """Return mean and standard deviation of settled motors, (movement, motor) [rad]."""
+        fault = member.fault(self.model)
+        arm = BelievedArm(self.model, fault)
+        pose = arm.settle(asked.command, asked.previous, asked.since_s)
+        scatter = arm.scatter(asked.command, asked.since_s)
+        if fault is not None and fault.obeys:
+            k, rate = fault.motor, fault.size
+            missed = asked.previous[:, k] - asked.command[:, k]
+            pose[:, k] += rate * missed
+            scatter[:, k] = np.hypot(scatter[:, k], np.sqrt(rate * (1.0 - rate)) * missed)
         return pose, scatter
-
-    def _load(self, pose: FloatArray, k: int) -> FloatArray:
-        """Return how far the load moves motor k, (movement,) [rad]."""
-        settling = self.model.settling
-        give = np.asarray(settling.compliance)
-        return np.asarray(sag(self.model.twin.robot, pose, give, settling.payload)[:, k])
