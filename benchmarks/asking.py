@@ -41,7 +41,7 @@ from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.believed_arm import Seen
 from failuretwin.decision.acting.judging import settled_evidence_of
 from failuretwin.decision.acting.safety import SafetyGate
-from failuretwin.decision.proportions import wilson_interval
+from failuretwin.decision.proportions import Share
 from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.decision.test_motions.design import Designer, Movement, next_movement
 from failuretwin.decision.test_motions.health_check import (
@@ -152,7 +152,7 @@ def carried_out(
 
 def share(hits: FloatArray) -> str:
     """Return how many, and the Wilson interval of the share."""
-    low, high = wilson_interval(int(np.sum(hits)), len(hits))
+    low, high = Share(int(np.sum(hits)), len(hits)).interval
     return f"{int(np.sum(hits))}/{len(hits)} ({100 * low:.1f} to {100 * high:.1f} %)"
 
 

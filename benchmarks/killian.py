@@ -24,7 +24,7 @@ import failuretwin as ft
 from failuretwin.connection.calibration.calibrate import calibrate
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis, single_faults
 from failuretwin.decision.evaluation import Judged, score_line
-from failuretwin.decision.proportions import wilson_interval
+from failuretwin.decision.proportions import Share
 from failuretwin.decision.results import write_json_lines
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import load_calibration
@@ -104,7 +104,7 @@ def report(name: str, listed: Sequence[TrueRun], diagnoses: Sequence[Diagnosis])
     for row in judged.scores.by_class():
         if row.runs:
             hits = round(row.recall * row.runs)
-            low, high = wilson_interval(hits, row.runs)
+            low, high = Share(hits, row.runs).interval
             print(f"  {row.name}: {hits} of {row.runs} ({100 * low:.0f} to {100 * high:.0f} %)")
     healthy = [d for d in diagnoses if d.truth == "healthy"]
     alarms = sum(d.diagnosis not in ("healthy", None) for d in healthy)

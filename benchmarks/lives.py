@@ -16,7 +16,7 @@ import numpy as np
 
 import failuretwin as ft
 from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.decision.proportions import wilson_interval
+from failuretwin.decision.proportions import Share
 from failuretwin.inference.together.fault_course import FaultCourse
 
 RUNS, SHORTEST, OF_CLASS, NEAR = 30, 4, 60, 2
@@ -38,7 +38,7 @@ def main() -> None:
     rng = np.random.default_rng(1)
     told = np.array([_told(by_class, names[1:], rng) for _ in range(options.lives)])
     for title, right in zip(("run named within two", "and nothing else said"), told.T, strict=True):
-        low, high = wilson_interval(int(right.sum()), len(right))
+        low, high = Share(int(right.sum()), len(right)).interval
         print(f"{title}: {right.mean():.1%} of {len(right)} ({low:.1%} to {high:.1%})")
 
 

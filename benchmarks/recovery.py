@@ -22,7 +22,7 @@ from failuretwin.connection.calibration.calibrate import fit_calibration
 from failuretwin.connection.calibration.observations import observe
 from failuretwin.connection.calibration.settling_fit import SortedMovements, fit_settling
 from failuretwin.core.hypothesis import HEALTHY
-from failuretwin.decision.proportions import wilson_interval
+from failuretwin.decision.proportions import Share
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections, Variation, vary
 from failuretwin.digital_model.robot import Robot
@@ -140,7 +140,7 @@ def main() -> None:
         if trials == 0:
             print(f"  {name:34s} {motor:18s} never identified")
             continue
-        low, high = wilson_interval(inside, trials)
+        low, high = Share(inside, trials).interval
         print(f"  {name:34s} {motor:18s} {inside:4d} of {trials:4d} ({low:.3f} to {high:.3f})")
 
 

@@ -26,7 +26,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from failuretwin.decision.proportions import wilson_interval
+from failuretwin.decision.proportions import Share
 
 ASKED = "several arms could carry the tool"
 
@@ -179,7 +179,7 @@ def show(tried: Sequence[Tried]) -> None:
 
 def _share(name: str, right: int, of: int) -> None:
     if of:
-        low, high = wilson_interval(right, of)
+        low, high = Share(right, of).interval
         print(f"{name}: {right} of {of}, 95 % interval {100 * low:.1f} to {100 * high:.1f} %")
 
 

@@ -18,7 +18,6 @@ from failuretwin.decision.proportions import (
     coverage_by_mode,
     judged_truth,
     score,
-    wilson_interval,
 )
 
 TRUTH = ["a", "a", "a", "b", "b", "c"]
@@ -43,7 +42,7 @@ def test_confusion_has_a_row_for_each_truth(scores):
     )
     assert (scores.right, scores.runs) == (3, 6)
     assert scores.accuracy == 0.5
-    assert scores.interval == wilson_interval(3, 6)
+    assert scores.interval == Share(3, 6).interval
 
 
 def test_classes_are_scored_apart(scores):
@@ -126,13 +125,13 @@ def test_unknown_means_every_fault_that_is_not_named(truth, hypotheses, right):
 def test_wilson_interval_is_that_of_scipy(trials, share):
     successes = round(share * trials)
     expected = binomtest(successes, trials).proportion_ci(method="wilson")
-    np.testing.assert_allclose(wilson_interval(successes, trials), expected, rtol=1e-9, atol=1e-12)
-    assert Share(successes, trials).interval == wilson_interval(successes, trials)
-    assert Share(successes, trials).value == successes / trials
+    share = Share(successes, trials)
+    np.testing.assert_allclose(share.interval, expected, rtol=1e-9, atol=1e-12)
+    assert share.value == successes / trials
 
 
 def test_a_share_of_nothing_is_not_known():
-    assert wilson_interval(0, 0) == Share(0, 0).interval == (0.0, 1.0)
+    assert Share(0, 0).interval == (0.0, 1.0)
     assert np.isnan(Share(0, 0).value)
 
 

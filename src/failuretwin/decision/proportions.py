@@ -12,16 +12,6 @@ from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.decision.scoring_rules import LogScore, log_score
 
 
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """Return the Wilson 95 % interval of a share (Wilson, JASA 1927); (0, 1) of no trials."""
-    from scipy.stats import binomtest
-
-    if trials == 0:
-        return 0.0, 1.0
-    low, high = binomtest(int(successes), int(trials)).proportion_ci(method="wilson")
-    return float(low), float(high)
-
-
 @dataclass(frozen=True)
 class Share:
     """`count` of `total`; the value is NaN where the total is 0."""
@@ -36,8 +26,13 @@ class Share:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Wilson 95 % interval."""
-        return wilson_interval(self.count, self.total)
+        """Wilson 95 % interval (Wilson, JASA 1927); (0, 1) where the total is 0."""
+        from scipy.stats import binomtest
+
+        if self.total == 0:
+            return 0.0, 1.0
+        low, high = binomtest(self.count, self.total).proportion_ci(method="wilson")
+        return float(low), float(high)
 
 
 # Accuracy, confusion matrix, precision, recall and F1.
@@ -106,7 +101,7 @@ class Scores:
     @property
     def interval(self) -> tuple[float, float]:
         """Wilson 95 % interval of the accuracy."""
-        return wilson_interval(self.right, self.runs)
+        return Share(self.right, self.runs).interval
 
     @property
     def macro_f1(self) -> float:

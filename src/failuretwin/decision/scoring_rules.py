@@ -108,7 +108,7 @@ def reliability(
     """
     if not confidence.size or not np.all((confidence >= 0.0) & (confidence <= 1.0)):
         raise InputError("expected the stated probability of at least one run, within 0 to 1.")
-    inside, bins = _bin_of(confidence, edges), len(edges) - 1
+    inside, bins = np.searchsorted(edges[1:-1], confidence, side="left"), len(edges) - 1
     count = np.bincount(inside, minlength=bins)
     total = np.bincount(inside, weights=confidence, minlength=bins)
     mean = np.full(bins, np.nan)
@@ -124,15 +124,9 @@ def calibrated_error(
     Answers are drawn from the stated probabilities, (run,) (consistency resampling: Broecker &
     Smith, Weather and Forecasting 2007).
     """
-    inside, runs = _bin_of(confidence, EQUAL_EDGES), len(confidence)
-    order = np.argsort(inside, kind="stable")
-    first, stated = np.flatnonzero(np.diff(inside[order], prepend=-1)), confidence[order]
-    surplus = ((rng.random(runs) < stated) - stated for _ in range(draws))
-    return np.array([np.abs(np.add.reduceat(each, first)).sum() for each in surplus]) / runs
-
-
-def _bin_of(confidence: FloatArray, edges: FloatArray) -> IntArray:
-    return np.searchsorted(edges[1:-1], confidence, side="left").astype(np.int64)
+    runs = len(confidence)
+    drawn = (rng.random(runs) < confidence for _ in range(draws))
+    return np.array([reliability(confidence, right).error for right in drawn])
 
 
 # Simulation-based calibration: rank of the truth among posterior draws.
