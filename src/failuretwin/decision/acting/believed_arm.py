@@ -188,8 +188,8 @@ class BelievedArm:
             settling = self.model.settling
             give = np.asarray(settling.compliance)
             load = sag(self.robot, pose, give, settling.payload)[..., k]
-        told, age_s = (previous, command, direction), fault.age_s(time_s)
-        arrival = Arrival(*(np.asarray(each[..., k]) for each in told), since_onset=age_s, sag=load)
+        told = (previous[..., k], command[..., k], direction[..., k], fault.age_s(time_s), load)
+        arrival = Arrival(*(np.asarray(each) for each in told))
         found = pose.copy()
         found[..., k] += fault.mode.settled_offset(np.array(fault.size), arrival)
         return found
