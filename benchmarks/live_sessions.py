@@ -138,8 +138,8 @@ def main() -> None:
             write_bag(bag, list(session_events(session, robot)), robot)
             events = through_ros(replay(bag, robot, Pace(SPEED)), robot)
         live = as_session(events, session, robot)
-        batch = diagnoser.diagnose(session_runs(session, robot, "measured").to_dataset())
-        again = diagnoser.diagnose(session_runs(live, robot, "measured").to_dataset())
+        batch = diagnoser.diagnose(session_runs(session, robot, "measured"))
+        again = diagnoser.diagnose(session_runs(live, robot, "measured"))
         stream = stream_answers(live, robot)
         same = sum(a.diagnosis == b.diagnosis for a, b in zip(batch, again, strict=True))
         off = max(

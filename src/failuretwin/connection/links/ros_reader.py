@@ -16,10 +16,10 @@ from failuretwin.data_knowledge.readers.bag_messages import (
     NS_PER_S,
     Kind,
     Role,
-    joint_rows,
-    tool_rows,
+    Rows,
+    topic_rows,
 )
-from failuretwin.data_knowledge.readers.bags import Track, motor_track
+from failuretwin.data_knowledge.readers.bags import motor_rows
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -105,16 +105,12 @@ class RosReader:
         """
         if kind not in KINDS[self._role]:
             raise InputError(f"{self._where}: {kind.value} cannot be the {self._role}.")
-        messages = [BagMessage(received_ns, content)]
-        if self._role == "tool":
-            rows = tool_rows(messages, kind)
-            return self._readings(rows.stamp_ns.tolist(), rows.value)
-        command = self._role == "command"
-        joints = joint_rows(messages, kind, self._where, command=command)
-        track = motor_track(joints, self._robot, self._where)
-        if command:
-            return self._commands(track)
-        return self._readings(track.stamp_ns.tolist(), track.value)
+        rows = topic_rows([BagMessage(received_ns, content)], kind, self._role, self._where)
+        if self._role != "tool":
+            rows = motor_rows(rows, self._robot)
+        if self._role == "command":
+            return self._commands(rows)
+        return self._readings(rows.stamp_ns.tolist(), rows.value)
 
     def _readings(self, stamps_ns: list[int], values: FloatArray) -> list[Event]:
         checked = self._checked(values, LARGEST)
@@ -130,14 +126,14 @@ class RosReader:
             return Reading(time, np.full(3, np.nan), value)
         return motor_reading(time, value, self._twin)
 
-    def _commands(self, track: Track) -> list[Event]:
-        targets = self._checked(track.value, LARGEST)
-        times = (track.stamp_ns / NS_PER_S).tolist()
-        if track.duration is None:
-            rows = zip(times, targets, strict=True)
-            sampled = [self._samples.add(time, self._completed(row)) for time, row in rows]
+    def _commands(self, rows: Rows) -> list[Event]:
+        targets = self._checked(rows.value, LARGEST)
+        times = (rows.stamp_ns / NS_PER_S).tolist()
+        if rows.duration is None:
+            samples = zip(times, targets, strict=True)
+            sampled = [self._samples.add(time, self._completed(row)) for time, row in samples]
             return [command for command in sampled if command is not None]
-        durations = self._checked(track.duration, LONGEST_S)
+        durations = self._checked(rows.duration, LONGEST_S)
         events: list[Event] = []
         for row, time in enumerate(times):
             target, longest = self._completed(targets[row]), float(np.nanmax(durations[row]))

@@ -17,6 +17,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.runs import AXES
 from failuretwin.core.types import MS_PER_S, FloatArray, IntArray, as_floats
 from failuretwin.data_knowledge.readers.bag_file import BagMessage, BagTopic
 
@@ -109,35 +110,25 @@ def check_role(role: Role, kind: Kind | None, what: str) -> None:
 
 
 @dataclass(frozen=True)
-class JointRows:
-    """Values of joints by name, sorted by time, no time twice.
+class Rows:
+    """Values of one topic, sorted by time, no time twice.
 
     Attributes:
+        where: File and topic, for error texts.
         stamp_ns: (row,) [ns].
+        value: Joints by name (row, name) [counts or rad], motors (row, motor) [rad], or tool
+            positions (row, axis) [m]; NaN where unknown.
         names: Names of the columns.
-        value: (row, name) [counts or rad]; NaN where a message does not name the joint.
-        duration: For targets: the time to get there, (row, name) [s]; None for samples.
+        duration: For targets: the time to get there, like `value` [s]; None for samples.
         in_counts: Whether values are servo counts.
     """
 
-    stamp_ns: IntArray
-    names: tuple[str, ...]
-    value: FloatArray
-    duration: FloatArray | None
-    in_counts: bool
-
-
-@dataclass(frozen=True)
-class ToolRows:
-    """Positions of the tool, sorted by time, no time twice.
-
-    Attributes:
-        stamp_ns: (row,) [ns].
-        value: (row, axis) [m].
-    """
-
+    where: str
     stamp_ns: IntArray
     value: FloatArray
+    names: tuple[str, ...] = ()
+    duration: FloatArray | None = None
+    in_counts: bool = False
 
 
 @dataclass(frozen=True)
@@ -150,40 +141,35 @@ class _Row:
     duration: FloatArray | None = None
 
 
-def tool_rows(messages: Sequence[BagMessage], kind: Kind) -> ToolRows:
-    """Return the tool positions in messages of kind POINT or POSE; lost ones are left out."""
-    rows = {}
-    for message in messages:
-        content = message.content
-        point = content.point if kind is Kind.POINT else content.pose.position
-        if np.isfinite([point.x, point.y, point.z]).all():
-            rows[_stamp_ns(message)] = (point.x, point.y, point.z)
-    stamps = sorted(rows)
-    values = as_floats([rows[stamp] for stamp in stamps]).reshape(-1, 3)
-    return ToolRows(np.array(stamps, dtype=np.int64), values)
-
-
-def joint_rows(
-    messages: Sequence[BagMessage], kind: Kind, where: str, *, command: bool
-) -> JointRows:
-    """Return the joint values in messages of any other kind.
+def topic_rows(messages: Sequence[BagMessage], kind: Kind, role: Role, where: str) -> Rows:
+    """Return the values in the messages of one topic; tool positions without a value are left out.
 
     Args:
-        messages: The messages of one topic.
+        messages: The messages.
         kind: Their kind.
-        where: Name of the file and topic for error texts.
-        command: Whether they are commands; the authors' message then carries durations.
+        role: Their role; the authors' message carries durations if it is ``command``.
+        where: File and topic for error texts.
 
     Raises:
         InputError: If names and values do not fit together or a time makes no sense.
     """
+    if kind in KINDS["tool"]:
+        rows = [_tool_row(message, kind) for message in messages]
+        rows = [row for row in rows if np.isfinite(row.value).all()]
+        return _joined(rows, where, AXES)
     if kind is Kind.TRAJECTORY:
         rows = _trajectory_rows(messages, where)
     elif kind is Kind.MONITORING:
-        rows = [_monitoring_row(message, where, command=command) for message in messages]
+        rows = [_monitoring_row(m, where, command=role == "command") for m in messages]
     else:
         rows = [_state_row(m, where) for m in messages if len(m.content.position)]
-    return _joined(rows, in_counts=kind is Kind.MONITORING)
+    return _joined(rows, where, in_counts=kind is Kind.MONITORING)
+
+
+def _tool_row(message: BagMessage, kind: Kind) -> _Row:
+    content = message.content
+    point = content.point if kind is Kind.POINT else content.pose.position
+    return _Row(_stamp_ns(message), AXES, as_floats([point.x, point.y, point.z]))
 
 
 def _stamp_ns(message: BagMessage) -> int:
@@ -285,9 +271,14 @@ def _check_lengths(names: Sequence[str], values: FloatArray, field: str, where: 
         )
 
 
-def _joined(rows: Sequence[_Row], *, in_counts: bool) -> JointRows:
-    """Return rows as one table; of values with the same stamp, the last received counts."""
-    names = list(dict.fromkeys(name for row in rows for name in row.names))
+def _joined(
+    rows: Sequence[_Row], where: str, first: Sequence[str] = (), *, in_counts: bool = False
+) -> Rows:
+    """Return rows as one table; of values with the same stamp, the last received counts.
+
+    The columns `first` exist in any case.
+    """
+    names = list(dict.fromkeys([*first, *(name for row in rows for name in row.names)]))
     column = {name: index for index, name in enumerate(names)}
     stamps, place = np.unique(
         np.array([row.stamp_ns for row in rows], dtype=np.int64), return_inverse=True
@@ -298,7 +289,7 @@ def _joined(rows: Sequence[_Row], *, in_counts: bool) -> JointRows:
         value[at, columns] = row.value
         duration[at, columns] = np.nan if row.duration is None else row.duration
     timed = any(row.duration is not None for row in rows)
-    return JointRows(stamps, tuple(names), value, duration if timed else None, in_counts)
+    return Rows(where, stamps, value, tuple(names), duration if timed else None, in_counts)
 
 
 # Which topic of a recording is what: commands, the tool's position, motor readings.

@@ -26,21 +26,19 @@ from failuretwin.data_knowledge.readers.bag_messages import (
     NS_PER_S,
     ROLES,
     BagTopics,
-    JointRows,
     Role,
-    ToolRows,
+    Rows,
     check_understood,
     fitting_topics,
-    joint_rows,
     nothing_for,
     only_topic,
     require_kind,
-    tool_rows,
+    topic_rows,
 )
-from failuretwin.data_knowledge.readers.timed_log import Samples, Targets, TimedLog
+from failuretwin.data_knowledge.readers.timed_log import Samples, Targets, TimedLog, held
 from failuretwin.digital_model.robot import Robot
 
-__all__ = ["BagTopics", "Track", "is_bag", "motor_track", "read_bag", "read_targets"]
+__all__ = ["BagTopics", "is_bag", "motor_rows", "read_bag", "read_targets"]
 
 CLOCK_GAP_NS = 3600 * NS_PER_S
 """A silence of this length [ns] means that the stamps come from more than one clock."""
@@ -117,23 +115,6 @@ def read_targets(path: Path, robot: Robot) -> Targets | None:
 
 
 @dataclass(frozen=True)
-class Track:
-    """What one topic says of the robot, sorted by time.
-
-    Attributes:
-        where: File and topic, for error texts.
-        stamp_ns: (row,) [ns].
-        value: Angles (row, motor) [rad] or tool positions (row, axis) [m]; NaN where unknown.
-        duration: For targets: the time to get there, (row, motor) [s].
-    """
-
-    where: str
-    stamp_ns: IntArray
-    value: FloatArray
-    duration: FloatArray | None = None
-
-
-@dataclass(frozen=True)
 class _Recording:
     """A recording of a robot, with the messages of all topics that may be needed."""
 
@@ -141,34 +122,26 @@ class _Recording:
     robot: Robot
     messages: dict[str, list[BagMessage]]
 
-    def tool(self, fitting: Sequence[BagTopic]) -> Track | None:
+    def tool(self, fitting: Sequence[BagTopic]) -> Rows | None:
         topic = only_topic("tool", fitting, self.path)
-        if topic is None:
-            return None
-        rows: ToolRows = tool_rows(self.messages[topic.name], require_kind(topic.fields))
-        return Track(self._where(topic), rows.stamp_ns, rows.value)
+        return None if topic is None else self._rows("tool", topic)
 
-    def motors(self, role: Role, fitting: Sequence[BagTopic], *, needed: bool) -> Track | None:
-        """Return what the topic for a role says; topics of other joints only do not count."""
-        read = {topic.name: self._joints(role, topic) for topic in fitting}
+    def motors(self, role: Role, fitting: Sequence[BagTopic], *, needed: bool) -> Rows | None:
+        """Return the rows of the topic for a role; topics of other joints only do not count."""
+        read = {topic.name: self._rows(role, topic) for topic in fitting}
         ours = [topic for topic in fitting if _names_a_motor(read[topic.name].names, self.robot)]
         # If none is ours but one is needed, the first is refused for the joints that it names.
         topic = only_topic(role, ours or (fitting[:1] if needed else []), self.path)
-        if topic is None:
-            return None
-        return motor_track(read[topic.name], self.robot, self._where(topic))
+        return None if topic is None else motor_rows(read[topic.name], self.robot)
 
-    def _joints(self, role: Role, topic: BagTopic) -> JointRows:
+    def _rows(self, role: Role, topic: BagTopic) -> Rows:
         messages, kind = self.messages[topic.name], require_kind(topic.fields)
-        return joint_rows(messages, kind, self._where(topic), command=role == "command")
-
-    def _where(self, topic: BagTopic) -> str:
-        return f"{self.path}: topic {topic.name}"
+        return topic_rows(messages, kind, role, f"{self.path}: topic {topic.name}")
 
 
-def motor_track(rows: JointRows, robot: Robot, where: str) -> Track:
-    """Return the angles of the robot's motors, leaving out rows that say nothing of them."""
-    columns = _motor_columns(rows.names, robot, where, in_counts=rows.in_counts)
+def motor_rows(rows: Rows, robot: Robot) -> Rows:
+    """Return the angles of the robot's motors [rad], without rows that name none of them."""
+    columns = _motor_columns(rows, robot)
     angle = rows.value[:, columns]
     if rows.in_counts:
         units = robot.servo_units
@@ -177,7 +150,8 @@ def motor_track(rows: JointRows, robot: Robot, where: str) -> Track:
         angle = np.where(sound, units.to_rad(angle), np.nan)
     said = np.asarray(np.isfinite(angle).any(axis=1))
     duration = None if rows.duration is None else rows.duration[said][:, columns]
-    return Track(where, rows.stamp_ns[said], angle[said], duration)
+    names = tuple(robot.motor_names)
+    return Rows(rows.where, rows.stamp_ns[said], angle[said], names, duration)
 
 
 def _names_a_motor(names: Sequence[str], robot: Robot) -> bool:
@@ -185,35 +159,29 @@ def _names_a_motor(names: Sequence[str], robot: Robot) -> bool:
     return any(set(scheme) & set(names) for scheme in _schemes(robot, in_counts=False).values())
 
 
-def _motor_columns(names: Sequence[str], robot: Robot, where: str, *, in_counts: bool) -> list[int]:
-    """Return the column of each motor among `names`, in chain order.
+def _motor_columns(rows: Rows, robot: Robot) -> list[int]:
+    """Return the column of each motor, in chain order.
 
     All motors are named in one way: by joint, by motor, by log column, or by the number that the
     log column ends in. The same name may mean two motors in two ways (the log column ``motor_1``
     of the ArmPi is not its motor 1), so the ways are never mixed and their order matters: values
     in counts come from the servo bus, angles from a driver that knows joints.
 
-    Args:
-        names: Names of the columns.
-        robot: The robot.
-        where: Name of the file and topic for error texts.
-        in_counts: Whether the values are servo counts.
-
     Raises:
         InputError: If a motor is missing.
     """
-    schemes = _schemes(robot, in_counts=in_counts)
-    column = {name: index for index, name in enumerate(names)}
+    schemes = _schemes(robot, in_counts=rows.in_counts)
+    column = {name: index for index, name in enumerate(rows.names)}
     for wanted in schemes.values():
         if all(name in column for name in wanted):
             return [column[name] for name in wanted]
     best = max(schemes.values(), key=lambda wanted: sum(name in column for name in wanted))
     missing = [name for name in best if name not in column]
     ways = "; ".join(f"{kind} {', '.join(wanted)}" for kind, wanted in schemes.items())
+    named = ", ".join(rows.names) or "no joint at all"
     raise InputError(
-        f"{where}: values for {', '.join(missing)} are missing; it names "
-        f"{', '.join(names) or 'no joint at all'}. Expected all motors of {robot.name!r} by one of "
-        f"these: {ways}."
+        f"{rows.where}: values for {', '.join(missing)} are missing; it names {named}. Expected "
+        f"all motors of {robot.name!r} by one of these: {ways}."
     )
 
 
@@ -230,7 +198,7 @@ def _schemes(robot: Robot, *, in_counts: bool) -> dict[str, list[str]]:
     return bus | arm if in_counts else arm | bus
 
 
-def _check_commanded(command: Track, robot: Robot) -> None:
+def _check_commanded(command: Rows, robot: Robot) -> None:
     """Raise an InputError if a motor is named in commands but never given a value."""
     never = np.flatnonzero(~np.isfinite(command.value).any(axis=0))
     if len(never):
@@ -238,7 +206,7 @@ def _check_commanded(command: Track, robot: Robot) -> None:
         raise InputError(f"{command.where}: no command holds a value for {names}. Record them.")
 
 
-def _check_whole(position: Track) -> None:
+def _check_whole(position: Rows) -> None:
     """Raise an InputError if no row of readings suffices to compute the tool path from."""
     if not np.isfinite(position.value).all(axis=1).any():
         raise InputError(
@@ -247,7 +215,7 @@ def _check_whole(position: Track) -> None:
         )
 
 
-def _first_stamp(tracks: Sequence[Track], path: Path) -> int:
+def _first_stamp(tracks: Sequence[Rows], path: Path) -> int:
     """Return the earliest stamp [ns], once it is sure that all stamps are of one clock.
 
     Raises:
@@ -274,11 +242,11 @@ def _seconds(stamp_ns: IntArray, zero_ns: int) -> FloatArray:
     return as_floats((stamp_ns - zero_ns) / NS_PER_S)
 
 
-def _samples(track: Track, zero_ns: int) -> Samples:
+def _samples(track: Rows, zero_ns: int) -> Samples:
     return Samples(_seconds(track.stamp_ns, zero_ns), track.value)
 
 
-def _command(command: Track, position: Track | None, zero_ns: int) -> Samples | Targets:
+def _command(command: Rows, position: Rows | None, zero_ns: int) -> Samples | Targets:
     if command.duration is None:
         return _samples(command, zero_ns)
     rows = slice(int(_starts_with_known_pose(command, position)), None)
@@ -288,12 +256,12 @@ def _command(command: Track, position: Track | None, zero_ns: int) -> Samples | 
     longest = np.nanmax(np.where(known, duration, np.nan), axis=1, keepdims=True)
     return Targets(
         time=_seconds(command.stamp_ns[rows], zero_ns),
-        target=_held(target),
+        target=held(target),
         duration=np.where(known, duration, longest),
     )
 
 
-def _starts_with_known_pose(command: Track, position: Track | None) -> bool:
+def _starts_with_known_pose(command: Rows, position: Rows | None) -> bool:
     """Return whether the first target only repeats where the readings say that the arm stands.
 
     Planners begin a trajectory with the pose it starts from. It is no movement, and readings tell
@@ -306,12 +274,3 @@ def _starts_with_known_pose(command: Track, position: Track | None) -> bool:
     at_once = bool(np.nanmax(command.duration[0]) == 0.0)
     followed = command.stamp_ns[1] - command.stamp_ns[0] == 1
     return at_once and bool(followed) and bool(position.stamp_ns[0] <= command.stamp_ns[0])
-
-
-def _held(target: FloatArray) -> FloatArray:
-    """Return targets (row, motor) with each NaN replaced by the one before, or else the next."""
-    rows = np.arange(len(target))[:, None]
-    known = np.isfinite(target)
-    before = np.maximum.accumulate(np.where(known, rows, -1), axis=0)
-    first = np.argmax(known, axis=0)
-    return np.take_along_axis(target, np.where(before < 0, first, before), axis=0)

@@ -15,7 +15,7 @@ from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.foreign import check_memory, reading, stored_bytes
 from failuretwin.core.runs import GOAL_VARIABLE
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
-from failuretwin.data_knowledge.readers.timed_log import SHAPES, Samples, Targets, TimedLog
+from failuretwin.data_knowledge.readers.timed_log import SHAPES, Samples, Targets, TimedLog, held
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:
@@ -370,19 +370,11 @@ def _commands(
     if columns.kind == "sampled":
         return samples
     # A log may repeat the target in every row; a movement begins where it changes.
-    target = _hold(samples.value)
+    target = held(samples.value)
     new = np.concatenate([[True], np.any(np.diff(target, axis=0) != 0.0, axis=1)])
     there = np.isin(time, samples.time[new])
     duration = _durations(table, there, columns, path)
     return Targets(samples.time[new], target[new], np.broadcast_to(duration, target[new].shape))
-
-
-def _hold(values: FloatArray) -> FloatArray:
-    """Return `values` (row, motor) with each NaN replaced by the value above it."""
-    held = values.copy()
-    for row in range(1, len(held)):
-        held[row] = np.where(np.isfinite(held[row]), held[row], held[row - 1])
-    return held
 
 
 def _durations(

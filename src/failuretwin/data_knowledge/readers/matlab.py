@@ -150,15 +150,20 @@ def _cell_array_runs(
     lengths = {len(run.desired) for run in paths}
     if len(lengths) > 1:
         raise InputError(f"{path}: runs have {sorted(lengths)} samples; expected equally many.")
-    desired = np.stack([run.desired for run in paths])
-    names = [run.name for run in paths]
+    return _recovered(paths, robot, approximate=approximate)
+
+
+def _recovered(paths: Sequence[_Paths], robot: Robot, *, approximate: bool) -> RunTable:
+    """Return runs with commands recovered from their desired paths, and the error of recovery."""
+    desired, names = np.stack([run.desired for run in paths]), [run.name for run in paths]
     time = published_time(desired, robot, names=names)
     movements = recover_movements(desired, time, robot, approximate=approximate, names=names)
-    start = float(time[0])
     off = path_error(movements, desired, time, robot)
-    shifted = replace(movements, start=movements.start - start)
-    table = _table(paths, time - start, shifted, READING_RATE_HZ, robot)
-    return _with_error(table, off)
+    worst = int(np.argmax(off))
+    shifted = replace(movements, start=movements.start - time[0])
+    table = _table(paths, time - time[0], shifted, READING_RATE_HZ, robot)
+    attributes = {RECOVERY_ERROR: float(off[worst]), RECOVERY_WORST: names[worst]}
+    return replace(table, attributes=attributes)
 
 
 def _pair_run(path: Path, dataset: Any, robot: Robot, *, approximate: bool) -> RunTable:
@@ -167,14 +172,7 @@ def _pair_run(path: Path, dataset: Any, robot: Robot, *, approximate: bool) -> R
     run = _Paths(name, desired, measured, path.parent.name)
     hidden = path.with_name(f"hidden_{path.name}")
     if not hidden.exists():
-        time = published_time(desired[None], robot, names=[name])
-        movements = recover_movements(
-            desired[None], time, robot, approximate=approximate, names=[name]
-        )
-        off = path_error(movements, desired[None], time, robot)
-        movements = replace(movements, start=movements.start - time[0])
-        table = _table([run], time - time[0], movements, READING_RATE_HZ, robot)
-        return _with_error(table, off)
+        return _recovered([run], robot, approximate=approximate)
     time, command, response_time, response = _hidden(hidden, len(robot.motors))
     if len(command) != len(desired) or not _same_path(command, desired, robot):
         raise InputError(f"{path}: its desired path is not that of the commands in {hidden.name}.")
@@ -250,13 +248,6 @@ def _table(
         movements=movements,
         truth=_truth(paths, time, robot),
     )
-
-
-def _with_error(table: RunTable, off: FloatArray) -> RunTable:
-    """Return the table with how far recovered commands miss the desired paths (run,) [m]."""
-    worst = int(np.argmax(off))
-    attributes = {RECOVERY_ERROR: float(off[worst]), RECOVERY_WORST: table.run[worst]}
-    return replace(table, attributes=attributes)
 
 
 def _truth(paths: Sequence[_Paths], time: FloatArray, robot: Robot) -> Truth | None:

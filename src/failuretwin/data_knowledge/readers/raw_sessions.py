@@ -7,20 +7,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from failuretwin.core.errors import InputError, unknown_name
-from failuretwin.core.foreign import check_memory, files_below
+from failuretwin.core.foreign import files_below
 from failuretwin.core.hypothesis import paper_hypotheses
-from failuretwin.core.movements import Movements, stack_movements
-from failuretwin.core.runs import RunTable, Truth, padded_bytes
+from failuretwin.core.movements import Movements
+from failuretwin.core.runs import RunTable, Truth, concatenate
 from failuretwin.core.types import MS_PER_S, FloatArray, as_floats
 from failuretwin.data_knowledge.readers.csv_log import load_csv, numbers
 from failuretwin.data_knowledge.readers.timed_log import check_clock, check_grid
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 COMMAND_FILE = "trajectory_monitoring_cmd.csv"
 DURATION_FILE = "trajectory_monitoring_cmd_duration.csv"
@@ -221,8 +224,8 @@ def label_of(session: RawSession) -> int:
 
 def session_runs(
     session: RawSession, robot: Robot, how: As, *, published_labels: bool = False
-) -> RunTable:
-    """Return the runs of a session.
+) -> xr.Dataset:
+    """Return the runs of a session as one run set.
 
     Args:
         session: The raw session.
@@ -235,71 +238,98 @@ def session_runs(
         InputError: If the session holds no complete run.
     """
     label = label_of(session) if published_labels else None
-    make = _measured_run if how == "measured" else _published_run
+    window_of = _measured_window if how == "measured" else _published_window
     spans = split_session(session, robot)
     for span in spans:
         _check_length(session, span)
-    runs = [make(session, robot, span, label) for span in spans]
-    length = max(len(run.command) for run in runs)
-    check_memory(
-        padded_bytes(len(runs), length, len(robot.motors)), str(session.folder), "its runs"
-    )
-    step = GRID_STEP_S if how == "measured" else PUBLISHED_TIME[1]
-    return RunTable(
-        run=[f"{session.name}/run_{i + 1:02d}" for i in range(len(runs))],
-        motor=robot.motor_names,
-        time=np.arange(length) * step if how == "measured" else PUBLISHED_TIME,
-        command=np.stack([_lengthen(run.command, length, hold=True) for run in runs]),
-        measured=np.stack([_lengthen(run.measured, length, hold=False) for run in runs]),
-        measured_rate_hz=READING_RATE_HZ,
-        duration=np.array([(len(run.command) - 1) * step for run in runs]),
-        movements=stack_movements([run.movements for run in runs]),
-        truth=None if label is None else _truth(label, runs, robot),
-        position=np.stack([_lengthen(run.position, length, hold=False) for run in runs]),
-    )
+    parts = []
+    for number, span in enumerate(spans, 1):
+        name, window = f"{session.name}/run_{number:02d}", window_of(session, robot, span)
+        parts.append(_run(session, robot, span, window, name, label).to_dataset())
+    return concatenate(parts)
 
 
 @dataclass(frozen=True)
-class _Run:
-    """One run on its own grid: command, position (time, motor) [rad], measured (time, axis) [m]."""
+class _Window:
+    """Time window of one run: its start by the session's clock, its grid, and readings within it.
 
-    command: FloatArray
-    measured: FloatArray
-    position: FloatArray
-    movements: Movements
-    held: float
+    `time` (time,) and `at` (reading,) count from `begin` [s]; `initial` (motor,) and `counts`
+    (reading, motor) are counts, NaN where a reading is lost.
+    """
+
+    begin: float
+    time: FloatArray
+    initial: FloatArray
+    at: FloatArray
+    counts: FloatArray
 
 
-def _measured_run(session: RawSession, robot: Robot, span: RowSpan, label: int | None) -> _Run:
-    units = robot.servo_units
-    begin, end = _measured_window(session, span)
-    stamps = np.concatenate([session.command_time[span.first : span.stop], session.reading_time])
-    check_clock(stamps[(stamps >= begin) & (stamps <= end)], str(session.folder))
-    check_grid((end - begin) / GRID_STEP_S, len(stamps), str(session.folder))
-    time = as_floats(np.arange(round((end - begin) / GRID_STEP_S) + 1) * GRID_STEP_S)
-    movements = _movements(session, robot, span, begin, _initial_counts(session, span, begin))
-    inside = (session.reading_time >= begin) & (session.reading_time <= end)
-    kept = inside & ~_before_gap(session)
-    counts = session.reading_counts[kept]
-    angle = np.where(units.valid(counts), units.to_rad(counts), np.nan)
-    at = session.reading_time[kept] - begin
-    held = np.nan
+def _run(
+    session: RawSession,
+    robot: Robot,
+    span: RowSpan,
+    window: _Window,
+    name: str,
+    label: int | None,
+) -> RunTable:
+    units, rows, time = robot.servo_units, slice(span.first, span.stop), window.time
+    movements = Movements(
+        initial=units.to_rad(window.initial)[None],
+        target=units.to_rad(session.target_counts[rows])[None],
+        ramp_duration=session.ramp_s[rows][None],
+        start=(session.command_time[rows] - window.begin)[None],
+    )
+    angle, held = units.to_rad(window.counts), np.nan
     if label is not None and 1 <= label <= len(robot.motors):
-        freeze = PUBLISHED_TIME[PUBLISHED_FREEZE]
-        motor = label - 1
-        raw = np.interp(freeze, session.reading_time - begin, session.reading_counts[:, motor])
-        held = float(units.to_rad(raw))
-        angle[(at >= freeze) & np.isfinite(angle[:, motor]), motor] = held
+        freeze, frozen = PUBLISHED_TIME[PUBLISHED_FREEZE], angle[:, label - 1]
+        raw = session.reading_counts[:, label - 1]
+        held = float(units.to_rad(np.interp(freeze, session.reading_time - window.begin, raw)))
+        frozen[(window.at >= freeze) & np.isfinite(frozen)] = held
     position = np.full((len(time), len(robot.motors)), np.nan)
-    position[np.minimum(np.rint(at / GRID_STEP_S).astype(int), len(time) - 1)] = angle
+    nearest = np.rint(window.at / (time[1] - time[0])).astype(int)
+    position[np.minimum(nearest, len(time) - 1)] = angle
     measured = np.full((len(time), 3), np.nan)
     sound = np.isfinite(position).all(axis=1)
     measured[sound] = DigitalTwin(robot).path(position[sound])
-    return _Run(movements.reference(time)[0], measured, position, movements, held)
+    return RunTable(
+        run=[name],
+        motor=robot.motor_names,
+        time=time,
+        command=movements.reference(time),
+        measured=measured[None],
+        measured_rate_hz=READING_RATE_HZ,
+        movements=movements,
+        truth=None if label is None else _truth(label, held, robot),
+        position=position[None],
+    )
 
 
-def _published_run(session: RawSession, robot: Robot, span: RowSpan, label: int | None) -> _Run:
-    units = robot.servo_units
+def _measured_window(session: RawSession, robot: Robot, span: RowSpan) -> _Window:
+    """Return the window from the last reading before a run to the next command, as measured."""
+    stamps = session.reading_time
+    command = float(session.command_time[span.first])
+    begin = _last_reading_before(session, command)
+    begin = command if begin is None or begin < command - 2.0 * GAP_S else begin
+    end = float(np.append(session.command_time, np.inf)[span.stop])
+    end = min(end, float(stamps[-1]))
+    both = np.concatenate([session.command_time[span.first : span.stop], stamps])
+    check_clock(both[(both >= begin) & (both <= end)], str(session.folder))
+    check_grid((end - begin) / GRID_STEP_S, len(both), str(session.folder))
+    # A reading before a gap stalled: it was taken at some time within the gap.
+    stalled = np.append(np.diff(stamps) > GAP_S, False)
+    kept = (stamps >= begin) & (stamps <= end) & ~stalled
+    counts = session.reading_counts[kept]
+    return _Window(
+        begin,
+        as_floats(np.arange(round((end - begin) / GRID_STEP_S) + 1) * GRID_STEP_S),
+        _initial_counts(session, span, begin),
+        stamps[kept] - begin,
+        np.where(robot.servo_units.valid(counts), counts, np.nan),
+    )
+
+
+def _published_window(session: RawSession, robot: Robot, span: RowSpan) -> _Window:
+    """Return the window of the published length, with readings drawn out by straight lines."""
     begin = _last_reading_before(session, session.command_time[span.first])
     if begin is None:
         raise InputError(
@@ -307,21 +337,12 @@ def _published_run(session: RawSession, robot: Robot, span: RowSpan, label: int 
             "form starts from. Read it as measured."
         )
     first = int(np.searchsorted(session.reading_time, begin))
-    time = PUBLISHED_TIME
-    movements = _movements(session, robot, span, begin, session.reading_counts[first])
-    raw = np.stack(
-        [
-            np.interp(time, session.reading_time - begin, counts, right=np.nan)
-            for counts in session.reading_counts.T
-        ],
-        axis=1,
-    )
-    position = units.to_rad(raw)
-    held = np.nan
-    if label is not None and 1 <= label <= len(robot.motors):
-        position[PUBLISHED_FREEZE:, label - 1] = held = position[PUBLISHED_FREEZE, label - 1]
-    measured = DigitalTwin(robot).path(position)
-    return _Run(movements.reference(time)[0], measured, position, movements, float(held))
+    at = session.reading_time - begin
+    lines = [
+        np.interp(PUBLISHED_TIME, at, motor, right=np.nan) for motor in session.reading_counts.T
+    ]
+    counts = np.stack(lines, axis=1)
+    return _Window(begin, PUBLISHED_TIME, session.reading_counts[first], PUBLISHED_TIME, counts)
 
 
 def _last_reading_before(session: RawSession, stamp: float) -> float | None:
@@ -340,17 +361,6 @@ def _check_length(session: RawSession, span: RowSpan) -> None:
         )
 
 
-def _measured_window(session: RawSession, span: RowSpan) -> tuple[float, float]:
-    """Return begin and end of a run [s]: from the last reading before it to the next command."""
-    command = float(session.command_time[span.first])
-    begin = _last_reading_before(session, command)
-    begin = command if begin is None or begin < command - 2.0 * GAP_S else begin
-    last = float(session.reading_time[-1])
-    end = float(session.command_time[span.stop]) if span.stop < len(session.command_time) else last
-    end = min(end, last)
-    return begin, end
-
-
 def _initial_counts(session: RawSession, span: RowSpan, begin: float) -> FloatArray:
     """Return where the first ramp starts, (motor,) [counts].
 
@@ -365,38 +375,12 @@ def _initial_counts(session: RawSession, span: RowSpan, begin: float) -> FloatAr
     return session.reading_counts[index]
 
 
-def _movements(
-    session: RawSession, robot: Robot, span: RowSpan, begin: float, initial_counts: FloatArray
-) -> Movements:
-    rows = slice(span.first, span.stop)
-    units = robot.servo_units
-    return Movements(
-        initial=units.to_rad(initial_counts)[None],
-        target=units.to_rad(session.target_counts[rows])[None],
-        ramp_duration=session.ramp_s[rows][None],
-        start=(session.command_time[rows] - begin)[None],
-    )
-
-
-def _before_gap(session: RawSession) -> np.ndarray:
-    """Return the readings whose read stalled: stamped before a gap, taken at some time in it."""
-    return np.append(np.diff(session.reading_time) > GAP_S, False)
-
-
-def _lengthen(values: FloatArray, length: int, *, hold: bool) -> FloatArray:
-    """Return `values` (time, ...) with `length` samples, the last held or NaN appended."""
-    fill = values[-1] if hold else np.full(values.shape[1:], np.nan)
-    return np.concatenate([values, np.broadcast_to(fill, (length - len(values), len(fill)))])
-
-
-def _truth(label: int, runs: list[_Run], robot: Robot) -> Truth:
-    fault = str(paper_hypotheses(robot.motor_names)[label])
+def _truth(label: int, held: float, robot: Robot) -> Truth:
     stuck = 1 <= label <= len(robot.motors)
     onset = PUBLISHED_TIME[PUBLISHED_FREEZE] if stuck else (np.nan if label == 0 else 0.0)
-    detail = {"source": "published label", "label": label, "frozen_afterwards": stuck}
     return Truth(
-        fault=[fault] * len(runs),
-        detail=[detail] * len(runs),
-        onset=np.full(len(runs), onset),
-        magnitude=np.array([run.held for run in runs]),
+        fault=[str(paper_hypotheses(robot.motor_names)[label])],
+        detail=[{"source": "published label", "label": label, "frozen_afterwards": stuck}],
+        onset=np.array([onset]),
+        magnitude=np.array([held]),
     )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeAlias, cast
 from failuretwin import __version__
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import files_below
-from failuretwin.core.runs import RunTable, concatenate
+from failuretwin.core.runs import concatenate
 from failuretwin.data_knowledge.readers.bags import BagTopics, is_bag, read_bag
 from failuretwin.data_knowledge.readers.column_guess import told_columns
 from failuretwin.data_knowledge.readers.csv_log import ColumnMap, read_mapped_csv
@@ -165,14 +165,16 @@ def _read_folder(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Data
 
 def _session_dataset(folder: Path, robot: Robot, options: ReadOptions) -> xr.Dataset:
     session = read_session(folder, robot)
-    table = session_runs(session, robot, options.how, published_labels=options.published_labels)
+    runs = session_runs(session, robot, options.how, published_labels=options.published_labels)
     choice = {"as": options.how, "published_labels": options.published_labels}
-    return _named(table, robot, f"raw session, as {options.how}; {VIRTUAL_TOOL}", choice)
+    return _named(runs, robot, f"raw session, as {options.how}; {VIRTUAL_TOOL}", choice)
 
 
 def _matlab_dataset(path: Path, robot: Robot, options: ReadOptions) -> xr.Dataset:
     table = read_matlab_file(path, robot, approximate=options.approximate)
-    return _named(table, robot, "published MATLAB file", {"approximate": options.approximate})
+    return _named(
+        table.to_dataset(), robot, "published MATLAB file", {"approximate": options.approximate}
+    )
 
 
 def _read_text(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
@@ -190,7 +192,7 @@ def _log_datasets(logs: Sequence[TimedLog], robot: Robot, source: str) -> list[x
     """Return a run set of each log, which says so where its tool path is none of a sensor."""
     return [
         _named(
-            timed_run(log, robot),
+            timed_run(log, robot).to_dataset(),
             robot,
             source if log.tool is not None else f"{source}; {VIRTUAL_TOOL}",
             {},
@@ -199,9 +201,8 @@ def _log_datasets(logs: Sequence[TimedLog], robot: Robot, source: str) -> list[x
     ]
 
 
-def _named(table: RunTable, robot: Robot, source: str, choice: Mapping[str, object]) -> xr.Dataset:
-    """Return the run set of a table with what it says of its origin."""
-    runs = table.to_dataset()
+def _named(runs: xr.Dataset, robot: Robot, source: str, choice: Mapping[str, object]) -> xr.Dataset:
+    """Return a run set with the attributes of its origin."""
     runs.attrs |= {
         "robot": robot.name,
         "source": source,

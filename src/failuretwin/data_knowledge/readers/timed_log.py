@@ -62,6 +62,15 @@ class Targets:
     duration: FloatArray
 
 
+def held(target: FloatArray) -> FloatArray:
+    """Return targets (row, motor) with each NaN replaced by the one before, or else the next."""
+    rows = np.arange(len(target))[:, None]
+    known = np.isfinite(target)
+    before = np.maximum.accumulate(np.where(known, rows, -1), axis=0)
+    first = np.argmax(known, axis=0)
+    return np.take_along_axis(target, np.where(before < 0, first, before), axis=0)
+
+
 SHAPES: Mapping[str, tuple[int, ...]] = {
     "tool_orientation": (3,),
     "accelerometer": (3,),
