@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import resource
-from contextlib import contextmanager
 from itertools import takewhile
 
 import numpy as np
@@ -16,6 +14,7 @@ from failuretwin.connection.links.replay import Pace, replay
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.data_knowledge.readers.bag_file import read_messages
+from full_disks import full_disk
 
 pytest.importorskip("mcap")
 pytest.importorskip("mujoco")
@@ -84,17 +83,6 @@ def test_a_recording_by_the_eyes_of_the_mcap_library(armpi, measured_armpi, tmp_
     }
     assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
     assert counted == summary.statistics.message_count > 100
-
-
-@contextmanager
-def full_disk():
-    """Let no file of this process grow, as on a disk that is full."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def test_a_full_disk_costs_no_diagnosis_and_is_got_over(

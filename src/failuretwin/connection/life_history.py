@@ -10,7 +10,6 @@ Section: docs/self_calibration.md#follow-the-life-of-a-robot
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,23 +111,17 @@ def keep_history(history: History, life: LifeFilter, rows: Sequence[dict[str, An
     path = history.path
     if path is None or not rows:
         return
-    lines = [json.dumps(row) for row in rows]
-    if history.size == 0:
-        lines.insert(0, json.dumps(_head(history.life)))
-    text = "".join(f"{line}\n" for line in lines).encode()
     state = path.with_suffix("").with_suffix(STATE)
     if _counted(state) != history.size:
         raise OutputError(
             f"{path}: has changed since it was read; another diagnosis tracks with the same "
             "calibration. It is as that one left it; run the command again."
         )
-    try:
-        _append(path, text, history.size)
-    except OSError as error:
-        raise OutputError(
-            f"{path}: could not be written ({error.strerror}). It is as before; free some space or "
-            "make its folder writable."
-        ) from error
+    lines = [_head(history.life)] if history.size == 0 else []
+    text = "".join(f"{json.dumps(line)}\n" for line in [*lines, *rows]).encode()
+    before = path.read_bytes()[: history.size] if history.size else b""
+    with replacing(path) as partial:
+        partial.write_bytes(before + text)
     with replacing(state) as partial, partial.open("wb") as file:
         size = np.array(history.size + len(text))
         np.savez(file, allow_pickle=False, **{SIZE: size, **life.to_arrays()})
@@ -140,23 +133,6 @@ def _counted(state: Path) -> int:
         return 0
     with np.load(state, allow_pickle=False) as stored:
         return int(stored[SIZE])
-
-
-def _append(path: Path, text: bytes, size: int) -> None:
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        os.ftruncate(descriptor, size)
-        os.lseek(descriptor, size, os.SEEK_SET)
-        try:
-            written = 0
-            while written < len(text):
-                written += os.write(descriptor, text[written:])
-            os.fsync(descriptor)
-        except OSError:
-            os.ftruncate(descriptor, size)
-            raise
-    finally:
-        os.close(descriptor)
 
 
 def _head(start: LifeFilter) -> dict[str, Any]:
