@@ -15,7 +15,6 @@ import tomli_w
 
 from bag_writers import JOINT_STATE, MONITORING, POINT, TRAJECTORY, entry, time_of, write_bag
 from failuretwin import load_robot, read_runs
-from failuretwin.connection.calibration.result import read_calibration
 from failuretwin.connection.links.ros_topics import load_topics
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.hypothesis import parse_hypotheses
@@ -314,7 +313,6 @@ SEEDS: dict[str, Seed] = {
     "profile": Seed(profile, use_profile),
     "urdf": Seed(urdf, check_urdf),
     "calibration": Seed(calibration, use_calibration),
-    "record": Seed(calibration, lambda path: read_calibration(path, ARMPI)),
     "column map": Seed(text("map.toml", COLUMN_MAP), lambda path: read_column_map(path, ARMPI)),
     "bag map": Seed(text("map.toml", "command = '/a'\ntool = '/b'\n"), table_of(BagTopics)),
     "lerobot map": Seed(text("map.toml", LEROBOT_MAP), table_of(LeRobotAngles)),

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from calibration_files import read_calibration
 from failuretwin.app.cli import cli
-from failuretwin.connection.calibration.result import read_calibration
 from failuretwin.connection.population import Population
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.generate import Plan, simulate

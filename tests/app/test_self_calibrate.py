@@ -10,8 +10,8 @@ from dataclasses import replace
 import pytest
 from click.testing import CliRunner
 
+from calibration_files import read_calibration
 from failuretwin.app.cli import cli
-from failuretwin.connection.calibration.result import read_calibration
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.store import save_run_set

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import brentq
 
 import failuretwin as ft
-from failuretwin.connection.calibration.result import read_calibration
+from calibration_files import read_calibration
 from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.generate import Plan, simulate

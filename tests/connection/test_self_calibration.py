@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calibration_files import read_calibration
 from failuretwin import load_robot
-from failuretwin.connection.calibration.result import read_calibration, save_calibration
+from failuretwin.connection.calibration.result import save_calibration
 from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser, more_when_late
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.generate import Plan, simulate

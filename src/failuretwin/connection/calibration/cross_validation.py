@@ -23,7 +23,6 @@ from failuretwin.connection.calibration.timing_fit import (
     AFTER_RAMP_S,
     Transients,
     lateness,
-    motion,
     movements_of,
     transients,
 )
@@ -31,7 +30,6 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.numerics import log_student
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
 from failuretwin.digital_model.arm_classes import generic_imperfections
-from failuretwin.digital_model.nonidealities import Timing
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import Settling
 from failuretwin.digital_model.twin import DigitalTwin
@@ -318,9 +316,10 @@ def example_transient(
     # What is shown is the calibration, which may have seen fewer sessions than this fit.
     ramps = transients(runs, movements, lateness(movements), part, settling, robot)
     twin = DigitalTwin(robot)
-    told = _motion(ramps, twin, found.imperfections.timing)
-    if not ramps.of_motors:
-        told = twin.path(told)
+    timing = found.imperfections.timing
+    usual = np.array([np.mean(timing.delay_s), np.mean(timing.ramp_shortening)])
+    values = np.tile(usual, (len(ramps.movements.start), 1))
+    told = ramps.predicted(robot, values, float(np.mean(timing.lag_s)))
     chosen = _typical(ramps, told)
     if chosen is None:
         return None
@@ -342,20 +341,6 @@ def example_transient(
         reading=ramps.reading[run][shown],
         of_motors=ramps.of_motors,
     )
-
-
-def _motion(ramps: Transients, twin: DigitalTwin, timing: Timing) -> FloatArray:
-    """Return how the typical calibrated robot makes the movements, (run, time, motor) [rad]."""
-    ones = np.ones(len(ramps.movements.start))
-    free = motion(
-        ramps.movements,
-        ramps.time,
-        twin,
-        float(np.mean(timing.delay_s)) * ones,
-        float(np.mean(timing.ramp_shortening)) * ones,
-        float(np.mean(timing.lag_s)),
-    )
-    return free + ramps.yielding
 
 
 def _typical(ramps: Transients, told: FloatArray) -> tuple[int, int] | None:

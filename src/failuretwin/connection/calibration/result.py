@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 
 from failuretwin import __version__
-from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.store import check_writable, write_text
 from failuretwin.digital_model.calibrated_robot import (
     CALIBRATION_TABLE,
     CalibratedLoop,
     CalibratedRobot,
-    load_calibration,
     with_loops,
 )
 from failuretwin.digital_model.geometry import SensorFrame
@@ -212,26 +210,6 @@ def check_calibration_file(path: Path) -> None:
     if path.suffix != ".toml":
         raise InputError(f"{path}: a calibration ends in .toml.")
     check_writable(path)
-
-
-def read_calibration(path: Path, robot: Robot) -> Calibration:
-    """Read all that `save_calibration` wrote, to look at; `load_calibration` is to work with it.
-
-    Raises:
-        InputError: If the file is no calibration, or one of another robot.
-    """
-    imperfections = load_calibration(path, robot).imperfections
-    table = read_toml(path)
-    record = table.pop(CALIBRATION_TABLE, None)
-    if record is None:
-        raise InputError(
-            f"{path}: holds imperfections without a calibration. Expected a file written by "
-            "`failuretwin calibrate`."
-        )
-    told = {name: value for name, value in record.items() if name not in ORIGIN}
-    where = f"{path}: {CALIBRATION_TABLE}"
-    found = from_table(Calibration, {**told, "imperfections": table}, where)
-    return replace(found, imperfections=imperfections)
 
 
 def _plain(value: Any) -> Any:

@@ -70,6 +70,18 @@ class Transients:
             used=self.used[runs],
         )
 
+    def predicted(self, robot: Robot, values: FloatArray, lag: float) -> FloatArray:
+        """Return the readings expected, (run, time, motor) [rad] or (run, time, axis) [m].
+
+        Args:
+            robot: The robot.
+            values: Delay [s] and shortening of each run, (run, 2).
+            lag: Lag of the robot [s].
+        """
+        twin, (delay, shortening) = DigitalTwin(robot), values.T
+        position = motion(self.movements, self.time, twin, delay, shortening, lag) + self.yielding
+        return position if self.of_motors else twin.path(position)
+
 
 @dataclass(frozen=True)
 class TimingFit:
@@ -180,11 +192,7 @@ def _fit_runs(
 
 def _residual(transients: Transients, robot: Robot, values: FloatArray, lag: float) -> FloatArray:
     """Return predicted minus read, (run, time, motor or axis); 0 where a reading does not count."""
-    twin = DigitalTwin(robot)
-    delay, shortening = values.T
-    position = motion(transients.movements, transients.time, twin, delay, shortening, lag)
-    position += transients.yielding
-    predicted = position if transients.of_motors else twin.path(position)
+    predicted = transients.predicted(robot, values, lag)
     residual = np.where(transients.used[..., None], predicted - transients.reading, 0.0)
     return np.nan_to_num(residual)
 
