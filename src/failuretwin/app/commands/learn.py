@@ -248,12 +248,12 @@ def study(
     Both feature sets, both readings of the learning rate, five repetitions, the figures of
     tables II and III beside the published ones. Each training that is done is kept.
     """
-    from failuretwin.app import study as paper
     from failuretwin.app.inputs import check_learning
     from failuretwin.app.reports.plots import figure_class
     from failuretwin.app.reports.study_page import write_study_page
     from failuretwin.app.reports.tables import progress_bar
     from failuretwin.core.errors import InputError
+    from failuretwin.decision.learned import paper_study as paper
     from failuretwin.digital_model.robot import load_robot
 
     if published_labels and test_path is None:
@@ -270,7 +270,7 @@ def study(
     check_learning()
     jobs = len(plan.jobs())
     tell(f"{jobs} trainings of {plan.iterations} iterations each")
-    with progress_bar("training", jobs * plan.iterations) as advance:
+    with progress_bar("training", jobs) as advance:
         trainings = paper.run_study(plan, model, test, out, advance)
     page = out / paper.PAGE
     write_study_page(trainings, plan, model, test, page)

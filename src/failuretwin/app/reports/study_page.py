@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,19 +13,23 @@ from failuretwin import __version__
 from failuretwin.app.reports import plots
 from failuretwin.app.reports.plots import BLUE, GREY, MM_PER_M, RED, SMALL
 from failuretwin.app.reports.tables import Table
-from failuretwin.app.study import (
+from failuretwin.core.runs import AXES
+from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.data_knowledge.store import write_text
+from failuretwin.decision.learned.paper_study import (
     FEATURES,
     RATES,
     REPRODUCING_RATE,
     Exam,
+    Spread,
     StudyPlan,
     Training,
+    accuracies,
     class_names,
+    mean_confusion,
+    of_kind,
+    ratio_spreads,
 )
-from failuretwin.core.runs import AXES
-from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.store import write_text
-from failuretwin.decision.proportions import class_ratios
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
@@ -35,15 +38,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Published figures (arXiv 2411.01360, tables II and III).
-
-
-@dataclass(frozen=True)
-class Spread:
-    """Mean and standard deviation over repetitions; NaN where undefined."""
-
-    mean: float
-    deviation: float
-
 
 NONE = Spread(math.nan, math.nan)
 
@@ -70,50 +64,9 @@ TABLE_3 = {
 }
 """Precision, recall and F1 of each class on 90 real runs, in the order of the paper's rows."""
 
-# Statistics over repetitions.
-
 COLOURS = {"training": GREY, "validation": BLUE, "test": RED}
 SETS = tuple(COLOURS)
 """Sets of runs whose accuracy is measured."""
-
-
-def of_kind(trainings: Sequence[Training], features: str, rate: float) -> list[Training]:
-    """Return the repetitions with these features and this learning rate."""
-    return [t for t in trainings if (t.job.features, t.job.learning_rate) == (features, rate)]
-
-
-def spread_of(values: Sequence[float] | FloatArray) -> Spread:
-    """Return mean and sample standard deviation; NaN if any value is NaN, as in the paper."""
-    array = np.asarray(values, dtype=np.float64)
-    deviation = float(array.std(ddof=1)) if len(array) > 1 else math.nan
-    return Spread(float(array.mean()), deviation)
-
-
-def accuracies(repeats: Sequence[Training], name: str) -> list[Spread]:
-    """Return the accuracy on one of `SETS` at each checkpoint."""
-    rows = np.array([training.accuracies[name] for training in repeats])
-    return [spread_of(column) for column in rows.T]
-
-
-def ratio_spreads(repeats: Sequence[Training]) -> list[tuple[Spread, ...]]:
-    """Return precision, recall and F1 of each class on the test set.
-
-    Precision and F1 are NaN in a repetition that never predicts the class, as in the paper.
-    """
-    ratios = class_ratios(np.array([training.confusion for training in repeats]))
-    ratios[np.isnan(ratios[..., 0]), 2] = np.nan  # (repeat, class, ratio)
-    return [tuple(spread_of(column) for column in rows.T) for rows in np.moveaxis(ratios, 1, 0)]
-
-
-def mean_confusion(repeats: Sequence[Training]) -> FloatArray:
-    """Return the row-normalised confusion matrix on the test set, (truth, diagnosis).
-
-    Rows of classes missing from the test set are NaN.
-    """
-    total = np.sum([training.confusion for training in repeats], axis=0).astype(np.float64)
-    with np.errstate(invalid="ignore"):
-        return total / total.sum(axis=1, keepdims=True)
-
 
 # Figures.
 

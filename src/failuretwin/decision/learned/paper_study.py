@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import multiprocessing
 import signal
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -25,11 +26,13 @@ from failuretwin.core.config import fingerprint, from_table
 from failuretwin.core.errors import FailureTwinError, InputError, OutputError, counted, reason
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.runs import check_motors, truth_of
+from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import SUFFIXES, replacing, write_text
 from failuretwin.decision.evaluation import Truths
 from failuretwin.decision.learned.feature_encoder import FeatureEncoder, signals_of
+from failuretwin.decision.proportions import class_ratios
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:
@@ -165,9 +168,6 @@ def make_arrays(plan: StudyPlan, robot: Robot, test: Exam, folder: Path) -> None
 
 # Trainings, each in a process of its own.
 
-POLL_S = 0.5
-"""Time between two progress updates [s]."""
-
 
 @dataclass(frozen=True)
 class Training:
@@ -190,11 +190,11 @@ def run_all(
 ) -> list[Training]:
     """Run the trainings without a result in `folder`; return all results.
 
-    `on_progress` receives numbers of iterations, including those of earlier attempts.
+    `on_progress` receives numbers of finished trainings, including those of earlier attempts.
     """
     jobs = plan.jobs()
     missing = [job for job in jobs if not _file(folder, job).is_file()]
-    on_progress((len(jobs) - len(missing)) * plan.iterations)
+    on_progress(len(jobs) - len(missing))
     if missing:
         _spread(partial(train, plan, folder, classes), missing, on_progress)
     files = [_file(folder, job) for job in jobs]
@@ -210,16 +210,11 @@ def _spread(
 
     at_a_time = 1 if torch.cuda.is_available() else min(len(jobs), cores())
     context = multiprocessing.get_context("spawn")
-    done, reported = context.Value("q", 0), 0
-    with ProcessPoolExecutor(at_a_time, context, initializer=_start, initargs=(done,)) as pool:
-        running = {pool.submit(work, job) for job in jobs}
+    with ProcessPoolExecutor(at_a_time, context, initializer=_start) as pool:
         try:
-            while running:
-                finished, running = wait(running, POLL_S, FIRST_COMPLETED)
-                on_progress(done.value - reported)
-                reported = done.value
-                for future in finished:
-                    future.result()
+            for future in as_completed([pool.submit(work, job) for job in jobs]):
+                future.result()
+                on_progress(1)
         except BrokenProcessPool as error:
             raise FailureTwinError(
                 "a training has died. Look for what ended it, such as too little memory, and go "
@@ -232,23 +227,11 @@ def _spread(
             raise
 
 
-_done: Any = None
-"""Iterations done by all processes; set in each of them."""
-
-
-def _start(done: Any) -> None:
-    global _done
-    _done = done
+def _start() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles Ctrl-C
     import torch
 
     torch.set_num_threads(1)
-
-
-def _count() -> None:
-    if _done is not None:
-        with _done.get_lock():
-            _done.value += 1
 
 
 def train(plan: StudyPlan, folder: Path, classes: int, job: Job) -> None:
@@ -268,7 +251,6 @@ def train(plan: StudyPlan, folder: Path, classes: int, job: Job) -> None:
     confusion = np.zeros((classes, classes), dtype=np.int64)
     pace = networks.Pace(plan.iterations, job.learning_rate)
     for iteration in networks.training(network, batches, pace):
-        _count()
         if iteration in plan.checkpoints:
             for name, (features, truth) in sets.items():
                 diagnosis = networks.scores_of(network, features).argmax(axis=1)
@@ -300,6 +282,55 @@ def _standardised_sets(path: Path, rng: np.random.Generator) -> dict[str, tuple[
 
 def _file(folder: Path, job: Job) -> Path:
     return folder / f"{job.name}.json"
+
+
+# Statistics over repetitions.
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean and standard deviation over repetitions; NaN where undefined."""
+
+    mean: float
+    deviation: float
+
+
+def of_kind(trainings: Sequence[Training], features: str, rate: float) -> list[Training]:
+    """Return the repetitions with these features and this learning rate."""
+    return [t for t in trainings if (t.job.features, t.job.learning_rate) == (features, rate)]
+
+
+def spread_of(values: Sequence[float] | FloatArray) -> Spread:
+    """Return mean and sample standard deviation; NaN if any value is NaN, as in the paper."""
+    array = np.asarray(values, dtype=np.float64)
+    deviation = float(array.std(ddof=1)) if len(array) > 1 else math.nan
+    return Spread(float(array.mean()), deviation)
+
+
+def accuracies(repeats: Sequence[Training], name: str) -> list[Spread]:
+    """Return the accuracy on the `training`, `validation` or `test` runs at each checkpoint."""
+    rows = np.array([training.accuracies[name] for training in repeats])
+    return [spread_of(column) for column in rows.T]
+
+
+def ratio_spreads(repeats: Sequence[Training]) -> list[tuple[Spread, ...]]:
+    """Return precision, recall and F1 of each class on the test set.
+
+    Precision and F1 are NaN in a repetition that never predicts the class, as in the paper.
+    """
+    ratios = class_ratios(np.array([training.confusion for training in repeats]))
+    ratios[np.isnan(ratios[..., 0]), 2] = np.nan  # (repeat, class, ratio)
+    return [tuple(spread_of(column) for column in rows.T) for rows in np.moveaxis(ratios, 1, 0)]
+
+
+def mean_confusion(repeats: Sequence[Training]) -> FloatArray:
+    """Return the row-normalised confusion matrix on the test set, (truth, diagnosis).
+
+    Rows of classes missing from the test set are NaN.
+    """
+    total = np.sum([training.confusion for training in repeats], axis=0).astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        return total / total.sum(axis=1, keepdims=True)
 
 
 # The study in one call.
