@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from failuretwin.app.reports.reports import group_lines, size_lines
+from failuretwin.app.reports.isolability_report import group_lines, size_lines
 from failuretwin.inference.isolability import IsolabilityReport
 
 BIAS, SCALE, STUCK = "motor_1:encoder_bias", "motor_1:encoder_scale", "motor_2:stuck"

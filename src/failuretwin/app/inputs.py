@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -189,21 +189,17 @@ def parse_cli_hypotheses(text: str | None, robot: Robot) -> tuple[Hypothesis, ..
     return hypotheses
 
 
-def chosen_diagnoser(
-    method: str, bayes: BayesDiagnoser, settings: Mapping[str, object]
-) -> Diagnoser:
+def chosen_diagnoser(method: str, bayes: BayesDiagnoser) -> Diagnoser:
     """Return the diagnoser that the user names.
 
     Args:
         method: ``bayes``, the file of a network, ``bayes+`` and that file, or ``module:Class`` of
             the user's own.
         bayes: The Bayesian diagnoser.
-        settings: Options by name that belong to it alone; None where not given.
 
     Raises:
-        InputError: If one of those is given with another method, the file is no network for this
-            robot or was never fitted to be blended, the extra `learn` is missing, or there is no
-            such class.
+        InputError: If the file is no network for this robot or was never fitted to be blended, the
+            extra `learn` is missing, or there is no such class.
     """
     if method == BAYES:
         return bayes
@@ -213,12 +209,6 @@ def chosen_diagnoser(
         raise InputError(
             f"--method {path}: is neither 'bayes', nor a file that exists, nor module:Class. Train "
             f"a network with `failuretwin train --out {path.with_suffix('.npz')}`."
-        )
-    given = [name for name, value in settings.items() if value is not None]
-    if given:
-        raise InputError(
-            f"{', '.join(given)}: only the Bayesian diagnosis can be told that; a network has "
-            "learned what it knows. Leave that out, or use --method bayes."
         )
     if own:
         return diagnoser_from_text(method, bayes.twin)

@@ -268,15 +268,18 @@ def design(
 ) -> None:
     """Choose movements that tell most, and say which faults they show, beside random ones."""
     from failuretwin.app.reports.check_report import motion_lines
+    from failuretwin.app.reports.isolability_report import compared_table
     from failuretwin.app.reports.tables import show
-    from failuretwin.app.smallest import smallest_beside_random
     from failuretwin.decision.test_motions.motions import write_motions
 
     asking = motion.checking(safety, calibration, robot, seed)
+    model = asking.known.robot
     planned = asking.motions(seconds, None, movements)
     if written is not None:
-        write_motions(planned, asking.known.robot, written)
-    show(*motion_lines(planned, asking.known.robot), *smallest_beside_random(asking, planned))
+        write_motions(planned, model, written)
+    random = asking.random_motions(planned.duration_s, len(planned.orders))
+    found = asking.isolability_of(planned), asking.isolability_of(random)
+    show(*motion_lines(planned, model), compared_table(*found, model))
 
 
 @click.command()
@@ -308,15 +311,19 @@ def isolability(
     seed: int,
 ) -> None:
     """Say the smallest fault of each motor and mode that motions of a robot can show."""
-    from failuretwin.app.reports.reports import group_lines
+    from failuretwin.app.reports import isolability_report as words
     from failuretwin.app.reports.tables import show
-    from failuretwin.app.smallest import save_picture, size_table, smallest_of, smallest_record
     from failuretwin.data_knowledge.store import write_records
 
     asking = MotionOptions(hypotheses).checking(SafetyOptions(), calibration, robot, seed)
-    found = smallest_of(asking, motions)
-    show(size_table(found, asking.known.robot), *group_lines(found, asking.known.robot))
+    model = asking.known.robot
+    found = (
+        asking.isolability_of(asking.random_motions())
+        if motions is None
+        else asking.isolability_in(motions)
+    )
+    show(words.size_table(found, model), *words.group_lines(found, model))
     if json_file is not None:
-        write_records(smallest_record(found), json_file)
+        write_records(words.isolability_records(found), json_file)
     if report is not None:
-        save_picture(found, asking.known.robot, report)
+        words.save_picture(found, model, report)

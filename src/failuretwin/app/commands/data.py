@@ -213,11 +213,11 @@ def robot() -> None:
 @link_options
 def check(urdf: Path, base: str | None, tool: str | None, sensor_noise: float) -> None:
     """Say whether a URDF can be used, which motors move the tool, and what is missing."""
-    from failuretwin.app.reports.reports import print_report
+    from failuretwin.app.reports.robot_report import print_urdf
     from failuretwin.digital_model.urdf.check import check_urdf
 
     report = check_urdf(urdf, base, tool, 1e-3 * sensor_noise)
-    print_report(report)
+    print_urdf(report)
     report.raise_errors()
 
 
@@ -298,7 +298,7 @@ def fit_(logs: tuple[Path, ...], out: Path, reading: LogOptions, robot: str, see
     from datetime import UTC, datetime
 
     from failuretwin.app.inputs import read_inputs
-    from failuretwin.app.reports.registration_report import print_registration
+    from failuretwin.app.reports.robot_report import print_registration
     from failuretwin.connection.registration.fit import fit_registration
     from failuretwin.core.errors import InputError
     from failuretwin.data_knowledge.store import replacing

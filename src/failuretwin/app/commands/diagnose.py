@@ -1,7 +1,9 @@
-"""`failuretwin diagnose`: what is wrong."""
+"""`failuretwin diagnose`: fault diagnosis of recorded runs."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +17,7 @@ from failuretwin.app.commands.options import (
     common_options,
     plugin_option,
     reading_options,
+    refuse_unused,
     report_option,
 )
 
@@ -30,6 +33,45 @@ if TYPE_CHECKING:
     from failuretwin.inference.diagnoser import BayesDiagnoser
     from failuretwin.inference.faults.priors import Priors
     from failuretwin.inference.together.fault_course import FaultCourse
+
+
+BAYES_ONLY = (
+    *("calibration", "track", "self_calibrate", "hypotheses"),
+    *("sse_range", "error_range", "onset", "sensing"),
+)
+"""Options that only the Bayesian diagnosis has."""
+LEARNING = ("out", "independent")
+"""Options that only learning from several runs has."""
+
+
+@dataclass(frozen=True)
+class Findings:
+    """Diagnoses of runs, and what the runs taught together.
+
+    Attributes:
+        diagnoses: Diagnosis of each run.
+        bayes: The Bayesian diagnoser, with the calibration learned from the runs.
+        learned: Result of --self-calibrate; None: not asked for.
+        tracked: Result of --track; None: not asked for.
+    """
+
+    diagnoses: Sequence[Diagnosis]
+    bayes: BayesDiagnoser
+    learned: SelfCalibration | None = None
+    tracked: Tracked | None = None
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences on the robot learned by --self-calibrate."""
+        return () if self.learned is None else self.learned.remarks
+
+    @property
+    def lines(self) -> list[str]:
+        """Lines on everything learned."""
+        from failuretwin.app.reports.learned_report import tracking_line
+
+        lines = [f"self-calibrated: {line}" for line in self.remarks]
+        return lines if self.tracked is None else [*lines, tracking_line(self.tracked)]
 
 
 @click.command()
@@ -130,95 +172,86 @@ def diagnose(
     downwards), such a file (.mat), a bag (.bag, .mcap), a LeRobot data set (a folder), an RTDE
     recording, or a CSV file, with --columns where its column names do not tell enough.
     """
-    del seed  # nothing here is drawn by chance
-
-    from failuretwin.app.inputs import (
-        chosen_diagnoser,
-        expected_name,
-        parse_cli_hypotheses,
-        read_inputs,
-        warn_mismatch,
-        with_doubts,
-    )
+    del seed  # the diagnosis draws nothing at random
+    from failuretwin.app import inputs as given
     from failuretwin.app.reports import reports
-    from failuretwin.app.reports.tables import progress_bar, show
-    from failuretwin.connection import tracked_diagnosis as tracking
+    from failuretwin.app.reports.isolability_report import isolability_summary
+    from failuretwin.app.reports.tables import show
     from failuretwin.decision.evaluation import Judged
     from failuretwin.decision.robot_state import course_of, robot_state
     from failuretwin.digital_model.calibrated_robot import load_calibration
-    from failuretwin.digital_model.robot import load_robot
     from failuretwin.inference.diagnoser import BayesDiagnoser
     from failuretwin.inference.faults.priors import priors_of
     from failuretwin.inference.observation.sensors import TOOL_ALONE, sensing_of
 
-    model = load_robot(robot)
-    known = load_calibration(calibration, model)
+    known = load_calibration(calibration, robot)
     bayes = BayesDiagnoser(
         known.twin,
         imperfections=known.imperfections,
-        hypotheses=parse_cli_hypotheses(hypotheses, model),
-        priors=priors_of(model, sse_range, onset, error_range),
+        hypotheses=given.parse_cli_hypotheses(hypotheses, known.robot),
+        priors=priors_of(known.robot, sse_range, onset, error_range),
         sensing=sensing,
     )
-    settings = {
-        "--calibration": calibration,
-        "--track": track or None,
-        "--self-calibrate": self_calibrate or None,
-        "--hypotheses": hypotheses,
-        "--sse-range": sse_range,
-        "--error-range": error_range,
-        "--onset": onset,
-        "--sensing": sensing,
-    }
+    if method != given.BAYES:
+        refuse_unused("only the Bayesian diagnosis has these options", *BAYES_ONLY)
+    diagnoser = given.chosen_diagnoser(method, bayes)
     together = track or self_calibrate
-    diagnoser = chosen_diagnoser(method, bayes, settings)
-    _check_together(calibration, track, self_calibrate, out, independent, sensing)
+    _check_together(calibration, track and self_calibrate, track, out)
+    if not together:
+        refuse_unused("nothing is learned without --track or --self-calibrate", *LEARNING)
     history = _history(bayes, calibration, out) if track else None
-    runs = read_inputs(inputs, model, reading)
+    runs = given.read_inputs(inputs, known.robot, reading)
+    sensed = sensing_of(runs, sensing)
+    given.warn_mismatch(runs, given.expected_name(diagnoser, bayes))
     if together:
-        _check_tool(sensing_of(runs, sensing))
-    warn_mismatch(runs, expected_name(diagnoser, bayes))
-    tracked = learned = None
-    if history is not None:
-        with progress_bar("diagnosing", runs.sizes["run"]) as advance:
-            tracked = tracking.diagnose_tracked(runs, bayes, history, advance)
-        diagnoses = tracked.diagnoses
-    elif self_calibrate:
-        learned, bayes = _learn_together(runs, bayes, calibration, out)
-        diagnoses = list(learned.diagnoses)
+        _check_tool(sensed)
+        found = _diagnose_together(runs, bayes, calibration, out, history)
     else:
-        diagnoses = diagnoser.diagnose(runs)
-    diagnoses = with_doubts(diagnoses, runs, known.twin)
+        found = Findings(diagnoser.diagnose(runs), bayes)
+    diagnoses = given.with_doubts(found.diagnoses, runs, known.twin)
     if (sse_range or error_range) and diagnoser is bayes:
-        _tell_ruled_out(runs, bayes, diagnoses, priors_of(model, None, onset))
-    course = None if independent or not together else course_of(diagnoses, bayes)
-    state = robot_state(diagnoses, model, course, _taught(learned) if together else None)
+        usual = priors_of(known.robot, None, onset)
+        _tell_ruled_out(runs, found.bayes, diagnoses, usual)
+    course = course_of(diagnoses, found.bayes) if together and not independent else None
+    state = robot_state(diagnoses, known.robot, course, found.remarks if together else None)
     _write_files(diagnoses, course, json_file, csv_file)
     if report is not None:
-        _write_page(runs, diagnoses, known.twin, state, learned, report)
-    _keep(tracked, runs, out)
+        _write_page(runs, diagnoses, known.twin, state, found.learned, report)
+    _keep(found.tracked, runs, out)
     reports.print_diagnoses(diagnoses)
-    if method == "bayes" and sensing_of(runs, sensing) == TOOL_ALONE:
-        show(*reports.isolability_summary(runs, bayes))
+    if method == given.BAYES and sensed == TOOL_ALONE:
+        show(*isolability_summary(runs, found.bayes))
     show(*reports.state_lines(state, together=course is not None))
     reports.print_scores(Judged.of(diagnoses))
-    show(*_learned_lines(reports.course_lines(course, state, model), learned, tracked))
+    last = [*reports.course_lines(course, state, known.robot), *found.lines]
+    show(*([""] if last else []), *last)
 
 
-def _taught(learned: SelfCalibration | None) -> tuple[str, ...]:
-    """Return what runs that were weighed together taught of the robot, where it is told."""
-    return () if learned is None else learned.remarks
+def _diagnose_together(
+    runs: xr.Dataset,
+    bayes: BayesDiagnoser,
+    calibration: Path | None,
+    out: Path | None,
+    history: History | None,
+) -> Findings:
+    """Return diagnoses that learn the robot from the runs: one after the other, or all at once.
 
+    Args:
+        runs: The runs, oldest first.
+        bayes: The diagnoser of single runs.
+        calibration: Calibration to start from; None: that of the kind of arm.
+        out: File for the learned calibration; None: not written.
+        history: Earlier runs of the robot, for --track; None: --self-calibrate.
+    """
+    from failuretwin.app.reports.tables import progress_bar
+    from failuretwin.connection.tracked_diagnosis import diagnose_tracked
 
-def _learned_lines(
-    course: list[str], learned: SelfCalibration | None, tracked: Tracked | None
-) -> list[str]:
-    """Return the course of the robot and what runs that were weighed together taught of it."""
-    from failuretwin.app.reports.reports import tracking_line
-
-    lines = [*course, *(f"self-calibrated: {line}" for line in _taught(learned))]
-    lines += [] if tracked is None else [tracking_line(tracked)]
-    return ["", *lines] if lines else []
+    if history is None:
+        learned, bayes = _self_calibrate(runs, bayes, calibration, out)
+        return Findings(list(learned.diagnoses), bayes, learned=learned)
+    with progress_bar("diagnosing", runs.sizes["run"]) as advance:
+        tracked = diagnose_tracked(runs, bayes, history, advance)
+    return Findings(tracked.diagnoses, bayes, tracked=tracked)
 
 
 def _check_tool(sensing: tuple[str, ...]) -> None:
@@ -235,7 +268,7 @@ def _check_tool(sensing: tuple[str, ...]) -> None:
 
 
 def _tell_ruled_out(
-    runs: xr.Dataset, bayes: BayesDiagnoser, diagnoses: list[Diagnosis], usual: Priors
+    runs: xr.Dataset, bayes: BayesDiagnoser, diagnoses: Sequence[Diagnosis], usual: Priors
 ) -> None:
     """Tell where runs show errors of a size that the user has ruled out.
 
@@ -272,38 +305,22 @@ SURE = 0.9
 """Probability from which a run that looks otherwise is told."""
 
 
-def _check_together(
-    calibration: Path | None,
-    track: bool,
-    self_calibrate: bool,
-    out: Path | None,
-    independent: bool,
-    sensing: str | None,
-) -> None:
-    """Refuse ways of weighing runs together that contradict each other.
+def _check_together(calibration: Path | None, both: bool, track: bool, out: Path | None) -> None:
+    """Refuse ways of learning from runs that contradict each other.
 
     Raises:
         InputError: If they do.
     """
     from failuretwin.core.errors import InputError
 
-    if out is not None and not (self_calibrate or track):
-        raise InputError("--out is for what is learned: add --self-calibrate or --track.")
+    if both:
+        raise InputError(
+            "--track judges each run by those before it, --self-calibrate by all. Choose one."
+        )
     if out is not None and track and _is_file(calibration):
         raise InputError(
             "--track keeps what it learns beside the calibration that it began with. Leave out "
             "--out, or --calibration to begin with what the kind of arm is like."
-        )
-    if independent and not (track or self_calibrate):
-        raise InputError("--independent is for runs weighed together: --track or --self-calibrate.")
-    if sensing not in (None, "tool") and (track or self_calibrate):
-        raise InputError(
-            "--track and --self-calibrate learn from the tool's position. Leave out --sensing, or "
-            "them."
-        )
-    if track and self_calibrate:
-        raise InputError(
-            "--track judges each run by those before it, --self-calibrate by all. Choose one."
         )
 
 
@@ -341,7 +358,7 @@ def _keep(tracked: Tracked | None, runs: xr.Dataset, out: Path | None) -> None:
 
 
 def _write_files(
-    diagnoses: list[Diagnosis],
+    diagnoses: Sequence[Diagnosis],
     course: FaultCourse | None,
     json_file: Path | None,
     csv_file: Path | None,
@@ -357,14 +374,14 @@ def _write_files(
 
 def _write_page(
     runs: xr.Dataset,
-    diagnoses: list[Diagnosis],
+    diagnoses: Sequence[Diagnosis],
     twin: DigitalTwin,
     state: RobotState,
     learned: SelfCalibration | None,
     folder: Path,
 ) -> None:
     """Write the technician's page, with what was learned where runs were weighed together."""
-    from failuretwin.app.reports.taught_report import taught_section
+    from failuretwin.app.reports.learned_report import taught_section
     from failuretwin.app.reports.technician_page import write_report
 
     sections = [] if learned is None else [taught_section(learned, twin.robot)]
@@ -372,7 +389,7 @@ def _write_page(
     click.echo(f"the page: {folder / 'index.html'}", err=True)
 
 
-def _learn_together(
+def _self_calibrate(
     runs: xr.Dataset, bayes: BayesDiagnoser, calibration: Path | None, out: Path | None
 ) -> tuple[SelfCalibration, BayesDiagnoser]:
     """Return what runs say together, and a diagnoser that knows what they teach.

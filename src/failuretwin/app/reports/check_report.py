@@ -1,4 +1,4 @@
-"""A health check and a design as lines, tables and JSON; what a robot's earlier checks found."""
+"""Health checks and designed motions as lines, tables and JSON; changes since earlier checks."""
 
 from __future__ import annotations
 
@@ -10,18 +10,15 @@ from typing import Any
 
 import numpy as np
 
+from failuretwin.app.reports.isolability_report import sizes_of_motor
 from failuretwin.app.reports.tables import Table, figures_table
 from failuretwin.app.reports.technician_page import Section, write_page
 from failuretwin.core.errors import InputError, counted
-from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.data_knowledge.store import filling, write_records
 from failuretwin.decision.robot_state import robot_state
 from failuretwin.decision.test_motions.health_check import OPEN, CheckResult
 from failuretwin.decision.test_motions.motions import Motions
 from failuretwin.digital_model.robot import Robot
-from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.explanation import size_words
-from failuretwin.inference.isolability import IsolabilityReport
 
 ERROR = "steady_state_error"
 CHANGED = 3.0
@@ -74,30 +71,6 @@ def write_check_page(results: Sequence[CheckResult], robot: Robot, folder: Path)
         write_page(diagnoses, state, robot, partial / "index.html", sections=measured)
 
 
-def shown_cell(found: IsolabilityReport, motor: str, robot: Robot) -> str:
-    """Return from which size on motions show errors of a motor."""
-    sizes = [
-        told_size(name, size, found.largest[name], robot)
-        for name, size in found.isolated.items()
-        if Hypothesis.parse(name).faults[0].motor == motor
-    ]
-    return ", ".join(sizes)
-
-
-def shown_from(found: IsolabilityReport, motor: str) -> float | None:
-    """Return the smallest random error of a motor that motions show [rad or m]; None: none."""
-    return found.isolated.get(f"{motor}:{ERROR}")
-
-
-def told_size(name: str, size: float | None, largest: float, robot: Robot) -> str:
-    """Return a size in the unit that people read; where none is found, that the largest is not."""
-    fault = Hypothesis.parse(name).faults[0]
-    unit = robot.own_unit(fault.motor, MODES[fault.mode].unit)
-    told = size_words(fault, largest if size is None else size, unit).strip(" ()+")
-    told = told.removeprefix("by about ").removeprefix("by ").removeprefix("of ").lstrip("+")
-    return f"not even {told}" if size is None else told
-
-
 def motor_table(result: CheckResult, robot: Robot) -> Table:
     """Return what each motor showed, zeros and play in degrees, of slides in millimetres."""
     found, shown, rows = result.offsets, result.shown, []
@@ -108,7 +81,7 @@ def motor_table(result: CheckResult, robot: Robot) -> Table:
             f"{result.by_motor.get(name, 0.0):.1%}",
             *(f"{factor * value[k]:+.2f} +- {factor * deviation[k]:.2f} {unit}"
               for value, deviation in ((found.zero, found.zero_sd), (found.play, found.play_sd))),
-            *([] if shown is None else [shown_cell(shown, name, robot)]),
+            *([] if shown is None else [sizes_of_motor(shown, name, robot)]),
         ])  # fmt: skip
     heads = ["motor", "faulty", "zero off by", "play"]
     return figures_table([*heads, *([] if shown is None else ["shows errors from"])], rows)
@@ -135,7 +108,7 @@ def check_record(result: CheckResult, robot: Robot, seconds: float) -> dict[str,
                 "play": float(found.play[k]),
                 "play_deviation": float(found.play_sd[k]),
                 "unit": "m" if robot.slides[k] else "rad",
-                "shown_from": None if shown is None else shown_from(shown, name),
+                "shown_from": None if shown is None else shown.isolated.get(f"{name}:{ERROR}"),
             }
             for k, name in enumerate(robot.motor_names)
         ],

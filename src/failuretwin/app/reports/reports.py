@@ -1,8 +1,7 @@
-"""What `diagnose`, `evaluate` and `robot check` show: their answers as sentences and tables."""
+"""Diagnoses and their scores as sentences and tables, for `diagnose` and `evaluate`."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,10 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from failuretwin.app.reports.tables import Table, figures_table, latex, show
-from failuretwin.connection.tracked_diagnosis import Tracked
 from failuretwin.core.errors import counted
-from failuretwin.core.hypothesis import Diagnosis, Hypothesis
-from failuretwin.core.types import as_floats
+from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.data_knowledge.store import write_text
 from failuretwin.decision import proportions, scoring_rules
 from failuretwin.decision.evaluation import (
@@ -26,19 +23,12 @@ from failuretwin.decision.evaluation import (
     score_line,
 )
 from failuretwin.decision.robot_state import RobotState
-from failuretwin.digital_model.kinematics import has_range
 from failuretwin.digital_model.robot import Robot
-from failuretwin.digital_model.urdf.file import UrdfJoint
-from failuretwin.digital_model.urdf.report import JointReport, UrdfReport
-from failuretwin.failure_behavior.registry import MODES
-from failuretwin.inference.diagnoser import BayesDiagnoser
-from failuretwin.inference.explanation import joint_names_in, plain_name, size_words
-from failuretwin.inference.isolability import IsolabilityReport, isolability
+from failuretwin.inference.explanation import joint_names_in
 from failuretwin.inference.together.fault_course import FaultCourse
-from failuretwin.inference.together.wear_limits import wear_unit
 
 if TYPE_CHECKING:
-    import xarray as xr
+    pass
 
 MAX_EXPLAINED = 3
 """So few runs are explained in full on the screen; for more there are --report and --json."""
@@ -264,174 +254,3 @@ def write_latex(evaluation: Evaluation, comparison: Comparison | None, path: Pat
         tables.append(Table(("Compared", "on the same runs"), comparison_rows(comparison)))
     text = "\n".join([r"% \usepackage{booktabs}", *map(latex, tables)])
     write_text(text, path)
-
-
-# What the motion of the runs at hand could not tell, in a line or two.
-
-MAX_MOTIONS = 3
-"""Motions that are looked at, spread evenly over the runs."""
-MAX_COMPARED = 16
-"""More hypotheses take longer to tell apart than to diagnose; then the user is left to ask."""
-
-
-def isolability_summary(runs: xr.Dataset, diagnoser: BayesDiagnoser) -> list[str]:
-    """Return which faults such motions cannot tell apart, and the smallest that they show."""
-    single = [h for h in diagnoser.hypothesis_set if h.known and len(h.faults) <= 1]
-    left_out = _left_out_lines([h for h in diagnoser.hypothesis_set if h not in single])
-    if not any(h.faults for h in single):
-        return left_out
-    if len(single) > MAX_COMPARED:
-        return [
-            f"which of these {len(single)} hypotheses such motions tell apart may take longer to "
-            f"work out than the diagnosis (done for up to {MAX_COMPARED}): call "
-            "failuretwin.isolability in Python (docs/isolability.md), or name fewer with "
-            "--hypotheses",
-            *left_out,
-        ]
-    command = as_floats(runs["command"].values)
-    moving = np.flatnonzero(np.ptp(command, axis=1).any(axis=1))
-    some = moving[np.unique(np.linspace(0, len(moving) - 1, MAX_MOTIONS).astype(int))]
-    found = isolability(
-        diagnoser.twin,
-        command[some],
-        as_floats(runs["time"].values),
-        imperfections=diagnoser.imperfections,
-        hypotheses=single,
-        priors=diagnoser.priors,
-        onset_s=diagnoser.priors.onset.known_s or 0.0,
-    )
-    robot = diagnoser.twin.robot
-    lines = group_lines(found, robot) + size_lines(found, robot)
-    return [joint_names_in(line, robot) for line in lines] + left_out
-
-
-def _left_out_lines(others: Sequence[Hypothesis]) -> list[str]:
-    """Return the hypotheses that nothing is said of here: pairs of faults, and `unknown`."""
-    pairs = sum(len(h.faults) > 1 for h in others)
-    names = [f"{counted(pairs, 'pair')} of faults"] * (pairs > 0)
-    names += [str(h) for h in others if not h.known]
-    said = "what motions tell apart is said of single faults only, not of "
-    return [said + " and ".join(names)] * bool(names)
-
-
-def group_lines(found: IsolabilityReport, robot: Robot) -> list[str]:
-    """Return the groups, with the sizes at which their faults look alike."""
-    if not found.groups:
-        return []
-    groups = (
-        " or ".join(_name(n, robot, found.typical.get(n)) for n in group) for group in found.groups
-    )
-    sized = any(name in found.typical for group in found.groups for name in group)
-    when = " when faults are as large as this" if sized else ""
-    return [f"cannot be told apart by such motions{when}: {'; '.join(groups)}"]
-
-
-def size_lines(found: IsolabilityReport, robot: Robot) -> list[str]:
-    """Return the smallest sizes that are found, and what is known of faults never found."""
-    hidden = [name for name, size in found.isolated.items() if size is None]
-    lines = {
-        "smallest faults that such motions show": found.isolated,
-        "not shown for certain, even when as large as this": {n: found.largest[n] for n in hidden},
-        "of these, that something is wrong shows from this size on": {
-            n: found.detected[n] for n in hidden
-        },
-    }
-    return [
-        f"{what}: {', '.join(_name(name, robot, size) for name, size in sizes.items() if size)}"
-        for what, sizes in lines.items()
-        if any(sizes.values())
-    ]
-
-
-def _name(hypothesis: str, robot: Robot, size: float | None = None) -> str:
-    """Return a hypothesis as a person would say it, with the size of its fault if it has one."""
-    parsed = Hypothesis.parse(hypothesis)
-    if size is None:
-        return plain_name(parsed)
-    fault = parsed.faults[0]
-    unit = robot.own_unit(fault.motor, MODES[fault.mode].unit)
-    return plain_name(parsed) + size_words(fault, size, unit).replace("+", "")  # either sign
-
-
-# What `robot check` prints: the joints of a URDF and what was found.
-
-
-def print_report(report: UrdfReport) -> None:
-    """Print the chain, its joints and all findings that are no errors."""
-    if report.joints:
-        headings = ("joint", "type", "limits", "speed", "effort", "link mass", "motor")
-        show(_summary(report), Table(headings, [_joint_row(joint) for joint in report.joints]))
-    for severity in ("warning", "note"):
-        show(*(f"\n{severity}: {message}" for message in report.having(severity)))
-
-
-def _summary(report: UrdfReport) -> str:
-    count = len(report.motors)
-    return (
-        f"{report.name or report.source.name}: from {report.base_link} to {report.tool_link}, "
-        f"{counted(count, 'motor')} can move the tool point\n"
-        f"the tool gets {report.reach:.3f} m away from the base's origin; "
-        f"what moves weighs {report.moving_mass:.3f} kg\n"
-    )
-
-
-def _joint_row(report: JointReport) -> tuple[str, ...]:
-    joint = report.joint
-    moving = joint.type not in ("fixed", "floating", "planar")
-    slides = joint.type == "prismatic"
-    scale, unit = (1e3, "mm") if slides else (180.0 / math.pi, "deg")
-    return (
-        joint.name,
-        joint.type,
-        _limits(joint, scale, unit) if moving else "",
-        _with_unit(joint.velocity, scale, f"{unit}/s") if moving else "",
-        _with_unit(joint.effort, 1.0, "N" if slides else "N m") if moving else "",
-        _with_unit(report.mass, 1.0, "kg") if moving or report.mass is not None else "",
-        report.motor or f"- ({report.reason})",
-    )
-
-
-def _limits(joint: UrdfJoint, scale: float, unit: str) -> str:
-    if joint.type == "continuous":
-        return "endless"
-    if not has_range(joint.low, joint.high):
-        return "?"
-    return f"{scale * joint.low:.4g} to {scale * joint.high:.4g} {unit}"
-
-
-def _with_unit(value: float | None, scale: float, unit: str) -> str:
-    return "?" if value is None or math.isnan(value) else f"{scale * value:.4g} {unit}"
-
-
-# What `diagnose --track` says of wear.
-
-
-def tracking_line(tracked: Tracked) -> str:
-    """Return what was learned of the runs, in one line."""
-    life, history = tracked.life, tracked.history
-    parts = [f"{len(tracked.rows)} runs learned", f"{life.arrived} in all"]
-    if tracked.known:
-        parts.append(f"{tracked.known} known already")
-    told = f"tracked: {', '.join(parts)}; {_largest_changes(tracked)}"
-    if life.alarm:
-        told += f"; learning is stopped: {life.alarm}"
-    if tracked.mixed:
-        told += f"; {tracked.mixed}"
-    return told if history.path is None else f"{told}; history: {history.path}"
-
-
-def _largest_changes(tracked: Tracked) -> str:
-    """Return the largest changes of bias and of sag, with their deviations."""
-    life = tracked.life
-    unit = wear_unit(life.model).reshape(3, -1)
-    share = np.divide(unit[0], unit[1], out=np.zeros_like(unit[0]), where=unit[1] > 0.0)
-    in_angle = np.stack([np.ones_like(share), share])  # of a compliance: at the largest load
-    (before, _), (after, doubt) = (one.offsets for one in (tracked.history.life, life))
-    moved, doubt = in_angle * (after - before)[:2], in_angle * doubt[:2]
-    told = []
-    for kind, change, deviation in zip(("bias", "sag"), moved, doubt, strict=True):
-        worst = int(np.argmax(np.abs(change)))
-        degrees, error = np.rad2deg(change[worst]), np.rad2deg(deviation[worst])
-        motor = life.model.motor_names[worst]
-        told.append(f"{kind} of {motor} {degrees:+.2f} deg (deviation {error:.2f})")
-    return f"largest changes: {', '.join(told)}"

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from failuretwin.connection.links.base import Commander
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
 from failuretwin.core.types import FloatArray, as_floats
@@ -20,7 +22,7 @@ from failuretwin.decision.test_motions.health_check import (
     faults_at_rest,
     result_of,
 )
-from failuretwin.decision.test_motions.motions import Motions, read_motions
+from failuretwin.decision.test_motions.motions import Motions, holds_motions, read_motions
 from failuretwin.decision.test_motions.outlook import Outlook, of_priors
 from failuretwin.digital_model.calibrated_robot import (
     CalibratedRobot,
@@ -33,6 +35,11 @@ from failuretwin.inference.isolability import IsolabilityReport, isolability
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
+
+MOST_RUNS = 3
+"""Runs of a log whose motions are examined, evenly spread."""
+RANDOM_S = 20.0
+"""Length of random motions where no others are given [s]."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +126,31 @@ class Checking:
         """
         known, priors = self.known, checking(self.model, self.asked)
         return isolability(known.twin, command, time, known.imperfections, self.asked, priors)
+
+    def isolability_of(self, motions: Motions) -> IsolabilityReport:
+        """Return the isolability of designed motions."""
+        time, command = motions.reference()
+        return self.isolability(command, time)
+
+    def random_motions(self, seconds: float = RANDOM_S, most: int = 1000) -> Motions:
+        """Return random movements within the usual ranges, at most `seconds` long [s]."""
+        designer = replace(self, usual=True).designer
+        return Motions.of(self.known.robot, designer.random(self.home, seconds, most))
+
+    def isolability_in(self, path: Path) -> IsolabilityReport:
+        """Return the isolability of motions in a file: designed ones, or those of a log.
+
+        Raises:
+            InputError: If it cannot be read, or holds no movement.
+        """
+        from failuretwin.data_knowledge.readers.read import read_runs
+
+        if holds_motions(path, self.known.robot):
+            return self.isolability_of(read_motions(path, self.known.robot))
+        runs = read_runs(path, self.known.robot)
+        subset = np.unique(np.linspace(0, runs.sizes["run"] - 1, MOST_RUNS).astype(np.int64))
+        command = as_floats(runs["command"].values)[subset]
+        return self.isolability(command, as_floats(runs["time"].values))
 
     def shown(self, result: CheckResult, command: FloatArray, time: FloatArray) -> CheckResult:
         """Return a result with what its movements can show, where it says that all is well.

@@ -1,0 +1,95 @@
+"""URDFs and fitted profiles in words and tables, for `robot check` and `robot fit`."""
+
+from __future__ import annotations
+
+import math
+
+from failuretwin.app.reports.tables import Table, show
+from failuretwin.connection.calibration.result import Parameter
+from failuretwin.connection.registration.fit import Registration
+from failuretwin.core.errors import counted
+from failuretwin.digital_model.kinematics import has_range
+from failuretwin.digital_model.urdf.file import UrdfJoint
+from failuretwin.digital_model.urdf.report import JointReport, UrdfReport
+
+SHOWN = {"m": (1e3, "mm"), "rad": (57.29577951308232, "deg")}
+"""Factor and name of the units that people read."""
+
+
+def print_registration(found: Registration) -> None:
+    """Print what was found and how far it can be trusted."""
+    profile = found.profile
+    show(f"{profile.name}: {found.poses} settled poses, the tool path alone\n")
+    rows = [_row(parameter) for parameter in found.parameters]
+    show(Table(("parameter", "value", "95 % interval", "unit", ""), rows, "lrrll"))
+    show(
+        "\nthe tool is off at the median: "
+        f"{found.before_mm:.3g} mm with the profile as it was, {found.frames_mm:.3g} mm with "
+        f"frame, tool point and zeros fitted, {found.after_mm:.3g} mm with the geometry too, in "
+        "poses that the fit had not seen",
+        f"the sensor and what no geometry explains: {1e3 * found.noise_m:.2g} mm on each axis",
+    )
+    if found.not_told:
+        show("\nthe poses do not tell, and what the profile or the URDF says stands:")
+        show(*(f"  {line}" for line in found.not_told))
+    show(*(f"note: {line}" for line in found.remarks))
+
+
+def _row(parameter: Parameter) -> tuple[str, ...]:
+    factor, unit = SHOWN.get(parameter.unit, (1.0, parameter.unit))
+    value, low, high = (
+        f"{factor * x:.5g}" for x in (parameter.value, parameter.low, parameter.high)
+    )
+    title = f"{parameter.name}, {parameter.motor}" if parameter.motor else parameter.name
+    known = "" if parameter.identified else "not identified"
+    return title, value, f"{low} to {high}", unit, known
+
+
+# Joints and findings of a URDF.
+
+
+def print_urdf(report: UrdfReport) -> None:
+    """Print the chain, its joints and all findings that are no errors."""
+    if report.joints:
+        headings = ("joint", "type", "limits", "speed", "effort", "link mass", "motor")
+        show(_summary(report), Table(headings, [_joint_row(joint) for joint in report.joints]))
+    for severity in ("warning", "note"):
+        show(*(f"\n{severity}: {message}" for message in report.having(severity)))
+
+
+def _summary(report: UrdfReport) -> str:
+    count = len(report.motors)
+    return (
+        f"{report.name or report.source.name}: from {report.base_link} to {report.tool_link}, "
+        f"{counted(count, 'motor')} can move the tool point\n"
+        f"the tool gets {report.reach:.3f} m away from the base's origin; "
+        f"what moves weighs {report.moving_mass:.3f} kg\n"
+    )
+
+
+def _joint_row(report: JointReport) -> tuple[str, ...]:
+    joint = report.joint
+    moving = joint.type not in ("fixed", "floating", "planar")
+    slides = joint.type == "prismatic"
+    scale, unit = (1e3, "mm") if slides else (180.0 / math.pi, "deg")
+    return (
+        joint.name,
+        joint.type,
+        _limits(joint, scale, unit) if moving else "",
+        _with_unit(joint.velocity, scale, f"{unit}/s") if moving else "",
+        _with_unit(joint.effort, 1.0, "N" if slides else "N m") if moving else "",
+        _with_unit(report.mass, 1.0, "kg") if moving or report.mass is not None else "",
+        report.motor or f"- ({report.reason})",
+    )
+
+
+def _limits(joint: UrdfJoint, scale: float, unit: str) -> str:
+    if joint.type == "continuous":
+        return "endless"
+    if not has_range(joint.low, joint.high):
+        return "?"
+    return f"{scale * joint.low:.4g} to {scale * joint.high:.4g} {unit}"
+
+
+def _with_unit(value: float | None, scale: float, unit: str) -> str:
+    return "?" if value is None or math.isnan(value) else f"{scale * value:.4g} {unit}"
