@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import parent_process
@@ -28,7 +28,7 @@ from failuretwin.core.hypothesis import (
     parse_hypotheses,
 )
 from failuretwin.core.movements import Movements, stack_movements
-from failuretwin.core.runs import RunTable, Truth
+from failuretwin.core.runs import RunTable, Truth, concatenate
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.simulated_sensors import SIMULATED, simulated_sensors
 from failuretwin.data_knowledge.workers import Workforce
@@ -405,27 +405,12 @@ def simulate(
     Raises:
         InputError: If workers are fewer than one or cannot be had.
     """
-    chunks = [
-        range(first, min(first + CHUNK_RUNS, plan.size))
-        for first in range(0, plan.size, CHUNK_RUNS)
-    ]
-    work, workforce = partial(simulate_runs, plan), Workforce(workers, scheduler)
-    with workforce.map_unordered(work, chunks) as results:
-        return _assembled(results, plan.size, on_progress)
-
-
-def _assembled(
-    parts: Iterable[tuple[range, RunTable]], runs: int, on_progress: Callable[[int], None]
-) -> xr.Dataset:
-    """Return one run set in which every part, in any order, has its place; none is held twice."""
-    arrays: dict[Hashable, np.ndarray] = {}
-    for place, table in parts:
-        part = table.to_dataset()
-        for name, variable in part.variables.items():
-            if variable.dims[:1] == ("run",):
-                empty = np.empty((runs, *variable.shape[1:]), variable.dtype)
-                arrays.setdefault(name, empty)[place.start : place.stop] = variable.values
-        on_progress(len(place))
-    shared = part.drop_dims("run").assign_coords(run=arrays.pop("run"))
-    filled = {name: (part[name].dims, array, part[name].attrs) for name, array in arrays.items()}
-    return shared.assign(filled)[list(part.data_vars)]
+    starts = range(0, plan.size, CHUNK_RUNS)
+    chunks = [range(first, min(first + CHUNK_RUNS, plan.size)) for first in starts]
+    parts: dict[range, xr.Dataset] = {}
+    workforce = Workforce(workers, scheduler)
+    with workforce.map_unordered(partial(simulate_runs, plan), chunks) as results:
+        for chunk, table in results:
+            parts[chunk] = table.to_dataset()
+            on_progress(len(chunk))
+    return concatenate([parts[chunk] for chunk in chunks])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -67,30 +67,20 @@ class AngleColumns:
 
 
 @dataclass(frozen=True)
-class CommandColumns:
-    """What the motors were told.
+class CommandColumns(AngleColumns):
+    """Commands of the motors, one column each, in chain order.
 
     Attributes:
-        columns: One column for each motor, in chain order.
         kind: sampled (the reference at every row) or target (where to go, with a duration).
-        unit: rad, deg or servo.
         duration_columns: For targets: time to get there, a column for each motor, or one for all.
         duration_unit: s, ms, us or ns.
         duration_s: For targets without such columns: the same time for every movement [s].
-        sign: As for angles.
-        zero: As for angles.
-        slide_unit: As for angles.
     """
 
-    columns: tuple[str, ...]
     kind: str = "sampled"
-    unit: str = "rad"
     duration_columns: tuple[str, ...] = ()
     duration_unit: str = "s"
     duration_s: float | None = None
-    sign: tuple[float, ...] = ()
-    zero: tuple[float, ...] = ()
-    slide_unit: str = "m"
 
 
 @dataclass(frozen=True)
@@ -164,28 +154,25 @@ def read_column_map(path: Path, robot: Robot) -> ColumnMap:
     where = str(path)
     table = {name: part for name, part in read_toml(path).items() if name != CORRECTION}
     mapping = from_table(ColumnMap, table, where)
-    _check_unit(mapping.time.unit, [*TIME_UNITS, ISO], f"{where}: time")
-    command = mapping.command
-    if command.kind not in ("sampled", "target"):
-        raise InputError(f"{where}: {unknown_name('kind', command.kind, ('sampled', 'target'))}")
-    _check_unit(command.duration_unit, TIME_UNITS, f"{where}: command")
+    _check_known("unit", mapping.time.unit, [*TIME_UNITS, ISO], f"{where}: time")
+    command, tool = mapping.command, mapping.tool
+    _check_known("kind", command.kind, ("sampled", "target"), where)
+    _check_known("unit", command.duration_unit, TIME_UNITS, f"{where}: command")
     if command.kind == "target" and not command.duration_columns and command.duration_s is None:
         raise InputError(
             f"{where}: targets need to know how long a movement takes. Name duration_columns, or "
             "give duration_s for all."
         )
-    if mapping.tool is None and mapping.position is None and not mapping.sensors:
+    if tool is None and mapping.position is None and not mapping.sensors:
         raise InputError(f"{where}: needs a [tool] table, or [position] to compute the path from.")
-    if mapping.tool is not None:
-        _check_unit(mapping.tool.unit, LENGTH_UNITS, f"{where}: tool")
+    if tool is not None:
+        _check_known("unit", tool.unit, LENGTH_UNITS, f"{where}: tool")
+        _check_distinct(tool.columns, f"{where}: tool")
     _check_anchor(mapping.sensors, where, robot)
-    named = ("command", command), ("position", mapping.position), ("goal", mapping.goal)
-    for name, angles in named:
+    for name in ("command", "position", "goal"):
+        angles = getattr(mapping, name)
         if angles is not None:
             _check_angles(angles, f"{where}: {name}", robot)
-            _check_distinct(angles.columns, f"{where}: {name}")
-    if mapping.tool is not None:
-        _check_distinct(mapping.tool.columns, f"{where}: tool")
     return mapping
 
 
@@ -204,14 +191,15 @@ def _check_distinct(columns: Sequence[str], where: str) -> None:
             raise InputError(f"{where}: column {column!r} is named twice. Each needs its own.")
 
 
-def _check_unit(unit: str, valid: Sequence[str] | dict[str, float], where: str) -> None:
-    if unit not in valid:
-        raise InputError(f"{where}: {unknown_name('unit', unit, valid)}")
+def _check_known(what: str, name: str, valid: Iterable[str], where: str) -> None:
+    if name not in valid:
+        raise InputError(f"{where}: {unknown_name(what, name, valid)}")
 
 
-def _check_angles(angles: CommandColumns | AngleColumns, where: str, robot: Robot) -> None:
-    _check_unit(angles.unit, [*ANGLE_UNITS, SERVO], where)
-    _check_unit(angles.slide_unit, LENGTH_UNITS, where)
+def _check_angles(angles: AngleColumns, where: str, robot: Robot) -> None:
+    _check_known("unit", angles.unit, [*ANGLE_UNITS, SERVO], where)
+    _check_known("unit", angles.slide_unit, LENGTH_UNITS, where)
+    _check_distinct(angles.columns, where)
     count = len(robot.motors)
     for name in ("columns", "sign", "zero"):
         values = getattr(angles, name)
@@ -348,7 +336,7 @@ def _present(time: FloatArray, values: FloatArray) -> Samples:
     return Samples(time[there], values[there])
 
 
-def _angles(values: FloatArray, columns: AngleColumns | CommandColumns, robot: Robot) -> FloatArray:
+def _angles(values: FloatArray, columns: AngleColumns, robot: Robot) -> FloatArray:
     """Return angles [rad, m of a slide] in the robot's sense; NaN for counts out of range."""
     if columns.unit == SERVO:
         units = robot.servo_units
