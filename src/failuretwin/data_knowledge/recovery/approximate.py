@@ -13,6 +13,7 @@ from failuretwin.data_knowledge.recovery.ramp_fit import (
     PathPart,
     fit,
     joined,
+    moving_spans,
     single_movements,
     without_idle_ramps,
 )
@@ -97,27 +98,16 @@ def _noise(path: PathPart) -> float:
     return float(1.4826 * np.median(bends) / np.sqrt(6.0)) if bends.size else 0.0
 
 
-def _moving_spans(path: PathPart) -> list[tuple[int, int]]:
+def _noisy_spans(path: PathPart) -> list[tuple[int, int]]:
     """Return first and last sample of every movement that stands out of a path's noise."""
     noise = _noise(path)
     width = SMOOTH_SAMPLES if noise > NO_NOISE_M and len(path.time) > 3 * SMOOTH_SAMPLES else 1
-    smooth = np.stack(
-        [np.convolve(axis, np.full(width, 1.0 / width), "valid") for axis in path.point.T], axis=1
-    )
-    change = np.linalg.norm(smooth[width:] - smooth[:-width], axis=1)
-    moving = change > max(NOISE_FACTOR * noise, NO_NOISE_M)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], moving.astype(int), [0]])))
-    spans: list[tuple[int, int]] = []
-    for first, last in edges.reshape(-1, 2).tolist():
-        # A change between two averages shows up to two widths before it begins.
-        begin, end = min(first + width - 1, last), min(last + width - 1, len(path.time) - 1)
-        if spans and path.time[begin] - path.time[spans[-1][1]] < LEAST_REST_S:
-            begin = spans.pop()[0]
-        spans.append((begin, end))
+    spans = moving_spans(path, max(NOISE_FACTOR * noise, NO_NOISE_M), LEAST_REST_S, width)
+    time, end = path.time, len(path.time) - 1
     return [
         (first, last)
         for first, last in spans
-        if path.time[last] - path.time[first] >= LEAST_MOVEMENT_S or last == len(path.time) - 1
+        if time[last] - time[first] >= LEAST_MOVEMENT_S or last == end
     ]
 
 
@@ -130,7 +120,7 @@ class _Fit:
     rng: np.random.Generator
 
     def movements(self) -> Movements:
-        spans = _moving_spans(self.path)
+        spans = _noisy_spans(self.path)
         zero = np.zeros((1, len(self.twin.robot.motors)))
         if not spans:
             return joined(self._poses(self.path.point.mean(axis=0), zero, 1)[0], [])

@@ -47,6 +47,33 @@ class PathPart:
         return self.take(rows)
 
 
+def moving_spans(
+    path: PathPart, still_m: float, least_rest_s: float, width: int = 1
+) -> list[tuple[int, int]]:
+    """Return the last sample before and the first sample after every movement of a path.
+
+    Where the record begins or ends within a movement, these are its first and last samples.
+
+    Args:
+        path: The path.
+        still_m: Largest motion of a resting tool between averages [m].
+        least_rest_s: Shorter rests belong to a movement [s].
+        width: Samples of the moving average.
+    """
+    average = [np.convolve(axis, np.full(width, 1.0 / width), "valid") for axis in path.point.T]
+    smooth = np.stack(average, axis=1)
+    moving = np.linalg.norm(smooth[width:] - smooth[:-width], axis=1) > still_m
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], moving.astype(int), [0]])))
+    spans: list[tuple[int, int]] = []
+    for first, last in edges.reshape(-1, 2).tolist():
+        # A change between two averages shows up to two widths before it begins.
+        begin, end = min(first + width - 1, last), min(last + width - 1, len(path.time) - 1)
+        if spans and path.time[begin] - path.time[spans[-1][1]] < least_rest_s:
+            begin = spans.pop()[0]
+        spans.append((begin, end))
+    return spans
+
+
 def single_movements(
     origin: FloatArray, target: FloatArray, duration: FloatArray | float, start: FloatArray | float
 ) -> Movements:

@@ -18,6 +18,7 @@ from failuretwin.data_knowledge.recovery.ramp_fit import (
     fit,
     joined,
     largest_error,
+    moving_spans,
     single_movements,
     without_idle_ramps,
 )
@@ -46,8 +47,8 @@ NONE = np.zeros(MOTORS, dtype=np.bool_)
 ALL = np.ones(MOTORS, dtype=np.bool_)
 STILL_M = 1e-10
 """Largest motion of a resting tool from one sample to the next [m]."""
-LEAST_REST = 5
-"""Fewest samples of a rest; fewer are the turning point of a movement."""
+LEAST_REST_S = 0.045
+"""Shortest rest [s]; a shorter one is the turning point of a movement."""
 
 
 class NoWholeUnitsError(Exception):
@@ -64,11 +65,11 @@ def solve_run(path: PathPart, arm: PlaneArm) -> Movements:
     Raises:
         NoWholeUnitsError: If no movements make this path.
     """
-    stretches = find_stretches(path.point)
-    if not stretches:
+    spans = moving_spans(path, STILL_M, LEAST_REST_S)
+    if not spans:
         return joined(_resting_pose(path, arm), [])
     ramps: list[Movements] = []
-    for first, last in reversed(stretches):
+    for first, last in reversed(spans):
         following = ramps[0].initial if ramps else None
         ramps.insert(0, _solve_stretch(path, first, last, arm, following))
     movements = without_idle_ramps(joined(ramps[0].initial[0], ramps))
@@ -77,21 +78,6 @@ def solve_run(path: PathPart, arm: PlaneArm) -> Movements:
         at = path.time[off.max(axis=1).argmax()]
         raise NoWholeUnitsError(f"at {at:.2f} s the tool does not rest where it should")
     return movements
-
-
-def find_stretches(path: FloatArray) -> list[tuple[int, int]]:
-    """Return where an exact `path` (time, axis) [m] moves: last sample before and first after.
-
-    At the ends of the record these are its first and last samples.
-    """
-    moving = np.linalg.norm(np.diff(path, axis=0), axis=1) > STILL_M
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], moving.astype(int), [0]])))
-    stretches: list[tuple[int, int]] = []
-    for first, last in edges.reshape(-1, 2).tolist():
-        if stretches and first - stretches[-1][1] < LEAST_REST:
-            first = stretches.pop()[0]
-        stretches.append((first, last))
-    return stretches
 
 
 def _resting_pose(path: PathPart, arm: PlaneArm) -> FloatArray:
