@@ -153,7 +153,7 @@ def test_an_arm_that_is_its_own_mirror_picture_is_told(tmp_path):
         (lambda q, p: (q, 1000.0 * p), "look like millimetres"),
         (lambda q, p: (q, 100.0 * p), "look like centimetres"),
         (lambda q, p: (np.degrees(q), p), "look like degrees"),
-        (lambda q, p: (q[:, [0, 2, 1, 3, 4]], p), "motor_2 and motor_3 seem to be swapped"),
+        (lambda q, p: (q[:, [0, 2, 1, 3, 4]], p), "motor 2 and motor 3 are swapped"),
         (lambda q, p: (q, p[::-1]), "Check that the logs are of this robot"),
     ],
 )

@@ -35,6 +35,7 @@ from failuretwin.digital_model.kinematics import Loads, SerialChain, rotation_to
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.settling import poses_in_range
 from failuretwin.digital_model.urdf.file import Triple, UrdfJoint, read_urdf, transform
+from failuretwin.inference.set_ups.registration import Frame
 
 # Standard deviations of what is believed before any pose is seen.
 
@@ -95,19 +96,17 @@ class Unknowns(tuple[Unknown, ...]):
 
 @dataclass(frozen=True)
 class Start:
-    """Where a fit starts, and what it is relative to.
+    """Senses, zeros and frame that a fit starts from, and that its numbers are relative to.
 
     Attributes:
         sense: Of each motor, (motor,).
         zero: Of each joint, (motor,) [rad or m].
-        R: Turn of the base in the sensor's frame, (3, 3).
-        origin: Of the base in the sensor's frame, (3,) [m].
+        frame: The base in the sensor's frame.
     """
 
     sense: FloatArray
     zero: FloatArray
-    R: FloatArray
-    origin: FloatArray
+    frame: Frame
 
 
 @dataclass(frozen=True)
@@ -250,12 +249,12 @@ class Fitted:
     @property
     def turn(self) -> FloatArray:
         """Turn of the base in the sensor's frame, (3, 3)."""
-        return rotation(self._three(*(f"base {angle}" for angle in ANGLES))) @ self.start.R
+        return rotation(self._three(*(f"base {angle}" for angle in ANGLES))) @ self.start.frame.R
 
     @property
     def origin(self) -> FloatArray:
         """Origin of the base in the sensor's frame, (3,) [m]."""
-        return self.start.origin + self._three("base x", "base y", "base z")
+        return self.start.frame.origin + self._three("base x", "base y", "base z")
 
     @property
     def tool_xyz(self) -> Triple:

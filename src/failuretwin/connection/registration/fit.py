@@ -6,7 +6,6 @@ Section: docs/another_arm.md#fit-the-frame-and-the-geometry
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +23,7 @@ from failuretwin.digital_model.profile import Profile
 from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.set_ups.registration import align
-from failuretwin.inference.set_ups.set_ups import MOST_RAD, UNIT_FACTOR, extent
+from failuretwin.inference.set_ups.set_ups import SetUp, extent, gross_unit, mistakes
 from failuretwin.inference.set_ups.wrong_setup import NEAR, wrong_setup
 
 LEARNED = 0.5
@@ -33,6 +32,8 @@ NOT_TOLD = 0.7
 """A direction is not told by the poses where its deviation stays above this share of before."""
 MAIN_PART = 0.35
 """Share of a direction from which a number is named as part of it."""
+SWAPPED = 0.25
+"""Columns are swapped if the tool is nearer than this share of its distance as it is [-]."""
 FOLDS = 5
 """Every fifth pose is predicted by a fit to the others."""
 
@@ -150,21 +151,9 @@ def _middle_mm(error: FloatArray) -> float:
 
 
 def _refuse_units(poses: Poses, robot: Robot) -> None:
-    expected = DigitalTwin(robot).path(poses.target)
-    ratio = extent(poses.point) / max(extent(expected), 1e-9)
-    farthest = float(np.abs(poses.target).max())
-    if farthest > MOST_RAD:
-        raise InputError(
-            f"commands reach {farthest:.0f} rad, so they look like degrees. Say "
-            'unit = "deg" under [command] in the column map.'
-        )
-    if ratio > UNIT_FACTOR:
-        unit = "millimetres (mm)" if ratio > 30 * UNIT_FACTOR else "centimetres (cm)"
-        raise InputError(
-            f"tool positions spread over {extent(poses.point):.0f} m, expected about "
-            f"{extent(expected):.2g} m: they look like {unit}. Say so as the unit under [tool] in "
-            "the column map."
-        )
+    setup = gross_unit(DigitalTwin(robot), poses.target, poses.point)
+    if setup is not None:
+        raise InputError(f"{setup.told} in the column map.")
 
 
 def _refuse_misfit(found: Posterior, poses: Poses, robot: Robot) -> None:
@@ -172,27 +161,26 @@ def _refuse_misfit(found: Posterior, poses: Poses, robot: Robot) -> None:
     if away <= NEAR * extent(poses.point):
         return
     setup = wrong_setup(DigitalTwin(robot), poses.target, poses.point)
-    told = setup.told if setup is not None else _swapped(robot, poses, away)
+    setup = setup or _swapped(robot, poses, away)
     raise InputError(
         f"with the best frame, senses and zeros the tool is still {1e3 * away:.0f} mm off at "
         f"the median, so nothing is written. "
-        + (told or "Check that the logs are of this robot, and the units of the column map.")
+        + (
+            f"Perhaps {setup.told}."
+            if setup is not None
+            else "Check that the logs are of this robot, and the units of the column map."
+        )
     )
 
 
-def _swapped(robot: Robot, poses: Poses, away: float) -> str:
-    """Return which two columns of commands are swapped, a sentence; empty if none are."""
-    twin, names = DigitalTwin(robot), robot.motor_names
-    best, told = 0.25 * away, ""
-    for a, b in combinations(range(len(names)), 2):
-        order = np.arange(len(names))
-        order[[a, b]] = b, a
-        off = align(twin.path(poses.target[:, order]), poses.point).away
-        if off < best:
-            best = off
-            told = f"The commands of {names[a]} and {names[b]} seem to be swapped: exchange their "
-            told += "columns in the map."
-    return told
+def _swapped(robot: Robot, poses: Poses, away: float) -> SetUp | None:
+    """Return which two columns of commands are swapped in some frame; None if none are."""
+    twin, swaps = DigitalTwin(robot), [one for one in mistakes(robot) if one.kind == "order"]
+    expected = [twin.path(swap.correction.command(poses.target)) for swap in swaps]
+    distance = [align(path, poses.point).away for path in expected]
+    if not swaps or min(distance) > SWAPPED * away:
+        return None
+    return swaps[int(np.argmin(distance))]
 
 
 # What was found, as a profile and in words.

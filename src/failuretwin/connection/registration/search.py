@@ -50,26 +50,6 @@ SEED = 0
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A way to take the commands.
-
-    Attributes:
-        sense: Of each motor, (motor,).
-        zero: Of each joint, (motor,).
-        frame: Where the arm then best stands for the sensor.
-    """
-
-    sense: FloatArray
-    zero: FloatArray
-    frame: Frame
-
-    @property
-    def start(self) -> Start:
-        """The same as where a fit starts."""
-        return Start(self.sense, self.zero, self.frame.R, self.frame.origin)
-
-
-@dataclass(frozen=True)
 class Registered:
     """What a search found.
 
@@ -96,14 +76,14 @@ def search(arm: Arm, poses: Poses) -> Registered:
     order = sorted(known.values(), key=lambda one: -_score(arm, one))
     top = order[0]
     ties = [f for f in order[1:] if f.log_likelihood > top.log_likelihood - SURE_NATS]
-    return Registered(_registered(arm, _as_candidate(top), poses), tuple(ties))
+    return Registered(_registered(arm, _as_start(top), poses), tuple(ties))
 
 
-def _fitted(arm: Arm, candidates: list[Candidate], poses: Poses) -> list[Posterior]:
+def _fitted(arm: Arm, starts: list[Start], poses: Poses) -> list[Posterior]:
     """Return those fitted that are worth it."""
-    nearest = min(candidate.frame.away for candidate in candidates)
-    worth = [c for c in candidates if c.frame.away <= max(WORTH * nearest, LEAST_M)]
-    return [_registered(arm, candidate, poses) for candidate in worth]
+    nearest = min(start.frame.away for start in starts)
+    worth = [c for c in starts if c.frame.away <= max(WORTH * nearest, LEAST_M)]
+    return [_registered(arm, start, poses) for start in worth]
 
 
 def _score(arm: Arm, found: Posterior) -> float:
@@ -114,20 +94,20 @@ def _score(arm: Arm, found: Posterior) -> float:
     return found.log_likelihood - TURN_NATS * turned + TURN_NATS * upright
 
 
-def _as_candidate(found: Posterior) -> Candidate:
+def _as_start(found: Posterior) -> Start:
     fitted = found.fitted
     zero = np.array([fitted.zero(j) for j in range(fitted.arm.motors)])
-    return Candidate(fitted.start.sense, zero, Frame(fitted.turn, fitted.origin, found.sigma))
+    return Start(fitted.start.sense, zero, Frame(fitted.turn, fitted.origin, found.sigma))
 
 
-def _registered(arm: Arm, candidate: Candidate, poses: Poses) -> Posterior:
-    return fit(arm, candidate.start, arm.frames(), poses)
+def _registered(arm: Arm, start: Start, poses: Poses) -> Posterior:
+    return fit(arm, start, arm.frames(), poses)
 
 
-def _ranked(arm: Arm, poses: Poses) -> list[Candidate]:
+def _ranked(arm: Arm, poses: Poses) -> list[Start]:
     """Return sets of senses with the zeros of the profile, best first."""
     found = [_placed(arm, poses, sense, arm.start_zero) for sense in _senses(arm)]
-    return sorted(found, key=lambda candidate: candidate.frame.away)
+    return sorted(found, key=lambda start: start.frame.away)
 
 
 def _senses(arm: Arm) -> Iterator[FloatArray]:
@@ -144,30 +124,30 @@ def _turned(sense: FloatArray, motors: tuple[int, ...]) -> FloatArray:
     return np.where(np.isin(np.arange(len(sense)), motors), -sense, sense)
 
 
-def _placed(arm: Arm, poses: Poses, sense: FloatArray, zero: FloatArray) -> Candidate:
+def _placed(arm: Arm, poses: Poses, sense: FloatArray, zero: FloatArray) -> Start:
     model = with_tool(arm.chain, arm.robot.profile.tool_xyz).position(sense * poses.target + zero)
-    return Candidate(sense, zero, align(model, poses.point, rounds=COARSE_ROUNDS))
+    return Start(sense, zero, align(model, poses.point, rounds=COARSE_ROUNDS))
 
 
-def _one_turned(arm: Arm, poses: Poses, best: Posterior) -> list[Candidate]:
-    found = _as_candidate(best)
+def _one_turned(arm: Arm, poses: Poses, best: Posterior) -> list[Start]:
+    found = _as_start(best)
     turned = [_turned(found.sense, (j,)) for j in range(arm.motors)]
     placed = [_placed(arm, poses, sense, found.zero) for sense in turned]
     return [one for one in placed if one.frame.away <= TURNED_WORTH * extent(poses.point)]
 
 
-def _with_zeros(arm: Arm, poses: Poses, ranked: list[Candidate]) -> list[Candidate]:
+def _with_zeros(arm: Arm, poses: Poses, ranked: list[Start]) -> list[Start]:
     """Return arms with zeros searched for joint by joint, best first."""
     rng = np.random.default_rng(SEED)
-    found: list[Candidate] = []
+    found: list[Start] = []
     for start in ranked[:STARTS]:
         found.append(_descended(arm, poses, start, rng))
         if found[-1].frame.away <= NEAR * extent(poses.point):
             break
-    return sorted([*found, *ranked], key=lambda candidate: candidate.frame.away)
+    return sorted([*found, *ranked], key=lambda start: start.frame.away)
 
 
-def _descended(arm: Arm, poses: Poses, found: Candidate, rng: np.random.Generator) -> Candidate:
+def _descended(arm: Arm, poses: Poses, found: Start, rng: np.random.Generator) -> Start:
     """Return the best of what is reached by changing sense and zero of one joint after another."""
     for _ in range(SWEEPS):
         before = found
@@ -178,7 +158,7 @@ def _descended(arm: Arm, poses: Poses, found: Candidate, rng: np.random.Generato
                 sense, zeros_now = found.sense.copy(), found.zero.copy()
                 sense[j], zeros_now[j] = sign, (zero + np.pi) % (2.0 * np.pi) - np.pi
                 tried.append(_placed(arm, poses, sense, zeros_now))
-            found = min(tried, key=lambda candidate: candidate.frame.away)
+            found = min(tried, key=lambda start: start.frame.away)
         if found is before:
             break
     return found
