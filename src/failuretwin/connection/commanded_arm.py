@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, replace
-from typing import Self
 
 import numpy as np
 
@@ -21,7 +20,14 @@ from failuretwin.connection.emulated_arm import (
     EmulatedArm,
     Emulation,
 )
-from failuretwin.connection.links.base import CommandSent, Event, LinkCounts, Order, Reading
+from failuretwin.connection.links.base import (
+    CommandSent,
+    Event,
+    LinkCounts,
+    NothingToClose,
+    Order,
+    Reading,
+)
 from failuretwin.connection.links.replay import AS_FAST_AS_POSSIBLE, Pace
 from failuretwin.connection.links.stream_time import Ramp
 from failuretwin.core.movements import Movements
@@ -37,7 +43,7 @@ OPERATOR = 1
 """Number of the operator's random stream, apart from the arm's own."""
 
 
-class CommandedArm(EmulatedArm):
+class CommandedArm(EmulatedArm, NothingToClose):
     """Emulated arm that takes orders; the same seed gives the same arm and disturbances.
 
     Disturbances are drawn per slice, so they differ by a clock and as fast as possible.
@@ -77,7 +83,7 @@ class CommandedArm(EmulatedArm):
     @property
     def angle(self) -> FloatArray:
         """True angles of the motors, (motor,) [rad]; for judging results only."""
-        return self._arm.angle
+        return self._arm.angle[0]
 
     def send(self, order: Order) -> None:
         """Take an order; it begins with the next slice, or when the bus answers again."""
@@ -94,12 +100,6 @@ class CommandedArm(EmulatedArm):
             return None
         self._given += 1
         return self._queue.popleft()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Do nothing: there is nothing to close."""
 
     def _pass(self) -> None:
         """Let one slice of time pass."""

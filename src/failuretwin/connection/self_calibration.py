@@ -36,7 +36,7 @@ from failuretwin.digital_model.calibrated_robot import (
 from failuretwin.digital_model.geometry import SensorFrame, roll_pitch_yaw
 from failuretwin.digital_model.nonidealities import Imperfections, LostCommand, Variation
 from failuretwin.digital_model.robot import Robot
-from failuretwin.digital_model.settling import poses_in_range
+from failuretwin.digital_model.settling import Settling, poses_in_range
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.diagnoser import BayesDiagnoser
 from failuretwin.inference.faults.priors import Priors
@@ -157,11 +157,7 @@ class SelfCalibratingDiagnoser:
         runs = as_runs(runs, robot)
         check_motors(runs, robot.name, robot.motor_names)
         movements = Evidence(runs).settled.movements
-        if movements.start.shape[1] == 0:
-            raise InputError(
-                "no run holds a movement: `command` never leaves its first value. Expected runs "
-                "of one movement at least."
-            )
+        check_moves(movements)
         believed = self._population(runs, movements)
         bayes = BayesDiagnoser(self.twin, believed, self.hypotheses, self.priors)
         model = bayes.healthy_model
@@ -208,6 +204,15 @@ def _name(robot: Robot) -> str:
 
 def _method(robot: Robot) -> str:
     return f"bayes, settled poses; healthy behaviour: {_name(robot)}"
+
+
+def check_moves(movements: Movements) -> None:
+    """Raise InputError if no run holds a movement."""
+    if movements.start.shape[1] == 0:
+        raise InputError(
+            "no run holds a movement: `command` never leaves its first value. Expected runs "
+            "of one movement at least."
+        )
 
 
 def more_when_late(entry: LostCommand) -> LostCommand:
@@ -265,16 +270,25 @@ def _variation(found: FolderPosterior) -> Variation:
     They are those beside the frame that the calibration holds: what the two make up for is no doubt
     of where the tool comes to rest.
     """
-    motors = len(found.model.scatter)
     if len(found.mean) == REGISTRATION:
         return found.model.imperfections.variation or Variation()
     own = np.linalg.inv(np.linalg.inv(found.covariance)[REGISTRATION:, REGISTRATION:])
-    bias, compliance, friction = np.sqrt(np.diag(own)).reshape(3, motors)
-    mean = np.abs(np.asarray(found.model.settling.compliance))
-    relative = np.divide(compliance, mean, out=np.zeros(motors), where=mean > 1e-9)
+    return stated_variation(np.sqrt(np.diag(own)), found.model.settling)
+
+
+def stated_variation(deviation: FloatArray, settling: Settling) -> Variation:
+    """Return deviations as a calibration states them: of compliance as a share, 1 at most.
+
+    Args:
+        deviation: Of bias, compliance and friction, (3 motor,).
+        settling: Where motors settle.
+    """
+    bias, compliance, friction = deviation.reshape(3, -1)
+    mean = np.abs(np.asarray(settling.compliance))
+    share = np.divide(compliance, mean, out=np.zeros_like(mean), where=mean > 1e-9)
     return Variation(
         bias=tuple(bias.tolist()),
-        compliance=tuple(np.minimum(relative, 1.0).tolist()),
+        compliance=tuple(np.minimum(share, 1.0).tolist()),
         friction=tuple(friction.tolist()),
     )
 

@@ -18,7 +18,12 @@ from failuretwin.connection.calibration.parameters import schedule_of, timing_of
 from failuretwin.connection.calibration.result import Calibration
 from failuretwin.connection.calibration.timing_fit import lateness
 from failuretwin.connection.life_history import History
-from failuretwin.connection.self_calibration import as_calibration, more_when_late
+from failuretwin.connection.self_calibration import (
+    as_calibration,
+    check_moves,
+    more_when_late,
+    stated_variation,
+)
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.movements import Movements
@@ -42,6 +47,7 @@ BATCH, SHARE = 10, 4
 """Runs that are judged with the same belief at most, and how many runs must have come for each:
 among the first ones every run counts for the next."""
 KEY_DIGITS = 16
+OFFSETS = ("bias", "compliance", "friction")
 
 
 @dataclass(frozen=True)
@@ -101,15 +107,8 @@ def begin(diagnoser: BayesDiagnoser, cold: bool, limits: WearLimits | None = Non
 
 def _assumed(model: HealthyModel, doubt: Variation) -> Variation:
     """Return the doubt of a calibration that states none: a scatter of each motor; assumed."""
-    bias, sag, friction = wear_unit(model).reshape(3, -1)
-    compliance = np.abs(np.asarray(model.settling.compliance))
-    relative = np.divide(sag, compliance, out=np.zeros_like(sag), where=compliance > 1e-9)
-    return replace(
-        doubt,
-        bias=tuple(bias.tolist()),
-        compliance=tuple(np.minimum(relative, 1.0).tolist()),
-        friction=tuple(friction.tolist()),
-    )
+    usual = stated_variation(wear_unit(model), model.settling)
+    return replace(doubt, bias=usual.bias, compliance=usual.compliance, friction=usual.friction)
 
 
 def diagnose_tracked(
@@ -194,22 +193,22 @@ def _row(
 
     And what it says by itself of each bias, beside what was given (`LifeFilter.bias_by_run`).
     """
-    mean, deviation = life.offsets
     faulty = None if diagnosis.undecided else 1.0 - diagnosis.posterior.get("healthy", 0.0)
-    named = dict(zip(("bias", "compliance", "friction"), mean.tolist(), strict=True))
-    doubts = dict(
-        zip(
-            ("bias_deviation", "compliance_deviation", "friction_deviation"),
-            deviation.tolist(),
-            strict=True,
-        )
+    mean, deviation = life.offsets
+    bias, bias_deviation = (
+        [value if np.isfinite(value) else None for value in part.tolist()] for part in alone
     )
-    told = {"number": number, "run": diagnosis.run, "key": key, "probability_faulty": faulty}
-    own = {
-        name: [value if np.isfinite(value) else None for value in part.tolist()]
-        for name, part in zip(("bias_alone", "bias_alone_deviation"), alone, strict=True)
+    return {
+        "number": number,
+        "run": diagnosis.run,
+        "key": key,
+        "probability_faulty": faulty,
+        "alarm": life.alarm,
+        **dict(zip(OFFSETS, mean.tolist(), strict=True)),
+        **{f"{name}_deviation": x for name, x in zip(OFFSETS, deviation.tolist(), strict=True)},
+        "bias_alone": bias,
+        "bias_alone_deviation": bias_deviation,
     }
-    return {**told, "alarm": life.alarm, **named, **doubts, **own}
 
 
 @dataclass(frozen=True)
@@ -234,11 +233,7 @@ class _Seen:
     def of(cls, runs: xr.Dataset, diagnoser: BayesDiagnoser, life: LifeFilter) -> _Seen:
         seen = Evidence(runs, life.model.settings)
         evidence = seen.sound.settled
-        if evidence.movements.start.shape[1] == 0:
-            raise InputError(
-                "no run holds a movement: `command` never leaves its first value. Expected runs "
-                "of one movement at least."
-            )
+        check_moves(evidence.movements)
         return cls(runs, diagnoser, seen, evidence, life.model.imperfections)
 
     @property

@@ -158,6 +158,16 @@ class Source(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
 
+class NothingToClose:
+    """Context manager of a source or sink that holds nothing to close."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Do nothing."""
+
+
 class Commander(Source, Protocol):
     """A source that also takes orders; implement it to act on a robot of your own.
 

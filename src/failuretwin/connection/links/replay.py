@@ -6,11 +6,16 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 
-from failuretwin.connection.links.base import CommandSent, Event, LinkCounts, Reading
+from failuretwin.connection.links.base import (
+    CommandSent,
+    Event,
+    LinkCounts,
+    NothingToClose,
+    Reading,
+)
 from failuretwin.connection.links.ros_reader import SampledCommands, goal_reading, motor_reading
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import GOAL_VARIABLE
@@ -65,7 +70,7 @@ class Pace:
         return left <= timeout_s
 
 
-class PacedSource:
+class PacedSource(NothingToClose):
     """Source that gives events when they are due and drops none.
 
     Args:
@@ -98,12 +103,6 @@ class PacedSource:
         self._next = None
         self._received += 1
         return event
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Do nothing: there is nothing to close."""
 
 
 def replay(path: Path, robot: Robot, pace: Pace, topics: BagTopics | None = None) -> PacedSource:

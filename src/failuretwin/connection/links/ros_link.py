@@ -15,6 +15,7 @@ from failuretwin.connection.links.base import (
     EventQueue,
     Item,
     LinkCounts,
+    NothingToClose,
     Order,
     Reading,
 )
@@ -101,7 +102,7 @@ def wait_for_listener(topic: str, listening: Callable[[], bool]) -> None:
         time.sleep(0.05)
 
 
-class RosSource:
+class RosSource(NothingToClose):
     """Source of readings and commands on a ROS network; it does not close the transport.
 
     Invalid messages are counted and left out.
@@ -164,12 +165,6 @@ class RosSource:
                 return
             for event in events:
                 self._queue.put(event)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Do nothing: the owner of the transport closes it."""
 
 
 class RosCommander(RosSource):
@@ -234,7 +229,7 @@ class Writer(Protocol):
         ...
 
 
-class RosSink:
+class RosSink(NothingToClose):
     """Sink that publishes items on a ROS network; it does not close the transport.
 
     Args:
@@ -257,12 +252,6 @@ class RosSink:
         """Publish an item."""
         for message in self._writer.messages(item):
             self._transport.publish(message)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Do nothing: the owner of the transport closes it."""
 
 
 def robot_sink(robot: Robot, topics: RosTopics, transport: Transport) -> RosSink:
