@@ -192,7 +192,7 @@ def vary(imperfections: Imperfections, rng: np.random.Generator) -> Imperfection
     if settling is not None:
         settling = _vary_settling(settling, variation, rng)
     factor = float(np.exp(variation.rates * rng.standard_normal()))
-    return replace(_scale_rates(imperfections, factor), settling=settling, variation=None)
+    return replace(with_rates(imperfections, factor), settling=settling, variation=None)
 
 
 def _vary_settling(settling: Settling, variation: Variation, rng: np.random.Generator) -> Settling:
@@ -209,7 +209,7 @@ def _vary_settling(settling: Settling, variation: Variation, rng: np.random.Gene
     )
 
 
-def _scale_rates(imperfections: Imperfections, factor: float) -> Imperfections:
+def with_rates(imperfections: Imperfections, factor: float) -> Imperfections:
     """Return the imperfections with every rate multiplied by `factor`, capped at 1."""
     timing, readings = imperfections.timing, imperfections.readings
     share = min(factor, HIGHEST_LOSS / max(imperfections.highest_loss, 1e-9))

@@ -168,11 +168,11 @@ class BayesDiagnoser:
         for first in range(0, len(names), chunk):
             rows = slice(first, first + chunk)
             says = [one.posterior(rows, way) for one, way in zip(seen, moving, strict=True)]
-            posterior_of_runs = mixed(says, set_ups, seen[0].rounding())
+            likeliest = mixed(says, set_ups, seen[0].rounding())
+            robots = seen[0].robots(likeliest, len(says) == 1 and set_ups.fits)
             for at in range(len(names))[rows]:
-                results.append(
-                    posterior_of_runs.to_diagnosis(at - first, names[at], quality[at], truth[at])
-                )
+                posterior, row = robots.of_run(at - first)
+                results.append(posterior.to_diagnosis(row, names[at], quality[at], truth[at]))
         return results
 
     def seen(self, runs: xr.Dataset) -> SeenRuns:

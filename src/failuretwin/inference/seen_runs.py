@@ -30,6 +30,7 @@ from failuretwin.inference.observation.rounding import (
     tool_rounding,
 )
 from failuretwin.inference.posterior import Posterior
+from failuretwin.inference.robot_mixture import RobotComponent, RobotMixture, robot_components
 from failuretwin.inference.set_up_posterior import SetUpPosterior
 from failuretwin.inference.set_up_weighing import ANOTHER, SetUpWeighing
 from failuretwin.inference.set_ups.clock import clock_posterior
@@ -125,8 +126,16 @@ class SeenRuns:
 
     @cached_property
     def in_doubt(self) -> bool:
-        """Whether the sensor may stand a little elsewhere than the profile says."""
-        return set_up_in_doubt(self.sample, self.hypotheses, self.priors)
+        """Whether the sensor may stand a little elsewhere than the profile says, by any robot."""
+        return all(
+            set_up_in_doubt(replace(self.sample, model=one.model), self.hypotheses, self.priors)
+            for one in self.components[:2]
+        )
+
+    @cached_property
+    def components(self) -> list[RobotComponent]:
+        """What is believed of the healthy robot; the first is the model."""
+        return robot_components(self.healthy, self.priors)
 
     def set_ups(self, thorough: bool = False) -> SetUpPosterior:
         """Return what is believed of the set-up: unit and clock first, then all else.
@@ -178,6 +187,16 @@ class SeenRuns:
         way = None if moving is None else moving[rows]
         likelihood = RunLikelihood(self.evidence.sound.settled[rows], self.healthy, way)
         return shared_posterior(likelihood, self.hypotheses, self.priors, self.in_doubt)
+
+    def robots(self, named: Posterior, others: bool) -> RobotMixture:
+        """Return what runs say of the robot: that of the model, or another of its kind.
+
+        Args:
+            named: Posterior of some of the runs by the model.
+            others: Whether other robots are weighed.
+        """
+        components = self.components if others else self.components[:1]
+        return RobotMixture.of(named, components, self.priors, self.in_doubt)
 
     def elsewhere(self) -> str:
         """Return that the sensor stands elsewhere, or is noisier, if most runs say so."""

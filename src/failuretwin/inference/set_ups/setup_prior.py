@@ -28,6 +28,8 @@ class SetupPrior(Bounded):
         wrong_rate: Probability that the log does not fit the profile in some other way, such as a
             motor that turns the other way: with a calibration that fitted this robot, and of an
             arm whose logs are seen for the first time.
+        another_rate: Probability that the robot is not the one of its calibration, or has changed
+            since: then it is as others of its class.
     """
 
     origin: tuple[float, float] = (0.0065, 0.026)
@@ -40,6 +42,7 @@ class SetupPrior(Bounded):
     all_rate: Share = 0.08
     noise_rate: Share = 0.08
     wrong_rate: tuple[float, float] = (0.01, 0.3)
+    another_rate: Share = 0.2
 
     @property
     def doubt(self) -> float:
@@ -49,7 +52,7 @@ class SetupPrior(Bounded):
 
     @classmethod
     def known(cls) -> SetupPrior:
-        """Return the belief that the sensor is registered exactly, with the noise that is known."""
+        """Return the belief that robot, sensor and noise are exactly as told."""
         return cls(
             origin_rate=0.0,
             turn_rate=0.0,
@@ -57,4 +60,5 @@ class SetupPrior(Bounded):
             all_rate=0.0,
             noise_rate=0.0,
             wrong_rate=(0.0, 0.0),
+            another_rate=0.0,
         )
