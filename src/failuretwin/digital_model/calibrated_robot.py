@@ -65,9 +65,9 @@ class CalibratedRobot:
     """A robot with calibrated servo loops, and its differences from their twin.
 
     Attributes:
-        robot: The robot; motors without a calibrated loop keep the profile's. imperfections:
-        Differences from the twin; their timing adds to these loops. They carry the name
-            and protocol of the calibration.
+        robot: The robot; motors without a calibrated loop keep the profile's.
+        imperfections: Differences from the twin; their timing adds to these loops. They carry the
+            name and protocol of the calibration.
     """
 
     robot: Robot
@@ -140,9 +140,8 @@ def load_calibration(
 
     Args:
         name_or_path: ``none``; ``generic`` for the prior of the arm's class; the name of `robot`
-        for
-            the calibration of its profile, the name of another file in that folder, or a TOML file.
-            None: the calibration of its profile, ``generic`` if it names none.
+            for the calibration of its profile, the name of another file in that folder, or a TOML
+            file. None: the calibration of its profile, ``generic`` if it names none.
         robot: The robot, its name or its profile.
 
     Raises:

@@ -25,14 +25,18 @@ class Disturbances:
     """Robot and random disturbances of one run, or of many along a leading run axis.
 
     Attributes:
-        bias: Constant error of each motor, (motor,) [rad]. compliance: Its yielding under load,
-        (motor,) [rad/(N m)]. friction: Distance by which it stops short, (motor,) [rad]. payload:
-        Mass at the tool point, () [kg]. lost: Lost commands, (movement, motor). scatter: Random
-        settled error, (1 + movement, motor) [rad]; the first row is before the run. delay: Dead
-        time, () [s]. lag: Time constant of a first-order lag, () [s]. shortening: Share by which
-        ramps end early, (). late: Late start, (movement,) [s]. stalled: Whether the command after
-        the run is late, so that the last movement's readings stop
-            too, ().
+        bias: Constant error of each motor, (motor,) [rad].
+        compliance: Its yielding under load, (motor,) [rad/(N m)].
+        friction: Distance by which it stops short, (motor,) [rad].
+        payload: Mass at the tool point, () [kg].
+        lost: Lost commands, (movement, motor).
+        scatter: Random settled error, (1 + movement, motor) [rad]; the first row is before the run.
+        delay: Dead time, () [s].
+        lag: Time constant of a first-order lag, () [s].
+        shortening: Share by which ramps end early, ().
+        late: Late start, (movement,) [s].
+        stalled: Whether the command after the run is late, so that the last movement's readings
+            stop too, ().
         gap_start: Time from the start of a movement until readings stop, (movement,) [s].
         reading_time: Times of the readings, (reading,) [s].
         glitch: Raw counts of corrupted readings, NaN where sound, (reading, motor).

@@ -46,9 +46,10 @@ class Poses:
     """Result for each goal and start.
 
     Attributes:
-        pose: Angles in the log's sense, (goal, start, motor) [rad]. miss_m: Distance of the tool
-        from the goal, (goal, start) [m]. miss_rad: Angle between tool axis and requested direction,
-        (goal, start) [rad]; 0 without one.
+        pose: Angles in the log's sense, (goal, start, motor) [rad].
+        miss_m: Distance of the tool from the goal, (goal, start) [m].
+        miss_rad: Angle between tool axis and requested direction, (goal, start) [rad]; 0 without
+            one.
     """
 
     pose: FloatArray

@@ -38,13 +38,13 @@ class Timing(Bounded):
     """Delays of motions behind their commands.
 
     Attributes:
-        delay_s: Range of the dead time in addition to the servo loop [s]. lag_s: Range of the time
-        constant of a first-order lag in addition to the servo loop [s]. ramp_shortening: Range of
-        the share by which ramps end early [-]. late_rate: Share of movements that start late
-        because of a stalled bus [-]. late_s: Range of the late start, common to all motors [s].
+        delay_s: Range of the dead time in addition to the servo loop [s].
+        lag_s: Range of the time constant of a first-order lag in addition to the servo loop [s].
+        ramp_shortening: Range of the share by which ramps end early [-].
+        late_rate: Share of movements that start late because of a stalled bus [-].
+        late_s: Range of the late start, common to all motors [s].
         gap_start_s: Time from the start of the previous movement until readings stop [s]; they
-        resume
-            with the late start.
+            resume with the late start.
     """
 
     delay_s: Annotated[tuple[float, float], Bounds(-1.0, LONGEST_S, in_order=True)] = (0.0, 0.0)
@@ -90,13 +90,14 @@ class Readings(Bounded):
     """Sampling of the tool sensor; without it, every grid time has a sample.
 
     Attributes:
-        rate_hz: Nominal rate [Hz]. jitter_s: Standard deviation of the sample times [s].
+        rate_hz: Nominal rate [Hz].
+        jitter_s: Standard deviation of the sample times [s].
         whole_counts: Whether the angles behind the virtual sensor are whole servo counts.
-        glitch_rate: Share of readings corrupted by each motor [-]. noise_m: Standard deviation of
-        noise on each axis [m]. drawn_out: Interpolate the grid between readings, with glitches
-        clamped to the servo's range, as
-            the published data do; otherwise readings lie at the nearest grid time, and gaps and
-            glitches are missing.
+        glitch_rate: Share of readings corrupted by each motor [-].
+        noise_m: Standard deviation of noise on each axis [m].
+        drawn_out: Interpolate the grid between readings, with glitches clamped to the servo's
+            range, as the published data do; otherwise readings lie at the nearest grid time, and
+            gaps and glitches are missing.
     """
 
     rate_hz: Annotated[float, Bounds(0.1, 1e5)]
@@ -114,11 +115,13 @@ class Variation(Bounded):
     One value per motor in chain order; empty for no variation.
 
     Attributes:
-        bias: Standard deviation of the constant error [rad]. compliance: Standard deviation of the
-        compliance's logarithm [-]. friction: Standard deviation of the friction [rad]. scatter:
-        Standard deviation of the scatter's logarithm [-]. rates: Standard deviation of the
-        logarithm of every rate of losses, late starts and glitches [-]. payload: Range of the
-        additional payload [kg].
+        bias: Standard deviation of the constant error [rad].
+        compliance: Standard deviation of the compliance's logarithm [-].
+        friction: Standard deviation of the friction [rad].
+        scatter: Standard deviation of the scatter's logarithm [-].
+        rates: Standard deviation of the logarithm of every rate of losses, late starts and glitches
+            [-].
+        payload: Range of the additional payload [kg].
     """
 
     bias: Spreads = ()

@@ -35,15 +35,15 @@ class MotorPhysics(Bounded):
         filter_s: Time constant of the set-point filter [s].
         damping: Back-EMF and viscous friction of the drive [N m s/rad]; the speed is limited to
             torque_limit / damping.
-        armature: Inertia of the rotor behind the gear [kg m2]. friction: Coulomb friction of the
-        gear [N m]; the drive stops up to friction / stiffness from its
-            set-point.
+        armature: Inertia of the rotor behind the gear [kg m2].
+        friction: Coulomb friction of the gear [N m]; the drive stops up to friction / stiffness
+            from its set-point.
         friction_yield: Elastic travel before the gear slips [rad].
         torque_limit: Stall torque [N m].
         flex_stiffness: Stiffness of the gear's output side [N m/rad].
         flex_damping: Damping of the output side [N m s/rad].
-        flex_inertia: Inertia that only takes part in the flexing, such as the gear's last stage
-            [kg m2]; it limits the ringing frequency of a light link.
+        flex_inertia: Inertia that only takes part in the flexing, such as the gear's last stage [kg
+            m2]; it limits the ringing frequency of a light link.
     """
 
     name: str
