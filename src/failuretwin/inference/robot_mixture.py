@@ -45,7 +45,7 @@ NOISY = 0.15
 COUNTS_NATS = 3.0
 """A component counts for a run where it comes within this of what explains the run best [nats]."""
 TOLD = 0.9
-"""Probability of another robot from which a run says so."""
+"""Probability of the other components from which a run says which it was judged by."""
 
 
 @dataclass(frozen=True)
@@ -224,15 +224,14 @@ class RobotMixture:
         posterior = np.array(part.posterior.log_posterior)
         posterior[row] = self.log_posterior[run]
         said = list(part.posterior.set_up) or [""] * len(part.rows)
-        if self._share(run, part) > TOLD:
+        if self._another(run) > TOLD:
             said[row] = "; ".join(filter(None, (said[row], part.told)))
         return replace(part.posterior, log_posterior=posterior, set_up=said), row
 
-    def _share(self, run: int, part: RobotPosterior) -> float:
-        """Return the probability of a component, or of any other than the first."""
+    def _another(self, run: int) -> float:
+        """Return the probability of the other components than the first."""
         joint = log_sum(self.log_joint[:, run], axis=1)
-        share = np.exp(joint - log_sum(joint, axis=0))
-        return float(share[self.parts.index(part)])
+        return float(1.0 - np.exp(joint[0] - log_sum(joint, axis=0)))
 
 
 def _glance(
