@@ -199,16 +199,15 @@ class RobotMixture:
         The first component behind the named one is asked for the best hypothesis so far too.
         """
         known, best = self.parts[0].posterior, np.argmax(self.log_posterior, axis=1)
-        healthy = np.array([h.is_healthy for h in known.hypotheses])
-        scored = [i for i, h in enumerate(known.hypotheses) if has_score(h)]
-        asked = np.tile(healthy[scored], (len(best), 1))
+        many = np.arange(len(known.hypotheses))
+        asked = np.tile([h.is_healthy for h in known.hypotheses], (len(best), 1))
         if len(self.parts) == 1:
-            asked |= best[:, None] == np.array(scored)
-        scored = [i for i, some in zip(scored, asked.any(axis=0), strict=True) if some]
+            asked = asked | (best[:, None] == many)
+        scored = [i for i in many if asked[:, i].any() and has_score(known.hypotheses[i])]
         if not scored:
             return np.arange(len(best))
-        asked = asked[:, asked.any(axis=0)]
-        glance = _glance(likelihood, [known.hypotheses[i] for i in scored], priors, asked)
+        some = [known.hypotheses[i] for i in scored]
+        glance = _glance(likelihood, some, priors, asked[:, scored])
         says = component.log_weight + (glance + known.log_prior[scored]).max(axis=1)
         reached = log_sum(log_sum(self.log_joint, axis=0), axis=1)
         return np.flatnonzero(says > reached - COUNTS_NATS)
