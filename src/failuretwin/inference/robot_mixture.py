@@ -199,10 +199,10 @@ class RobotMixture:
         The first component behind the named one is asked for the best hypothesis so far too.
         """
         known, best = self.parts[0].posterior, np.argmax(self.log_posterior, axis=1)
-        many = np.arange(len(known.hypotheses))
+        many = range(len(known.hypotheses))
         asked = np.tile([h.is_healthy for h in known.hypotheses], (len(best), 1))
         if len(self.parts) == 1:
-            asked = asked | (best[:, None] == many)
+            asked = asked | (best[:, None] == np.array(many))
         scored = [i for i in many if asked[:, i].any() and has_score(known.hypotheses[i])]
         if not scored:
             return np.arange(len(best))
