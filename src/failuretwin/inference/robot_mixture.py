@@ -32,11 +32,11 @@ from failuretwin.inference.theta.shared_likelihood import has_score
 from failuretwin.inference.theta.shared_posterior import shared_posterior
 from failuretwin.inference.theta.shared_weighing import SharedWeighing
 
-USUAL = 0.35
+USUAL = 0.4
 """Share of robots that scatter as their class does, lose as many commands and are seen as well;
-this and the shares below are assumed: two in three arms were built, mounted or worn otherwise than
+this and the shares below are assumed: three in five arms were built, mounted or worn otherwise than
 the class says."""
-SCATTER = {2.0: 0.2, 4.0: 0.15}
+SCATTER = {2.0: 0.25, 4.0: 0.05}
 """Factors on the scatter of the class, and the share of robots of each [-]."""
 LOSSES = {3.0: 0.15}
 """Factors on its rates of lost commands, and the share of robots of each [-]."""
@@ -78,7 +78,8 @@ def robot_components(model: HealthyModel, priors: Priors) -> list[RobotComponent
     if known.name == GENERIC_NAME:
         return _population(model, priors, "")
     name = f"these runs do not seem to be of the robot of calibration {known.name!r}"
-    usual = replace(generic_imperfections(model.twin.robot), sensors=known.sensors)
+    usual = generic_imperfections(model.twin.robot)
+    usual = replace(usual, protocol=known.protocol, sensors=known.sensors)
     kind = _population(replace(model, imperfections=usual), priors, name)
     others = [replace(one, log_weight=one.log_weight + float(log_of(another))) for one in kind]
     return [RobotComponent("", float(np.log1p(-another)), model), *others]

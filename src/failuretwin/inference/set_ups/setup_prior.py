@@ -42,7 +42,7 @@ class SetupPrior(Bounded):
     all_rate: Share = 0.08
     noise_rate: Share = 0.08
     wrong_rate: tuple[float, float] = (0.01, 0.3)
-    another_rate: Share = 0.2
+    another_rate: Share = 0.1
 
     @property
     def doubt(self) -> float:

@@ -216,7 +216,7 @@ class LinearResponse:
 
     def whole_at(self, delta: FloatArray) -> RunLikelihood:
         """Return what settled positions and readings on the way say at theta + delta."""
-        settled = self.at(delta, range(self.layout.motors))
+        settled = self.at(delta, range(len(self.motors)))
         return replace(settled, moving=self.moving)
 
 
