@@ -98,7 +98,7 @@ def test_intervals_of_stuck_motors_hold_as_many_as_they_did(real, told, how, ang
 def test_older_campaign_with_the_bundled_calibration(
     campaign, twin, more, right, healthy_kept, score
 ):
-    """Healthy runs of another campaign stay healthy, also with small errors among the hypotheses."""
+    """Healthy runs of another campaign stay healthy, with small errors among the hypotheses too."""
     listed, runs = campaign
     motors = twin.robot.motor_names
     faults = [f"{motor}:{mode}" for mode in (*OLDER_MODES, *more) for motor in motors]
