@@ -11,7 +11,6 @@ from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.decision.learned.feature_encoder import (
     FeatureEncoder,
     expectation_of,
-    joint_frames,
     signals_of,
 )
 from failuretwin.digital_model.nonidealities import Imperfections, Readings
@@ -101,7 +100,8 @@ def test_an_unknown_feature_set_is_refused(armpi):
 def test_joint_axes_are_those_that_the_tool_turns_about(armpi, twin):
     """Against the derivative of the path, which is tested against finite differences."""
     pose = np.random.default_rng(0).uniform(-1.5, 1.5, (50, 4))
-    origin, axis, tool = joint_frames(armpi, pose)
+    rotation, place = armpi.chain.frames(pose)
+    origin, axis, tool = place[:, :-1], rotation[:, :-1, :, 2], place[:, -1]
     point, jacobian = twin.path_and_jacobian(pose)
     np.testing.assert_allclose(tool, point, atol=1e-12)
     turning = np.cross(axis, tool[:, None, :] - origin)

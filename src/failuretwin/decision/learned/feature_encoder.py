@@ -162,7 +162,8 @@ class RobustFeatures:
         index, seen = _points(signals)
         run, known = np.arange(len(index))[:, None], seen[..., None]
         pose = self._healthy_pose(signals, index)
-        origin, axis, tool = joint_frames(self.robot, pose * self.robot.sensor_sense)
+        rotation, point = self.robot.chain.frames(pose * self.robot.sensor_sense)
+        origin, axis, tool = point[..., :-1, :], rotation[..., :-1, :, 2], point[..., -1, :]
         measured = np.where(known, signals.measured[run, index], tool)
         turn, misfit = _explained(origin, axis, tool, measured)
         turn = turn * self.robot.sensor_sense
@@ -209,28 +210,6 @@ def _direction(command: FloatArray) -> FloatArray:
     when = np.where(sign != 0.0, np.arange(command.shape[1])[:, None], 0)
     last = np.maximum.accumulate(when, axis=1)
     return np.take_along_axis(sign, last, axis=1)
-
-
-def joint_frames(robot: Robot, pose: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return joint origins [m] and unit axes, (..., motor, 3), and tool points (..., 3) [m].
-
-    All are in the base frame. `pose` (..., motor) [rad] is in the sense of the tool sensor; all
-    joints must be revolute.
-    """
-    lead = pose.shape[:-1]
-    rotation = np.broadcast_to(np.eye(3), (*lead, 3, 3))
-    point = np.zeros((*lead, 3))
-    origins, axes = [], []
-    for joint, angle in zip(robot.chain.joints, np.moveaxis(pose, -1, 0), strict=True):
-        point = point + rotation @ joint.T_pj[:3, 3]
-        rotation = rotation @ joint.T_pj[:3, :3]
-        origins.append(point)
-        axes.append(rotation[..., :, 2])
-        c, s = np.cos(angle)[..., None], np.sin(angle)[..., None]
-        x, y = rotation[..., :, 0], rotation[..., :, 1]
-        rotation = np.stack([c * x + s * y, c * y - s * x, rotation[..., :, 2]], axis=-1)
-    tool = point + rotation @ robot.chain.T_jt[:3, 3]
-    return np.stack(origins, axis=-2), np.stack(axes, axis=-2), tool
 
 
 def _explained(

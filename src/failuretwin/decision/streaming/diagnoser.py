@@ -146,9 +146,8 @@ class StreamingDiagnoser:
         Raises:
             InputError: If a motor is missing, shapes do not fit or the time is not finite.
         """
-        reference = None if command is None else reference_of(self._motors, command)[None]
-        point = None if measured is None else as_floats(measured)[None]
-        if len(self._fleet.update(time, reference, point)):
+        reference = reference_of(self._motors, command)
+        if len(self._fleet.update(time, *map(row_of, (reference, measured)))):
             self._diagnosis = self._told()
         return self._answer()
 
@@ -192,8 +191,15 @@ class StreamingDiagnoser:
         return None if found is None else replace(found, run="stream")
 
 
-def reference_of(motors: Sequence[str], command: Mapping[str, float] | ArrayLike) -> FloatArray:
-    """Return a reference as an array, (motor,) [rad].
+def row_of(values: ArrayLike | None) -> FloatArray | None:
+    """Return the values of one robot as those of a fleet of one, (1, ...); None stays None."""
+    return None if values is None else as_floats(values)[None]
+
+
+def reference_of(
+    motors: Sequence[str], command: Mapping[str, float] | ArrayLike | None
+) -> FloatArray | None:
+    """Return a reference as an array, (motor,) [rad]; None stays None.
 
     Args:
         motors: Names of the motors in chain order.
@@ -203,7 +209,7 @@ def reference_of(motors: Sequence[str], command: Mapping[str, float] | ArrayLike
         InputError: If a motor is missing.
     """
     if not isinstance(command, Mapping):
-        return as_floats(command)
+        return None if command is None else as_floats(command)
     for name in motors:
         if name not in command:
             raise unknown_name("motor", name, command)

@@ -19,7 +19,7 @@ from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.numerics import Weighted, log_of
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.decision.streaming.alarm_rule import AlarmRule
-from failuretwin.decision.streaming.diagnoser import reference_of
+from failuretwin.decision.streaming.diagnoser import reference_of, row_of
 from failuretwin.decision.streaming.fleet import StreamingFleet
 from failuretwin.decision.streaming.learning import LifeLearner
 from failuretwin.decision.streaming.set_up_watch import PROOF, SetUpWatch
@@ -175,13 +175,12 @@ class FaultMonitor:
             InputError: If a motor is missing, shapes do not fit or the time is not finite.
         """
         motors = self._fleet.diagnoser.twin.robot.motor_names
-        reference = None if command is None else reference_of(motors, command)[None]
-        point = None if measured is None else as_floats(measured)[None]
-        motors_say = None if position is None else as_floats(position)[None]
-        goals = None if goal is None else as_floats(goal)[None]
-        if len(self._fleet.update(time, reference, point, motors_say, goals)):
+        reference = reference_of(motors, command)
+        point = None if measured is None else as_floats(measured)
+        rows = map(row_of, (reference, point, position, goal))
+        if len(self._fleet.update(time, *rows)):
             self._judge()
-        self._set_up.see(time, _row(reference), _row(point))
+        self._set_up.see(time, reference, point)
         self._count_rounding()
         return self._answer()
 
@@ -313,11 +312,6 @@ class FaultMonitor:
             if own > 0.5:
                 self._fleet.adopt(self._models[-1].imperfections)
                 self._models[-1] = self._fleet.model
-
-
-def _row(values: FloatArray | None) -> FloatArray | None:
-    """Return what there is of the robot."""
-    return None if values is None else as_floats(values[0])
 
 
 def monitor(
