@@ -11,7 +11,7 @@ from small_world import SmallWorld, believed, carry_out, task_of
 from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm, Seen
 from failuretwin.decision.acting.judging import Judge
-from failuretwin.decision.acting.parking import parking_place
+from failuretwin.decision.acting.reach import parking_place
 from failuretwin.decision.acting.reactions import lost_command
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.task import Task
@@ -84,8 +84,8 @@ def test_it_is_parked_where_all_targets_need_it(armpi):
     place = parking_place(gate, 1, Task.of_points(tools).targets, 1.2)
     there = parking_place(gate, 1, Task.of_points(tools).targets, -0.25)
     assert there.angle == -0.25
-    assert there.reached == there.targets == len(tools)
-    assert place.reached <= there.reached
+    assert there.reached.sum() == len(there.points) == len(tools)
+    assert place.reached.sum() <= there.reached.sum()
     assert abs(place.angle + 0.25) < 0.4
 
 
@@ -93,7 +93,7 @@ def test_of_places_that_are_as_good_the_nearest_is_taken(armpi):
     target = task_of(armpi, 1, 3).targets
     for stands in (-0.2, 0.1):
         place = parking_place(SafetyGate(armpi), 3, target, stands)
-        assert place.reached == 1
+        assert place.reached.sum() == 1
         assert place.angle == stands
 
 

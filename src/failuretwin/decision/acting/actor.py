@@ -19,9 +19,9 @@ from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault, Seen
 from failuretwin.decision.acting.judging import Judge, Judgement
-from failuretwin.decision.acting.outcome import USUAL, ActingSettings, TargetResult
-from failuretwin.decision.acting.parking import parking_place
+from failuretwin.decision.acting.outcome import ActingSettings, TargetResult
 from failuretwin.decision.acting.planner import Plan, Planner, Standing
+from failuretwin.decision.acting.reach import parking_place
 from failuretwin.decision.acting.reactions import lost_command, probing, told
 from failuretwin.decision.acting.sparing import Effort
 from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, Target, Task
@@ -35,6 +35,8 @@ SMALLEST_NEWS_RAD = 0.02
 [rad]."""
 LEFT_OPEN = 0.9
 """What is wrong is open as long as nothing is more probable, healthy included."""
+FIRST_GAIN, LATER_GAIN = 1.0, 0.7
+"""Share of the error that the first correction takes off, and each later one."""
 HALVINGS = 3
 """A correction that is not safe is tried at half, a quarter and an eighth."""
 
@@ -64,7 +66,7 @@ class Actor:
         task: The task.
         belief: What the arm is taken to be.
         command: What the motors were told last, (motor,) [rad].
-        settings: How it is carried out.
+        settings: How it is carried out; None: the defaults.
         judge: Weighs movements in `see`; None: nothing is diagnosed there.
     """
 
@@ -75,11 +77,11 @@ class Actor:
         task: Task,
         belief: Belief,
         command: FloatArray,
-        settings: ActingSettings = USUAL,
+        settings: ActingSettings | None = None,
         judge: Judge | None = None,
     ) -> None:
         self._planner, self.model, self._task, self._judge = planner, model, task, judge
-        self.belief, self._settings = belief, settings
+        self.belief, self._settings = belief, settings or ActingSettings()
         self.results: list[TargetResult] = []
         self.said: list[str] = []
         self._command = self._previous = command
@@ -90,7 +92,7 @@ class Actor:
         self._since_probe = 0
         self.ways: list[tuple[Effort, ...]] = []  # as taken, and as if no motor were spared
         self._judgement: Judgement | None = None
-        self._questions = settings.questions
+        self._questions = self._settings.questions
 
     # What is known.
 
@@ -297,9 +299,14 @@ class Actor:
         left = self._task.targets[len(self.results) :]
         stands = float(at.pose[believed.motor])
         place = parking_place(self._planner.gate, believed.motor, left, stands)
-        if place.reached:
+        reached = int(place.reached.sum())
+        if reached:
             self.belief.stands_at(place.angle, 0.0)
-            self._say(place.told(self.model.motor_names[believed.motor]))
+            self._say(
+                f"{place.motor} is parked at {np.rad2deg(place.angle):.0f} deg before it stops "
+                f"elsewhere: {reached} of the next {len(place.points)} targets can be reached "
+                "without it"
+            )
 
     def _out_of_reach(self, plan: Plan, at: Standing) -> Plan:
         """Return what to do where the motor that rests keeps the tool from its target."""
@@ -387,14 +394,15 @@ class Actor:
         assert seen.point is not None
         first = attempt.corrections == 0
         attempt.corrections += 1
-        gain = self._settings.first_gain if first else self._settings.later_gain
+        taken_off = FIRST_GAIN if first else LATER_GAIN
         wrong = ""
         miss, turn = self.target.point - seen.point, self._turn(seen)
         then = arm.settle(seen.command, seen.previous, self._time_s + self._pace_s)
         slips = then - arm.settle(seen.command, seen.previous, seen.rest_s)
-        for share in gain * 0.5 ** np.arange(HALVINGS + 1):
+        gain = arm.gain(seen.command, seen.previous, seen.rest_s)
+        for share in taken_off * 0.5 ** np.arange(HALVINGS + 1):
             step = self._step(arm, attempt.pose, share * miss, share * turn)
-            command = np.clip(self._command + (step - slips) / arm.gain(seen), *arm.limits)
+            command = np.clip(self._command + (step - slips) / gain, *arm.limits)
             command = arm.rounded(arm.with_rest(command, self._command))
             order, wrong = self._planner.checked(command, arm, self.standing())
             if not wrong:

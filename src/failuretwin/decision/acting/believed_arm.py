@@ -208,7 +208,7 @@ class BelievedArm:
         command = self._nearly(pose, previous)
         for _ in range(NEWTON_STEPS):
             settled = self.settle(command, previous, time_s)
-            gain = self._gain(command, previous, time_s, settled)
+            gain = self.gain(command, previous, time_s)
             step = np.where(self.held, 0.0, (pose - settled) / gain)
             command = command + step
             if np.abs(step).max() < CLOSE_RAD:
@@ -224,20 +224,14 @@ class BelievedArm:
         offset = self.model.settling.offset(self.robot, pose, direction)
         return np.where(self.held, pose, pose - offset)
 
-    def gain(self, seen: Seen) -> FloatArray:
-        """Return how far each motor follows a change of its command, (motor,) [-]."""
-        settled = self.settle(seen.command, seen.previous, seen.rest_s)
-        return self._gain(seen.command, seen.previous, seen.rest_s, settled)
-
-    def _gain(
-        self, command: FloatArray, previous: FloatArray, time_s: float, settled: FloatArray
-    ) -> FloatArray:
+    def gain(self, command: FloatArray, previous: FloatArray, time_s: float) -> FloatArray:
+        """Return how far each motor follows a change of its command, (motor,) [-]; see `settle`."""
         gain, fault = np.ones_like(command), self.fault
         if fault is not None and fault.inverted:
             probed = command.copy()
             probed[fault.motor] += PROBE_RAD
-            moved = (self.settle(probed, previous, time_s) - settled)[fault.motor]
-            gain[fault.motor] = max(moved / PROBE_RAD, LEAST_GAIN)
+            moved = self.settle(probed, previous, time_s) - self.settle(command, previous, time_s)
+            gain[fault.motor] = max(moved[fault.motor] / PROBE_RAD, LEAST_GAIN)
         return gain
 
     def with_rest(self, command: FloatArray, previous: FloatArray) -> FloatArray:

@@ -40,14 +40,11 @@ def followed(
     offset, deviation = np.array([_offset(model, believed.motor, seen) for seen in since]).T
     time = np.array([seen.rest_s for seen in since])
     last = time[-1]
-    columns = np.stack([np.ones_like(time), time - last], axis=-1)
-    share, (now, rate), doubt = np.ones_like(time), np.zeros(2), 0.0
+    share, (rate, now), covariance = np.ones_like(time), np.zeros(2), np.eye(2)
     for _ in range(ROUNDS):
-        weighed = columns * (share / deviation**2)[:, None]
-        precision = weighed.T @ columns
-        now, rate = np.linalg.solve(precision, weighed.T @ offset)
-        doubt = float(np.sqrt(np.linalg.inv(precision)[0, 0]))
-        away = (offset - columns @ [now, rate]) / (FAR * deviation)
+        weight = np.sqrt(share) / deviation
+        (rate, now), covariance = np.polyfit(time - last, offset, 1, w=weight, cov="unscaled")
+        away = (offset - now - rate * (time - last)) / (FAR * deviation)
         share = 1.0 / (1.0 + away**2)
     if now * rate <= 0.0:
         return believed
@@ -55,7 +52,7 @@ def followed(
     return replace(
         believed,
         size=float(rate),
-        spread=HALF_90 * doubt / grown_s,
+        spread=HALF_90 * float(np.sqrt(covariance[1, 1])) / grown_s,
         since_s=float(last - grown_s),
     )
 

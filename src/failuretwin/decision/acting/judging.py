@@ -79,14 +79,14 @@ class Judgement:
         Whether an error is constant or drawn anew takes several movements to tell, which motor it
         is of takes far fewer. Were it drawn anew, inverting it would do no worse than feedback.
         """
-        some = [each for each in self.posterior.hypotheses if _reaction(each) is Reaction.INVERT]
-        best = max(some, key=self.probability, default=HEALTHY)
-        twins = [
-            each
-            for each in self.posterior.hypotheses
-            if _is_off(each) and best.faults and each.faults[0].motor == best.faults[0].motor
-        ]
-        return best, sum(self.probability(each) for each in twins)
+        single = [h for h in self.posterior.hypotheses if h.known and len(h.faults) == 1]
+        modes = {h: MODES[h.faults[0].mode] for h in single}
+        constant = [h for h in single if modes[h].reaction is Reaction.INVERT]
+        best = max(constant, key=self.probability, default=HEALTHY)
+        drawn_anew = [h for h in single if modes[h].signature is Signature.REDRAWN_OFFSET]
+        motors = {fault.motor for fault in best.faults}
+        twins = [h for h in (*constant, *drawn_anew) if h.faults[0].motor in motors]
+        return best, sum(map(self.probability, twins))
 
     def log_evidence(self, hypothesis: Hypothesis) -> float:
         """Return log p(movements | hypothesis)."""
@@ -108,21 +108,6 @@ class Judgement:
         at = self.posterior.hypotheses.index(hypothesis)
         onset = self.posterior.weights[at].estimate(self.row).onset
         return 0.0 if onset is None else float(onset.quantiles((0.5,))[0])
-
-
-def _reaction(hypothesis: Hypothesis) -> Reaction | None:
-    """Return what is done about one fault; None: healthy, unknown, or several faults."""
-    if not hypothesis.known or len(hypothesis.faults) != 1:
-        return None
-    return MODES[hypothesis.faults[0].mode].reaction
-
-
-def _is_off(hypothesis: Hypothesis) -> bool:
-    """Return whether it is one fault that leaves its motor off its target."""
-    if _reaction(hypothesis) is Reaction.INVERT:
-        return True
-    known = hypothesis.known and len(hypothesis.faults) == 1
-    return known and MODES[hypothesis.faults[0].mode].signature is Signature.REDRAWN_OFFSET
 
 
 @dataclass(frozen=True)

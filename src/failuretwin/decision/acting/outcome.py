@@ -16,8 +16,6 @@ class ActingSettings:
     Attributes:
         most_movements: After so many a target is given up.
         feedback: Whether what the tool misses is corrected; else each target has one movement.
-        first_gain: Share of the error that the first correction takes off.
-        later_gain: The same of those that follow.
         most_repeats: So often a command that seems lost is sent again for one target.
         probe_every: A motor that is held is told to move once in so many targets, so that a
             repair is noticed.
@@ -27,15 +25,9 @@ class ActingSettings:
 
     most_movements: int = 6
     feedback: bool = True
-    first_gain: float = 1.0
-    later_gain: float = 0.7
     most_repeats: int = 1
     probe_every: int = 8
     questions: int = 0
-
-
-USUAL = ActingSettings()
-"""How a task is carried out where nothing is said."""
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,12 @@ import numpy as np
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.decision.acting.safety import SafetyGate
-from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, TOLERANCE_M, Task
+from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, TOLERANCE_M, Target, Task
 from failuretwin.digital_model.inverse_kinematics import (
     STARTS,
     InverseKinematics,
     feedback_factor,
+    usable_limits,
 )
 from failuretwin.digital_model.robot import Robot, load_robot
 
@@ -27,6 +28,8 @@ POINTS = 300
 """Points of a workspace, unless told otherwise."""
 ANGLES = 9
 """Held angles of each motor that are tried."""
+LOOKED_AHEAD = 12
+"""Next targets that decide where a motor is parked."""
 
 
 @dataclass(frozen=True)
@@ -186,3 +189,23 @@ def reach_by_motor(
         share = [reach(gate, points, (name, float(a)), seed).share for a in angle]
         found.append(MotorReach(name, angle, np.array(share), float(factor[k])))
     return found
+
+
+def parking_place(gate: SafetyGate, motor: int, targets: Sequence[Target], stands: float) -> Reach:
+    """Return the reach with a motor parked at the angle that keeps most of the next targets.
+
+        angle* = argmax over angles of the number of targets that the other motors reach
+
+    Of angles that are as good, the one nearest to the present angle.
+
+    Args:
+        gate: The arm, and what is safe.
+        motor: Index of the motor, which still moves.
+        targets: Remaining targets in their order; at least one.
+        stands: Present angle of the motor [rad].
+    """
+    low, high = (ends[motor] for ends in usable_limits(gate.robot))
+    angles = np.append(np.linspace(low, high, ANGLES + 2)[1:-1], np.clip(stands, low, high))
+    name, near = gate.robot.motor_names[motor], Task(tuple(targets[:LOOKED_AHEAD]))
+    found = [reach(gate, near, (name, float(angle))) for angle in angles]
+    return min(found, key=lambda each: (-each.reached.sum(), abs(each.angle - stands)))

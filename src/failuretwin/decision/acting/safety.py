@@ -101,10 +101,12 @@ class SafetyGate:
 
         By constant speed, and by an acceleration up to the middle and down again.
         """
+        return max(float(self._needed_s(travel).max()) * (1.0 + 1e-6), self.limits.least_ramp_s)
+
+    def _needed_s(self, travel: FloatArray) -> FloatArray:
+        """Return the shortest time of each motor for its travel, (motor,) [s]."""
         away = np.abs(travel)
-        by_speed, by_acceleration = away / self.speed, 2.0 * np.sqrt(away / self.acceleration)
-        longest = max(float(by_speed.max()), float(by_acceleration.max()))
-        return max(longest * (1.0 + 1e-6), self.limits.least_ramp_s)
+        return np.maximum(away / self.speed, 2.0 * np.sqrt(away / self.acceleration))
 
     def wrong(self, order: Order, ways: Sequence[Way]) -> str:
         """Return why an order must not be sent, empty if it may.
@@ -119,11 +121,7 @@ class SafetyGate:
         beyond = (order.target < low - ROUNDING) | (order.target > high + ROUNDING)
         if beyond.any():
             return f"{self._names(beyond)} would leave its limits"
-        travel = order.target - ways[0][0]
-        needed = np.maximum(
-            np.abs(travel) / self.speed, 2.0 * np.sqrt(np.abs(travel) / self.acceleration)
-        )
-        fast = order.duration < needed * (1.0 - ROUNDING)
+        fast = order.duration < self._needed_s(order.target - ways[0][0]) * (1.0 - ROUNDING)
         if fast.any():
             return f"{self._names(fast)} would be faster than is allowed"
         return self.in_the_way(ways)

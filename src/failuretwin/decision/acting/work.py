@@ -223,18 +223,30 @@ def first_standing(commander: Commander) -> FloatArray:
     Raises:
         InputError: If neither is heard within `FIRST_WAIT_S`.
     """
-    until = time.monotonic() + FIRST_WAIT_S
-    while time.monotonic() < until:
-        event = commander.poll(POLL_S)
-        if commander.standing is not None:
-            return commander.standing
-        if (angles := _angles(event)) is not None:
-            return angles
+
+    def heard(event: Event | None) -> FloatArray | None:
+        return _angles(event) if commander.standing is None else commander.standing
+
+    found = _awaited(commander, heard)
+    if found is not None:
+        return found
     raise InputError(
         f"{commander.name}: neither a command nor the angles of the motors are heard within "
         f"{FIRST_WAIT_S:g} s, so it is not known where the arm stands. Move it once by hand or by "
         "its own programs, or let it publish its joint states."
     )
+
+
+def _awaited(
+    commander: Commander, pose_of: Callable[[Event | None], FloatArray | None]
+) -> FloatArray | None:
+    """Return the first pose among the next events, (motor,) [rad]; None: timed out."""
+    until = time.monotonic() + FIRST_WAIT_S
+    while time.monotonic() < until:
+        found = pose_of(commander.poll(POLL_S))
+        if found is not None:
+            return found
+    return None
 
 
 def _angles(event: Event | None) -> FloatArray | None:
@@ -252,11 +264,8 @@ def where_it_stands(commander: Commander) -> FloatArray:
     Raises:
         InputError: If neither is heard within `FIRST_WAIT_S`.
     """
-    until = time.monotonic() + FIRST_WAIT_S
-    while time.monotonic() < until:
-        event = commander.poll(POLL_S)
-        if (angles := _angles(event)) is not None:
-            return angles
-    if commander.standing is not None:
-        return commander.standing
+    found = _awaited(commander, _angles)
+    found = commander.standing if found is None else found
+    if found is not None:
+        return found
     raise InputError(f"{commander.name}: it is not known where the arm stands; nothing was sent.")
