@@ -36,7 +36,7 @@ from failuretwin.inference.posterior import (
     check_diagnosable,
     shows_in_transients,
 )
-from failuretwin.inference.seen_runs import SeenRuns, mixed
+from failuretwin.inference.seen_runs import SeenRuns, common_remarks, mixed
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -168,8 +168,9 @@ class BayesDiagnoser:
         for first in range(0, len(names), chunk):
             rows = slice(first, first + chunk)
             says = [one.posterior(rows, way) for one, way in zip(seen, moving, strict=True)]
-            likeliest = mixed(says, set_ups, seen[0].rounding())
-            robots = seen[0].robots(likeliest, len(says) == 1 and set_ups.fits)
+            rounding = seen[0].rounding()
+            likeliest, common = mixed(says, set_ups, rounding), common_remarks(set_ups, rounding)
+            robots = seen[0].robots(likeliest, common, len(says) == 1 and set_ups.fits)
             for at in range(len(names))[rows]:
                 posterior, row = robots.of_run(at - first)
                 results.append(posterior.to_diagnosis(row, names[at], quality[at], truth[at]))

@@ -145,13 +145,20 @@ class RobotMixture:
 
     Attributes:
         parts: By component; the first holds all runs.
+        common: What is said of the log of all runs; the first component's posterior says it.
     """
 
     parts: Sequence[RobotPosterior]
+    common: Sequence[str]
 
     @classmethod
     def of(
-        cls, named: Posterior, components: Sequence[RobotComponent], priors: Priors, in_doubt: bool
+        cls,
+        named: Posterior,
+        components: Sequence[RobotComponent],
+        priors: Priors,
+        in_doubt: bool,
+        common: Sequence[str] = (),
     ) -> RobotMixture:
         """Weigh the other components where they may explain a run better.
 
@@ -161,13 +168,14 @@ class RobotMixture:
             priors: Beliefs about faults and set-ups.
             in_doubt: Whether the sensor may stand elsewhere: weighed with the first two, since what
                 differs from the usual robot explains the same runs.
+            common: What is said of the log of all runs.
         """
         first, *others = components
         alone = replace(named.likelihood, moving=None)
         settled, rows = named, np.arange(len(named.log_posterior))
         if others and named.likelihood.moving is not None:
             settled = shared_posterior(alone, named.hypotheses, priors, in_doubt)
-        mixture = cls([RobotPosterior.of(first, rows, named, settled)])
+        mixture = cls([RobotPosterior.of(first, rows, named, settled)], common)
         for one in others:
             likelihood = RunLikelihood(alone.evidence, one.model)
             some = mixture.rows_to_weigh(one, likelihood, priors)
@@ -175,7 +183,7 @@ class RobotMixture:
                 doubt = in_doubt and one is others[0]
                 says = shared_posterior(likelihood[some], named.hypotheses, priors, doubt)
                 part = RobotPosterior.of(one, some, says, says)
-                mixture = cls([*mixture.parts, part])
+                mixture = cls([*mixture.parts, part], common)
         return mixture
 
     @cached_property
@@ -224,8 +232,9 @@ class RobotMixture:
         posterior = np.array(part.posterior.log_posterior)
         posterior[row] = self.log_posterior[run]
         said = list(part.posterior.set_up) or [""] * len(part.rows)
-        if self._another(run) > TOLD:
-            said[row] = "; ".join(filter(None, (said[row], part.told)))
+        common = () if part is self.parts[0] else self.common
+        told = part.told if self._another(run) > TOLD else ""
+        said[row] = "; ".join(filter(None, (*common, said[row], told)))
         return replace(part.posterior, log_posterior=posterior, set_up=said), row
 
     def _another(self, run: int) -> float:

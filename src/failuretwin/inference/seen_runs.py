@@ -188,15 +188,16 @@ class SeenRuns:
         likelihood = RunLikelihood(self.evidence.sound.settled[rows], self.healthy, way)
         return shared_posterior(likelihood, self.hypotheses, self.priors, self.in_doubt)
 
-    def robots(self, named: Posterior, others: bool) -> RobotMixture:
+    def robots(self, named: Posterior, common: Sequence[str], others: bool) -> RobotMixture:
         """Return what runs say of the robot: that of the model, or another of its kind.
 
         Args:
             named: Posterior of some of the runs by the model.
+            common: What is said of the log of all runs.
             others: Whether other robots are weighed.
         """
         components = self.components if others else self.components[:1]
-        return RobotMixture.of(named, components, self.priors, self.in_doubt)
+        return RobotMixture.of(named, components, self.priors, self.in_doubt, common)
 
     def elsewhere(self) -> str:
         """Return that the sensor stands elsewhere, or is noisier, if most runs say so."""
@@ -240,18 +241,24 @@ def mixed(
     if len(posteriors) > 1:
         stacked = np.stack([one.log_posterior for one in posteriors]) + weight[:, None, None]
         likeliest = replace(likeliest, log_posterior=log_sum(stacked, axis=0))
-    remark, count = set_up_remark(set_ups), len(likeliest.log_posterior)
-    if set_ups.fits and set_ups.wrong >= SURE:
-        remark = f"{remark}; judged with that undone"
+    count, common = len(likeliest.log_posterior), common_remarks(set_ups, rounding)
     known = likeliest.set_up or [""] * count
-    if remark or rounding:
-        said = ["; ".join(filter(None, (remark, *rounding, one))) for one in known]
+    if common:
+        said = ["; ".join(filter(None, (*common, one))) for one in known]
         likeliest = replace(likeliest, set_up=said)
     if set_ups.fits:
         return likeliest
     everywhere = bool(set_ups.best.set_up.what)
     lost = [everywhere or _unexplained(likeliest, run, known[run]) for run in range(count)]
     return replace(likeliest, no_verdict=[ANOTHER if one else "" for one in lost])
+
+
+def common_remarks(set_ups: SetUpPosterior, rounding: Sequence[str]) -> list[str]:
+    """Return what is to be said of the log of all runs, of its set-up first."""
+    remark = set_up_remark(set_ups)
+    if set_ups.fits and set_ups.wrong >= SURE:
+        remark = f"{remark}; judged with that undone"
+    return [line for line in (remark, *rounding) if line]
 
 
 def _unexplained(posterior: Posterior, run: int, set_up: str) -> bool:
