@@ -18,7 +18,9 @@ from failuretwin.app.commands.options import (
     PATH,
     calibration_option,
     common_options,
+    json_option,
     plugin_option,
+    topics_option,
 )
 from failuretwin.app.terminal import tell
 
@@ -36,20 +38,20 @@ from failuretwin.app.terminal import tell
     "--most-movements",
     type=click.IntRange(min=1),
     default=6,
-    help="Give a target up after so many.",
+    help="Maximum number of attempts per target.",
 )
 @click.option(
     "--ask",
     "questions",
     type=click.IntRange(min=0),
     default=0,
-    help="Make so many movements at most only to settle what is wrong, while that is open.",
+    help="Maximum number of extra diagnostic movements.",
 )
 @click.option(
     "--spare",
     multiple=True,
     metavar="MOTOR[=WEIGHT]",
-    help="A worn motor that poses shall load and move little. Can be given several times.",
+    help="Motor to spare: plan poses that load and move it less. Can be given several times.",
 )
 @click.option(
     "--wear",
@@ -58,9 +60,7 @@ from failuretwin.app.terminal import tell
     metavar="CAL.history.jsonl",
     help="What `diagnose --track` keeps: motors are spared by how worn they are.",
 )
-@click.option(
-    "--json", "json_file", type=PATH, metavar="FILE", help="Write a line for each target."
-)
+@json_option("Write one object a target, one a line.")
 @arm_options
 @safety_options
 @calibration_option
@@ -122,7 +122,7 @@ def act(
 @click.option(
     "--on", "place", default="ros1", metavar="ros1|ros2|rosbridge://HOST[:PORT]", help="The arm."
 )
-@click.option("--topics", type=PATH, metavar="FILE.toml", help="Names and types of ROS topics.")
+@topics_option
 @common_options
 def stop(place: str, topics: Path | None, robot: str, seed: int) -> None:
     """Order an arm to stay where it is; an `act` that works on it hears that and ends.

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from failuretwin.app.commands.options import PATH, calibration_option, common_options
+from failuretwin.app.commands.options import PATH, calibration_option, common_options, json_option
 from failuretwin.app.terminal import tell
 
 
@@ -14,10 +14,12 @@ from failuretwin.app.terminal import tell
 @click.argument(
     "source", metavar="[RESULTS.jsonl|HISTORY.history.jsonl]", type=PATH, required=False
 )
-@click.option("--costs", type=PATH, metavar="FILE.toml", help="What things cost you.")
-@click.option("--template", type=PATH, metavar="FILE.toml", help="Write costs to be filled in.")
-@click.option("--run", metavar="NAME", help="The run that is meant. Default: the last.")
-@click.option("--json", "json_file", type=PATH, metavar="FILE", help="Write what is advised.")
+@click.option(
+    "--costs", type=PATH, metavar="FILE.toml", help="Cost table: downtime, repair, replacement."
+)
+@click.option("--template", type=PATH, metavar="FILE.toml", help="Write a cost table to fill in.")
+@click.option("--run", metavar="NAME", help="Run to use. Default: the last one.")
+@json_option("Write the advice.")
 @calibration_option
 @common_options
 def advise(

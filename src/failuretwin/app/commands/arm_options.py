@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from failuretwin.app.commands.options import PATH, gathered
+from failuretwin.app.commands.options import F, fault_option, gathered, topics_option
 
 if TYPE_CHECKING:
     from failuretwin.connection.links.base import Commander
@@ -19,6 +20,27 @@ if TYPE_CHECKING:
     from failuretwin.digital_model.robot import Robot
 
 SPEED_SHARE = 0.5
+
+
+def move_option(when: str = "") -> Callable[[F], F]:
+    """Return the option `--move`; `when` says which option it belongs to."""
+    return click.option(
+        "--move",
+        is_flag=True,
+        help=f"{when}Send orders to a real arm. Without it the orders are only shown. An emulated "
+        "arm needs no --move.",
+    )
+
+
+floor_option = click.option(
+    "--floor", type=float, metavar="METRES", help="Height of the floor. Default: the base."
+)
+radius_option = click.option(
+    "--radius",
+    type=click.FloatRange(min=0.0),
+    metavar="METRES",
+    help="Radius of the links, for the distance that they keep. Default: by the arm's reach.",
+)
 
 
 @dataclass(frozen=True)
@@ -58,21 +80,9 @@ arm_options = gathered(
         metavar="emulated|ros1|ros2|rosbridge://HOST[:PORT]",
         help="The arm.",
     ),
-    click.option(
-        "--fault",
-        "faults",
-        multiple=True,
-        metavar="MOTOR:MODE[=SIZE][@START]",
-        help="A fault of an emulated arm, such as motor_3:stuck, motor_3:stuck=-0.4 or "
-        "motor_2:encoder_bias=0.1@20. Can be given several times.",
-    ),
-    click.option(
-        "--move",
-        is_flag=True,
-        help="Really send orders. Without it a real arm gets none, and what would be ordered is "
-        "told. An emulated arm needs no --move.",
-    ),
-    click.option("--topics", type=PATH, metavar="FILE.toml", help="Names and types of ROS topics."),
+    fault_option,
+    move_option(),
+    topics_option,
 )
 
 
@@ -130,12 +140,7 @@ probe_options = gathered(
         metavar="SECONDS",
         help="With --probe: only so long after the last command of others was carried out.",
     ),
-    click.option(
-        "--move",
-        is_flag=True,
-        help="With --probe: really send orders. Without it a real arm gets none, and what would be "
-        "ordered is told. An emulated arm needs no --move.",
-    ),
+    move_option("With --probe: "),
 )
 
 
@@ -148,13 +153,6 @@ safety_options = gathered(
         default=SPEED_SHARE,
         help="Share of each motor's speed limit that may be used.",
     ),
-    click.option(
-        "--floor", type=float, metavar="METRES", help="Height of the floor. Default: the base."
-    ),
-    click.option(
-        "--radius",
-        type=click.FloatRange(min=0.0),
-        metavar="METRES",
-        help="Radius of the links, for the distance that they keep. Default: by the arm's reach.",
-    ),
+    floor_option,
+    radius_option,
 )

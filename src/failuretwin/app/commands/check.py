@@ -22,6 +22,7 @@ from failuretwin.app.commands.options import (
     calibration_option,
     common_options,
     gathered,
+    json_option,
     plugin_option,
     refuse_unused,
     report_option,
@@ -131,9 +132,9 @@ MOTIONS = ("written", "motions", "keep", "speed_share", "floor", "radius")
     "--further",
     type=click.IntRange(min=0),
     default=0,
-    help="So many further movements at most, if it is still open then what is wrong.",
+    help="Maximum number of further movements if the result is still open.",
 )
-@click.option("--json", "json_file", type=PATH, metavar="FILE", help="Write an object a line.")
+@json_option("Write one object a line.")
 @report_option("Write index.html: the state of the robot, which motor, how surely, what to do.")
 @arm_options
 @motion_options
@@ -247,7 +248,9 @@ def _check_logs(
 
 @click.command()
 @seconds_option
-@click.option("--movements", type=click.IntRange(min=1), default=1000, help="So many at most.")
+@click.option(
+    "--movements", type=click.IntRange(min=1), default=1000, help="Maximum number of movements."
+)
 @click.option(
     "--write", "written", type=PATH, metavar="FILE", help="Write .json, .csv, .mcap or .bag."
 )
@@ -297,7 +300,7 @@ def design(
     help="What is laid beside each other. Default: the paper's nine classes.",
 )
 @report_option("Draw the smallest sizes there, isolability.png.")
-@click.option("--json", "json_file", type=PATH, metavar="FILE", help="Write the table.")
+@json_option("Write the table.")
 @calibration_option
 @plugin_option
 @common_options

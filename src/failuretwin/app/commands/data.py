@@ -240,27 +240,42 @@ def init(
     sensor_noise: float,
 ) -> None:
     """Write a commented profile for the robot of a URDF, ready for --robot PROFILE."""
-    from failuretwin.core.errors import InputError
-    from failuretwin.data_knowledge.store import replacing
     from failuretwin.digital_model.profile_text import profile_text
-    from failuretwin.digital_model.robot import load_robot
     from failuretwin.digital_model.urdf.check import check_urdf
 
-    if out.suffix != ".toml":
-        raise InputError(f"{out}: a profile ends in .toml. Give such a name.")
-    if out.exists():
-        raise InputError(f"{out}: exists already. Choose another name, or remove it first.")
+    _check_profile(out)
     report = check_urdf(urdf, base, tool, 1e-3 * sensor_noise)
-    text = profile_text(report, out, _home(home, report))
-    with replacing(out) as partial:
-        partial.write_text(text, encoding="utf-8")
-        load_robot(partial)
+    _write_profile(profile_text(report, out, _home(home, report)), out)
     for message in report.having("warning"):
         tell(f"warning: {message}", err=True)
     tell(
         f"profile with {counted(len(report.motors), 'motor')} written to {out}; go through the "
         "lines that say 'assumed'"
     )
+
+
+def _check_profile(out: Path, replaced: Path | None = None) -> None:
+    """Check the name of a profile to write; only the profile `replaced` may be overwritten.
+
+    Raises:
+        InputError: If it does not end in .toml, or another file has this name.
+    """
+    from failuretwin.core.errors import InputError
+
+    if out.suffix != ".toml":
+        raise InputError(f"{out}: a profile ends in .toml. Give such a name.")
+    if out.exists() and (replaced is None or out.resolve() != replaced.resolve()):
+        raise InputError(f"{out}: exists already. Choose another name, or remove it first.")
+
+
+def _write_profile(text: str, out: Path) -> None:
+    """Write a profile that `load_robot` accepts; otherwise nothing is written."""
+    from failuretwin.data_knowledge.store import replacing
+    from failuretwin.digital_model.robot import load_robot
+
+    with replacing(out) as partial:
+        partial.write_text(text, encoding="utf-8")
+        load_robot(partial)
 
 
 def _home(text: str | None, report: UrdfReport) -> list[float]:
@@ -300,22 +315,15 @@ def fit_(logs: tuple[Path, ...], out: Path, reading: LogOptions, robot: str, see
     from failuretwin.app.inputs import read_inputs
     from failuretwin.app.reports.robot_report import print_registration
     from failuretwin.connection.registration.fit import fit_registration
-    from failuretwin.core.errors import InputError
-    from failuretwin.data_knowledge.store import replacing
     from failuretwin.digital_model.profile_text import fitted_text
     from failuretwin.digital_model.robot import load_robot
 
-    if out.suffix != ".toml":
-        raise InputError(f"{out}: a profile ends in .toml. Give such a name.")
     model = load_robot(robot)
-    if out.exists() and out.resolve() != model.source.resolve():
-        raise InputError(f"{out}: exists already. Choose another name, or remove it first.")
+    _check_profile(out, model.source)
     runs = read_inputs(logs, model, reading)
     names = ", ".join(log.name for log in logs)
     found = fit_registration(runs, model, names, datetime.now(UTC).date().isoformat())
     text = fitted_text(model.source.read_text(encoding="utf-8"), model.source, out, found.profile)
-    with replacing(out) as partial:
-        partial.write_text(text, encoding="utf-8")
-        load_robot(partial)
+    _write_profile(text, out)
     print_registration(found)
     tell(f"written to {out}; use it with --robot {out}")

@@ -15,6 +15,7 @@ from failuretwin.app.commands.options import (
     LogOptions,
     calibration_option,
     common_options,
+    json_option,
     plugin_option,
     reading_options,
     refuse_unused,
@@ -138,7 +139,7 @@ class Findings:
     help="What to believe: tool (its position), orientation, accelerometer, gyroscope, wire, "
     "encoders, or several joined by '+'. Default: tool where runs have it, else what they have.",
 )
-@click.option("--json", "json_file", type=PATH, help="Write an object a line, a line a run.")
+@json_option("Write one object a run, one a line.")
 @click.option("--csv", "csv_file", type=PATH, help="Write a table, a row a run.")
 @report_option(
     "Write index.html: the state of the robot, what to do, and pictures of some runs.", "--plot"

@@ -6,7 +6,13 @@ from pathlib import Path
 
 import click
 
-from failuretwin.app.commands.options import PATH, common_options, plugin_option, report_option
+from failuretwin.app.commands.options import (
+    PATH,
+    common_options,
+    plugin_option,
+    published_labels_option,
+    report_option,
+)
 
 
 @click.command()
@@ -18,11 +24,7 @@ from failuretwin.app.commands.options import PATH, common_options, plugin_option
     help="Run set or raw sessions that know the truth; default: the results. Needed for the "
     "coverage of intervals.",
 )
-@click.option(
-    "--published-labels",
-    is_flag=True,
-    help="Take the truth of raw sessions from folder names that end in _label_K, as diagnose does.",
-)
+@published_labels_option
 @click.option(
     "--against",
     type=PATH,

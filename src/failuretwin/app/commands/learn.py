@@ -14,6 +14,7 @@ from failuretwin.app.commands.options import (
     calibration_option,
     common_options,
     plugin_option,
+    published_labels_option,
     reading_options,
     report_option,
 )
@@ -225,12 +226,7 @@ def train(
     metavar="PATH",
     help="Real runs to test on. Default: runs of the physics engine, as a stand-in.",
 )
-@click.option(
-    "--published-labels",
-    is_flag=True,
-    help="Take the truth of raw test sessions from folder names that end in _label_K and freeze "
-    "the motor of labels 1-4 from sample 49 on, as the authors of the data did.",
-)
+@published_labels_option
 @click.option("--quick", is_flag=True, help="A small version of about two minutes.")
 @click.option("--resume", is_flag=True, help="Go on with a study that was cut short.")
 @common_options

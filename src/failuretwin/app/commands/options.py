@@ -131,6 +131,35 @@ def plugin_option(command: F) -> F:
     )(command)
 
 
+def json_option(text: str) -> Callable[[F], F]:
+    """Return the option `--json FILE`."""
+    return click.option("--json", "json_file", type=PATH, metavar="FILE", help=text)
+
+
+published_labels_option = click.option(
+    "--published-labels",
+    is_flag=True,
+    help="Take the truth of raw sessions from folder names that end in _label_K and freeze the "
+    "motor of labels 1-4 from sample 49 on, as the authors of the data did.",
+)
+topics_option = click.option(
+    "--topics",
+    type=PATH,
+    metavar="FILE.toml",
+    help="Names and types of the robot's ROS topics, see docs/live.md. Default: those of the data "
+    "set's authors.",
+)
+fault_option = click.option(
+    "--fault",
+    "faults",
+    multiple=True,
+    metavar="MOTOR:MODE[=SIZE][@START[-END]]",
+    help="Fault of an emulated robot, such as motor_3:stuck@40-80 (repaired after 80 s), "
+    "motor_3:stuck@40, or motor_2:slow=0.5 (SIZE in the unit of its mode). Can be given several "
+    "times.",
+)
+
+
 @dataclass(frozen=True)
 class LogOptions:
     """How logs become runs, as the help texts of `reading_options` say it."""
@@ -152,12 +181,7 @@ reading_options = gathered(
         help="Read raw sessions with readings at their times and gaps missing, or drawn out by "
         "straight lines as the authors published them.",
     ),
-    click.option(
-        "--published-labels",
-        is_flag=True,
-        help="Take the truth from folder names that end in _label_K and freeze the motor of labels "
-        "1-4 from sample 49 on, as the authors of the data did.",
-    ),
+    published_labels_option,
     click.option(
         "--columns",
         type=PATH,
@@ -187,22 +211,8 @@ class LiveOptions:
 live_options = gathered(
     LiveOptions,
     "live",
-    click.option(
-        "--topics",
-        type=PATH,
-        metavar="FILE.toml",
-        help="Names and types of the robot's ROS topics, see docs/live.md. Default: those of the "
-        "data set's authors.",
-    ),
-    click.option(
-        "--fault",
-        "faults",
-        multiple=True,
-        metavar="MOTOR:MODE[=SIZE][@START[-END]]",
-        help="A fault of an emulated robot, such as motor_3:stuck@40-80 (repaired after 80 s), "
-        "motor_3:stuck@40, or motor_2:slow=0.5 (SIZE in the unit of its mode). Can be given "
-        "several times.",
-    ),
+    topics_option,
+    fault_option,
     click.option(
         "--speed",
         type=click.FloatRange(min=0.0),

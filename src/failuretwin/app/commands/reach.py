@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from failuretwin.app.commands.options import PATH, common_options, report_option
+from failuretwin.app.commands.arm_options import floor_option, radius_option
+from failuretwin.app.commands.options import PATH, common_options, json_option, report_option
 from failuretwin.app.terminal import tell
 
 
@@ -18,12 +19,10 @@ from failuretwin.app.terminal import tell
     help="The motor that is stuck, and where [rad, m for one that slides]. Default: every motor "
     "in turn, all over its travel.",
 )
-@click.option("--floor", type=float, metavar="METRES", help="Height of the floor. Default: base.")
-@click.option(
-    "--radius", type=click.FloatRange(min=0.0), metavar="METRES", help="Radius of the links."
-)
+@floor_option
+@radius_option
 @report_option("Draw a map of the workspace there, reach.png.")
-@click.option("--json", "json_file", type=PATH, metavar="FILE", help="Write all points.")
+@json_option("Write all points.")
 @common_options
 def reach(
     task: Path | None,

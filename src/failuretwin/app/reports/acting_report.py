@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from failuretwin.app.reports.plots import clean, new_figure
-from failuretwin.data_knowledge.store import filling
+from failuretwin.app.reports.plots import clean, new_figure, save_figure
 from failuretwin.decision.acting.outcome import TargetResult
 from failuretwin.decision.acting.reach import MotorReach, Reach
 
@@ -88,5 +87,4 @@ def save_map(maps: Sequence[Reach], folder: Path) -> None:
             panel.set_ylabel(name_up)
             panel.set_aspect("equal", adjustable="datalim")
         above.set_title(f"{found.motor} at {np.rad2deg(found.angle):.0f} deg: {found.share:.0%}")
-    with filling(folder) as partial:
-        figure.savefig(partial / "reach.png", dpi=130)
+    save_figure(figure, folder, "reach.png")

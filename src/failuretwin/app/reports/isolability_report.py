@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from failuretwin.app.reports.plots import clean, new_figure
+from failuretwin.app.reports.plots import clean, new_figure, save_figure
 from failuretwin.app.reports.tables import Table, figures_table
 from failuretwin.core.errors import counted
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import as_floats
-from failuretwin.data_knowledge.store import filling
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.diagnoser import BayesDiagnoser
@@ -134,8 +133,7 @@ def save_picture(found: IsolabilityReport, robot: Robot, folder: Path) -> None:
         "smallest fault shown: blue, told from healthy; red, from all others; pale: not even",
         fontsize=8,
     )
-    with filling(folder) as partial:
-        figure.savefig(partial / "isolability.png", dpi=130)
+    save_figure(figure, folder, "isolability.png")
 
 
 # Remarks of `diagnose` on the motions of its runs.

@@ -55,6 +55,16 @@ def new_figure(width: float, height: float) -> Figure:
     return made
 
 
+def save_figure(figure: Figure, folder: Path, name: str) -> None:
+    """Write a figure into a folder as a PNG file.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    with filling(folder) as partial:
+        figure.savefig(partial / name, dpi=130)
+
+
 def png(figure: Figure) -> str:
     """Return a figure as a PNG file in base64, as pages hold it."""
     buffer = BytesIO()
@@ -182,8 +192,7 @@ def write_reliability(evaluation: Evaluation, folder: Path) -> None:
     if evaluation.calibration is None:
         raise InputError("no run got a verdict, so there is no reliability to draw.")
     figure = reliability_figure(evaluation.calibration.equal, evaluation.runs_and_protocol)
-    with filling(folder) as partial:
-        figure.savefig(partial / NAME, dpi=130)
+    save_figure(figure, folder, NAME)
 
 
 def reliability_figure(bins: Reliability, title: str) -> Figure:
