@@ -56,9 +56,9 @@ def test_imperfect_runs_are_diagnosed(diagnoses):
 
 
 def test_runs_of_the_published_twin_are_diagnosed(twin, armpi):
-    runs = simulate(Plan(armpi, paper_hypotheses(armpi.motor_names), 10, 2))
+    runs = simulate(Plan(armpi, paper_hypotheses(armpi.motor_names), 4, 2))
     found = BayesDiagnoser(twin).diagnose(runs)
-    assert sum(d.truth == d.diagnosis for d in found) >= 0.92 * 90
+    assert sum(d.truth == d.diagnosis for d in found) >= 0.92 * 36
 
 
 def test_command_and_measured_are_enough(twin, few, diagnoses):
@@ -229,7 +229,7 @@ def test_hypotheses_may_be_few(twin, few):
 
 
 def test_a_single_hypothesis_is_certain(twin, few):
-    found = BayesDiagnoser(twin, hypotheses=(HEALTHY,)).diagnose(few)
+    found = BayesDiagnoser(twin, hypotheses=(HEALTHY,)).diagnose(few.isel(run=[0, 1]))
     np.testing.assert_array_equal(posteriors(found), 1.0)
     assert {d.runner_up for d in found} == {None}
 
@@ -250,10 +250,11 @@ def test_known_onset_helps_and_is_reported(twin, imperfect, diagnoses):
 
 def test_wrong_onset_misleads(twin, imperfect, diagnoses):
     """A motor that stood still from 0.49 s on hardly got stuck at 7 s: the onset is believed."""
-    runs = imperfect.isel(run=slice(20, 100))
-    late = BayesDiagnoser(twin, priors=priors_of(twin.robot, None, 7.0)).diagnose(runs)
+    some = slice(20, 100, 4)
+    priors = dataclasses.replace(priors_of(twin.robot, None, 7.0), setup=SetupPrior.known())
+    late = BayesDiagnoser(twin, priors=priors).diagnose(imperfect.isel(run=some))
     right = sum(d.truth == d.diagnosis for d in late)
-    assert right < 0.6 * len(known(diagnoses, "stuck"))
+    assert right < 0.6 * len(known(diagnoses[some], "stuck"))
 
 
 def test_ranges_of_errors_are_in_servo_units(armpi):
@@ -336,7 +337,7 @@ def test_robot_of_which_nothing_is_known_is_judged_with_wide_offsets(armpi, impe
         armpi, profile=dataclasses.replace(armpi.profile, imperfections=None)
     )
     assert load_calibration(None, unknown).imperfections.protocol == "P0"
-    found = BayesDiagnoser(DigitalTwin(unknown)).diagnose(imperfect)
+    found = BayesDiagnoser(DigitalTwin(unknown)).diagnose(imperfect.isel(run=slice(None, None, 4)))
     assert {d.protocol for d in found} == {"P0"}
     assert "not calibrated" in found[0].method
     right = np.mean([d.truth == d.diagnosis for d in found])

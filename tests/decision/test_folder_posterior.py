@@ -105,8 +105,8 @@ def test_nor_does_how_many_are_weighed_at_a_time(twin, mixed, found, monkeypatch
     np.testing.assert_allclose(theta.mean / WIDTH, whole_set.mean / WIDTH, atol=1e-6)
 
 
-def test_later_passes_change_nothing_that_matters(twin, mixed, monkeypatch):
-    _, log_posterior, _ = judged(twin, mixed)
+def test_later_passes_change_nothing_that_matters(twin, mixed, found, monkeypatch):
+    _, log_posterior, _ = found
     monkeypatch.setattr(folder, "PASSES", 8)
     monkeypatch.setattr(folder, "MOST_PASSES", 8)
     _, later, _ = judged(twin, mixed)
@@ -128,7 +128,7 @@ def test_early_ones_do(twin, mixed, monkeypatch):
 def test_one_run_alone_is_judged_with_the_prior(twin, mixed, monkeypatch):
     """What it says itself of the robot does not count for its own hypothesis a second time."""
     monkeypatch.setattr(habits, "SCATTER_SPREAD", 1e-6)
-    for run in range(8):
+    for run in range(0, 8, 2):  # one of each truth
         alone = mixed.isel(run=[run])
         theta, log_posterior, names = judged(twin, alone, priors=SURE)
         weighing = SharedWeighing(theta.posteriors[0].likelihood, names, SURE)

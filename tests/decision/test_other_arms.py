@@ -54,7 +54,7 @@ def test_bundled_arms_are_diagnosed(name, kind):
     """
     robot = load_robot(name)
     imperfections = KINDS[kind](robot)
-    runs = simulate(Plan(robot, paper_hypotheses(robot.motor_names), 2, 3, imperfections))
+    runs = simulate(Plan(robot, paper_hypotheses(robot.motor_names), 1, 3, imperfections))
     found = BayesDiagnoser(DigitalTwin(robot), imperfections).diagnose(runs)
     check(found)
     assert accuracy(found) >= (0.7 if kind == "generic" else 0.8)

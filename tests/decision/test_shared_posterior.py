@@ -89,14 +89,13 @@ def test_a_set_up_that_is_known_is_not_asked_for(twin, runs):
 # Where the sensor stands elsewhere.
 
 
-@pytest.mark.parametrize("imperfections", [KNOWN, DOUBTED])
 @pytest.mark.parametrize(
-    "off",
+    ("off", "imperfections"),
     [
-        {"shift": SHIFT},
-        {"shift": (0.01, 0.015, -0.01)},
-        {"turn_deg": (0.0, 2.0, 0.0)},
-        {"scale": 1.03},
+        ({"shift": SHIFT}, KNOWN),
+        ({"shift": (0.01, 0.015, -0.01)}, DOUBTED),
+        ({"turn_deg": (0.0, 2.0, 0.0)}, DOUBTED),
+        ({"scale": 1.03}, KNOWN),
     ],
 )
 def test_verdicts_stand_and_the_set_up_is_told(twin, runs, off, imperfections):
