@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
+from failuretwin import BayesDiagnoser, DigitalTwin, SetupPrior, load_robot
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.data_knowledge.generate import Plan, simulate
 from failuretwin.digital_model.arm_classes import generic_imperfections
@@ -14,6 +14,7 @@ from failuretwin.digital_model.robot import bundled_folder, bundled_robots
 from failuretwin.digital_model.settling import largest_load
 from failuretwin.digital_model.urdf.check import check_urdf
 from failuretwin.digital_model.urdf.file import read_urdf
+from failuretwin.inference.faults.priors import Priors
 
 NEW = ("panda", "so101", "ur5e")
 SAME_PLACE_M = 1e-9
@@ -253,12 +254,13 @@ def test_what_is_known_of_the_class_saves_healthy_arms_from_sure_alarms():
     known = load_calibration(None, "so101")
     plan = Plan(known.robot, [Hypothesis()], 10, seed=3, imperfections=known.imperfections)
     runs, alarms = simulate(plan), {}
+    known_set_up = Priors(setup=SetupPrior.known())
 
     for name, healthy in (
         ("class", known.imperfections),
         ("generic", generic_imperfections(known.robot)),
     ):
-        found = BayesDiagnoser(known.twin, healthy).diagnose(runs)
+        found = BayesDiagnoser(known.twin, healthy, priors=known_set_up).diagnose(runs)
         alarms[name] = [d.probability for d in found if d.diagnosis != "healthy"]
 
     assert len(alarms["generic"]) >= 6
