@@ -14,6 +14,7 @@ from failuretwin.decision.acting.believed_arm import Seen
 from failuretwin.decision.acting.judging import Judge, settled_evidence_of
 from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.decision.test_motions.health_check import (
+    LOOSE_RAD,
     CheckResult,
     HealthCheck,
     checking,
@@ -34,13 +35,23 @@ from failuretwin.inference.posterior import log_prior
 COUNT_RAD = np.deg2rad(0.24)
 
 
-def seen_of(model, designed, off=0.0, play=0.0, noise=None):
-    """Return movements as seen if motors are off by (motor,) [rad], and have play (motor,)."""
-    window, time = [], 0.0
+def seen_of(model, designed, off=0.0, play=0.0, noise=None, held=None):
+    """Return movements as seen if motors are off by (motor,) [rad], and have play (motor,).
+
+    Args:
+        model: The healthy robot.
+        designed: The movements.
+        off: Displacement of each motor [rad].
+        play: Play of each motor [rad].
+        noise: Scatter of each movement, (movement, motor) [rad].
+        held: Motors that stay where they are in a movement, (movement, motor).
+    """
+    window, time, pose = [], 0.0, designed[0].previous
     for i, movement in enumerate(designed):
-        direction = np.sign(movement.order.target - movement.previous)
+        direction, stood = np.sign(movement.order.target - movement.previous), pose
         pose = model.settle(movement.order.target, direction, model.none_held) + off
         pose = pose - 0.5 * play * direction + (0.0 if noise is None else noise[i])
+        pose = pose if held is None else np.where(held[i], stood, pose)
         told = (movement.order.target, movement.previous, movement.order.duration)
         end = time + movement.seconds
         window.append(Seen(*told, time, end - 0.1, model.twin.path(pose)))
@@ -48,25 +59,68 @@ def seen_of(model, designed, off=0.0, play=0.0, noise=None):
     return window
 
 
+def offsets_of(model, window):
+    likelihood = RunLikelihood(settled_evidence_of([window]), model)
+    hypotheses = paper_hypotheses(model.motor_names)
+    return motor_offsets(likelihood, hypotheses, checking(model, hypotheses))
+
+
+def scattered(model, designed, rng):
+    """Return scatter as the model states it: Student t, the tail common to all motors."""
+    dof = model.settling.tail_dof
+    tail = np.sqrt(dof / rng.chisquare(dof, (len(designed), 1)))
+    return model.without_doubt.scatter * tail * rng.standard_normal((len(designed), 4))
+
+
+def deviations(found, off, play):
+    """Return how many standard deviations zeros and plays are from the truth, (2, motor)."""
+    return np.abs([(found.zero - off) / found.zero_sd, (found.play - play) / found.play_sd])
+
+
 def test_zeros_and_play_are_found_from_both_sides(model, designed):
     off, play = np.deg2rad([0.5, -0.4, 0.0, 0.6]), np.deg2rad([0.0, 1.0, 0.5, 0.0])
-    found = motor_offsets(settled_evidence_of([seen_of(model, designed, off, play)]), model)
+    found = offsets_of(model, seen_of(model, designed, off, play))
     np.testing.assert_allclose(found.zero, off, atol=np.deg2rad(0.08))
     np.testing.assert_allclose(found.play, play, atol=np.deg2rad(0.08))
 
 
-def test_their_deviations_are_what_they_scatter_by(model, designed):
-    rng = np.random.default_rng(0)
-    zero, play = [], []
-    for _ in range(200):
-        noise = model.scatter * rng.standard_normal((len(designed), 4))
-        found = motor_offsets(settled_evidence_of([seen_of(model, designed, noise=noise)]), model)
-        zero.append(found.zero / found.zero_sd)
-        play.append(found.play / found.play_sd)
-    # a Student t is expected, of which normal scatter is a narrow case
-    for scaled in (np.array(zero), np.array(play)):
-        assert np.all(np.abs(scaled.mean(axis=0)) < 0.3)
-        assert np.all((scaled.std(axis=0) > 0.6) & (scaled.std(axis=0) < 1.1))
+def test_intervals_of_zeros_and_play_contain_the_truth(model, designed):
+    rng, away = np.random.default_rng(0), []
+    for _ in range(20):
+        off, play = 0.01 * rng.standard_normal((2, 4))
+        noise = scattered(model, designed, rng)
+        found = offsets_of(model, seen_of(model, designed, off, play, noise))
+        away.append(deviations(found, off, play))
+    assert np.max(away) < 4.0
+    share_error = np.sqrt(0.9 * 0.1 / np.size(away))
+    assert abs(np.mean(np.array(away) < 1.645) - 0.9) < 3.0 * share_error
+
+
+@pytest.mark.parametrize("motor", [0, 2])
+def test_a_lost_command_does_not_spoil_zeros_and_play(model, designed, motor):
+    """A motor that stayed behind once is no zero and no play, of it or of the others."""
+    rng, off = np.random.default_rng(motor), np.deg2rad([0.5, -0.4, 0.3, 0.6])
+    travel = [abs(each.order.target - each.previous)[motor] for each in designed]
+    lost = np.zeros((len(designed), 4), dtype=bool)
+    lost[1 + np.argmax(travel[1:]), motor] = True
+    noise = scattered(model, designed, rng)
+    found = offsets_of(model, seen_of(model, designed, off, 0.0, noise, lost))
+    whole = offsets_of(model, seen_of(model, designed, off, 0.0, noise))
+    assert deviations(found, off, 0.0).max() < 4.0
+    assert np.all(found.zero_sd < 1.5 * whole.zero_sd)
+
+
+@pytest.mark.parametrize("motor", [0, 2])
+def test_a_stuck_motor_tells_no_zero_of_its_own_and_spoils_no_other(model, designed, motor):
+    rng, off = np.random.default_rng(motor), np.deg2rad([0.5, -0.4, 0.3, 0.6])
+    stuck = np.tile(np.arange(4) == motor, (len(designed), 1))
+    noise = scattered(model, designed, rng)
+    found = offsets_of(model, seen_of(model, designed, off, 0.0, noise, stuck))
+    assert found.zero_sd[motor] > 0.8 * LOOSE_RAD
+    assert found.play_sd[motor] > 0.8 * LOOSE_RAD
+    others = np.arange(4) != motor
+    assert deviations(found, off, 0.0)[:, others].max() < 4.0
+    assert np.all(found.zero_sd[others] < 0.6 * LOOSE_RAD)
 
 
 def test_a_check_begins_with_two_to_one_that_all_is_well(model):
@@ -101,6 +155,7 @@ def test_an_arm_without_a_fault_is_green(known, model, gate, designed):
     pytest.importorskip("mujoco")
     result, check = carried_out(known, model, gate, designed, ())
     assert (result.light, result.motor) == ("green", "")
+    assert result.diagnosis.quality == ()
     assert result.movements == len(designed) == len(check.window)
     assert sum(result.by_motor.values()) < 0.05
 
@@ -110,7 +165,7 @@ def test_what_is_named_is_the_motor_whatever_its_mode(model, designed):
     diagnosis = ft.Diagnosis(
         "check", {"healthy": 0.02, "motor_2:encoder_bias": 0.5, "motor_2:steady_state_error": 0.48}
     )
-    offsets = motor_offsets(settled_evidence_of([seen_of(model, designed)]), model)
+    offsets = offsets_of(model, seen_of(model, designed))
     assert CheckResult(diagnosis, offsets, 5).motor == "motor_2"
     assert CheckResult(diagnosis, offsets, 5).light == "red"
     open_one = ft.Diagnosis("check", {"healthy": 0.3, "motor_2:stuck": 0.4, "motor_3:stuck": 0.3})

@@ -22,6 +22,7 @@ from failuretwin.core.hypothesis import (
     Hypothesis,
     motor_probabilities,
 )
+from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.believed_arm import Seen
 from failuretwin.decision.acting.judging import settled_evidence_of, shown_faults
@@ -29,17 +30,24 @@ from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.work import OrderSequence, Work, first_standing
 from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.decision.test_motions.motions import Motions
+from failuretwin.digital_model.nonidealities import Variation
 from failuretwin.failure_behavior.mode import Range, Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.faults.priors import Priors, visible_sizes
 from failuretwin.inference.isolability import IsolabilityReport
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
-from failuretwin.inference.observation.evidence import SettledEvidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.observation.log_quality import LogQuality
+from failuretwin.inference.observation.log_quality import BEYOND_USUAL, LogQuality
 from failuretwin.inference.observation.settings import ERROR_STEPS, WIDEST_ERROR
 from failuretwin.inference.posterior import Posterior, log_prior
-from failuretwin.inference.theta.shared_posterior import set_up_in_doubt, shared_posterior
+from failuretwin.inference.theta.shared_belief import mixed
+from failuretwin.inference.theta.shared_posterior import (
+    Mixture,
+    set_up_in_doubt,
+    shared_posterior,
+)
+from failuretwin.inference.theta.shared_unknowns import REGISTRATION, SharedLayout
+from failuretwin.inference.theta.shared_weighing import Candidate, SharedWeighing
 
 HEALTHY_TO_FAULTY = 2.0
 """Odds that an arm is healthy that nobody suspects; assumed."""
@@ -53,10 +61,8 @@ minute show a sixth of that, and "healthy" must not be surer than they can make 
 GREEN, RED, OPEN = "green", "red", "open"
 LIGHTS = {HEALTHY_STATE: GREEN, FAULTY_STATE: RED, OPEN_STATE: OPEN}
 """Light of each state of a diagnosis."""
-ROUNDS = 8
-"""Steps in which movements that fit ill get less weight."""
 LOOSE_RAD = 0.1
-"""What zeros and play may be before anything is seen, their deviation [rad]."""
+"""Standard deviation of zeros and play before anything is seen [rad]; assumed."""
 
 
 def checking(model: HealthyModel, hypotheses: Sequence[Hypothesis]) -> Priors:
@@ -93,13 +99,13 @@ def _error_ranges(model: HealthyModel) -> Sequence[Range] | Mapping[str, Sequenc
 
 @dataclass(frozen=True)
 class MotorOffsets:
-    """What settled movements say of each motor if nothing is wrong with the others.
+    """Posterior of the zero and the play of each motor.
 
     Attributes:
-        zero: By how much it settles beside where it should, (motor,) [rad].
-        zero_sd: Standard deviation of that.
-        play: By how much that differs by the side it comes from, (motor,) [rad].
-        play_sd: Standard deviation of that.
+        zero: Mean of the zero, by which a motor settles beside its target, (motor,) [rad].
+        zero_sd: Standard deviation of it.
+        play: Mean of the play, the difference by the side it comes from, (motor,) [rad].
+        play_sd: Standard deviation of it.
     """
 
     zero: FloatArray
@@ -108,36 +114,61 @@ class MotorOffsets:
     play_sd: FloatArray
 
 
-def motor_offsets(evidence: SettledEvidence, model: HealthyModel) -> MotorOffsets:
-    """Return offsets of all motors from one run, weighed by how well each movement fits.
+def motor_offsets(
+    likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis], priors: Priors
+) -> MotorOffsets:
+    """Return the zeros and the play of all motors, hypotheses and lost commands summed out.
 
-        r_m = J_m (b - d_m p / 2) + e_m,    e_m ~ Student t with scale S_m
+        p(b, f | run) = sum over h and components c of P(h, c | run) N(theta_hc, (P_c^-1 + A_hc)^-1)
+
+    with zero b and play 2 f of `inference.theta`. The prior is wide, `LOOSE_RAD`, and not that of
+    the calibration: a check measures what has moved since. A hypothesis that calls a motor faulty
+    leaves the prior of its zero and play. The sensor's frame is taken as the profile states it.
 
     Args:
-        evidence: Settled positions of one run.
-        model: The healthy robot.
+        likelihood: One run.
+        hypotheses: Healthy and single faults.
+        priors: Beliefs about faults and set-ups.
     """
-    movements, usable = evidence.movements, evidence.usable[0]
-    told = np.concatenate([movements.initial[:, None], movements.target], axis=1)[0]
-    command, travel = told[1:][usable], np.diff(told, axis=0)[usable]
-    direction = np.where(np.abs(travel) > 1e-9, np.sign(travel), 0.0)
-    pose = model.settle(command, direction, model.none_held)
-    error, jacobian, spread = model.residual(evidence.point[0][usable], pose, model.scatter)
-    design = np.concatenate([jacobian, -0.5 * jacobian * direction[:, None]], axis=-1)
-    count, channels, dof = design.shape[-1], error.shape[-1], model.settling.tail_dof
-    whitened = np.stack([spread.solve(design[..., i]) for i in range(count)], axis=-1)
-    weight = np.ones(len(error))
-    for _ in range(ROUNDS):
-        precision = (
-            np.einsum("m,maj,mai->ji", weight, whitened, design) + np.eye(count) / LOOSE_RAD**2
-        )
-        found = np.linalg.solve(precision, np.einsum("m,maj,ma->j", weight, whitened, error))
-        left = error - design @ found
-        if np.isfinite(dof):
-            weight = (dof + channels) / (dof + np.einsum("ma,ma->m", left, spread.solve(left)))
-    deviation = np.sqrt(np.diag(np.linalg.inv(precision)))
-    motors = count // 2
-    return MotorOffsets(found[:motors], deviation[:motors], found[motors:], deviation[motors:])
+    layout = SharedLayout(len(likelihood.model.scatter), offsets=True)
+    weighing = SharedWeighing(_with_loose_offsets(likelihood), hypotheses, priors, layout)
+    candidates = weighing.as_told
+    theta, covariance = zip(*(_normal_of(each, weighing) for each in candidates), strict=True)
+    weight = _best_starts(Mixture.of(weighing, candidates))
+    (mean,), (spread,) = mixed(weight[None], np.stack(theta)[None], np.stack(covariance)[None])
+    zero, _, friction = mean[REGISTRATION:].reshape(3, -1)
+    zero_sd, _, friction_sd = np.sqrt(np.diag(spread)[REGISTRATION:]).reshape(3, -1)
+    return MotorOffsets(zero, zero_sd, 2.0 * friction, 2.0 * friction_sd)
+
+
+def _normal_of(candidate: Candidate, weighing: SharedWeighing) -> tuple[FloatArray, FloatArray]:
+    """Return mean (hypothesis, theta) and covariance (hypothesis, theta, theta) of one run."""
+    found = candidate.found
+    precision = np.diag(weighing.parts[candidate.component].deviation ** -2.0)
+    return found.theta[0], np.asarray(np.linalg.inv(precision + found.information[0]))
+
+
+def _best_starts(mixture: Mixture) -> FloatArray:
+    """Return the probability of each candidate and hypothesis, (candidate, hypothesis), of one run.
+
+    Candidates of one component are the same posterior searched from several starts: the one with
+    the highest evidence counts.
+    """
+    height = mixture.log_evidence[0] + mixture.weighing.log_odds
+    component = np.array([each.component for each in mixture.candidates])
+    rivals = np.where((component[:, None] == component)[..., None], height, -np.inf)
+    best = np.arange(len(height))[:, None] == np.argmax(rivals, axis=1)
+    height = np.where(best, height, -np.inf)
+    return np.asarray(np.exp(height - log_sum(height, axis=(0, 1))))
+
+
+def _with_loose_offsets(likelihood: RunLikelihood) -> RunLikelihood:
+    """Return a run of a robot whose zeros and play nobody has measured."""
+    model = likelihood.model
+    loose, given = np.full(len(model.scatter), LOOSE_RAD), model.imperfections
+    doubt = replace(given.variation or Variation(), bias=tuple(loose), friction=tuple(0.5 * loose))
+    model = replace(model, imperfections=replace(given, variation=doubt))
+    return RunLikelihood(likelihood.evidence, model)
 
 
 @dataclass(frozen=True)
@@ -190,17 +221,28 @@ def judged(
     return shared_posterior(likelihood, hypotheses, priors, in_doubt)
 
 
-def result_of(likelihood: RunLikelihood, diagnosis: Diagnosis, further: int = 0) -> CheckResult:
-    """Return what one run says beyond its diagnosis.
+def result_of(
+    likelihood: RunLikelihood,
+    hypotheses: Sequence[Hypothesis],
+    priors: Priors,
+    diagnosis: Diagnosis,
+    further: int = 0,
+) -> CheckResult:
+    """Return the result of a check: its diagnosis, with zeros and play.
+
+    Designed movements reach the joint limits, so commands outside the usual ranges are no remark.
 
     Args:
         likelihood: The run.
+        hypotheses: What may be the case.
+        priors: Beliefs about faults and set-ups.
         diagnosis: Its diagnosis.
         further: How many of its movements were not planned.
     """
-    evidence = likelihood.evidence
-    offsets = motor_offsets(evidence, likelihood.model)
-    return CheckResult(diagnosis, offsets, int(evidence.usable.sum()), further)
+    remarks = tuple(line for line in diagnosis.quality if not line.startswith(BEYOND_USUAL))
+    diagnosis = replace(diagnosis, quality=remarks)
+    offsets = motor_offsets(likelihood, hypotheses, priors)
+    return CheckResult(diagnosis, offsets, int(likelihood.usable.sum()), further)
 
 
 @dataclass
@@ -269,4 +311,4 @@ class HealthCheck:
     def result(self) -> CheckResult:
         """Result of the check."""
         diagnosis = self.posterior.to_diagnosis(0, "check", LogQuality())
-        return result_of(self.likelihood, diagnosis, self._added)
+        return result_of(self.likelihood, self.hypotheses, self.priors, diagnosis, self._added)

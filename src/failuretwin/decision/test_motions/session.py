@@ -180,7 +180,12 @@ class Checking:
         settled = Evidence(runs, self.model.settings).sound.settled
         command, time = as_floats(runs["command"].values), as_floats(runs["time"].values)
         found = [
-            result_of(RunLikelihood(settled[row : row + 1], self.model), diagnosis)
+            result_of(
+                RunLikelihood(settled[row : row + 1], self.model),
+                self.hypotheses,
+                priors,
+                diagnosis,
+            )
             for row, diagnosis in enumerate(diagnoser.diagnose(runs))
         ]
         return [self.shown(each, command[row : row + 1], time) for row, each in enumerate(found)]

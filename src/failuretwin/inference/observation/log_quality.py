@@ -89,6 +89,9 @@ def log_quality(
 
 SLACK = 0.01
 """Share of a range by which a command may leave it unremarked: limits are often rounded."""
+BEYOND = "commands go beyond"
+BEYOND_USUAL = f"{BEYOND} movement_range"
+"""Begin of the remarks on commands outside the joint limits, and outside the usual ranges."""
 
 
 def commands_beyond(robot: Robot, movements: Movements, run: int) -> list[str]:
@@ -115,7 +118,7 @@ def commands_beyond(robot: Robot, movements: Movements, run: int) -> list[str]:
         remarked |= beyond
         if len(which):
             spans = [_span(robot, int(k), lowest[k], highest[k], ranges[k]) for k in which]
-            lines.append(f"commands go beyond {name}: {', '.join(spans)}; {means}")
+            lines.append(f"{BEYOND} {name}: {', '.join(spans)}; {means}")
     return lines
 
 
