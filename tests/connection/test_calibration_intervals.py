@@ -136,7 +136,7 @@ def test_doubt_about_the_lag_is_doubt_about_the_delay():
     lags = best.mean() + 0.004 * np.array([[-1.0], [0.0], [1.0]])
     costs = (lags - best) ** 2
     values = np.stack([own - lags, np.zeros((3, runs))], axis=2)
-    delay, shortening, lag = joint_doubt(values, costs, 0.004)
+    delay, shortening, lag = joint_doubt(values, costs, 0.004, float(best.mean()))
     half = stats.t.ppf(0.975, runs - 1) / np.sqrt(runs)
     assert lag == pytest.approx(half * np.std(best, ddof=1), rel=1e-9)
     assert delay == pytest.approx(half * np.std(own - best, ddof=1), rel=1e-9)

@@ -133,22 +133,26 @@ def fit_timing(transients: Transients, robot: Robot) -> TimingFit | None:
         delay=found[:, 0],
         shortening=found[:, 1],
         lag=lag,
-        doubt=joint_doubt(values, costs, LAG_STEP_S),
+        doubt=joint_doubt(values, costs, LAG_STEP_S, float(middle)),
         residual=float(1.4826 * np.nanmedian(residual)),
     )
 
 
-def joint_doubt(values: FloatArray, costs: FloatArray, step: float) -> tuple[float, float, float]:
+def joint_doubt(
+    values: FloatArray, costs: FloatArray, step: float, lag: float
+) -> tuple[float, float, float]:
     """Return half 95 % intervals of mean delay, mean shortening and lag.
 
     Sandwich estimate with runs as clusters: of n runs, run r moves the lag by
     T_r = -n (c_r' - mean c') / C'' and the mean of x by x_r - mean x + T_r d(mean x)/dT; the
-    quantile is that of Student's t with n - 1 degrees of freedom.
+    quantile is that of Student's t with n - 1 degrees of freedom. A lag at its bound moves by the
+    share of its interval that lies within the bounds.
 
     Args:
         values: x, delay and shortening, below, at and above the lag found, (3, run, 2).
         costs: c, their costs, (3, run).
         step: Difference of these lags [s].
+        lag: The middle one of them [s].
     """
     from scipy.stats import t
 
@@ -157,12 +161,17 @@ def joint_doubt(values: FloatArray, costs: FloatArray, step: float) -> tuple[flo
     curvature = float(np.sum(costs[2] - 2.0 * costs[1] + costs[0])) / step**2
     curvature = max(curvature, float(np.abs(slope).sum()) / LONGEST_LAG_S)
     lag_shift = -runs * (slope - slope.mean()) / max(curvature, 1e-300)
+    quantile, count = float(t.ppf(0.975, runs - 1)), runs * (runs - 1.0)
+    width = quantile * float(np.sqrt(np.sum(lag_shift**2) / count))
+    best = lag - float(slope.sum()) / max(curvature, 1e-300)
+    low, high = np.clip([best - width, best + width], 0.0, LONGEST_LAG_S)
+    lag_shift = lag_shift * ((high - low) / max(2.0 * width, 1e-300))
     drift = (values[2] - values[0]).mean(axis=0) / (2.0 * step)
     mean_shift = values[1] - values[1].mean(axis=0) + lag_shift[:, None] * drift
     shifts = np.column_stack([mean_shift, lag_shift])
-    deviation = np.sqrt(np.sum(shifts**2, axis=0) / (runs * (runs - 1.0)))
-    delay, shortening, lag = (t.ppf(0.975, runs - 1) * deviation).tolist()
-    return delay, shortening, lag
+    deviation = np.sqrt(np.sum(shifts**2, axis=0) / count)
+    of_delay, of_shortening, of_lag = (quantile * deviation).tolist()
+    return of_delay, of_shortening, of_lag
 
 
 def _fit_runs(
