@@ -35,7 +35,7 @@ def test_a_check_names_the_motor_and_what_to_do(failuretwin, tmp_path):
     assert step.removeprefix("what to do: ") in page.replace("&#39;", "'")
     assert "What the check measured" in page
     assert "shows errors from" not in page
-    assert "zero of motor_2 changed by +4." in answer.stdout
+    assert "motor 2 has a shifted zero by +4." in answer.stdout
     record = json.loads(out.read_text())
     assert (record["light"], record["motor"]) == ("red", "motor_2")
     assert sum(record["posterior"].values()) == pytest.approx(1.0)

@@ -129,8 +129,10 @@ class Robot:
 
     def own_unit(self, motor: str, unit: str) -> str:
         """Return the unit of a magnitude at a motor: m instead of rad where it slides."""
+        if not unit.startswith("rad"):
+            return unit
         slides = self.slides[self.motor_names.index(motor)]
-        return unit.replace("rad", "m", 1) if slides and unit.startswith("rad") else unit
+        return unit.replace("rad", "m", 1) if slides else unit
 
     @cached_property
     def resting_pose(self) -> FloatArray:

@@ -66,14 +66,14 @@ class RobotComponent:
 def robot_components(model: HealthyModel, priors: Priors) -> list[RobotComponent]:
     """Return what is believed of a healthy robot; the first is the model itself.
 
-    An ideal robot, and one whose set-up is known, has no other.
+    An ideal robot, one whose set-up is known, and one that other sensors watch have no other.
 
     Args:
         model: The named calibration, or the population of its class.
         priors: Beliefs about set-ups.
     """
     another, known = priors.setup.another_rate, model.imperfections
-    if another == 0.0 or known.settling is None:
+    if another == 0.0 or known.settling is None or not model.sensors.tool_alone:
         return [RobotComponent("", 0.0, model)]
     if known.name == GENERIC_NAME:
         return _population(model, priors, "")
