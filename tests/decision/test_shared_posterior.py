@@ -86,6 +86,19 @@ def test_a_set_up_that_is_known_is_not_asked_for(twin, runs):
     assert not right(found)
 
 
+@pytest.mark.parametrize("in_doubt", [False, True])
+def test_where_no_hypothesis_has_a_score_all_is_taken_as_told(twin, runs, in_doubt):
+    """Faults that settle as healthy motors do say nothing of offsets or of the sensor's frame."""
+    faults = [Hypothesis.parse(f"motor_{i}:lag") for i in (2, 3)]
+    diagnoser = BayesDiagnoser(twin, DOUBTED, faults)
+    seen = Evidence(runs, diagnoser.healthy_model.settings).sound
+    likelihood = RunLikelihood(seen.settled, diagnoser.healthy_model)
+    found = shared_posterior(likelihood, faults, Priors(), in_doubt)
+    expected = compute_posterior(likelihood, faults, Priors())
+    np.testing.assert_array_equal(found.log_posterior, expected.log_posterior)
+    assert len(diagnoser.diagnose(runs)) == runs.sizes["run"]
+
+
 # Where the sensor stands elsewhere.
 
 

@@ -28,6 +28,7 @@ from failuretwin.inference.posterior import log_prior, marginal_likelihoods
 from failuretwin.inference.set_up_posterior import SetUpPosterior, WeighedSetUp, with_doubt
 from failuretwin.inference.set_ups.log_correction import LogCorrection
 from failuretwin.inference.set_ups.set_ups import FEWEST_TO_TURN, SetUp, mistakes, turned, zero_off
+from failuretwin.inference.theta.shared_likelihood import has_score
 from failuretwin.inference.theta.shared_posterior import Mixture
 from failuretwin.inference.theta.shared_unknowns import layout_of
 from failuretwin.inference.theta.shared_weighing import SharedWeighing
@@ -136,7 +137,12 @@ class SetUpWeighing:
         return found
 
     def weigh_moved(self, set_up: SetUp) -> WeighedSetUp:
-        """Return the same of one with a sensor that may stand a little elsewhere."""
+        """Return the same of one with a sensor that may stand a little elsewhere.
+
+        Where no hypothesis has a score, none tells where it stands: it is where the profile has it.
+        """
+        if not any(has_score(h) for h in self.hypotheses):
+            return self.weigh([set_up], everything=True)[0]
         likelihood = self.behind([set_up])
         weighing = SharedWeighing(likelihood, self.hypotheses, self.priors)
         mixture = Mixture.of(weighing, weighing.candidates)

@@ -73,12 +73,16 @@ def shared_posterior(
 ) -> Posterior:
     """Weigh every hypothesis by some runs, what they share integrated out.
 
+    Where no hypothesis has a score, no theta can be searched for: all is then taken as told.
+
     Args:
         likelihood: The runs as they were seen.
         hypotheses: What may be the case.
         priors: Beliefs about faults and set-ups.
         in_doubt: Whether their set-up may be off.
     """
+    if not any(has_score(h) for h in hypotheses):
+        return compute_posterior(likelihood, hypotheses, priors)
     weighing = SharedWeighing(likelihood, hypotheses, priors)
     if in_doubt:
         return Mixture.of(weighing, weighing.candidates).posterior()
