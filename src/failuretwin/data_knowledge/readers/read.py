@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, cast
 
@@ -72,6 +73,16 @@ class ReadOptions:
     lerobot: LeRobotAngles | None = None
     topics: BagTopics | None = None
     approximate: bool = False
+
+
+def sample_log() -> Path:
+    """Return the path of a CSV file with three runs of an ArmPi FPV: healthy, stuck, off target.
+
+    Simulated with the physics engine and the imperfections of the bundled calibration (lost
+    commands, late starts, sag, scatter). Tool position at 10 Hz. Commands in rad, positions in m in
+    the base frame. Run 1 is run 160 of 250 healthy ones of seed 13.
+    """
+    return Path(str(files("failuretwin.data_knowledge") / "samples" / "armpi_fpv.csv"))
 
 
 def read_runs(
@@ -152,8 +163,8 @@ def _read_folder(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Data
     )
     found += [part for folder in sets for part in _read_source(folder, robot, options)]
     if not found and options.columns is not None:
-        files = sorted(files_below(path, "*.csv"))
-        found = [part for file in files for part in _read_text(file, robot, options)]
+        tables = sorted(files_below(path, "*.csv"))
+        found = [part for file in tables for part in _read_text(file, robot, options)]
     if not found:
         raise InputError(
             f"{path}: no raw session in it or below, no published MATLAB file and no LeRobot data "

@@ -14,9 +14,8 @@ import numpy as np
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements, stack_movements
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.recovery.approximate import fit_run
 from failuretwin.data_knowledge.recovery.plane_arm import PlaneArm, plane_arm
-from failuretwin.data_knowledge.recovery.ramp_fit import PathPart
+from failuretwin.data_knowledge.recovery.ramp_fit import PathPart, fit_run
 from failuretwin.data_knowledge.recovery.whole_counts import NoWholeUnitsError, solve_run
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
