@@ -48,8 +48,7 @@ class Hypothesis:
         Args:
             text: Such as ``"motor_1:stuck+motor_3:drift"``.
             motors: Names of the robot's motors in chain order; None: any names in any order, for
-            text from
-                results.
+                text from results.
 
         Raises:
             InputError: If the text does not follow the form or names an unknown motor.
@@ -117,7 +116,7 @@ def parse_hypotheses(
 
     Raises:
         InputError: If one is not valid or repeated, none is given, or a text is given instead of a
-        list.
+            list.
     """
     if isinstance(given, str):
         raise InputError(

@@ -28,7 +28,7 @@ from failuretwin.core.hypothesis import (
     parse_hypotheses,
 )
 from failuretwin.core.movements import Movements, stack_movements
-from failuretwin.core.runs import RunTable, Truth, concatenate
+from failuretwin.core.runs import STEP_S, RunTable, Truth, concatenate
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.signals import SIMULATED, drive_of, simulated_sensors
 from failuretwin.data_knowledge.workers import Workforce
@@ -56,8 +56,6 @@ if TYPE_CHECKING:
 
 # What to simulate: robot, states, imperfections, chance; small enough to write down.
 
-STEP_S = 0.01
-"""Step of the time grid [s], as published."""
 ENGINES = ("servo", "physics")
 LATE_STARTS = 2
 """Late starts that a run has room for; what more of them push beyond the grid is cut off."""

@@ -15,7 +15,7 @@ from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.foreign import files_below
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Movements
-from failuretwin.core.runs import RunTable, Truth, concatenate
+from failuretwin.core.runs import STEP_S, RunTable, Truth, concatenate
 from failuretwin.core.types import MS_PER_S, FloatArray, as_floats
 from failuretwin.data_knowledge.readers.csv_log import load_csv, numbers
 from failuretwin.data_knowledge.readers.timed_log import check_clock, check_grid
@@ -161,8 +161,6 @@ As = Literal["measured", "published"]
 
 READING_RATE_HZ = 10.0
 """Nominal rate of the robot's readings [Hz]."""
-GRID_STEP_S = 0.01
-"""Step of the time grid that measured readings are put on [s]."""
 GAP_S = 0.5
 """A longer silence between two readings is a gap [s]; the nominal step is 0.1 s."""
 PUBLISHED_TIME = np.linspace(0.0, 10.0, 1000)
@@ -301,14 +299,14 @@ def _measured_window(session: RawSession, robot: Robot, span: range) -> _Window:
     end = min(end, float(stamps[-1]))
     both = np.concatenate([session.command_time[span.start : span.stop], stamps])
     check_clock(both[(both >= begin) & (both <= end)], str(session.folder))
-    check_grid((end - begin) / GRID_STEP_S, len(both), str(session.folder))
+    check_grid((end - begin) / STEP_S, len(both), str(session.folder))
     # A reading before a gap stalled: it was taken at some time within the gap.
     stalled = np.append(np.diff(stamps) > GAP_S, False)
     kept = (stamps >= begin) & (stamps <= end) & ~stalled
     counts = session.reading_counts[kept]
     return _Window(
         begin,
-        as_floats(np.arange(round((end - begin) / GRID_STEP_S) + 1) * GRID_STEP_S),
+        as_floats(np.arange(round((end - begin) / STEP_S) + 1) * STEP_S),
         _initial_counts(session, span, begin),
         stamps[kept] - begin,
         np.where(robot.servo_units.valid(counts), counts, np.nan),
@@ -364,10 +362,17 @@ def _initial_counts(session: RawSession, span: range, begin: float) -> FloatArra
 
 def _truth(label: int, held: float, robot: Robot) -> Truth:
     stuck = 1 <= label <= len(robot.motors)
-    onset = PUBLISHED_TIME[PUBLISHED_FREEZE] if stuck else (np.nan if label == 0 else 0.0)
+    fault = str(paper_hypotheses(robot.motor_names)[label])
     return Truth(
-        fault=[str(paper_hypotheses(robot.motor_names)[label])],
+        fault=[fault],
         detail=[{"source": "published label", "label": label, "frozen_afterwards": stuck}],
-        onset=np.array([onset]),
+        onset=np.array([published_onset(fault, PUBLISHED_TIME)]),
         magnitude=np.array([held]),
     )
+
+
+def published_onset(fault: str, time: FloatArray) -> float:
+    """Return the onset of a published fault on the grid `time` (time,) [s]; NaN: healthy."""
+    if fault == "healthy":
+        return float("nan")
+    return float(time[PUBLISHED_FREEZE]) if fault.endswith(":stuck") else 0.0

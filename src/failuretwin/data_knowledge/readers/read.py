@@ -13,7 +13,9 @@ from failuretwin import __version__
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import files_below
 from failuretwin.core.runs import concatenate
-from failuretwin.data_knowledge.readers.bags import BagTopics, is_bag, read_bag
+from failuretwin.data_knowledge.readers.bag_file import is_bag
+from failuretwin.data_knowledge.readers.bag_messages import BagTopics
+from failuretwin.data_knowledge.readers.bags import read_bag
 from failuretwin.data_knowledge.readers.column_guess import told_columns
 from failuretwin.data_knowledge.readers.csv_log import ColumnMap, read_mapped_csv
 from failuretwin.data_knowledge.readers.lerobot import (
@@ -131,9 +133,10 @@ def _read_source(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Data
     if path.suffix in SUFFIXES:
         return [load_run_set(path)]
     if is_bag(path):
-        return _log_datasets(read_bag(path, robot, options.topics), robot, "bag")
+        return _log_datasets([read_bag(path, robot, options.topics)], robot, "bag")
     if is_lerobot(path):
-        source = f"LeRobot {lerobot_version(path)}, angles in {_lerobot_unit(options)}"
+        unit = "degrees (assumed)" if options.lerobot is None else options.lerobot.unit
+        source = f"LeRobot {lerobot_version(path)}, angles in {unit}"
         return _log_datasets(read_lerobot(path, robot, options.lerobot), robot, source)
     if path.is_dir():
         return _read_folder(path, robot, options)
@@ -147,10 +150,6 @@ def _read_source(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Data
         f"LeRobot data set (a folder with {INFO_FILE}), or a folder that holds "
         f"{', '.join(SESSION_FILES)}."
     )
-
-
-def _lerobot_unit(options: ReadOptions) -> str:
-    return "degrees (assumed)" if options.lerobot is None else options.lerobot.unit
 
 
 def _read_folder(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
