@@ -13,10 +13,9 @@ from typing import Annotated
 
 import numpy as np
 
-from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.errors import InputError
 from failuretwin.core.polyline import REST_S, TURN_RAD, simplify
-from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray
 
 ROUNDING_RAD = 2e-3
 """Tolerance of the straight lines that replace logged references [rad], a tenth of a degree: half a
