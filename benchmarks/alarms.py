@@ -25,8 +25,7 @@ from alarms_world import Lives, live
 from telling import per_100_hours
 
 import failuretwin as ft
-from failuretwin.core.alarm import RAISED
-from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.core.hypothesis import RAISED, paper_hypotheses
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.alarm_rule import AlarmRule
 from failuretwin.decision.streaming.learning import LifeLearner

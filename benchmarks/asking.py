@@ -35,8 +35,7 @@ from failuretwin.app.arms import emulation_with
 from failuretwin.app.shadow import Shadow
 from failuretwin.connection.commanded_arm import OperatedArm, Shifts
 from failuretwin.connection.links.base import Order
-from failuretwin.core.alarm import CLEAR, RAISED, SUSPECTED
-from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
+from failuretwin.core.hypothesis import CLEAR, RAISED, SUSPECTED, Hypothesis, paper_hypotheses
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.believed_arm import Seen
 from failuretwin.decision.acting.judging import settled_evidence_of

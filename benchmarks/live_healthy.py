@@ -17,7 +17,7 @@ from failuretwin import DigitalTwin
 from failuretwin.app.shadow import Shadow
 from failuretwin.connection.emulated_arm import Emulation, emulated
 from failuretwin.connection.links.replay import Pace
-from failuretwin.core.alarm import CLEAR, RAISED, SUSPECTED, Alarm
+from failuretwin.core.hypothesis import CLEAR, RAISED, SUSPECTED, Alarm
 from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.digital_model.calibrated_robot import load_calibration
 

@@ -21,8 +21,7 @@ from failuretwin import DigitalTwin, load_robot
 from failuretwin.app.shadow import Shadow
 from failuretwin.connection.emulated_arm import Emulation, emulated
 from failuretwin.connection.links.replay import Pace
-from failuretwin.core.alarm import RAISED, SUSPECTED
-from failuretwin.core.hypothesis import paper_hypotheses
+from failuretwin.core.hypothesis import RAISED, SUSPECTED, paper_hypotheses
 from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.failure_behavior.injection import ScheduledFault, state_at

@@ -111,7 +111,7 @@ def stream_answers(session: RawSession, robot: Robot) -> list[str | None]:
     """Return the last answer of the stream in each run, cut at the command rows."""
     twin, found = DigitalTwin(robot), []
     for span in split_session(session, robot):
-        begin = session.command_time[span.first] - 0.5
+        begin = session.command_time[span.start] - 0.5
         end = np.append(session.command_time, np.inf)[span.stop]
         events = list(session_events(session, robot))
         # Where the arm was told to stand before the run is known from the command before it.

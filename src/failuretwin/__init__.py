@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from failuretwin.core.hypothesis import Diagnosis, Fault, Hypothesis
     from failuretwin.core.runs import run_set
     from failuretwin.data_knowledge.generate import Plan, iterate, simulate
-    from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
-    from failuretwin.data_knowledge.sample_log import sample_log
+    from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs, sample_log
     from failuretwin.decision.acting.reach import reach
     from failuretwin.decision.acting.session import act
     from failuretwin.decision.acting.task import Target, Task
@@ -114,7 +113,7 @@ _HOME = {
     "remaining_life": "decision.maintenance.remaining_life",
     "run_figure": "app.reports.plots",
     "run_set": "core.runs",
-    "sample_log": "data_knowledge.sample_log",
+    "sample_log": "data_knowledge.readers.read",
     "save_calibration": "connection.calibration.result",
     "simulate": "data_knowledge.generate",
     "train": "decision.training",

@@ -14,9 +14,16 @@ from failuretwin.app.shadow import Shadow
 from failuretwin.connection.links.base import OK, Answer, CommandSent, LinkCounts, Order, Reading
 from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.connection.links.ros_writer import RosWriter
-from failuretwin.core.alarm import ALL_CLEAR, CLEAR, RAISED, SUSPECTED, Alarm
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import Diagnosis, Hypothesis
+from failuretwin.core.hypothesis import (
+    ALL_CLEAR,
+    CLEAR,
+    RAISED,
+    SUSPECTED,
+    Alarm,
+    Diagnosis,
+    Hypothesis,
+)
 from failuretwin.core.numerics import Weighted
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.streaming.monitor import Believed, monitor

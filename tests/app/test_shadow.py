@@ -15,8 +15,15 @@ from failuretwin.app.shadow import Changes, Shadow
 from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, LinkCounts, Reading
 from failuretwin.connection.links.ros_reader import SampledCommands
 from failuretwin.connection.links.ros_topics import RosTopics
-from failuretwin.core.alarm import ALL_CLEAR, CLEAR, RAISED, SUSPECTED, Alarm, Episode
-from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.hypothesis import (
+    ALL_CLEAR,
+    CLEAR,
+    RAISED,
+    SUSPECTED,
+    Alarm,
+    Diagnosis,
+    Episode,
+)
 from failuretwin.decision.streaming.monitor import FaultMonitor
 
 HEALTHY = Diagnosis("live", {"healthy": 0.99, "motor_3:stuck": 0.01}, verdict="healthy, 99 % sure")

@@ -15,8 +15,7 @@ from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, Ev
 from failuretwin.connection.links.ros1 import Ros1Transport
 from failuretwin.connection.links.ros_link import RosSource, diagnostics_sink, robot_sink
 from failuretwin.connection.links.ros_topics import RosTopics
-from failuretwin.core.alarm import ALL_CLEAR, RAISED, Alarm, Episode
-from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.hypothesis import ALL_CLEAR, RAISED, Alarm, Diagnosis, Episode
 from little_logs import LOG_COLUMNS
 from ros_peer import RosPeer
 from roscores import need_ros

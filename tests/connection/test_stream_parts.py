@@ -34,9 +34,16 @@ from failuretwin.connection.links.statuses import (
     statuses,
 )
 from failuretwin.connection.links.stream_time import ReorderBuffer, StreamClock
-from failuretwin.core.alarm import ALL_CLEAR, CLEAR, RAISED, SUSPECTED, Alarm, Episode
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.hypothesis import (
+    ALL_CLEAR,
+    CLEAR,
+    RAISED,
+    SUSPECTED,
+    Alarm,
+    Diagnosis,
+    Episode,
+)
 
 YEAR_S = 3.15e7
 

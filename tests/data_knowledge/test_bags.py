@@ -12,7 +12,9 @@ from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.data_knowledge.readers.bags import BagTopics, is_bag, read_bag
+from failuretwin.data_knowledge.readers.bag_file import is_bag
+from failuretwin.data_knowledge.readers.bag_messages import BagTopics
+from failuretwin.data_knowledge.readers.bags import read_bag
 from failuretwin.data_knowledge.readers.raw_sessions import read_session
 from failuretwin.data_knowledge.readers.timed_log import Targets, timed_run
 from failuretwin.digital_model.calibrated_robot import load_calibration
@@ -96,8 +98,7 @@ def read(tmp_path, armpi):
     """Write entries as a recording and read them back."""
 
     def make(entries, form="mcap", topics=None, **options):
-        (log,) = read_bag(write_bag(tmp_path, form, entries, **options), armpi, topics)
-        return log
+        return read_bag(write_bag(tmp_path, form, entries, **options), armpi, topics)
 
     return make
 
@@ -298,7 +299,7 @@ def test_package_of_the_message_does_not_matter(tmp_path, armpi):
     text += "float64[6] temperature\nfloat64[] voltage\n"
     entries = [replace(item, type="lab/msg/Servos") for item in commands()]
     path = write_bag(tmp_path, "ros1", [*readings(), *entries], types={"lab/msg/Servos": text})
-    (log,) = read_bag(path, armpi)
+    log = read_bag(path, armpi)
     np.testing.assert_allclose(log.command.target, to_rad([[500] * 4, [510] * 4]), atol=1e-6)
 
 
@@ -308,13 +309,13 @@ def test_older_ros2_bags_hold_no_definitions(tmp_path, armpi, type_):
     if type_ == JOINT_STATE:
         entries = [*readings(), *(state(0.1 * k, [0.1] * 4, "/command") for k in range(3))]
     path = write_bag(tmp_path, "ros2", entries)
-    (whole,) = read_bag(path, armpi)
+    whole = read_bag(path, armpi)
     database = sqlite3.connect(next(path.glob("*.db3")))
     database.execute("DROP TABLE message_definitions")
     database.execute("UPDATE schema SET schema_version = 3")
     database.commit()
     database.close()
-    (log,) = read_bag(path, armpi)
+    log = read_bag(path, armpi)
     np.testing.assert_array_equal(log.position.value, whole.position.value)
     if isinstance(log.command, Targets):
         np.testing.assert_array_equal(log.command.target, whole.command.target)
@@ -339,7 +340,7 @@ def test_a_type_that_makes_no_sense_spoils_no_other(tmp_path, armpi):
     nonsense = definition.replace(b"float64[] effort", b"float64{} effort")
     path.write_bytes(both.read_bytes().replace(b"header\n" + definition, b"header\n" + nonsense))
     assert path.read_bytes() != both.read_bytes()
-    (log,), (expected,) = (read_bag(p, armpi) for p in (path, sound))
+    log, expected = (read_bag(p, armpi) for p in (path, sound))
     np.testing.assert_array_equal(log.position.value, expected.position.value)
 
 
@@ -486,7 +487,7 @@ def test_topics_can_be_named(tmp_path, armpi):
     table = read_toml(tmp_path / "map.toml")["topics"]
     topics = from_table(BagTopics, table, "map.toml: topics")
     assert topics == BagTopics(command="b/command", position="/wanted")
-    (log,) = read_bag(path, armpi, topics)
+    log = read_bag(path, armpi, topics)
     assert isinstance(log.command, Targets)
     np.testing.assert_array_equal(log.position.value[:, 0], [0.5, 0.6])
 
@@ -705,7 +706,7 @@ def test_bytes_gone_wrong_never_end_in_a_traceback(tmp_path, armpi):
         for place in rng.integers(len(sound), size=30):
             path.write_bytes(sound[:place] + rng.bytes(4) + sound[place + 4 :])
             try:
-                (log,) = read_bag(path, armpi)
+                log = read_bag(path, armpi)
             except InputError as error:
                 assert str(path) in str(error)
             else:
@@ -727,7 +728,7 @@ def test_what_is_a_bag(tmp_path):
 
 def test_database_of_a_ros2_bag_can_be_read_alone(tmp_path, armpi):
     folder = write_bag(tmp_path, "ros2", [*readings(), *commands()])
-    (whole,), (alone,) = (read_bag(p, armpi) for p in (folder, next(folder.glob("*.db3"))))
+    whole, alone = (read_bag(p, armpi) for p in (folder, next(folder.glob("*.db3"))))
     np.testing.assert_array_equal(whole.position.value, alone.position.value)
     assert whole.name == "run"
 

@@ -31,7 +31,7 @@ from failuretwin.core.foreign import (
 )
 from failuretwin.core.hypothesis import parse_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.data_knowledge.readers.bag_claims import check_chunks
+from failuretwin.data_knowledge.readers.bag_file import check_chunks
 from failuretwin.data_knowledge.readers.file_claims import check_matlab, check_npz
 from failuretwin.data_knowledge.readers.matlab import export_runs, write_csv
 from failuretwin.data_knowledge.resumable import produce

@@ -15,7 +15,6 @@ from failuretwin.data_knowledge.recovery.plane_arm import plane_arm
 from failuretwin.data_knowledge.recovery.ramp_fit import PathPart, fit
 from failuretwin.data_knowledge.recovery.recovery import (
     path_error,
-    published_time,
     published_time_bases,
     recover_movements,
 )
@@ -45,7 +44,10 @@ def truth(data):
 
 @pytest.fixture(scope="module")
 def recovered(sample, armpi):
-    return recover_movements(sample, FROM_ZERO, armpi, names=names_of(sample))
+    """Movements of the published runs; their time grid is found too."""
+    time, movements = recover_movements(sample, armpi, names=names_of(sample))
+    np.testing.assert_array_equal(time, FROM_ZERO)
+    return movements
 
 
 @pytest.fixture(scope="module")
@@ -68,9 +70,15 @@ def movements(armpi, counts, start, ramp=0.8):
     return Movements(angle[None, 0], angle[None, 1:], ramps[None], np.array([start], dtype=float))
 
 
+def on_known_grid(desired, robot, time=FROM_ZERO, **options):
+    grid, found = recover_movements(desired, robot, time=time, **options)
+    np.testing.assert_array_equal(grid, time)
+    return found
+
+
 def recover_one(armpi, twin, wanted, time=FROM_ZERO, **options):
     desired = twin.path(wanted.reference(time))
-    found = recover_movements(desired, time, armpi, names=["only"], **options)
+    found = on_known_grid(desired, armpi, names=["only"], **options, time=time)
     assert path_error(found, desired, time, armpi).max() <= 1e-9
     return found
 
@@ -107,18 +115,11 @@ def test_targets_of_cut_off_ramps_are_whole_units_too(recovered, armpi):
     np.testing.assert_allclose(counts, counts.round(), atol=1e-6)
 
 
-def test_time_base_of_published_runs_is_found(sample, armpi):
-    found = published_time(sample, armpi, names=names_of(sample))
-    np.testing.assert_array_equal(found, FROM_ZERO)
-
-
 @pytest.mark.parametrize("time", BASES, ids=["from_zero", "from_first_step"])
 def test_simulated_runs_come_back_on_both_time_bases(simulated, armpi, twin, time):
     desired = twin.path(simulated.reference(time))
-    names = names_of(desired)
-    np.testing.assert_array_equal(published_time(desired, armpi, names=names), time)
-
-    found = recover_movements(desired, time, armpi, names=names)
+    grid, found = recover_movements(desired, armpi, names=names_of(desired))
+    np.testing.assert_array_equal(grid, time)
     assert path_error(found, desired, time, armpi).max() <= 1e-12
     seen = simulated.start < time[-1]
     np.testing.assert_array_equal(found.exists, seen)
@@ -130,7 +131,7 @@ def test_simulated_runs_come_back_on_both_time_bases(simulated, armpi, twin, tim
 def test_the_wrong_time_base_leaves_a_residual(simulated, armpi, twin):
     desired = twin.path(simulated.reference(FROM_ZERO))
     with pytest.raises(InputError, match="start and durations of the published kind"):
-        recover_movements(desired, FROM_FIRST_STEP, armpi, names=names_of(desired))
+        on_known_grid(desired, armpi, names=names_of(desired), time=FROM_FIRST_STEP)
 
 
 def test_time_bases_are_the_published_ones():
@@ -154,7 +155,7 @@ def test_a_spoilt_path_is_refused_by_name(simulated, armpi, twin, kind):
         spoilt[np.isin(FROM_ZERO, ramp), 1] = 1e-3
     desired[1] += spoilt
     with pytest.raises(InputError, match="run 'run_1'") as caught:
-        recover_movements(desired, FROM_ZERO, armpi, names=names_of(desired))
+        on_known_grid(desired, armpi, names=names_of(desired))
     assert "--approximate" in str(caught.value)
 
 
@@ -230,7 +231,7 @@ def test_a_start_outside_the_movements_range_is_found(armpi, twin):
 def test_shorter_records_and_other_numbers_of_runs_work(armpi, twin, simulated):
     time = FROM_ZERO[:400]
     desired = twin.path(simulated.reference(time))[:2]
-    found = recover_movements(desired, time, armpi, names=["a", "b"])
+    found = on_known_grid(desired, armpi, names=["a", "b"], time=time)
     assert path_error(found, desired, time, armpi).max() <= 1e-9
 
 
@@ -265,7 +266,7 @@ def physical(robot):
 def test_the_search_follows_the_chain(armpi, simulated, change):
     robot = change(armpi)
     desired = DigitalTwin(robot).path(simulated.reference(FROM_ZERO))[:2]
-    found = recover_movements(desired, FROM_ZERO, robot, names=["a", "b"])
+    found = on_known_grid(desired, robot, names=["a", "b"])
     assert path_error(found, desired, FROM_ZERO, robot).max() <= 1e-12
 
 
@@ -306,14 +307,12 @@ def test_another_kind_of_arm_asks_for_approximate(armpi, simulated):
     robot = skewed(armpi)
     desired = DigitalTwin(robot).path(simulated.reference(FROM_ZERO))[:1]
     with pytest.raises(InputError, match="three parallel axes") as caught:
-        recover_movements(desired, FROM_ZERO, robot, names=["a"])
+        on_known_grid(desired, robot, names=["a"])
     assert "--approximate" in str(caught.value)
 
-    found = recover_movements(desired, FROM_ZERO, robot, approximate=True, names=["a"])
-    assert path_error(found, desired, FROM_ZERO, robot).max() < 5e-3
-    np.testing.assert_array_equal(
-        published_time(desired, robot, names=["a"]), published_time_bases(1000)[0]
-    )
+    grid, found = recover_movements(desired, robot, approximate=True, names=["a"])
+    np.testing.assert_array_equal(grid, published_time_bases(1000)[0])
+    assert path_error(found, desired, grid, robot).max() < 5e-3
 
 
 @pytest.fixture(scope="module")
@@ -331,15 +330,15 @@ def test_targets_between_units_are_fitted_when_asked(armpi, twin, between_units)
     desired = twin.path(between_units.reference(FROM_ZERO))
     names = names_of(desired)
     with pytest.raises(InputError, match=r"run 'run_0'.*--approximate"):
-        recover_movements(desired, FROM_ZERO, armpi, names=names)
-    found = recover_movements(desired, FROM_ZERO, armpi, approximate=True, names=names)
+        on_known_grid(desired, armpi, names=names)
+    found = on_known_grid(desired, armpi, approximate=True, names=names)
     assert path_error(found, desired, FROM_ZERO, armpi).max() < 1e-3
 
 
 def test_noisy_paths_are_fitted_when_asked(armpi, twin, between_units):
     desired = twin.path(between_units.reference(FROM_ZERO))
     noisy = desired + 1e-4 * np.random.default_rng(0).standard_normal(desired.shape)
-    found = recover_movements(noisy, FROM_ZERO, armpi, approximate=True, names=names_of(desired))
+    found = on_known_grid(noisy, armpi, approximate=True, names=names_of(desired))
     off = twin.path(found.reference(FROM_ZERO)) - desired
     assert np.sqrt(np.mean(np.sum(off**2, axis=2), axis=1)).max() < 5e-4
 
@@ -347,8 +346,8 @@ def test_noisy_paths_are_fitted_when_asked(armpi, twin, between_units):
 def test_approximate_keeps_exact_runs_exact(simulated, armpi, twin):
     desired = twin.path(simulated.reference(FROM_ZERO))[:3]
     names = names_of(desired)
-    exact = recover_movements(desired, FROM_ZERO, armpi, names=names)
-    also = recover_movements(desired, FROM_ZERO, armpi, approximate=True, names=names)
+    exact = on_known_grid(desired, armpi, names=names)
+    also = on_known_grid(desired, armpi, approximate=True, names=names)
     np.testing.assert_array_equal(exact.target, also.target)
 
 
@@ -358,15 +357,15 @@ def test_a_path_of_no_movements_is_refused_even_then(armpi):
     with pytest.raises(
         InputError, match=r"run 'circle': the best movements .* off its desired path"
     ):
-        recover_movements(circle[None], time, armpi, approximate=True, names=["circle"])
+        on_known_grid(circle[None], armpi, approximate=True, names=["circle"], time=time)
 
 
 def test_arrays_that_do_not_fit_are_refused(armpi):
     path = np.zeros((2, 1000, 3))
     with pytest.raises(InputError, match="shape"):
-        recover_movements(path[..., :2], FROM_ZERO, armpi, names=["a", "b"])
+        on_known_grid(path[..., :2], armpi, names=["a", "b"])
     with pytest.raises(InputError, match="1 names for 2 runs"):
-        recover_movements(path, FROM_ZERO, armpi, names=["a"])
+        on_known_grid(path, armpi, names=["a"])
     path[1, 5] = np.nan
     with pytest.raises(InputError, match=r"run 'b'.*not finite"):
-        recover_movements(path, FROM_ZERO, armpi, names=["a", "b"])
+        on_known_grid(path, armpi, names=["a", "b"])

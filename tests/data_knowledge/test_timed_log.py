@@ -6,8 +6,8 @@ import pytest
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.polyline import resolution, simplify, simplify_motors
+from failuretwin.core.runs import STEP_S
 from failuretwin.data_knowledge.readers.timed_log import (
-    STEP_S,
     Samples,
     Targets,
     TimedLog,

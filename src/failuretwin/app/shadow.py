@@ -23,8 +23,7 @@ from failuretwin.connection.links.base import (
 )
 from failuretwin.connection.links.statuses import statuses
 from failuretwin.connection.links.stream_time import LiveReference, ReorderBuffer, StreamClock
-from failuretwin.core.alarm import RAISED, SUSPECTED, Alarm, Episode
-from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.hypothesis import RAISED, SUSPECTED, Alarm, Episode, Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser
 from failuretwin.decision.streaming.monitor import FaultMonitor

@@ -1,4 +1,4 @@
-"""Faults, hypotheses and diagnoses.
+"""Faults, hypotheses, diagnoses and alarms.
 
 Text form in files and on the command line: ``healthy``, ``unknown``, ``motor_1:stuck``, or several
 faults joined by ``+`` in chain order.
@@ -48,8 +48,7 @@ class Hypothesis:
         Args:
             text: Such as ``"motor_1:stuck+motor_3:drift"``.
             motors: Names of the robot's motors in chain order; None: any names in any order, for
-            text from
-                results.
+                text from results.
 
         Raises:
             InputError: If the text does not follow the form or names an unknown motor.
@@ -117,7 +116,7 @@ def parse_hypotheses(
 
     Raises:
         InputError: If one is not valid or repeated, none is given, or a text is given instead of a
-        list.
+            list.
     """
     if isinstance(given, str):
         raise InputError(
@@ -277,3 +276,54 @@ class Diagnosis:
         record["posterior"] = dict(self.posterior)
         record["evidence"] = [asdict(movement) for movement in self.evidence]
         return record | {name: list(record[name]) for name in ("explanation", "quality")}
+
+
+# Alarms: the state of monitoring, and fault episodes.
+
+CLEAR, SUSPECTED, RAISED = "clear", "suspected", "alarm"
+"""States of an alarm, from best to worst."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A fault from its alarm to its end.
+
+    Attributes:
+        number: Its number in the stream, from 1.
+        cause: The diagnosed hypothesis.
+        raised_s: Time of the alarm in the stream [s].
+        cleared_s: End of the fault [s]; None while it lasts.
+    """
+
+    number: int
+    cause: str
+    raised_s: float
+    cleared_s: float | None = None
+
+    @property
+    def duration_s(self) -> float | None:
+        """Its duration [s]; None while it lasts."""
+        return None if self.cleared_s is None else self.cleared_s - self.raised_s
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """Result of the alarm rule, the same for all outputs.
+
+    Attributes:
+        state: `CLEAR`, `SUSPECTED` or `RAISED`.
+        cause: The most probable fault; empty if the state is `CLEAR`.
+        episode: The latest fault with an alarm; None before the first.
+    """
+
+    state: str = CLEAR
+    cause: str = ""
+    episode: Episode | None = None
+
+    def concerns(self, motor: str) -> bool:
+        """Return whether its cause includes a motor."""
+        return any(part.partition(":")[0] == motor for part in self.cause.split("+"))
+
+
+ALL_CLEAR = Alarm()
+"""No fault is or was suspected."""

@@ -13,10 +13,9 @@ from typing import Annotated
 
 import numpy as np
 
-from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.errors import InputError
 from failuretwin.core.polyline import REST_S, TURN_RAD, simplify
-from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray
 
 ROUNDING_RAD = 2e-3
 """Tolerance of the straight lines that replace logged references [rad], a tenth of a degree: half a
@@ -140,15 +139,8 @@ def find_movements(command: FloatArray, time: FloatArray) -> Movements:
             "`command` holds values that are not finite. Expected an angle [rad] at every "
             "sample; hold the last command where a run has ended."
         )
-    found = [_movements_of_run(run, time) for run in command]
-    count = max((len(start) for start, _, _ in found), default=0)
-    runs, _, motors = command.shape
-    start = np.full((runs, count), np.nan)
-    target, ramp = np.full((2, runs, count, motors), np.nan)
-    for i, of_run in enumerate(found):
-        until = len(of_run[0])
-        start[i, :until], target[i, :until], ramp[i, :until] = of_run
-    return Movements(np.array(command[:, 0]), target, ramp, start)
+    none = Movements.empty(run=0, movement=0, motor=command.shape[2])
+    return stack_movements([none, *(_movements_of_run(run, time) for run in command)])
 
 
 @dataclass(frozen=True)
@@ -174,10 +166,8 @@ class _Corners:
         return lines[self.speed[:-1] != 0.0]
 
 
-def _movements_of_run(
-    command: FloatArray, time: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return start (movement,), target and ramp duration (movement, motor) of one run."""
+def _movements_of_run(command: FloatArray, time: FloatArray) -> Movements:
+    """Return the movements in the reference of one run (time, motor), with a run axis of 1."""
     motors = [_corners(reference, time) for reference in command.T]
     start = _merge_starts(np.sort(np.concatenate([c.starts() for c in motors])))
     if max(c.bends() for c in motors) > GUIDED_BENDS * len(start):
@@ -186,7 +176,7 @@ def _movements_of_run(
     target, ramp = np.empty((2, len(start), len(motors)))
     for k, corners in enumerate(motors):
         target[:, k], ramp[:, k] = _ramps(corners, start, end)
-    return start, target, ramp
+    return Movements(command[None, 0], target[None], ramp[None], start[None])
 
 
 def _corners(reference: FloatArray, time: FloatArray) -> _Corners:

@@ -95,8 +95,7 @@ class Covariance(ABC):
     Attributes:
         determinant: (...).
         dims: Dimension of the Student t density; less than d where deviations lie on a surface,
-        such as
-            rotations among matrices.
+            such as rotations among matrices.
     """
 
     determinant: FloatArray

@@ -50,6 +50,8 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str]] = {
 }
 """Dimensions and unit of every variable of a run set."""
 
+STEP_S = 0.01
+"""Step of the time grid of published, simulated and most logged runs [s]."""
 GOAL_VARIABLE = "goal"
 """Variable of the goals that motors report to have received."""
 UNIFORM = 1e-3
@@ -176,8 +178,7 @@ def run_set(
         names: Unique name of each run; None: ``run_1``, ``run_2``, ...
         measured_rate_hz: True rate of the tool sensor [Hz]; None: the rate of the grid.
         sensors: Readings of other sensors, by variable (`accelerometer`, `position`, ...), each
-        with a
-            first axis for runs, or without where `command` has none.
+            with a first axis for runs, or without where `command` has none.
 
     Raises:
         InputError: If shapes do not fit together, or the grid is not uniform from 0.

@@ -28,17 +28,15 @@ from failuretwin.core.hypothesis import (
     parse_hypotheses,
 )
 from failuretwin.core.movements import Movements, stack_movements
-from failuretwin.core.runs import RunTable, Truth, concatenate
+from failuretwin.core.runs import STEP_S, RunTable, Truth, concatenate
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.simulated_sensors import SIMULATED, simulated_sensors
+from failuretwin.data_knowledge.signals import SIMULATED, drive_of, simulated_sensors
 from failuretwin.data_knowledge.workers import Workforce
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.disturbances import (
     Disturbances,
-    actual_movements,
     delay_commands,
     draw_disturbances,
-    lagged,
     sense,
     stack,
 )
@@ -46,7 +44,7 @@ from failuretwin.digital_model.nonidealities import NO_IMPERFECTIONS, Imperfecti
 from failuretwin.digital_model.physics.engine import PhysicsEngine
 from failuretwin.digital_model.robot import Robot, load_robot
 from failuretwin.digital_model.settling import Settling, loads_in_range
-from failuretwin.digital_model.twin import DigitalTwin, Drive, Engine, ServoEngine
+from failuretwin.digital_model.twin import DigitalTwin, Engine, ServoEngine
 from failuretwin.failure_behavior.fault import FaultValue
 from failuretwin.failure_behavior.injection import Injection
 from failuretwin.failure_behavior.mode import FaultMode
@@ -58,8 +56,6 @@ if TYPE_CHECKING:
 
 # What to simulate: robot, states, imperfections, chance; small enough to write down.
 
-STEP_S = 0.01
-"""Step of the time grid [s], as published."""
 ENGINES = ("servo", "physics")
 LATE_STARTS = 2
 """Late starts that a run has room for; what more of them push beyond the grid is cut off."""
@@ -218,43 +214,6 @@ class Plan:
         urdf = (self.robot.folder / self.robot.profile.urdf).read_bytes()
         content = {"plan": canonical(self), "urdf_sha256": hashlib.sha256(urdf).hexdigest()}
         return {**content, "plan_sha256": fingerprint(content)}
-
-
-# From commands to what the motors are really told, once faults and bad luck have had their say.
-
-
-def drive_of(
-    commanded: Movements,
-    command: FloatArray,
-    time: FloatArray,
-    injection: Injection,
-    chance: Disturbances,
-) -> Drive:
-    """Return what the motors of some runs are told.
-
-    Args:
-        commanded: Movements as commanded.
-        command: Their references, (run, time, motor) [rad].
-        time: Uniform grid, (time,) [s].
-        injection: Faults of the runs.
-        chance: Bad luck of the runs.
-    """
-    faulty, lost = injection.on_movements(commanded, chance.lost)
-    actual = actual_movements(faulty, replace(chance, lost=lost))
-    followed = command if _same(actual, commanded) else actual.reference(time)
-    followed = lagged(followed, time, chance.lag)
-    return Drive(
-        reference=injection.on_reference(followed, time),
-        held=injection.held(time),
-        weakness=injection.weakness(time),
-        compliance=chance.compliance if chance.compliance.any() else None,
-        payload=chance.payload if chance.payload.any() else None,
-    )
-
-
-def _same(one: Movements, other: Movements) -> bool:
-    names = ("initial", "target", "ramp_duration", "start")
-    return all(np.array_equal(getattr(one, n), getattr(other, n), equal_nan=True) for n in names)
 
 
 CHUNK_RUNS = 100

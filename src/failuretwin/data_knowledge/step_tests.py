@@ -14,9 +14,10 @@ import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import files_below
-from failuretwin.core.types import MS_PER_S, BoolArray, FloatArray, ServoUnits, frozen_array
-from failuretwin.data_knowledge.readers.csv_log import load_csv, numbers
+from failuretwin.core.types import MS_PER_S, BoolArray, FloatArray, frozen_array
+from failuretwin.data_knowledge.readers.csv_log import first_line, load_csv, numbers
 from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.servo import ServoUnits
 
 # What keeps a step of a step test from telling of a healthy motor.
 
@@ -120,13 +121,7 @@ class StepTest:
 
 def is_step_test(path: Path) -> bool:
     """Return whether a file has exactly the header of a step test."""
-    if path.suffix != ".csv" or not path.is_file():
-        return False
-    try:
-        with path.open(encoding="utf-8") as file:
-            return file.readline().strip() == HEADER
-    except (OSError, UnicodeDecodeError):
-        return False
+    return path.suffix == ".csv" and path.is_file() and first_line(path) == HEADER
 
 
 def find_step_tests(path: Path) -> list[Path]:

@@ -10,9 +10,8 @@ from typing import Annotated
 
 from failuretwin.core.config import AtLeastZero, Bounded, Bounds
 from failuretwin.core.errors import InputError, unknown_name
-from failuretwin.core.types import ServoUnits
 from failuretwin.digital_model.geometry import AS_STATED, NO_OFFSET, NOT_MOVED, Geometry, Pose
-from failuretwin.digital_model.servo import ServoLoop
+from failuretwin.digital_model.servo import ServoLoop, ServoUnits
 from failuretwin.digital_model.urdf.file import Triple
 
 POSES = ("log", "physical")

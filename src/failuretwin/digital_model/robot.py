@@ -13,7 +13,7 @@ import numpy as np
 
 from failuretwin.core.config import from_table, read_toml
 from failuretwin.core.errors import InputError, unknown_name
-from failuretwin.core.types import BoolArray, FloatArray, ServoUnits, frozen_array
+from failuretwin.core.types import BoolArray, FloatArray, frozen_array
 from failuretwin.digital_model.geometry import SensorFrame, seen_chain, with_tool
 from failuretwin.digital_model.kinematics import (
     CANNOT_MOVE,
@@ -24,6 +24,7 @@ from failuretwin.digital_model.kinematics import (
     levers,
 )
 from failuretwin.digital_model.profile import Motor, Profile
+from failuretwin.digital_model.servo import ServoUnits
 from failuretwin.digital_model.urdf.file import read_urdf
 
 

@@ -4,7 +4,7 @@ Each motor is a PI loop around a second-order input filter, and the joint follow
 
     (P s + I) / (s (tau s + 1)^2 + P s + I)
 
-All solutions are exact between samples.
+All solutions are exact between samples. `ServoUnits` is the count scale of a servo.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from failuretwin.core.config import AtLeastZero, Bounded, Bounds
 from failuretwin.core.errors import InputError
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import FloatArray, as_floats
 
 SLOWEST_S = 100.0
 """Longest time constant of a loop [s]; with a slower one no movement is visible."""
@@ -174,3 +175,55 @@ def _transitions(gains: FloatArray, step: float) -> tuple[FloatArray, FloatArray
     held[:, 0, 3] = 1.0
     ahead, capped = (np.swapaxes(np.asarray(expm(step * m)), 1, 2) for m in (free, held))
     return np.concatenate([ahead[..., :3], demanded[..., None]], axis=2), capped[..., :3]
+
+
+# Conversion at the border: counts of servos to radians.
+
+LARGEST_SCALE = 2e7
+"""Largest value in a count scale: encoders of 24 bits count to 1.7e7."""
+
+
+@dataclass(frozen=True)
+class ServoUnits:
+    """The count scale of a position servo: angle = (zero_deg - deg_per_count * counts) in degrees.
+
+    Attributes:
+        zero_deg: Joint angle at zero counts [deg].
+        deg_per_count: Degrees per count; positive means that counts run against the angle.
+        low: Smallest valid count.
+        high: Largest valid count.
+    """
+
+    zero_deg: float
+    deg_per_count: float
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        values = (self.zero_deg, self.deg_per_count, self.low, self.high)
+        sane = all(abs(value) <= LARGEST_SCALE for value in values)  # which NaN is not
+        if not sane or self.deg_per_count == 0.0 or not self.low < self.high:
+            raise InputError(
+                f"servo_units are zero_deg {values[0]:g}, deg_per_count {values[1]:g}, low "
+                f"{values[2]:g}, high {values[3]:g}. Expected low below high, a count that is not "
+                f"0 deg, and nothing beyond {LARGEST_SCALE:g}."
+            )
+
+    @property
+    def rad_per_count(self) -> float:
+        """Size of one count [rad], always positive."""
+        return abs(self.deg_per_count) * np.pi / 180.0
+
+    def to_rad(self, counts: ArrayLike) -> FloatArray:
+        """Return joint angles [rad] of `counts`, clamped to the valid range."""
+        clamped = np.clip(as_floats(counts), self.low, self.high)
+        return (self.zero_deg - self.deg_per_count * clamped) * np.pi / 180.0
+
+    def to_counts(self, angle: ArrayLike) -> FloatArray:
+        """Return unrounded counts of joint angles [rad]."""
+        return (self.zero_deg - np.rad2deg(as_floats(angle))) / self.deg_per_count
+
+    def valid(self, counts: ArrayLike) -> np.ndarray:
+        """Return which `counts` a healthy servo can report; NaN is not valid."""
+        values = as_floats(counts)
+        return (values >= self.low) & (values <= self.high)

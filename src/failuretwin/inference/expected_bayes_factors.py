@@ -23,7 +23,7 @@ from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.numerics import log_of
 from failuretwin.core.runs import check_motors, check_runs
 from failuretwin.core.types import BoolArray, FloatArray, as_floats
-from failuretwin.data_knowledge.noise_free import noise_free_path
+from failuretwin.data_knowledge.signals import noise_free_path
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.failure_behavior.fault import FaultValue

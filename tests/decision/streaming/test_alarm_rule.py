@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from failuretwin.core.alarm import CLEAR, RAISED, SUSPECTED
 from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import CLEAR, RAISED, SUSPECTED
 from failuretwin.decision.streaming.alarm_rule import AlarmRule
 
 NAMES = ["healthy", "motor_1:stuck", "motor_2:stuck"]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from failuretwin import BayesDiagnoser
-from failuretwin.core.alarm import CLEAR, RAISED
 from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import CLEAR, RAISED
 from failuretwin.core.runs import run_set
 from failuretwin.decision.streaming.fleet import StreamingFleet
 from failuretwin.decision.streaming.monitor import monitor

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from failuretwin import BayesDiagnoser
-from failuretwin.core.alarm import CLEAR, RAISED
 from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import CLEAR, RAISED
 from failuretwin.decision.streaming.alarm_rule import UNUSED, movements_to_tell
 from failuretwin.decision.streaming.learning import RUN, LifeLearner
 from failuretwin.decision.streaming.monitor import monitor

@@ -9,7 +9,7 @@ import pytest
 
 from failuretwin import BayesDiagnoser
 from failuretwin.connection.links.base import OK
-from failuretwin.core.alarm import CLEAR, RAISED, Alarm, Episode
+from failuretwin.core.hypothesis import CLEAR, RAISED, Alarm, Episode
 from failuretwin.core.runs import concatenate, run_set
 from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.decision.streaming.set_up_watch import RUN, SetUpWatch, StreamRuns

@@ -8,7 +8,7 @@ import pytest
 from failuretwin import InputError, load_robot
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis, paper_hypotheses
 from failuretwin.core.movements import Movements
-from failuretwin.data_knowledge.noise_free import noise_free_path
+from failuretwin.data_knowledge.signals import noise_free_path
 from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
 from failuretwin.decision.test_motions.design import Designer
 from failuretwin.decision.test_motions.health_check import checking

@@ -18,7 +18,7 @@ def demo(report: Path | None) -> None:
 
     One is healthy, one has a stuck motor, one a motor that misses its targets.
     """
-    from failuretwin.data_knowledge.sample_log import sample_log
+    from failuretwin.data_knowledge.readers.read import sample_log
 
     words = [str(sample_log()), *([] if report is None else ["--report", str(report)])]
     tell(f"failuretwin diagnose {' '.join(words)}\n")

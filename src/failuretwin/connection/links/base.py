@@ -8,9 +8,8 @@ from importlib import import_module
 from threading import Condition
 from typing import Protocol, Self, cast
 
-from failuretwin.core.alarm import ALL_CLEAR, Alarm
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import Diagnosis
+from failuretwin.core.hypothesis import ALL_CLEAR, Alarm, Diagnosis
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.robot import Robot
 

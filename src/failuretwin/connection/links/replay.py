@@ -20,7 +20,9 @@ from failuretwin.connection.links.ros_reader import SampledCommands, goal_readin
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import GOAL_VARIABLE
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.readers.bags import BagTopics, is_bag, read_bag
+from failuretwin.data_knowledge.readers.bag_file import is_bag
+from failuretwin.data_knowledge.readers.bag_messages import BagTopics
+from failuretwin.data_knowledge.readers.bags import read_bag
 from failuretwin.data_knowledge.readers.raw_sessions import RawSession, find_sessions, read_session
 from failuretwin.data_knowledge.readers.timed_log import Samples, Targets, TimedLog
 from failuretwin.digital_model.robot import Robot
@@ -120,8 +122,7 @@ def replay(path: Path, robot: Robot, pace: Pace, topics: BagTopics | None = None
     if not path.exists():
         raise InputError(f"{path}: does not exist. Expected a raw session or a bag.")
     if is_bag(path):
-        (log,) = read_bag(path, robot, topics)
-        return PacedSource(path.name, log_events(log, robot), pace)
+        return PacedSource(path.name, log_events(read_bag(path, robot, topics), robot), pace)
     folders = find_sessions(path) if path.is_dir() else []
     if len(folders) != 1:
         raise InputError(

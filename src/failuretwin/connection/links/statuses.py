@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from failuretwin.connection.links.base import STALE, Answer
-from failuretwin.core.alarm import CLEAR, RAISED, SUSPECTED, Alarm
-from failuretwin.core.hypothesis import Diagnosis, Hypothesis
+from failuretwin.core.hypothesis import CLEAR, RAISED, SUSPECTED, Alarm, Diagnosis, Hypothesis
 from failuretwin.inference.explanation import percent, plain_name
 
 LEVEL_OK, LEVEL_WARN, LEVEL_ERROR, LEVEL_STALE = range(4)

@@ -18,7 +18,6 @@ from failuretwin.core.types import FloatArray, IntArray, as_floats
 from failuretwin.data_knowledge.readers.bag_file import (
     BagMessage,
     BagTopic,
-    is_bag,
     read_messages,
     read_topics,
 )
@@ -38,13 +37,11 @@ from failuretwin.data_knowledge.readers.bag_messages import (
 from failuretwin.data_knowledge.readers.timed_log import Samples, Targets, TimedLog, held
 from failuretwin.digital_model.robot import Robot
 
-__all__ = ["BagTopics", "is_bag", "motor_rows", "read_bag", "read_targets"]
-
 CLOCK_GAP_NS = 3600 * NS_PER_S
 """A silence of this length [ns] means that the stamps come from more than one clock."""
 
 
-def read_bag(path: Path, robot: Robot, topics: BagTopics | None = None) -> list[TimedLog]:
+def read_bag(path: Path, robot: Robot, topics: BagTopics | None = None) -> TimedLog:
     """Read a ROS 1 bag (.bag), a ROS 2 bag (folder or .db3) or an MCAP file.
 
     Args:
@@ -77,15 +74,13 @@ def read_bag(path: Path, robot: Robot, topics: BagTopics | None = None) -> list[
             raise nothing_for("tool", found, path)
         _check_whole(position)
     zero_ns = _first_stamp([t for t in (command, tool, position) if t is not None], path)
-    return [
-        TimedLog(
-            name=path.name if path.is_dir() else path.stem,
-            command=_command(command, position, zero_ns),
-            tool=None if tool is None else Samples(_seconds(tool.stamp_ns, zero_ns), tool.value),
-            position=None if position is None else _samples(position, zero_ns),
-            sensors={} if goal is None else {GOAL_VARIABLE: _samples(goal, zero_ns)},
-        )
-    ]
+    return TimedLog(
+        name=path.name if path.is_dir() else path.stem,
+        command=_command(command, position, zero_ns),
+        tool=None if tool is None else _samples(tool, zero_ns),
+        position=None if position is None else _samples(position, zero_ns),
+        sensors={} if goal is None else {GOAL_VARIABLE: _samples(goal, zero_ns)},
+    )
 
 
 def read_targets(path: Path, robot: Robot) -> Targets | None:

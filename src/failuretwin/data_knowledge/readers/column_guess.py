@@ -26,6 +26,7 @@ from failuretwin.data_knowledge.readers.csv_log import (
     CommandColumns,
     TimeColumn,
     ToolColumns,
+    first_line,
     load_csv,
 )
 from failuretwin.digital_model.robot import Robot
@@ -233,11 +234,8 @@ def _candidates(words: Mapping[str, set[str]], robot: Robot) -> _Candidates:
 
 
 def _separator(path: Path) -> str:
-    try:
-        with path.open(encoding="utf-8") as file:
-            header = file.readline().strip()
-    except (OSError, UnicodeDecodeError):
-        return ","
+    """Return the separator of columns that the header of a CSV file suggests."""
+    header = first_line(path)
     likely = max(",;\t", key=header.count)
     return likely if likely in header or " " not in header else BLANKS
 

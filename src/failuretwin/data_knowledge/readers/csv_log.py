@@ -226,6 +226,15 @@ def read_mapped_csv(path: Path, mapping: ColumnMap, robot: Robot) -> list[TimedL
     return [_log(part, f"{path.stem}/{key}", path, mapping, robot) for key, part in groups]
 
 
+def first_line(path: Path) -> str:
+    """Return the first line of a text file, stripped; empty if it cannot be read as text."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            return file.readline().strip()
+    except (OSError, UnicodeDecodeError):
+        return ""
+
+
 def load_csv(path: Path, separator: str = ",") -> pd.DataFrame:
     """Return a CSV file with every cell as text.
 

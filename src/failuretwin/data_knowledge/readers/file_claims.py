@@ -11,9 +11,11 @@ import json
 import math
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import LEAST_BYTES, check_size, read_text, reading
@@ -143,23 +145,13 @@ def _check_chunks(node: Mapping[str, Any], folder: Path) -> None:
     there = sum(1 for file in folder.rglob("*") if file.is_file() and file.name != "zarr.json")
     if there >= math.prod(counts):
         return
-    missing = next((key for key in _keys(counts, separator) if not (folder / key).is_file()), None)
+    keys = (separator.join(["c", *map(str, index)]) for index in np.ndindex(*counts))
+    missing = next((key for key in keys if not (folder / key).is_file()), None)
     if missing is not None:
         raise InputError(
             f"{folder}: chunk {missing} is missing ({there} of {math.prod(counts)} are there). "
             "Copy the store again; if it is whole, write it with write_empty_chunks=True."
         )
-
-
-def _keys(counts: Sequence[int], separator: str) -> Iterator[str]:
-    """Return the names of all chunks in order."""
-    total = math.prod(counts)
-    for number in range(total):
-        index, rest = [], number
-        for count in reversed(counts):
-            rest, place = divmod(rest, count)
-            index.append(str(place))
-        yield separator.join(["c", *reversed(index)])
 
 
 # MATLAB, versions 5 to 7: elements with a tag that says type and length, also within each other.

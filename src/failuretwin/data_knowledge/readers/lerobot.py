@@ -180,19 +180,15 @@ def channel_names(info: Mapping[str, Any], feature: str) -> list[str]:
     return [str(name) for name in names] if isinstance(names, list) else []
 
 
-def _data_files(path: Path) -> list[Path]:
+def _all_frames(path: Path, known: LeRobotAngles, robot: Robot) -> _Frames:
+    info = _info(path)
+    picks = [_channels(info, feature, known, robot, path) for feature in (ACTION, STATE)]
     files = sorted((path / "data").rglob("*.parquet"))
     if not files:
         raise InputError(
             f"{path}: no parquet files below data/. Fetch the whole data set, not its meta alone."
         )
-    return files
-
-
-def _all_frames(path: Path, known: LeRobotAngles, robot: Robot) -> _Frames:
-    info = _info(path)
-    picks = [_channels(info, feature, known, robot, path) for feature in (ACTION, STATE)]
-    parts = [_frames(file, picks) for file in _data_files(path)]
+    parts = [_frames(file, picks) for file in files]
     frames = _Frames(*(np.concatenate(column) for column in zip(*parts, strict=True)))
     if len(frames.episode) == 0:
         raise InputError(f"{path}: holds no frames. Record at least one episode.")

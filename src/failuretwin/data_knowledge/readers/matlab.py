@@ -24,10 +24,9 @@ from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.runs import AXES, RunTable, Truth, truth_of
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.readers.file_claims import check_matlab
-from failuretwin.data_knowledge.readers.raw_sessions import PUBLISHED_FREEZE, READING_RATE_HZ
+from failuretwin.data_knowledge.readers.raw_sessions import READING_RATE_HZ, published_onset
 from failuretwin.data_knowledge.recovery.recovery import (
     path_error,
-    published_time,
     recover_movements,
 )
 from failuretwin.data_knowledge.store import SUFFIXES, filling, replacing, save_run_set
@@ -138,7 +137,7 @@ def _cell_array_runs(
     cells = np.ravel(content[runs])
     if len(cells) == 0:
         raise InputError(f"{path}: `{runs}` holds no runs. Expected cells of (samples, 6).")
-    texts = [_text(cell) for cell in np.ravel(content.get(labels, []))]
+    texts = [str(np.ravel(cell)[0]) for cell in np.ravel(content.get(labels, []))]
     if texts and len(texts) != len(cells):
         raise InputError(f"{path}: {len(cells)} runs in `{runs}` but {len(texts)} labels.")
     _check_labels(texts, robot, path)
@@ -156,8 +155,7 @@ def _cell_array_runs(
 def _recovered(paths: Sequence[_Paths], robot: Robot, *, approximate: bool) -> RunTable:
     """Return runs with commands recovered from their desired paths, and the error of recovery."""
     desired, names = np.stack([run.desired for run in paths]), [run.name for run in paths]
-    time = published_time(desired, robot, names=names)
-    movements = recover_movements(desired, time, robot, approximate=approximate, names=names)
+    time, movements = recover_movements(desired, robot, names=names, approximate=approximate)
     off = path_error(movements, desired, time, robot)
     worst = int(np.argmax(off))
     shifted = replace(movements, start=movements.start - time[0])
@@ -256,19 +254,12 @@ def _truth(paths: Sequence[_Paths], time: FloatArray, robot: Robot) -> Truth | N
     if any(fault is None for fault in faults):
         return None
     known = [str(fault) for fault in faults]
-    onset = [_onset(fault, time) for fault in known]
     return Truth(
         fault=known,
         detail=[{"source": "published label", "label": run.label} for run in paths],
-        onset=np.array(onset),
+        onset=np.array([published_onset(fault, time) for fault in known]),
         magnitude=np.full(len(known), np.nan),
     )
-
-
-def _onset(fault: str, time: FloatArray) -> float:
-    if fault == "healthy":
-        return float("nan")
-    return float(time[PUBLISHED_FREEZE]) if fault.endswith(":stuck") else 0.0
 
 
 def _check_labels(texts: Sequence[str], robot: Robot, path: Path) -> None:
@@ -277,10 +268,6 @@ def _check_labels(texts: Sequence[str], robot: Robot, path: Path) -> None:
     if unknown and len(unknown) < len(texts):
         valid = [label_text(str(h)) for h in paper_hypotheses(robot.motor_names)]
         raise InputError(f"{path}: {unknown_name('label', unknown[0], valid)}")
-
-
-def _text(cell: Any) -> str:
-    return str(np.ravel(cell)[0])
 
 
 def _split_paths(values: Any, where: str) -> tuple[FloatArray, FloatArray]:

@@ -15,7 +15,7 @@ from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.foreign import files_below
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Movements
-from failuretwin.core.runs import RunTable, Truth, concatenate
+from failuretwin.core.runs import STEP_S, RunTable, Truth, concatenate
 from failuretwin.core.types import MS_PER_S, FloatArray, as_floats
 from failuretwin.data_knowledge.readers.csv_log import load_csv, numbers
 from failuretwin.data_knowledge.readers.timed_log import check_clock, check_grid
@@ -161,8 +161,6 @@ As = Literal["measured", "published"]
 
 READING_RATE_HZ = 10.0
 """Nominal rate of the robot's readings [Hz]."""
-GRID_STEP_S = 0.01
-"""Step of the time grid that measured readings are put on [s]."""
 GAP_S = 0.5
 """A longer silence between two readings is a gap [s]; the nominal step is 0.1 s."""
 PUBLISHED_TIME = np.linspace(0.0, 10.0, 1000)
@@ -171,20 +169,7 @@ PUBLISHED_FREEZE = 49
 """0-based sample from which the authors froze the motor of a stuck label."""
 
 
-@dataclass(frozen=True)
-class RowSpan:
-    """Command rows of one run within a session.
-
-    Attributes:
-        first: First row of the run.
-        stop: Row after its last one.
-    """
-
-    first: int
-    stop: int
-
-
-def split_session(session: RawSession, robot: Robot) -> list[RowSpan]:
+def split_session(session: RawSession, robot: Robot) -> list[range]:
     """Return which command rows form the runs of a session.
 
     Sessions of random movements send the arm home (every motor at the middle of its scale), make
@@ -195,12 +180,12 @@ def split_session(session: RawSession, robot: Robot) -> list[RowSpan]:
     home = np.flatnonzero(np.all(target == (units.low + units.high) / 2.0, axis=1))
     groups = list(pairwise([*home, len(target)]))
     if not any(_ends_in_repeat(target[first:stop]) for first, stop in groups):
-        return [RowSpan(0, len(target))]
+        return [range(len(target))]
     spans = [
-        RowSpan(int(first) + 1, int(stop) - int(_ends_in_repeat(target[first:stop])))
+        range(int(first) + 1, int(stop) - int(_ends_in_repeat(target[first:stop])))
         for first, stop in groups
     ]
-    return [span for span in spans if span.stop > span.first]
+    return [span for span in spans if span]
 
 
 def _ends_in_repeat(target: FloatArray) -> bool:
@@ -267,12 +252,12 @@ class _Window:
 def _run(
     session: RawSession,
     robot: Robot,
-    span: RowSpan,
+    span: range,
     window: _Window,
     name: str,
     label: int | None,
 ) -> RunTable:
-    units, rows, time = robot.servo_units, slice(span.first, span.stop), window.time
+    units, rows, time = robot.servo_units, slice(span.start, span.stop), window.time
     movements = Movements(
         initial=units.to_rad(window.initial)[None],
         target=units.to_rad(session.target_counts[rows])[None],
@@ -304,33 +289,33 @@ def _run(
     )
 
 
-def _measured_window(session: RawSession, robot: Robot, span: RowSpan) -> _Window:
+def _measured_window(session: RawSession, robot: Robot, span: range) -> _Window:
     """Return the window from the last reading before a run to the next command, as measured."""
     stamps = session.reading_time
-    command = float(session.command_time[span.first])
+    command = float(session.command_time[span.start])
     begin = _last_reading_before(session, command)
     begin = command if begin is None or begin < command - 2.0 * GAP_S else begin
     end = float(np.append(session.command_time, np.inf)[span.stop])
     end = min(end, float(stamps[-1]))
-    both = np.concatenate([session.command_time[span.first : span.stop], stamps])
+    both = np.concatenate([session.command_time[span.start : span.stop], stamps])
     check_clock(both[(both >= begin) & (both <= end)], str(session.folder))
-    check_grid((end - begin) / GRID_STEP_S, len(both), str(session.folder))
+    check_grid((end - begin) / STEP_S, len(both), str(session.folder))
     # A reading before a gap stalled: it was taken at some time within the gap.
     stalled = np.append(np.diff(stamps) > GAP_S, False)
     kept = (stamps >= begin) & (stamps <= end) & ~stalled
     counts = session.reading_counts[kept]
     return _Window(
         begin,
-        as_floats(np.arange(round((end - begin) / GRID_STEP_S) + 1) * GRID_STEP_S),
+        as_floats(np.arange(round((end - begin) / STEP_S) + 1) * STEP_S),
         _initial_counts(session, span, begin),
         stamps[kept] - begin,
         np.where(robot.servo_units.valid(counts), counts, np.nan),
     )
 
 
-def _published_window(session: RawSession, robot: Robot, span: RowSpan) -> _Window:
+def _published_window(session: RawSession, robot: Robot, span: range) -> _Window:
     """Return the window of the published length, with readings drawn out by straight lines."""
-    begin = _last_reading_before(session, session.command_time[span.first])
+    begin = _last_reading_before(session, session.command_time[span.start])
     if begin is None:
         raise InputError(
             f"{session.folder}: no reading before the first command of a run, which the published "
@@ -351,36 +336,43 @@ def _last_reading_before(session: RawSession, stamp: float) -> float | None:
     return None if index < 0 else float(session.reading_time[index])
 
 
-def _check_length(session: RawSession, span: RowSpan) -> None:
+def _check_length(session: RawSession, span: range) -> None:
     """Raise InputError unless the readings outlast the first ramp of a run."""
-    reached = session.command_time[span.first] + session.ramp_s[span.first].max()
+    reached = session.command_time[span.start] + session.ramp_s[span.start].max()
     if session.reading_time[-1] < reached:
         raise InputError(
             f"{session.folder}: the readings end before the first movement of the run does (line "
-            f"{span.first + 2} of {COMMAND_FILE}). A run needs one whole movement at least."
+            f"{span.start + 2} of {COMMAND_FILE}). A run needs one whole movement at least."
         )
 
 
-def _initial_counts(session: RawSession, span: RowSpan, begin: float) -> FloatArray:
+def _initial_counts(session: RawSession, span: range, begin: float) -> FloatArray:
     """Return where the first ramp starts, (motor,) [counts].
 
     It is the target before it, where the session holds one; else the reading at the start, as
     published; else (the log starts later) the first target, so that no ramp is seen.
     """
-    if span.first > 0:
-        return session.target_counts[span.first - 1]
+    if span.start > 0:
+        return session.target_counts[span.start - 1]
     index = int(np.searchsorted(session.reading_time, begin))
-    if session.reading_time[index] > session.command_time[span.first]:
-        return session.target_counts[span.first]
+    if session.reading_time[index] > session.command_time[span.start]:
+        return session.target_counts[span.start]
     return session.reading_counts[index]
 
 
 def _truth(label: int, held: float, robot: Robot) -> Truth:
     stuck = 1 <= label <= len(robot.motors)
-    onset = PUBLISHED_TIME[PUBLISHED_FREEZE] if stuck else (np.nan if label == 0 else 0.0)
+    fault = str(paper_hypotheses(robot.motor_names)[label])
     return Truth(
-        fault=[str(paper_hypotheses(robot.motor_names)[label])],
+        fault=[fault],
         detail=[{"source": "published label", "label": label, "frozen_afterwards": stuck}],
-        onset=np.array([onset]),
+        onset=np.array([published_onset(fault, PUBLISHED_TIME)]),
         magnitude=np.array([held]),
     )
+
+
+def published_onset(fault: str, time: FloatArray) -> float:
+    """Return the onset of a published fault on the grid `time` (time,) [s]; NaN: healthy."""
+    if fault == "healthy":
+        return float("nan")
+    return float(time[PUBLISHED_FREEZE]) if fault.endswith(":stuck") else 0.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, cast
 
@@ -12,7 +13,9 @@ from failuretwin import __version__
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import files_below
 from failuretwin.core.runs import concatenate
-from failuretwin.data_knowledge.readers.bags import BagTopics, is_bag, read_bag
+from failuretwin.data_knowledge.readers.bag_file import is_bag
+from failuretwin.data_knowledge.readers.bag_messages import BagTopics
+from failuretwin.data_knowledge.readers.bags import read_bag
 from failuretwin.data_knowledge.readers.column_guess import told_columns
 from failuretwin.data_knowledge.readers.csv_log import ColumnMap, read_mapped_csv
 from failuretwin.data_knowledge.readers.lerobot import (
@@ -74,6 +77,16 @@ class ReadOptions:
     approximate: bool = False
 
 
+def sample_log() -> Path:
+    """Return the path of a CSV file with three runs of an ArmPi FPV: healthy, stuck, off target.
+
+    Simulated with the physics engine and the imperfections of the bundled calibration (lost
+    commands, late starts, sag, scatter). Tool position at 10 Hz. Commands in rad, positions in m in
+    the base frame. Run 1 is run 160 of 250 healthy ones of seed 13.
+    """
+    return Path(str(files("failuretwin.data_knowledge") / "samples" / "armpi_fpv.csv"))
+
+
 def read_runs(
     sources: str | Path | Sequence[str | Path],
     robot: Robot | str = "armpi_fpv",
@@ -120,9 +133,10 @@ def _read_source(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Data
     if path.suffix in SUFFIXES:
         return [load_run_set(path)]
     if is_bag(path):
-        return _log_datasets(read_bag(path, robot, options.topics), robot, "bag")
+        return _log_datasets([read_bag(path, robot, options.topics)], robot, "bag")
     if is_lerobot(path):
-        source = f"LeRobot {lerobot_version(path)}, angles in {_lerobot_unit(options)}"
+        unit = "degrees (assumed)" if options.lerobot is None else options.lerobot.unit
+        source = f"LeRobot {lerobot_version(path)}, angles in {unit}"
         return _log_datasets(read_lerobot(path, robot, options.lerobot), robot, source)
     if path.is_dir():
         return _read_folder(path, robot, options)
@@ -138,10 +152,6 @@ def _read_source(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Data
     )
 
 
-def _lerobot_unit(options: ReadOptions) -> str:
-    return "degrees (assumed)" if options.lerobot is None else options.lerobot.unit
-
-
 def _read_folder(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
     found = [_session_dataset(folder, robot, options) for folder in find_sessions(path)]
     found += [_matlab_dataset(file, robot, options) for file in find_matlab_files(path)]
@@ -152,8 +162,8 @@ def _read_folder(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Data
     )
     found += [part for folder in sets for part in _read_source(folder, robot, options)]
     if not found and options.columns is not None:
-        files = sorted(files_below(path, "*.csv"))
-        found = [part for file in files for part in _read_text(file, robot, options)]
+        tables = sorted(files_below(path, "*.csv"))
+        found = [part for file in tables for part in _read_text(file, robot, options)]
     if not found:
         raise InputError(
             f"{path}: no raw session in it or below, no published MATLAB file and no LeRobot data "

@@ -22,6 +22,7 @@ from failuretwin.data_knowledge.readers.csv_log import (
     SensorColumns,
     TimeColumn,
     ToolColumns,
+    first_line,
     load_csv,
     numbers,
     read_mapped_csv,
@@ -50,11 +51,7 @@ def is_rtde(path: Path) -> bool:
 
 def _header(path: Path) -> tuple[list[str], str]:
     """Return the names of the columns, and what stands between them."""
-    try:
-        with path.open(encoding="utf-8") as file:
-            line = file.readline()
-    except (OSError, UnicodeDecodeError):
-        return [], BLANKS
+    line = first_line(path)
     separator = next((mark for mark in ",;" if mark in line), BLANKS)
     return line.replace(separator, " ").split(), separator
 

@@ -14,13 +14,11 @@ import numpy as np
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import ROUNDING_RAD, Movements
 from failuretwin.core.polyline import simplify_motors
-from failuretwin.core.runs import RunTable
+from failuretwin.core.runs import STEP_S, RunTable
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
-STEP_S = 0.01
-"""Step of the time grid [s]; finer where the sensor is faster."""
 LONGEST_SILENCE_S = 60.0
 """Longer without any command or reading is a jump of the clock [s], and no time grid spans it."""
 SAMPLES_PER_STAMP = 200
@@ -170,7 +168,10 @@ def _check_commands(log: TimedLog) -> None:
 
 
 def _grid_step(stamps: FloatArray, tool: Samples) -> float:
-    """Return the step of the time grid [s]: the log's own, where it is even and fine enough."""
+    """Return the step of the time grid [s]: the log's own, where it is even and fine enough.
+
+    Otherwise it is the usual one, or that of a faster sensor.
+    """
     steps = np.diff(stamps)
     own = float(steps.mean())
     if own <= 2.0 * STEP_S and np.ptp(steps) < 1e-3 * own:

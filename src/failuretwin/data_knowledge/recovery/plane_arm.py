@@ -14,8 +14,9 @@ from functools import cached_property
 import numpy as np
 
 from failuretwin.core.errors import InputError
-from failuretwin.core.types import BoolArray, FloatArray, ServoUnits
+from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.servo import ServoUnits
 from failuretwin.digital_model.twin import DigitalTwin
 
 EXACT_M = 1e-9

@@ -13,27 +13,24 @@ import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.movements import Movements, stack_movements
+from failuretwin.core.runs import STEP_S
 from failuretwin.core.types import FloatArray, as_floats
-from failuretwin.data_knowledge.recovery.approximate import fit_run
 from failuretwin.data_knowledge.recovery.plane_arm import PlaneArm, plane_arm
-from failuretwin.data_knowledge.recovery.ramp_fit import PathPart
+from failuretwin.data_knowledge.recovery.ramp_fit import PathPart, fit_run
 from failuretwin.data_knowledge.recovery.whole_counts import NoWholeUnitsError, solve_run
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 
-STEP_S = 0.01
-"""Nominal step of published runs [s]."""
-
 
 def recover_movements(
     desired: FloatArray,
-    time: FloatArray,
     robot: Robot,
     *,
-    approximate: bool = False,
     names: Sequence[str],
-) -> Movements:
-    """Return the movements whose reference makes the desired paths.
+    time: FloatArray | None = None,
+    approximate: bool = False,
+) -> tuple[FloatArray, Movements]:
+    """Return the time grid (time,) [s] and the movements whose reference makes the desired paths.
 
     Targets are whole servo units, ramps of the published durations; motors that stay have a
     duration of 0, movements without any travel do not appear. The last ramp of a record that ends
@@ -42,25 +39,28 @@ def recover_movements(
 
     Args:
         desired: Desired tool paths in the base frame, (run, time, axis) [m].
-        time: Uniform time grid, (time,) [s].
         robot: The robot.
+        names: Name of each run, for messages.
+        time: Uniform time grid, (time,) [s]; None: the published one that fits.
         approximate: Fit the runs that have no such movements by least squares, with targets
             and durations of any value. A tool position leaves the pose of an arm with more than
             three motors open; the fit takes the pose nearest to the one before it among those
             that also fit the ramps.
-        names: Name of each run, for messages.
 
     Raises:
         InputError: If the arrays do not fit, or a run has no such movements and `approximate`
             is False, or nothing of a run's path can be fitted.
     """
-    desired, time = _checked(desired, time, names)
+    desired = as_floats(desired)
+    grids = published_time_bases(np.shape(desired)[1]) if time is None else [as_floats(time)]
+    _check(desired, grids[0], names)
     arm = _arm_unless(robot, approximate=approximate)
+    grid = _fitting_grid(grids, desired, arm)
     parts = [
-        _recover_run(PathPart(time, path), robot, arm, approximate, name)
+        _recover_run(PathPart(grid, path), robot, arm, approximate, name)
         for path, name in zip(desired, names, strict=True)
     ]
-    return stack_movements(parts)
+    return grid, stack_movements(parts)
 
 
 def path_error(
@@ -87,32 +87,23 @@ def published_time_bases(samples: int) -> list[FloatArray]:
     return [as_floats(np.arange(1, samples + 1) * STEP_S), np.linspace(0.0, end, samples)]
 
 
-def published_time(desired: FloatArray, robot: Robot, *, names: Sequence[str]) -> FloatArray:
-    """Return the time base on which movements of published durations make the desired paths.
+def _fitting_grid(
+    grids: Sequence[FloatArray], desired: FloatArray, arm: PlaneArm | None
+) -> FloatArray:
+    """Return the grid on which movements of published durations make the desired paths.
 
-    The bases differ in their step, which whole movements reveal; an offset of the whole run in
+    The grids differ in their step, which whole movements reveal; an offset of the whole run in
     time could not be seen. Runs whose movements are all cut off fit both. Where no run decides,
     because none is exact or the robot is of another kind than the search for whole units can
-    handle, it is the grid from 0.01 s.
-
-    Args:
-        desired: Desired tool paths in the base frame, (run, time, axis) [m].
-        robot: The robot.
-        names: Name of each run, for messages.
-
-    Raises:
-        InputError: If the arrays do not fit.
+    handle, it is the first.
     """
-    bases = published_time_bases(np.shape(desired)[1])
-    desired, _ = _checked(desired, bases[0], names)
-    arm = _arm_unless(robot, approximate=True)
-    if arm is None:
-        return bases[0]
+    if arm is None or len(grids) == 1:
+        return grids[0]
     for path in desired:
-        fitting = [base for base in bases if _is_exact(PathPart(base, path), arm)]
+        fitting = [grid for grid in grids if _is_exact(PathPart(grid, path), arm)]
         if len(fitting) == 1:
             return fitting[0]
-    return bases[0]
+    return grids[0]
 
 
 def _is_exact(path: PathPart, arm: PlaneArm) -> bool:
@@ -151,10 +142,7 @@ def _arm_unless(robot: Robot, *, approximate: bool) -> PlaneArm | None:
         return None
 
 
-def _checked(
-    desired: FloatArray, time: FloatArray, names: Sequence[str]
-) -> tuple[FloatArray, FloatArray]:
-    desired, time = as_floats(desired), as_floats(time)
+def _check(desired: FloatArray, time: FloatArray, names: Sequence[str]) -> None:
     if desired.ndim != 3 or desired.shape[1:] != (len(time), 3) or len(time) < 2:
         raise InputError(
             f"`desired` has shape {desired.shape}, expected (run, {len(time)} times, 3 axes) with "
@@ -168,4 +156,3 @@ def _checked(
                 f"run {name!r}: its desired path holds values that are not finite. Expected a "
                 "position [m] at every sample."
             )
-    return desired, time

@@ -21,8 +21,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from failuretwin.core.alarm import ALL_CLEAR, CLEAR, RAISED, SUSPECTED, Alarm, Episode
 from failuretwin.core.errors import InputError
+from failuretwin.core.hypothesis import ALL_CLEAR, CLEAR, RAISED, SUSPECTED, Alarm, Episode
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.inference.together.fault_filter import S_PER_H

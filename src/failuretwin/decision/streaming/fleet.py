@@ -16,10 +16,9 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
-from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
+from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.decision.streaming.tracking import MovementTracker
 from failuretwin.decision.streaming.trouble import (
     DEAD,

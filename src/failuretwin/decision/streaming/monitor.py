@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from failuretwin.connection.links.base import OK, STALE, Answer
-from failuretwin.core.alarm import CLEAR
-from failuretwin.core.hypothesis import Diagnosis, Hypothesis
+from failuretwin.core.hypothesis import CLEAR, Diagnosis, Hypothesis
 from failuretwin.core.numerics import Weighted, log_of
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.decision.streaming.alarm_rule import AlarmRule

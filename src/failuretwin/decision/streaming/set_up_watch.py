@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.core.alarm import RAISED, Alarm
 from failuretwin.core.errors import InputError
-from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.hypothesis import RAISED, Alarm, Hypothesis
 from failuretwin.core.polyline import TURN_RAD
 from failuretwin.core.runs import concatenate, time_step
 from failuretwin.core.types import FloatArray

@@ -7,7 +7,6 @@ from typing import Annotated
 
 import numpy as np
 
-from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.movements import (
     GRID_S,
     Movements,
@@ -15,7 +14,7 @@ from failuretwin.core.movements import (
     movements_of_samples,
 )
 from failuretwin.core.polyline import TURN_RAD
-from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray, IntArray
 from failuretwin.decision.streaming.window import MovementWindow, SampleBuffer
 from failuretwin.inference.observation.evidence import (
     JUST_AFTER_S,

@@ -8,8 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from failuretwin.core.arrays import ArrayStruct, Axes
-from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray, IntArray
 from failuretwin.inference.observation.evidence import SettledEvidence
 from failuretwin.inference.observation.log_quality import (
     FROZEN_S,

@@ -8,9 +8,8 @@ from typing import Annotated
 
 import numpy as np
 
-from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.movements import Movements
-from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray, IntArray
 from failuretwin.inference.movements.joint_likelihood import (
     MovementLikelihoods,
     joint_likelihoods,

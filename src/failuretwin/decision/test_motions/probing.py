@@ -18,8 +18,8 @@ import numpy as np
 
 from failuretwin.connection.links.base import OK, Answer, Commander, CommandSent, Event, Item, Order
 from failuretwin.connection.links.stream_time import StreamClock
-from failuretwin.core.alarm import CLEAR, RAISED
 from failuretwin.core.errors import InputError, counted
+from failuretwin.core.hypothesis import CLEAR, RAISED
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.rest import RestWatch
 from failuretwin.decision.acting.safety import SafetyGate, UnsafeOrderError

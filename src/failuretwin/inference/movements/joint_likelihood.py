@@ -22,9 +22,8 @@ from typing import Annotated
 
 import numpy as np
 
-from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.numerics import log_fall
-from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray
 from failuretwin.inference.observation.command_loss import CommandOutcomes
 from failuretwin.inference.observation.evidence import SettledEvidence
 from failuretwin.inference.observation.healthy_model import Explanation, HealthyModel, scattered

@@ -17,10 +17,9 @@ from typing import Annotated, TypeVar
 import numpy as np
 from scipy.sparse import csr_array
 
-from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.movements import Movements
 from failuretwin.core.numerics import log_of
-from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot
 

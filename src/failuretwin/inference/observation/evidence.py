@@ -16,11 +16,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.movements import Movements, find_movements
 from failuretwin.core.numerics import masked_median
 from failuretwin.core.runs import GOAL_VARIABLE, measured_rate
-from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
+from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray, IntArray, as_floats
 from failuretwin.inference.observation.log_quality import (
     LogQuality,
     drop_invalid,

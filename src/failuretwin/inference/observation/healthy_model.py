@@ -16,10 +16,9 @@ from typing import Annotated
 
 import numpy as np
 
-from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.movements import Movements
 from failuretwin.core.numerics import Covariance, log_sum
-from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
 from failuretwin.digital_model.nonidealities import Imperfections, Timing
 from failuretwin.digital_model.settling import Settling, loads_in_range, poses_in_range

@@ -20,9 +20,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.runs import measured_rate, time_step
-from failuretwin.core.types import BoolArray, FloatArray, IntArray, as_floats
+from failuretwin.core.types import ArrayStruct, Axes, BoolArray, FloatArray, IntArray, as_floats
 
 if TYPE_CHECKING:
     import xarray as xr

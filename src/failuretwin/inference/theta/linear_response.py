@@ -18,9 +18,8 @@ from typing import Annotated
 
 import numpy as np
 
-from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.numerics import log_fall
-from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.core.types import ArrayStruct, Axes, FloatArray, IntArray
 from failuretwin.inference.movements.joint_likelihood import (
     LEAST_PRECISION,
     JointLikelihood,

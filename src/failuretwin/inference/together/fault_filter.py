@@ -24,11 +24,10 @@ from typing import Annotated
 
 import numpy as np
 
-from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Fault, Hypothesis
 from failuretwin.core.numerics import Weighted, log_of
-from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.core.types import ArrayStruct, Axes, FloatArray, IntArray
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.faults.fault_models import redrawn_offset_model

@@ -20,9 +20,8 @@ from typing import Annotated
 
 import numpy as np
 
-from failuretwin.core.arrays import ArrayStruct, Axes
 from failuretwin.core.numerics import log_sum
-from failuretwin.core.types import FloatArray
+from failuretwin.core.types import ArrayStruct, Axes, FloatArray
 from failuretwin.inference.together.fault_filter import FaultBelief, FaultEvidence, FaultFilter
 
 FOREIGN = 0.1

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from failuretwin.core.types import ServoUnits
+from failuretwin.digital_model.servo import ServoUnits
 
 UNITS = ServoUnits(zero_deg=120.0, deg_per_count=0.24, low=0.0, high=1000.0)
 RISING = ServoUnits(zero_deg=-150.0, deg_per_count=-0.29, low=0.0, high=1023.0)
