@@ -14,7 +14,7 @@ import numpy as np
 
 import failuretwin as ft
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.decision.maintenance.expected_cost import Costs, cost_table
+from failuretwin.decision.expected_cost import Costs, cost_table
 from failuretwin.inference.faults.priors import MONITORING
 
 COSTS = Costs(

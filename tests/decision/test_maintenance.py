@@ -7,7 +7,7 @@ import pytest
 
 from failuretwin import InputError
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.decision.maintenance.expected_cost import (
+from failuretwin.decision.expected_cost import (
     TEMPLATE,
     Costs,
     Missed,
@@ -16,7 +16,7 @@ from failuretwin.decision.maintenance.expected_cost import (
     cost_table,
     load_costs,
 )
-from failuretwin.decision.maintenance.remaining_life import remaining_life
+from failuretwin.decision.remaining_life import remaining_life
 
 MISSED = {
     "any": {"going_on": 0.5, "compensating": 0.2, "slowly": 0.5},

@@ -226,10 +226,6 @@ def _hinge(difference: FloatArray, probability: FloatArray) -> tuple[int, float]
     With its probability at t and the others in proportion, the difference of two costs is
     t d_h + (1 - t) sum over others of p d / (1 - p_h): a line in t, which is 0 at one place.
 
-    Args:
-        difference: Cost of the best less that of the second, by hypothesis.
-        probability: Of each hypothesis.
-
     Returns:
         Its index, -1 if none, and the probability.
     """
