@@ -19,12 +19,16 @@ from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault, Seen
 from failuretwin.decision.acting.judging import Judge, Judgement
-from failuretwin.decision.acting.outcome import ActingSettings, TargetResult
 from failuretwin.decision.acting.planner import Plan, Planner, Standing
 from failuretwin.decision.acting.reach import parking_place
-from failuretwin.decision.acting.reactions import lost_command, probing, told
 from failuretwin.decision.acting.sparing import Effort
-from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, Target, Task
+from failuretwin.decision.acting.task import (
+    DIRECTION_TOLERANCE_RAD,
+    ActingSettings,
+    Target,
+    TargetResult,
+    Task,
+)
 from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.digital_model.inverse_kinematics import angle_between
 from failuretwin.failure_behavior.mode import Reaction
@@ -328,7 +332,7 @@ class Actor:
         """Return an order that also asks whether a motor that is held has been repaired."""
         if self._since_probe < self._settings.probe_every or not self._settings.feedback:
             return order
-        command = probing(self.arm, order.target)
+        command = self.arm.probing(order.target)
         if command is None:
             return order
         self._since_probe = 0
@@ -340,7 +344,7 @@ class Actor:
         seen, attempt = self._seen, self._attempt
         assert seen is not None and self._order is not None
         if attempt.repeats < self._settings.most_repeats:
-            lost = [] if seen.point is None else lost_command(self.arm, seen)
+            lost = [] if seen.point is None else self.arm.lost_command(seen)
             if lost or seen.point is None:
                 attempt.repeats += 1
                 names = ", ".join(self.model.motor_names[k] for k in lost)
@@ -448,7 +452,7 @@ class Actor:
         believed = self.belief.believed
         if believed is None:
             return
-        self._say(told(believed, self.model.twin.robot))
+        self._say(believed.in_words(self.model.twin.robot))
         if not believed.rests:
             return
         left = self._task.targets[len(self.results) :]

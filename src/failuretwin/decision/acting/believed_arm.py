@@ -23,12 +23,13 @@ from failuretwin.digital_model.settling import sag
 from failuretwin.failure_behavior.fault import Arrival
 from failuretwin.failure_behavior.mode import FaultMode, Reaction, Signature
 from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.explanation import size_words
 from failuretwin.inference.observation.healthy_model import HealthyModel
 
 UNMOVED_RAD = 1e-9
 """Commands nearer than this are the same [rad]."""
 NEWTON_STEPS = 5
-PROBE_RAD = 0.01
+GAIN_STEP_RAD = 0.01
 """Step by which it is asked how far the faulty motor follows its command [rad]."""
 CLOSE_RAD = 5e-4
 """A command is near enough once it changes by no more; the next change is a tenth of it [rad]."""
@@ -40,6 +41,14 @@ WAY = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Places on its way at which a motor that has stuck may stand, as shares of the way."""
 HALF_90 = 1.645
 """Half of a 90 % interval in standard deviations."""
+LEAST_LOSS_RATE = 0.01
+"""Share of commands taken to get lost at least, of arms whose losses are not known [-]."""
+MOVED_RAD = 0.02
+"""A motor that was told to move by less cannot be seen to have lost its command [rad]."""
+SURPRISE_NATS = 2.0
+"""A loss must explain the tool's place better by so much beside its rate [nats]."""
+PROBE_RAD = 0.15
+"""A held motor is told to move by so much when it is asked whether it was repaired [rad]."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +130,12 @@ class BelievedFault:
         """Whether a known offset is taken off its commands."""
         offset = self.mode.signature in (Signature.OFFSET, Signature.GROWING_OFFSET)
         return offset and not self.set_aside and bool(np.isfinite(self.size))
+
+    def in_words(self, robot: Robot) -> str:
+        """Return the fault and what is done about it, in words."""
+        unit = robot.own_unit(self.fault.motor, self.mode.unit)
+        size = size_words(self.fault, self.size, unit) if np.isfinite(self.size) else ""
+        return f"{self.mode.plain_name(self.fault.motor)}{size}: {self.reaction.value}"
 
     def age_s(self, time_s: FloatArray | float) -> FloatArray:
         """Return the time since the fault began [s], 0 before."""
@@ -229,9 +244,9 @@ class BelievedArm:
         gain, fault = np.ones_like(command), self.fault
         if fault is not None and fault.inverted:
             probed = command.copy()
-            probed[fault.motor] += PROBE_RAD
+            probed[fault.motor] += GAIN_STEP_RAD
             moved = self.settle(probed, previous, time_s) - self.settle(command, previous, time_s)
-            gain[fault.motor] = max(moved[fault.motor] / PROBE_RAD, LEAST_GAIN)
+            gain[fault.motor] = max(moved[fault.motor] / GAIN_STEP_RAD, LEAST_GAIN)
         return gain
 
     def with_rest(self, command: FloatArray, previous: FloatArray) -> FloatArray:
@@ -255,6 +270,17 @@ class BelievedArm:
         ends = np.sort(units.to_counts(np.array([low, high])), axis=0)
         least, most = np.ceil(ends[0] - 1e-9), np.floor(ends[1] + 1e-9)
         return np.asarray(units.to_rad(np.clip(np.round(units.to_counts(command)), least, most)))
+
+    def probing(self, command: FloatArray) -> FloatArray | None:
+        """Return a command that also moves a held motor if it was repaired; None: none is held."""
+        fault = self.fault
+        if fault is None or not fault.rests or fault.reaction is not Reaction.LOCK:
+            return None
+        k, (low, high) = fault.motor, self.limits
+        inward = 1.0 if command[k] < 0.5 * (low[k] + high[k]) else -1.0
+        probed = command.copy()
+        probed[k] += inward * PROBE_RAD
+        return self.rounded(probed)
 
     # What a movement says of the arm.
 
@@ -325,3 +351,38 @@ class BelievedArm:
             pull = spread.solve(error + jacobian @ (pose - expected))
             pose = expected + scatter**2 * (jacobian.T @ pull)
         return np.asarray(pose)
+
+    def lost_command(self, seen: Seen) -> list[int]:
+        """Return which motors seem not to have got a command, empty if all seem to have.
+
+            log p(e | lost) + log rate > log p(e | arrived) + 2
+
+        A motor that is held does not count: it is not expected to move. One that sticks now and
+        then may also stand on its way.
+        """
+        arrived, best, lost = self.log_density_arrived(seen), -np.inf, list[int]()
+        moved = np.abs(seen.command - seen.previous) > MOVED_RAD
+        for motors, rate in self._loss_sets():
+            if not moved[motors].any() or (len(motors) == 1 and self.held[motors].any()):
+                continue
+            command = seen.command.copy()
+            command[motors] = seen.previous[motors]
+            says = self.log_density_arrived(replace(seen, command=command)) + np.log(rate)
+            if says > best:
+                best, lost = says, motors
+        fault = self.fault
+        if fault is not None and fault.obeys and moved[fault.motor]:
+            says = self.log_density_missed(seen)
+            if says > best:
+                best, lost = says, [fault.motor]
+        return lost if best > arrived + SURPRISE_NATS else []
+
+    def _loss_sets(self) -> list[tuple[list[int], float]]:
+        """Return sets of motors that may lose a command together, and how often."""
+        names = self.robot.motor_names
+        found: dict[tuple[int, ...], float] = {(k,): LEAST_LOSS_RATE for k in range(len(names))}
+        found[tuple(range(len(names)))] = LEAST_LOSS_RATE
+        for entry in self.model.imperfections.lost_commands:
+            motors = tuple(names.index(motor) for motor in entry.motors)
+            found[motors] = max(entry.rate, LEAST_LOSS_RATE)
+        return [(list(motors), rate) for motors, rate in found.items()]

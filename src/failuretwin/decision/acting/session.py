@@ -17,11 +17,10 @@ from failuretwin.decision.acting.actor import Actor
 from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm
 from failuretwin.decision.acting.judging import Judge
-from failuretwin.decision.acting.outcome import ActingSettings, TargetResult
 from failuretwin.decision.acting.planner import Plan, Planner, Standing
 from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
 from failuretwin.decision.acting.sparing import sparing_lines, wear_weights
-from failuretwin.decision.acting.task import Task
+from failuretwin.decision.acting.task import ActingSettings, TargetResult, Task
 from failuretwin.decision.acting.work import Work, first_standing
 from failuretwin.digital_model.calibrated_robot import (
     CalibratedRobot,

@@ -19,8 +19,8 @@ import numpy as np
 from failuretwin.connection.links.base import Order
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.rest import QUIET_S
 from failuretwin.decision.acting.safety import SafetyGate, Way
+from failuretwin.decision.acting.work import QUIET_S
 from failuretwin.decision.test_motions.outlook import Asked, Outlook, of_posterior
 from failuretwin.digital_model.inverse_kinematics import usable_limits
 from failuretwin.inference.observation.evidence import SETTLING_S

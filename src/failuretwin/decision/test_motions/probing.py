@@ -21,9 +21,8 @@ from failuretwin.connection.links.stream_time import StreamClock
 from failuretwin.core.alarm import CLEAR, RAISED
 from failuretwin.core.errors import InputError, counted
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.rest import RestWatch
 from failuretwin.decision.acting.safety import SafetyGate, UnsafeOrderError
-from failuretwin.decision.acting.work import OrderSequence, Work
+from failuretwin.decision.acting.work import OrderSequence, RestWatch, Work
 from failuretwin.decision.streaming.alarm_rule import NAMED
 from failuretwin.decision.streaming.monitor import Believed, FaultMonitor
 from failuretwin.decision.test_motions.design import Designer
