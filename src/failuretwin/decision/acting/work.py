@@ -29,17 +29,23 @@ OURS_RAD = 1e-3
 """A command that differs by more from ours is somebody else's [rad]."""
 POLL_S = 0.1
 QUIET_S = 0.5
-"""The tool is at rest once it has been still for so long [s]."""
+"""Time without motion that counts as rest [s]."""
 LEAST_READINGS = 3
-"""And was read so often meanwhile."""
+"""Readings that rest needs at least."""
 LATE_S = 0.3
-"""A movement that begins late is waited for so much longer than arms of this kind need [s]."""
+"""Extra time for a late start, beyond what arms of this kind need [s]."""
 MOVED_FACTOR = 2.0
-"""A tool that was to move by so many times what tells rest from motion is waited for to begin."""
+"""Expected travel from which a late start is waited for, in spreads that tell motion from rest."""
 
 
 class Halted(InputError):  # noqa: N818 - it is no error of the user
     """Work was stopped before the task was over; nothing more is sent."""
+
+
+def would_order(order: Order) -> str:
+    """Return an order that is not sent, in words."""
+    angles = " ".join(f"{angle:.1f}" for angle in np.rad2deg(order.target))
+    return f"would order {angles} deg in {order.duration.max():.2f} s"
 
 
 class Worker(Protocol):
