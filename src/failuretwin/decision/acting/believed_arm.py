@@ -42,13 +42,13 @@ WAY = (0.1, 0.3, 0.5, 0.7, 0.9)
 HALF_90 = 1.645
 """Half of a 90 % interval in standard deviations."""
 LEAST_LOSS_RATE = 0.01
-"""Share of commands taken to get lost at least, of arms whose losses are not known [-]."""
+"""Smallest drop rate of commands that is assumed [-]."""
 MOVED_RAD = 0.02
-"""A motor that was told to move by less cannot be seen to have lost its command [rad]."""
+"""Smallest commanded movement whose loss can be seen [rad]."""
 SURPRISE_NATS = 2.0
-"""A loss must explain the tool's place better by so much beside its rate [nats]."""
+"""Evidence for a dropped command, in addition to its rate, from which it is sent again [nats]."""
 PROBE_RAD = 0.15
-"""A held motor is told to move by so much when it is asked whether it was repaired [rad]."""
+"""Movement of a held motor that tests whether it was repaired [rad]."""
 
 
 @dataclass(frozen=True)
@@ -209,6 +209,23 @@ class BelievedArm:
         found[..., k] += fault.mode.settled_offset(np.array(fault.size), arrival)
         return found
 
+    def expected(
+        self, command: FloatArray, previous: FloatArray, time_s: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return mean and standard deviation of where motors settle, (..., motor) [rad] each.
+
+        A movement that the faulty motor may miss counts by its first two moments. Arguments as of
+        `settle`.
+        """
+        pose = self.settle(command, previous, time_s)
+        scatter, fault = self.scatter(command, time_s), self.fault
+        if fault is not None and fault.obeys:
+            k, rate = fault.motor, fault.size
+            missed = previous[..., k] - command[..., k]
+            pose[..., k] += rate * missed
+            scatter[..., k] = np.hypot(scatter[..., k], np.sqrt(rate * (1.0 - rate)) * missed)
+        return pose, scatter
+
     def command_for(self, pose: FloatArray, previous: FloatArray, time_s: float) -> FloatArray:
         """Return the command that leads to a pose, (motor,) [rad], within limits, in whole counts.
 
@@ -272,7 +289,7 @@ class BelievedArm:
         return np.asarray(units.to_rad(np.clip(np.round(units.to_counts(command)), least, most)))
 
     def probing(self, command: FloatArray) -> FloatArray | None:
-        """Return a command that also moves a held motor if it was repaired; None: none is held."""
+        """Return the command with a test movement of the held motor; None: no motor is held."""
         fault = self.fault
         if fault is None or not fault.rests or fault.reaction is not Reaction.LOCK:
             return None
@@ -353,12 +370,12 @@ class BelievedArm:
         return np.asarray(pose)
 
     def lost_command(self, seen: Seen) -> list[int]:
-        """Return which motors seem not to have got a command, empty if all seem to have.
+        """Return the motors that seem to have missed their command; empty: none.
 
             log p(e | lost) + log rate > log p(e | arrived) + 2
 
-        A motor that is held does not count: it is not expected to move. One that sticks now and
-        then may also stand on its way.
+        A held motor does not count: it is not expected to move. A motor that sticks now and then
+        may also stand on its way.
         """
         arrived, best, lost = self.log_density_arrived(seen), -np.inf, list[int]()
         moved = np.abs(seen.command - seen.previous) > MOVED_RAD
@@ -378,7 +395,7 @@ class BelievedArm:
         return lost if best > arrived + SURPRISE_NATS else []
 
     def _loss_sets(self) -> list[tuple[list[int], float]]:
-        """Return sets of motors that may lose a command together, and how often."""
+        """Return the sets of motors that may miss a command together, with their rates."""
         names = self.robot.motor_names
         found: dict[tuple[int, ...], float] = {(k,): LEAST_LOSS_RATE for k in range(len(names))}
         found[tuple(range(len(names)))] = LEAST_LOSS_RATE

@@ -174,9 +174,6 @@ class Asked:
         number = np.full(count, len(made.command))
         return cls(poses, np.tile(at, (count, 1)), np.full(count, since_s), number)
 
-    def __getitem__(self, some: IntArray) -> Asked:
-        return Asked(self.command[some], self.previous[some], self.since_s[some], self.number[some])
-
 
 @dataclass(frozen=True)
 class Outlook:
@@ -236,13 +233,15 @@ class Outlook:
         Returns:
             (movement, member, channel) [m] and (movement, member, channel, channel) [m2].
         """
-        healthy = BelievedArm(self.model).settle(asked.command, asked.previous, asked.since_s)
-        pose = np.repeat(healthy[:, None], len(self.members), axis=1)
-        scatter = np.broadcast_to(self.model.scatter, pose.shape).copy()
+        told = asked.command, asked.previous, asked.since_s
+        healthy = BelievedArm(self.model).expected(*told)
+        pose, scatter = (np.repeat(each[:, None], len(self.members), axis=1) for each in healthy)
         for at, member in enumerate(self.members):
-            struck = np.flatnonzero(asked.number >= member.first)
-            if not member.hypothesis.is_healthy and len(struck):
-                pose[struck, at], scatter[struck, at] = self._faulty(member, asked[struck])
+            struck = asked.number >= member.first
+            arm = BelievedArm(self.model, member.fault(self.model))
+            if arm.fault is not None and struck.any():
+                rows = (each[struck] for each in told)
+                pose[struck, at], scatter[struck, at] = arm.expected(*rows)
         mean, jacobian = self.model.sensors.expected(pose)
         root = jacobian * scatter[..., None, :]
         noise = self.model.path_noise**2 * np.eye(mean.shape[-1])
@@ -256,19 +255,6 @@ class Outlook:
     def information(self, nats: FloatArray) -> FloatArray:
         """Return what distances (..., member, member) tell about the hypothesis, (...) [nats]."""
         return expected_information(nats, self.log_share, self.kind)
-
-    def _faulty(self, member: Member, asked: Asked) -> tuple[FloatArray, FloatArray]:
-        """Return mean and standard deviation of settled motors, (movement, motor) [rad]."""
-        fault = member.fault(self.model)
-        arm = BelievedArm(self.model, fault)
-        pose = arm.settle(asked.command, asked.previous, asked.since_s)
-        scatter = arm.scatter(asked.command, asked.since_s)
-        if fault is not None and fault.obeys:
-            k, rate = fault.motor, fault.size
-            missed = asked.previous[:, k] - asked.command[:, k]
-            pose[:, k] += rate * missed
-            scatter[:, k] = np.hypot(scatter[:, k], np.sqrt(rate * (1.0 - rate)) * missed)
-        return pose, scatter
 
 
 # How much movements tell.
