@@ -207,16 +207,12 @@ class Planner:
         """Return the first pose of some that has a safe way: which, its order, or why none has."""
         why = ""
         for i in order[:TRIED]:
-            ordered, wrong = self.order_for(found.pose[0, i], arm, at)
+            command = arm.command_for(found.pose[0, i], at.command, at.time_s)
+            ordered, wrong = self.checked(command, arm, at)
             if not wrong:
                 return int(i), ordered, ""
             why = why or wrong
         return int(order[0]), None, why
-
-    def order_for(self, pose: FloatArray, arm: BelievedArm, at: Standing) -> tuple[Order, str]:
-        """Return the order that brings the arm to a pose, and why it must not be sent."""
-        command = arm.command_for(pose, at.command, at.time_s)
-        return self.checked(command, arm, at)
 
     def checked(self, command: FloatArray, arm: BelievedArm, at: Standing) -> tuple[Order, str]:
         """Return the order of a command (motor,) [rad], and why it must not be sent."""
