@@ -1,4 +1,4 @@
-"""Scoring rules, judged against scikit-learn, scipy and closed-form posteriors."""
+"""Scores of probabilities and comparisons, judged against scikit-learn, scipy and closed forms."""
 
 from __future__ import annotations
 

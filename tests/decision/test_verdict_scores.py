@@ -1,4 +1,4 @@
-"""Shares, judged against scikit-learn and scipy."""
+"""Scores of verdicts and intervals, judged against scikit-learn and scipy."""
 
 from __future__ import annotations
 
