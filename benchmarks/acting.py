@@ -37,10 +37,9 @@ from failuretwin.decision.acting.actor import Actor
 from failuretwin.decision.acting.belief import CAP, LATCH, Belief
 from failuretwin.decision.acting.believed_arm import BelievedFault, Seen
 from failuretwin.decision.acting.judging import ACTED_ON, Judge, Judgement
-from failuretwin.decision.acting.outcome import ActingSettings, TargetResult
 from failuretwin.decision.acting.planner import Planner
 from failuretwin.decision.acting.safety import SafetyGate
-from failuretwin.decision.acting.task import Task
+from failuretwin.decision.acting.task import ActingSettings, TargetResult, Task
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
 from failuretwin.digital_model.robot import Robot

@@ -19,9 +19,9 @@ from failuretwin.connection.links.base import Event
 from failuretwin.core.hypothesis import Fault
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.actor import Actor
-from failuretwin.decision.acting.outcome import ActingSettings
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.session import Acting
+from failuretwin.decision.acting.task import ActingSettings
 from failuretwin.decision.acting.work import Work, first_standing
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
 from failuretwin.failure_behavior.injection import ScheduledFault

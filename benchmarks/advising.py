@@ -14,15 +14,15 @@ import numpy as np
 
 import failuretwin as ft
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.decision.maintenance.expected_cost import Costs, cost_table
+from failuretwin.decision.expected_cost import Costs, Missed, cost_table
 from failuretwin.inference.faults.priors import MONITORING
 
 COSTS = Costs(
     targets=10.0, missed_target=3.0, compensate=1.0, slow_down=1.0, inspect=3.0, replace=10.0,
     stop=15.0,
     missed={
-        "stuck": {"going_on": 0.95, "compensating": 0.4, "slowly": 0.95},
-        "steady_state_error": {"going_on": 0.8, "compensating": 0.1, "slowly": 0.8},
+        "stuck": Missed(0.95, 0.4, 0.95),
+        "steady_state_error": Missed(0.8, 0.1, 0.8),
     },
 )  # fmt: skip
 

@@ -40,7 +40,7 @@ from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.believed_arm import Seen
 from failuretwin.decision.acting.judging import settled_evidence_of
 from failuretwin.decision.acting.safety import SafetyGate
-from failuretwin.decision.proportions import Share
+from failuretwin.decision.scoring import Share
 from failuretwin.decision.streaming.monitor import monitor
 from failuretwin.decision.test_motions.design import Designer, Movement, next_movement
 from failuretwin.decision.test_motions.health_check import (

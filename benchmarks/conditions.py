@@ -26,7 +26,7 @@ import failuretwin as ft
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.decision.scoring_rules import calibrated_error, reliability
+from failuretwin.decision.scoring import calibrated_error, reliability
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import calibrated
 from failuretwin.digital_model.nonidealities import Imperfections

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
+from ranks import check_ranks, rank_of_truth
 from rich.progress import track
 from telling import share
 
@@ -22,10 +23,8 @@ import failuretwin as ft
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis, paper_hypotheses
 from failuretwin.core.numerics import Weighted
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.scoring_rules import (
+from failuretwin.decision.scoring import (
     calibrated_error,
-    check_ranks,
-    rank_of_truth,
     reliability,
 )
 from failuretwin.digital_model.calibrated_robot import load_calibration

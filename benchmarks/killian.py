@@ -24,8 +24,8 @@ import failuretwin as ft
 from failuretwin.connection.calibration.calibrate import calibrate
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis, single_faults
 from failuretwin.decision.evaluation import Judged, score_line
-from failuretwin.decision.proportions import Share
 from failuretwin.decision.results import write_json_lines
+from failuretwin.decision.scoring import Share
 from failuretwin.digital_model.arm_classes import generic_imperfections
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections

@@ -16,7 +16,7 @@ import numpy as np
 
 import failuretwin as ft
 from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.decision.proportions import Share
+from failuretwin.decision.scoring import Share
 from failuretwin.inference.together.fault_course import FaultCourse
 
 RUNS, SHORTEST, OF_CLASS, NEAR = 30, 4, 60, 2

@@ -19,7 +19,7 @@ from failuretwin.data_knowledge.generate import simulate
 from failuretwin.decision.learned.log_pool import HybridDiagnoser
 from failuretwin.decision.learned.networks import NETWORKS
 from failuretwin.decision.learned.storage import load_network, save_network
-from failuretwin.decision.scoring_rules import (
+from failuretwin.decision.scoring import (
     log_score,
     log_score_gain,
     mcnemar,
@@ -61,7 +61,7 @@ def judged(diagnoses: Sequence[Diagnosis]) -> tuple[float, float, float]:
 def nats_of(diagnoses: Sequence[Diagnosis]) -> FloatArray:
     """Return the log score of each run [nats]."""
     truth = [str(d.truth) for d in diagnoses]
-    return log_score(truth, [d.posterior for d in diagnoses]).nats
+    return log_score(truth, [d.posterior for d in diagnoses])
 
 
 def print_networks(said: Mapping[str, Sequence[Diagnosis]], what: str) -> None:

@@ -22,7 +22,7 @@ from failuretwin.connection.calibration.calibrate import fit_calibration
 from failuretwin.connection.calibration.observations import observe
 from failuretwin.connection.calibration.settling_fit import SortedMovements, fit_settling
 from failuretwin.core.hypothesis import HEALTHY
-from failuretwin.decision.proportions import Share
+from failuretwin.decision.scoring import Share
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections, Variation, vary
 from failuretwin.digital_model.robot import Robot

@@ -23,7 +23,7 @@ from failuretwin.app.maintenance import BIAS_ALONE, motor_lives
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.maintenance.remaining_life import RemainingLife, remaining_life
+from failuretwin.decision.remaining_life import RemainingLife, remaining_life
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
 from failuretwin.digital_model.nonidealities import vary
 from failuretwin.digital_model.settling import sag

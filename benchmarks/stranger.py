@@ -22,7 +22,7 @@ from telling import calibration, nats, right, share
 import failuretwin as ft
 from failuretwin.core.hypothesis import HEALTHY, Diagnosis, Hypothesis, paper_hypotheses
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.proportions import IntervalCase, coverage_by_mode
+from failuretwin.decision.scoring import IntervalCase, coverage_by_mode
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot

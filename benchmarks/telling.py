@@ -9,8 +9,7 @@ from scipy import stats
 
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.decision.proportions import Share
-from failuretwin.decision.scoring_rules import calibrated_error, log_score, reliability
+from failuretwin.decision.scoring import Share, calibrated_error, log_score, reliability
 
 
 def share(count: int, total: int) -> str:
@@ -34,7 +33,7 @@ def right(found: Sequence[Diagnosis]) -> BoolArray:
 
 def nats(found: Sequence[Diagnosis]) -> FloatArray:
     """Return the log score of each run, (run,) [nats]."""
-    return log_score([str(d.truth) for d in found], [d.posterior for d in found]).nats
+    return log_score([str(d.truth) for d in found], [d.posterior for d in found])
 
 
 def calibration(found: Sequence[Diagnosis], rng: np.random.Generator) -> str:

@@ -38,7 +38,7 @@ from failuretwin.core.hypothesis import (
     single_faults,
 )
 from failuretwin.core.types import BoolArray, FloatArray
-from failuretwin.decision.scoring_rules import log_score_gain
+from failuretwin.decision.scoring import log_score_gain
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.robot import Robot

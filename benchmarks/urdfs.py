@@ -26,7 +26,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from failuretwin.decision.proportions import Share
+from failuretwin.decision.scoring import Share
 
 ASKED = "several arms could carry the tool"
 

@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     from failuretwin.decision.acting.session import act
     from failuretwin.decision.acting.task import Target, Task
     from failuretwin.decision.evaluation import compare, evaluate
+    from failuretwin.decision.expected_cost import advise
     from failuretwin.decision.learned.log_pool import HybridDiagnoser
     from failuretwin.decision.learned.storage import load_network
-    from failuretwin.decision.maintenance.expected_cost import advise
-    from failuretwin.decision.maintenance.remaining_life import remaining_life
+    from failuretwin.decision.remaining_life import remaining_life
     from failuretwin.decision.results import read_results
     from failuretwin.decision.streaming.diagnoser import StreamingDiagnoser
     from failuretwin.decision.streaming.fleet import StreamingFleet
@@ -93,7 +93,7 @@ _HOME = {
     "Target": "decision.acting.task",
     "Task": "decision.acting.task",
     "act": "decision.acting.session",
-    "advise": "decision.maintenance.expected_cost",
+    "advise": "decision.expected_cost",
     "calibrate": "connection.calibration.calibrate",
     "check": "decision.test_motions.session",
     "compare": "decision.evaluation",
@@ -110,7 +110,7 @@ _HOME = {
     "read_results": "decision.results",
     "read_runs": "data_knowledge.readers.read",
     "register_mode": "failure_behavior.registry",
-    "remaining_life": "decision.maintenance.remaining_life",
+    "remaining_life": "decision.remaining_life",
     "run_figure": "app.reports.plots",
     "run_set": "core.runs",
     "sample_log": "data_knowledge.readers.read",

@@ -7,7 +7,7 @@ import pytest
 
 from failuretwin import InputError
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.decision.maintenance.expected_cost import (
+from failuretwin.decision.expected_cost import (
     TEMPLATE,
     Costs,
     Missed,
@@ -16,11 +16,11 @@ from failuretwin.decision.maintenance.expected_cost import (
     cost_table,
     load_costs,
 )
-from failuretwin.decision.maintenance.remaining_life import remaining_life
+from failuretwin.decision.remaining_life import remaining_life
 
 MISSED = {
-    "any": {"going_on": 0.5, "compensating": 0.2, "slowly": 0.5},
-    "stuck": {"going_on": 0.9, "compensating": 0.4, "slowly": 0.8},
+    "any": Missed(0.5, 0.2, 0.5),
+    "stuck": Missed(0.9, 0.4, 0.8),
 }
 
 
@@ -95,7 +95,7 @@ def test_costs_come_from_the_user_alone(tmp_path):
     path.write_text(TEMPLATE)
     found = load_costs(path)
     assert found.currency == "EUR"
-    assert found.rows["stuck"].going_on == 0.9
+    assert found.missed["stuck"].going_on == 0.9
     assert found.healthy == Missed(0.0, 0.0, 0.0)
     path.write_text(TEMPLATE.replace("missed_target = 1.0", ""))
     with pytest.raises(InputError, match="missed_target"):

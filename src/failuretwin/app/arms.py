@@ -22,7 +22,7 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.bag_messages import BagTopics
-from failuretwin.decision.acting.sparing import stopped_learning, wear_weights
+from failuretwin.decision.acting.planner import stopped_learning, wear_weights
 from failuretwin.digital_model.calibrated_robot import (
     CalibratedRobot,
     RobotLike,

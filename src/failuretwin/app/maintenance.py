@@ -12,8 +12,8 @@ from failuretwin.connection.life_history import read_rows
 from failuretwin.core.errors import InputError, OutputError
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.store import write_records, write_text
-from failuretwin.decision.maintenance.expected_cost import TEMPLATE, advise, load_costs
-from failuretwin.decision.maintenance.remaining_life import (
+from failuretwin.decision.expected_cost import TEMPLATE, advise, load_costs
+from failuretwin.decision.remaining_life import (
     LEAST_RUNS,
     RemainingLife,
     remaining_life,

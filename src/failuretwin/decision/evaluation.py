@@ -19,7 +19,7 @@ from failuretwin.core.hypothesis import Diagnosis, Hypothesis
 from failuretwin.core.runs import truth_of
 from failuretwin.core.types import BoolArray, FloatArray
 from failuretwin.data_knowledge.readers.read import RunsLike, as_runs
-from failuretwin.decision import proportions, scoring_rules
+from failuretwin.decision import scoring
 from failuretwin.decision.results import Record, Results, read_results, some_names
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ class Judged:
         given = as_results(results).diagnoses
         known = [d.truth if truths is None else truths[d.run].fault for d in given]
         pairs = [(d, true) for d, true in zip(given, known, strict=True) if true]
-        truth = tuple(proportions.judged_truth(true, d.posterior) for d, true in pairs)
+        truth = tuple(scoring.judged_truth(true, d.posterior) for d, true in pairs)
         return cls(
             diagnoses=tuple(d for d, _ in pairs),
             truth=truth,
@@ -138,9 +138,9 @@ class Judged:
         return [d.posterior for d in self.diagnoses]
 
     @cached_property
-    def scores(self) -> proportions.Scores:
+    def scores(self) -> scoring.Scores:
         """Accuracy and log score; needs at least one run."""
-        return proportions.score(self.truth, self.verdicts, self.posteriors)
+        return scoring.score_diagnoses(self.truth, self.verdicts, self.posteriors)
 
 
 def as_results(given: Given, name: str = "the results") -> Results:
@@ -159,20 +159,19 @@ def score_line(judged: Judged) -> str:
     return (
         f"{scores.right} of {counted(scores.runs, 'run')} right: accuracy "
         f"{100 * scores.accuracy:.1f} % (95 % interval {100 * low:.1f} to {100 * high:.1f} %), "
-        f"protocol {judged.protocol}, log score {_log_score_text(scores.log_scores)}"
+        f"protocol {judged.protocol}, log score {_log_score_text(scores)}"
     )
 
 
-def _log_score_text(scores: scoring_rules.LogScore) -> str:
-    text = f"{scores.mean:.3f} nats a run"
-    if not scores.impossible:
+def _log_score_text(scores: scoring.Scores) -> str:
+    text, rest = f"{scores.log_score:.3f} nats a run", scores.nats[np.isfinite(scores.nats)]
+    if rest.size == scores.runs:
         return text
-    rest = scores.nats.size - scores.impossible
-    if not rest:
+    if not rest.size:
         return f"{text} (the truth was given no probability in any run)"
     return (
-        f"{text} (of {scores.impossible} runs the truth was given no probability; the other "
-        f"{rest}: {scores.mean_of_rest:.3f})"
+        f"{text} (of {scores.runs - rest.size} runs the truth was given no probability; the other "
+        f"{rest.size}: {rest.mean():.3f})"
     )
 
 
@@ -194,8 +193,8 @@ class Calibration:
     `by_chance` holds the errors of a perfectly calibrated method in equal bins, (draw,).
     """
 
-    equal: scoring_rules.Reliability
-    adaptive: scoring_rules.Reliability
+    equal: scoring.Reliability
+    adaptive: scoring.Reliability
     by_chance: FloatArray
 
 
@@ -212,13 +211,13 @@ class Evaluation:
     """
 
     judged: Judged
-    alarms: proportions.Alarms
+    alarms: scoring.Alarms
     brier: float
     calibration: Calibration | None
-    coverage: Sequence[proportions.Coverage]
+    coverage: Sequence[scoring.Coverage]
 
     @property
-    def scores(self) -> proportions.Scores:
+    def scores(self) -> scoring.Scores:
         """Accuracy and log score."""
         return self.judged.scores
 
@@ -251,10 +250,10 @@ def evaluate(
     intervals = () if truths is None else _intervals(judged, truths)
     return Evaluation(
         judged=judged,
-        alarms=proportions.count_alarms(judged.truth, judged.verdicts),
-        brier=float(scoring_rules.brier_score(judged.truth, judged.posteriors).mean()),
+        alarms=scoring.count_alarms(judged.truth, judged.verdicts),
+        brier=float(scoring.brier_score(judged.truth, judged.posteriors).mean()),
         calibration=_calibration(judged, rng or np.random.default_rng(0)),
-        coverage=proportions.coverage_by_mode(intervals),
+        coverage=scoring.coverage_by_mode(intervals),
     )
 
 
@@ -276,13 +275,13 @@ def _calibration(judged: Judged, rng: np.random.Generator) -> Calibration | None
     stated = np.array([posterior[verdict] for verdict, posterior in pairs if verdict is not None])
     stated, right = np.minimum(stated, 1.0), judged.right[decided]  # sums may round above 1
     return Calibration(
-        equal=scoring_rules.reliability(stated, right),
-        adaptive=scoring_rules.reliability(stated, right, scoring_rules.adaptive_edges(stated)),
-        by_chance=scoring_rules.calibrated_error(stated, rng),
+        equal=scoring.reliability(stated, right),
+        adaptive=scoring.reliability(stated, right, scoring.adaptive_edges(stated)),
+        by_chance=scoring.calibrated_error(stated, rng),
     )
 
 
-def _intervals(judged: Judged, truths: Truths) -> Iterator[proportions.IntervalCase]:
+def _intervals(judged: Judged, truths: Truths) -> Iterator[scoring.IntervalCase]:
     """Yield the intervals of correctly diagnosed runs with their true values."""
     for diagnosis, right in zip(judged.diagnoses, judged.truth, strict=True):
         if diagnosis.diagnosis != right:
@@ -294,7 +293,7 @@ def _intervals(judged: Judged, truths: Truths) -> Iterator[proportions.IntervalC
             ("magnitude", diagnosis.magnitude_90, known.magnitude),
         ):
             if interval is not None and np.isfinite(true):
-                yield proportions.IntervalCase(mode, quantity, *interval, true)
+                yield scoring.IntervalCase(mode, quantity, *interval, true)
 
 
 # Two methods on the same runs.
@@ -314,8 +313,8 @@ class Comparison:
 
     first: str
     second: str
-    split: scoring_rules.McNemar
-    gain: scoring_rules.LogScoreGain
+    split: scoring.McNemar
+    gain: scoring.LogScoreGain
     as_unknown: tuple[int, int]
 
     @property
@@ -350,10 +349,10 @@ def compare(
     return Comparison(
         first=f"{one.name} (protocol {Judged.of(one).protocol})",
         second=f"{other.name} (protocol {Judged.of(other).protocol})",
-        split=scoring_rules.mcnemar(ours.right, theirs.right),
-        gain=scoring_rules.log_score_gain(
-            ours.scores.log_scores.nats,
-            theirs.scores.log_scores.nats,
+        split=scoring.mcnemar(ours.right, theirs.right),
+        gain=scoring.log_score_gain(
+            ours.scores.nats,
+            theirs.scores.nats,
             rng or np.random.default_rng(0),
         ),
         as_unknown=(sum(ours.as_unknown.values()), sum(theirs.as_unknown.values())),

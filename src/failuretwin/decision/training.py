@@ -28,7 +28,7 @@ from failuretwin.decision.learned.feature_encoder import (
 )
 from failuretwin.decision.learned.log_pool import HybridDiagnoser, fit_pool_weights
 from failuretwin.decision.learned.networks import Batch, Standard, epoch
-from failuretwin.decision.proportions import Scores
+from failuretwin.decision.scoring import Scores
 from failuretwin.digital_model.arm_classes import class_name
 from failuretwin.digital_model.calibrated_robot import HealthyLike, RobotLike, calibrated
 from failuretwin.digital_model.nonidealities import SETTLING_LISTS, Imperfections

@@ -11,10 +11,9 @@ from failuretwin.decision.acting.actor import Actor
 from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault
 from failuretwin.decision.acting.judging import Judge
-from failuretwin.decision.acting.outcome import ActingSettings
 from failuretwin.decision.acting.planner import Planner
 from failuretwin.decision.acting.safety import SafetyGate
-from failuretwin.decision.acting.task import Target, Task
+from failuretwin.decision.acting.task import ActingSettings, Target, Task
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
 
 PERIOD_S = 1.5

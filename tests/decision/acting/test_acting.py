@@ -9,7 +9,7 @@ from small_world import SmallWorld, believed, carry_out, task_of
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm
-from failuretwin.decision.acting.outcome import ActingSettings
+from failuretwin.decision.acting.task import ActingSettings
 from failuretwin.failure_behavior.mode import Reaction
 from failuretwin.failure_behavior.registry import MODES
 

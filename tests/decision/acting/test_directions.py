@@ -9,10 +9,9 @@ import pytest
 from small_world import SmallWorld, believed, carry_out, task_of, task_with_directions
 
 from failuretwin.decision.acting.belief import Belief
-from failuretwin.decision.acting.outcome import ActingSettings
 from failuretwin.decision.acting.reach import reach
 from failuretwin.decision.acting.safety import SafetyGate
-from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, Target, Task
+from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, ActingSettings, Target, Task
 
 
 def axis_of(robot, pose):

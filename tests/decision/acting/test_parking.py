@@ -12,7 +12,6 @@ from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm, Seen
 from failuretwin.decision.acting.judging import Judge
 from failuretwin.decision.acting.reach import parking_place
-from failuretwin.decision.acting.reactions import lost_command
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.task import Task
 from failuretwin.digital_model.inverse_kinematics import InverseKinematics
@@ -111,9 +110,9 @@ def test_a_motor_on_its_way_is_what_such_an_arm_does_and_a_healthy_one_does_not(
     gain = arm.log_density(arrived) - healthy.log_density(arrived)
     assert gain == pytest.approx(np.log(1.0 - 0.5 * (0.1 + 0.3)), abs=0.02)
     assert arm.log_density(stopped) > healthy.log_density(stopped) + 5.0
-    assert lost_command(arm, stopped) == [1]
-    assert lost_command(healthy, stopped) == []
-    assert lost_command(arm, arrived) == []
+    assert arm.lost_command(stopped) == [1]
+    assert healthy.lost_command(stopped) == []
+    assert arm.lost_command(arrived) == []
     unmoved = replace(arrived, previous=np.where([False, True, False, False], command, previous))
     gain = arm.log_density(unmoved) - healthy.log_density(unmoved)
     assert abs(gain) < 0.05  # a motor that is told nothing new says nothing

@@ -10,8 +10,7 @@ from small_world import SmallWorld, carry_out, task_of
 
 from failuretwin import InputError
 from failuretwin.app.arms import spared_of
-from failuretwin.decision.acting.planner import Standing, turned_round
-from failuretwin.decision.acting.sparing import sparing_lines, wear_weights
+from failuretwin.decision.acting.planner import Standing, sparing_lines, turned_round, wear_weights
 from failuretwin.inference.together.wear_limits import WearLimits, wear_unit
 
 

@@ -19,10 +19,15 @@ from failuretwin.decision.acting.actor import Actor
 from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.judging import Judge
 from failuretwin.decision.acting.planner import Planner
-from failuretwin.decision.acting.rest import RestWatch
 from failuretwin.decision.acting.safety import SafetyGate, UnsafeOrderError
 from failuretwin.decision.acting.task import Target, Task, read_task
-from failuretwin.decision.acting.work import Halted, Work, first_standing, where_it_stands
+from failuretwin.decision.acting.work import (
+    Halted,
+    RestWatch,
+    Work,
+    first_standing,
+    where_it_stands,
+)
 from failuretwin.failure_behavior.injection import ScheduledFault
 
 

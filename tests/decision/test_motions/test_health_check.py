@@ -16,13 +16,13 @@ from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.decision.test_motions.health_check import (
     LOOSE_RAD,
     CheckResult,
-    HealthCheck,
     checking,
     faults_at_rest,
     judged,
     motor_offsets,
 )
 from failuretwin.decision.test_motions.motions import Motions, read_motions, write_motions
+from failuretwin.decision.test_motions.session import Checking
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.failure_behavior.injection import ScheduledFault
 from failuretwin.failure_behavior.modes import SteadyStateError
@@ -142,18 +142,17 @@ def test_a_motor_that_carries_nothing_is_not_asked_for_its_strength(model):
     assert "motor_2:torque_loss" in acted_on
 
 
-def carried_out(known, model, gate, designed, schedule, modes=None, further=0):
+def carried_out(known, gate, designed, schedule, modes=None, further=0):
     emulation = Emulation(known.robot, known.imperfections, schedule, 3, modes or {})
     motions = Motions.of(known.robot, designed)
-    hypotheses = faults_at_rest(model)
     with CommandedArm(emulation) as arm:
-        check = HealthCheck(model, gate, motions, hypotheses, checking(model, hypotheses), further)
+        check = Checking(known, gate).health_check(motions, further)
         return check.work(arm, lambda _: None), check
 
 
-def test_an_arm_without_a_fault_is_green(known, model, gate, designed):
+def test_an_arm_without_a_fault_is_green(known, gate, designed):
     pytest.importorskip("mujoco")
-    result, check = carried_out(known, model, gate, designed, ())
+    result, check = carried_out(known, gate, designed, ())
     assert (result.light, result.motor) == ("green", "")
     assert result.diagnosis.quality == ()
     assert result.movements == len(designed) == len(check.window)
@@ -207,16 +206,16 @@ def test_the_next_movement_settles_what_is_open(model, gate, designed):
     assert next_movement(model, gate, sure, at) is None
 
 
-def test_further_movements_are_made_only_while_it_is_open(known, model, gate, designed):
+def test_further_movements_are_made_only_while_it_is_open(known, gate, designed):
     pytest.importorskip("mujoco")
     fault = ScheduledFault(Hypothesis.parse("motor_4:steady_state_error").faults[0], 0.0)
     modes = dict(MODES) | {"steady_state_error": SteadyStateError(magnitude=(0.02, 0.02))}
-    emulation = (known, model, gate, designed[:3], (fault,), modes)
+    emulation = (known, gate, designed[:3], (fault,), modes)
     result, check = carried_out(*emulation, further=6)
     assert result.further == len(check.window) - 3
     assert 1 <= result.further <= 6
     assert result.light != "open" or result.further == 6
-    settled, _ = carried_out(known, model, gate, designed, (), further=6)
+    settled, _ = carried_out(known, gate, designed, (), further=6)
     assert (settled.light, settled.further) == ("green", 0)
 
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from failuretwin.decision.test_motions.information import (
+from failuretwin.decision.test_motions.outlook import (
     expected_information,
     pairwise_distance,
 )

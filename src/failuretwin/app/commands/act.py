@@ -88,9 +88,8 @@ def act(
     from failuretwin.app.arms import spared_of
     from failuretwin.app.reports.acting_report import table_lines
     from failuretwin.data_knowledge.store import write_records
-    from failuretwin.decision.acting.outcome import ActingSettings
     from failuretwin.decision.acting.session import Acting
-    from failuretwin.decision.acting.task import read_task
+    from failuretwin.decision.acting.task import ActingSettings, read_task
     from failuretwin.decision.acting.work import first_standing
     from failuretwin.digital_model.calibrated_robot import load_calibration
 

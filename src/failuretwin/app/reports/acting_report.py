@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from failuretwin.app.reports.plots import clean, new_figure, save_figure
-from failuretwin.decision.acting.outcome import TargetResult
 from failuretwin.decision.acting.reach import MotorReach, Reach
+from failuretwin.decision.acting.task import TargetResult
 
 NEVER = 0.85
 """Share of an error that a correction leaves, above which feedback alone does not converge in

@@ -18,8 +18,7 @@ from failuretwin.core.runs import AXES, unique_names
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.store import filling
 from failuretwin.decision.evaluation import Evaluation
-from failuretwin.decision.proportions import Share
-from failuretwin.decision.scoring_rules import Reliability
+from failuretwin.decision.scoring import Reliability, Share
 from failuretwin.digital_model.twin import DigitalTwin
 from failuretwin.inference.explanation import plain_name
 

@@ -13,7 +13,7 @@ from failuretwin.app.reports.tables import Table, figures_table, latex, show
 from failuretwin.core.errors import counted
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.data_knowledge.store import write_text
-from failuretwin.decision import proportions, scoring_rules
+from failuretwin.decision import scoring
 from failuretwin.decision.evaluation import (
     Calibration,
     Comparison,
@@ -60,7 +60,7 @@ def _mark(diagnosis: Diagnosis) -> str:
     """Return whether a verdict is right; empty where there is none or the truth is not known."""
     if diagnosis.truth is None or diagnosis.diagnosis is None:
         return ""
-    truth = proportions.judged_truth(diagnosis.truth, diagnosis.posterior)
+    truth = scoring.judged_truth(diagnosis.truth, diagnosis.posterior)
     return "right" if truth == diagnosis.diagnosis else "WRONG"
 
 
@@ -92,7 +92,7 @@ def print_scores(judged: Judged) -> None:
     show("", class_table(judged.scores), "", _confusion_table(judged.scores))
 
 
-def class_table(scores: proportions.Scores) -> Table:
+def class_table(scores: scoring.Scores) -> Table:
     """Return precision, recall and F1 of each class."""
     return figures_table(
         ("class", "runs", "precision", "recall", "F1"),
@@ -103,7 +103,7 @@ def class_table(scores: proportions.Scores) -> Table:
     )
 
 
-def _confusion_table(scores: proportions.Scores) -> Table:
+def _confusion_table(scores: scoring.Scores) -> Table:
     return figures_table(
         ("truth", *(f"({i})" for i in range(len(scores.classes)))),
         [
@@ -136,7 +136,7 @@ def summary_table(evaluation: Evaluation) -> Table:
     scores, alarms = evaluation.scores, evaluation.alarms
     false_alarms = _percent(alarms.false_alarms) + _abstained(alarms.healthy_abstained)
     rows = [
-        ("accuracy", _percent(proportions.Share(scores.right, scores.runs))),
+        ("accuracy", _percent(scoring.Share(scores.right, scores.runs))),
         ("macro-F1", f"{scores.macro_f1:.3f}, mean over the classes that were true of any run"),
         ("false-alarm rate", false_alarms),
         ("missed-detection rate", _percent(alarms.missed) + _abstained(alarms.faulty_abstained)),
@@ -148,7 +148,7 @@ def summary_table(evaluation: Evaluation) -> Table:
     return Table(("Score", evaluation.runs_and_protocol), rows, header=False)
 
 
-def _percent(share: proportions.Share) -> str:
+def _percent(share: scoring.Share) -> str:
     """Return a share and its Wilson interval in per cent; a dash for a share of nothing."""
     if not share.total:
         return "-"
@@ -173,10 +173,10 @@ def _calibration_rows(calibration: Calibration) -> list[tuple[str, str]]:
     ]
 
 
-def _reliability_table(bins: scoring_rules.Reliability) -> Table:
+def _reliability_table(bins: scoring.Reliability) -> Table:
     rows = []
     for i in np.flatnonzero(bins.count):
-        right = proportions.Share(int(bins.right[i]), int(bins.count[i]))
+        right = scoring.Share(int(bins.right[i]), int(bins.count[i]))
         low, high = right.interval
         edges = f"{bins.edges[i]:.1f} to {bins.edges[i + 1]:.1f}"
         ratios = f"{bins.confidence[i]:.3f}", f"{right.value:.3f}", f"{low:.3f} to {high:.3f}"
@@ -188,7 +188,7 @@ def _reliability_table(bins: scoring_rules.Reliability) -> Table:
     )
 
 
-def coverage_table(coverage: Sequence[proportions.Coverage]) -> Table:
+def coverage_table(coverage: Sequence[scoring.Coverage]) -> Table:
     """Return a row for each quantity of each fault mode."""
     rows = []
     for row in coverage:

@@ -19,8 +19,8 @@ from failuretwin.app.reports.tables import Table
 from failuretwin.core.hypothesis import FAULTY_STATE, HEALTHY_STATE, OPEN_STATE, Diagnosis
 from failuretwin.data_knowledge.store import filling
 from failuretwin.decision.evaluation import Judged, as_unknown_line, score_line
-from failuretwin.decision.proportions import judged_truth
 from failuretwin.decision.robot_state import RobotState, state_of_run
+from failuretwin.decision.scoring import judged_truth
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
 

@@ -19,12 +19,15 @@ from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault, Seen
 from failuretwin.decision.acting.judging import Judge, Judgement
-from failuretwin.decision.acting.outcome import ActingSettings, TargetResult
-from failuretwin.decision.acting.planner import Plan, Planner, Standing
+from failuretwin.decision.acting.planner import Effort, Plan, Planner, Standing
 from failuretwin.decision.acting.reach import parking_place
-from failuretwin.decision.acting.reactions import lost_command, probing, told
-from failuretwin.decision.acting.sparing import Effort
-from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, Target, Task
+from failuretwin.decision.acting.task import (
+    DIRECTION_TOLERANCE_RAD,
+    ActingSettings,
+    Target,
+    TargetResult,
+    Task,
+)
 from failuretwin.decision.test_motions.design import next_movement
 from failuretwin.digital_model.inverse_kinematics import angle_between
 from failuretwin.failure_behavior.mode import Reaction
@@ -147,8 +150,7 @@ class Actor:
     def learn(self, judgement: Judgement | None) -> None:
         """Learn from the movement that was seen, and conclude the target if it is time to.
 
-        Args:
-            judgement: What the movements of `belief.window` say; None: they were not weighed.
+        The judgement is of the movements in `belief.window`; None: they were not weighed.
         """
         seen = self._seen
         if seen is None or self.done:
@@ -161,22 +163,18 @@ class Actor:
         if self._attempt.asks:
             self._attempt.asks, self._attempt.anew = False, True
             return
-        error = self._error_m(seen)
+        error, feedback = self._error_m(seen), self._settings.feedback
         if self._attempt.movements == 1:
             self._attempt.first_error_m = error
         if error <= self.target.tolerance_m and self._error_rad(seen) <= DIRECTION_TOLERANCE_RAD:
             self._conclude("")
-        elif self._attempt.movements >= self._most_movements:
+        elif self._attempt.movements >= (self._settings.most_movements if feedback else 1):
             self._conclude(f"not reached in {self._attempt.movements} movements")
         elif self._tried_in_vain():
             self._conclude("out of reach, tried once as if the arm were healthy")
 
     def _tried_in_vain(self) -> bool:
         return self._attempt.as_healthy and self.belief.confirmed and not self._attempt.repeats
-
-    @property
-    def _most_movements(self) -> int:
-        return self._settings.most_movements if self._settings.feedback else 1
 
     def _error_m(self, seen: Seen) -> float:
         if seen.point is None:
@@ -286,7 +284,7 @@ class Actor:
         attempt.pose = plan.pose
         if plan.unspared is not None:
             poses = plan.pose, plan.unspared
-            self.ways.append(tuple(Effort.of(self._planner, pose, at) for pose in poses))
+            self.ways.append(tuple(self._planner.effort(pose, at) for pose in poses))
         return self._probed(plan.order, at)
 
     def _set_aside(self, at: Standing) -> None:
@@ -328,7 +326,7 @@ class Actor:
         """Return an order that also asks whether a motor that is held has been repaired."""
         if self._since_probe < self._settings.probe_every or not self._settings.feedback:
             return order
-        command = probing(self.arm, order.target)
+        command = self.arm.probing(order.target)
         if command is None:
             return order
         self._since_probe = 0
@@ -340,7 +338,7 @@ class Actor:
         seen, attempt = self._seen, self._attempt
         assert seen is not None and self._order is not None
         if attempt.repeats < self._settings.most_repeats:
-            lost = [] if seen.point is None else lost_command(self.arm, seen)
+            lost = [] if seen.point is None else self.arm.lost_command(seen)
             if lost or seen.point is None:
                 attempt.repeats += 1
                 names = ", ".join(self.model.motor_names[k] for k in lost)
@@ -421,15 +419,10 @@ class Actor:
     def _step(
         self, arm: BelievedArm, pose: FloatArray, miss: FloatArray, turn: FloatArray
     ) -> FloatArray:
-        """Return by how much the motors must turn to move the tool, (motor,) [rad].
+        """Return the step from a pose that moves the tool and turns its axis, (motor,) [rad].
 
-        The point comes first: what the motors cannot do of both is taken from the direction.
-
-        Args:
-            arm: The arm as it is believed to be.
-            pose: Where the motors were to settle, (motor,) [rad].
-            miss: How far the tool must go, (3,) [m].
-            turn: By how much its axis must change, (3,).
+        The tool goes by `miss`, (3,) [m]; its axis changes by `turn`, (3,). The point comes first:
+        what the motors cannot do of both is taken from the direction.
         """
         whole = self._planner.whole
         goal, start = whole.tool(pose[None])[0] + miss, pose[None]
@@ -448,7 +441,7 @@ class Actor:
         believed = self.belief.believed
         if believed is None:
             return
-        self._say(told(believed, self.model.twin.robot))
+        self._say(believed.in_words(self.model.twin.robot))
         if not believed.rests:
             return
         left = self._task.targets[len(self.results) :]

@@ -7,6 +7,13 @@ any more. So a fault that was probable once is believed until movements speak ag
 
 and until another fault explains the latest movements better by as much. What was seen before it was
 let go is forgotten then: the arm may have been repaired.
+
+The latest few movements show a drift as a constant error, so rate and beginning of one that is
+believed are fitted to all movements since it began,
+
+    o_i = J_k' S_k^-1 e_i / (J_k' S_k^-1 J_k),    o_i = rate (t_i - since) + noise
+
+with e the miss of the tool at rest, S_k its scatter by all motors.
 """
 
 from __future__ import annotations
@@ -17,8 +24,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from failuretwin.core.hypothesis import HEALTHY, Hypothesis
-from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault, Seen
-from failuretwin.decision.acting.drifting import followed
+from failuretwin.core.types import FloatArray
+from failuretwin.decision.acting.believed_arm import HALF_90, BelievedArm, BelievedFault, Seen
 from failuretwin.decision.acting.judging import Judgement
 from failuretwin.failure_behavior.mode import Reaction, Signature
 from failuretwin.failure_behavior.registry import MODES
@@ -41,6 +48,11 @@ CAP = 8.0
 """Largest log Bayes factor: a repair must show within a few movements."""
 LET_GO = -5.0
 """Log Bayes factor below which a belief is dropped."""
+LINE_MOVEMENTS = 3
+"""Movements that a drift is fitted to at least."""
+FAR = 3.0
+"""A movement so many deviations off the line counts half; lost commands are such."""
+ROUNDS = 5
 
 
 @dataclass
@@ -132,7 +144,7 @@ class Belief:
         if believed is None or believed.reaction is Reaction.PARK:
             return
         if believed.mode.signature is Signature.GROWING_OFFSET:
-            self.believed = followed(self.model, believed, self.history)
+            self.believed = fitted_drift(self.model, believed, self.history)
             return
         hypothesis = Hypothesis((believed.fault,))
         if hypothesis not in judgement.posterior.hypotheses:
@@ -190,3 +202,50 @@ class Belief:
     def _let_go(self) -> None:
         self.believed, self.lead = None, START_LEAD
         del self.history[:-1]
+
+
+# A drift.
+
+
+def fitted_drift(
+    model: HealthyModel, believed: BelievedFault, history: Sequence[Seen]
+) -> BelievedFault:
+    """Return a drift with the rate and beginning fitted to the movements since it began."""
+    since = [s for s in history if s.point is not None and s.rest_s > believed.since_s]
+    if len(since) < LINE_MOVEMENTS:
+        return believed
+    offset, deviation = np.array([_offset(model, believed.motor, seen) for seen in since]).T
+    time = np.array([seen.rest_s for seen in since])
+    last = time[-1]
+    share, (rate, now), covariance = np.ones_like(time), np.zeros(2), np.eye(2)
+    for _ in range(ROUNDS):
+        weight = np.sqrt(share) / deviation
+        (rate, now), covariance = np.polyfit(time - last, offset, 1, w=weight, cov="unscaled")
+        away = (offset - now - rate * (time - last)) / (FAR * deviation)
+        share = 1.0 / (1.0 + away**2)
+    if now * rate <= 0.0:
+        return believed
+    grown_s = float(now / rate)
+    return replace(
+        believed,
+        size=float(rate),
+        spread=HALF_90 * float(np.sqrt(covariance[1, 1])) / grown_s,
+        since_s=float(last - grown_s),
+    )
+
+
+def _offset(model: HealthyModel, motor: int, seen: Seen) -> tuple[float, float]:
+    """Return by how much one motor is off, were all others healthy, and its deviation [rad]."""
+    arm = BelievedArm(model)
+    pose = arm.settle(seen.command, seen.previous, seen.rest_s)
+    assert seen.point is not None
+    found, variance = 0.0, np.inf
+    for _ in range(3):
+        turned = pose.copy()
+        turned[motor] += found
+        error, jacobian, spread = model.residual(seen.point, turned, model.scatter)
+        column: FloatArray = jacobian[:, motor]
+        pull = spread.solve(column)
+        variance = 1.0 / max(float(column @ pull), 1e-12)
+        found += variance * float(pull @ error)
+    return found, float(np.sqrt(variance))

@@ -23,12 +23,13 @@ from failuretwin.digital_model.settling import sag
 from failuretwin.failure_behavior.fault import Arrival
 from failuretwin.failure_behavior.mode import FaultMode, Reaction, Signature
 from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.explanation import size_words
 from failuretwin.inference.observation.healthy_model import HealthyModel
 
 UNMOVED_RAD = 1e-9
 """Commands nearer than this are the same [rad]."""
 NEWTON_STEPS = 5
-PROBE_RAD = 0.01
+GAIN_STEP_RAD = 0.01
 """Step by which it is asked how far the faulty motor follows its command [rad]."""
 CLOSE_RAD = 5e-4
 """A command is near enough once it changes by no more; the next change is a tenth of it [rad]."""
@@ -40,6 +41,14 @@ WAY = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Places on its way at which a motor that has stuck may stand, as shares of the way."""
 HALF_90 = 1.645
 """Half of a 90 % interval in standard deviations."""
+LEAST_LOSS_RATE = 0.01
+"""Smallest drop rate of commands that is assumed [-]."""
+MOVED_RAD = 0.02
+"""Smallest commanded movement whose loss can be seen [rad]."""
+SURPRISE_NATS = 2.0
+"""Evidence for a dropped command, in addition to its rate, from which it is sent again [nats]."""
+PROBE_RAD = 0.15
+"""Movement of a held motor that tests whether it was repaired [rad]."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +131,12 @@ class BelievedFault:
         offset = self.mode.signature in (Signature.OFFSET, Signature.GROWING_OFFSET)
         return offset and not self.set_aside and bool(np.isfinite(self.size))
 
+    def in_words(self, robot: Robot) -> str:
+        """Return the fault and what is done about it, in words."""
+        unit = robot.own_unit(self.fault.motor, self.mode.unit)
+        size = size_words(self.fault, self.size, unit) if np.isfinite(self.size) else ""
+        return f"{self.mode.plain_name(self.fault.motor)}{size}: {self.reaction.value}"
+
     def age_s(self, time_s: FloatArray | float) -> FloatArray:
         """Return the time since the fault began [s], 0 before."""
         return np.maximum(np.asarray(time_s) - self.since_s, 0.0)
@@ -194,6 +209,23 @@ class BelievedArm:
         found[..., k] += fault.mode.settled_offset(np.array(fault.size), arrival)
         return found
 
+    def expected(
+        self, command: FloatArray, previous: FloatArray, time_s: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return mean and standard deviation of where motors settle, (..., motor) [rad] each.
+
+        A movement that the faulty motor may miss counts by its first two moments. Arguments as of
+        `settle`.
+        """
+        pose = self.settle(command, previous, time_s)
+        scatter, fault = self.scatter(command, time_s), self.fault
+        if fault is not None and fault.obeys:
+            k, rate = fault.motor, fault.size
+            missed = previous[..., k] - command[..., k]
+            pose[..., k] += rate * missed
+            scatter[..., k] = np.hypot(scatter[..., k], np.sqrt(rate * (1.0 - rate)) * missed)
+        return pose, scatter
+
     def command_for(self, pose: FloatArray, previous: FloatArray, time_s: float) -> FloatArray:
         """Return the command that leads to a pose, (motor,) [rad], within limits, in whole counts.
 
@@ -229,9 +261,9 @@ class BelievedArm:
         gain, fault = np.ones_like(command), self.fault
         if fault is not None and fault.inverted:
             probed = command.copy()
-            probed[fault.motor] += PROBE_RAD
+            probed[fault.motor] += GAIN_STEP_RAD
             moved = self.settle(probed, previous, time_s) - self.settle(command, previous, time_s)
-            gain[fault.motor] = max(moved[fault.motor] / PROBE_RAD, LEAST_GAIN)
+            gain[fault.motor] = max(moved[fault.motor] / GAIN_STEP_RAD, LEAST_GAIN)
         return gain
 
     def with_rest(self, command: FloatArray, previous: FloatArray) -> FloatArray:
@@ -255,6 +287,17 @@ class BelievedArm:
         ends = np.sort(units.to_counts(np.array([low, high])), axis=0)
         least, most = np.ceil(ends[0] - 1e-9), np.floor(ends[1] + 1e-9)
         return np.asarray(units.to_rad(np.clip(np.round(units.to_counts(command)), least, most)))
+
+    def probing(self, command: FloatArray) -> FloatArray | None:
+        """Return the command with a test movement of the held motor; None: no motor is held."""
+        fault = self.fault
+        if fault is None or not fault.rests or fault.reaction is not Reaction.LOCK:
+            return None
+        k, (low, high) = fault.motor, self.limits
+        inward = 1.0 if command[k] < 0.5 * (low[k] + high[k]) else -1.0
+        probed = command.copy()
+        probed[k] += inward * PROBE_RAD
+        return self.rounded(probed)
 
     # What a movement says of the arm.
 
@@ -325,3 +368,38 @@ class BelievedArm:
             pull = spread.solve(error + jacobian @ (pose - expected))
             pose = expected + scatter**2 * (jacobian.T @ pull)
         return np.asarray(pose)
+
+    def lost_command(self, seen: Seen) -> list[int]:
+        """Return the motors that seem to have missed their command; empty: none.
+
+            log p(e | lost) + log rate > log p(e | arrived) + 2
+
+        A held motor does not count: it is not expected to move. A motor that sticks now and then
+        may also stand on its way.
+        """
+        arrived, best, lost = self.log_density_arrived(seen), -np.inf, list[int]()
+        moved = np.abs(seen.command - seen.previous) > MOVED_RAD
+        for motors, rate in self._loss_sets():
+            if not moved[motors].any() or (len(motors) == 1 and self.held[motors].any()):
+                continue
+            command = seen.command.copy()
+            command[motors] = seen.previous[motors]
+            says = self.log_density_arrived(replace(seen, command=command)) + np.log(rate)
+            if says > best:
+                best, lost = says, motors
+        fault = self.fault
+        if fault is not None and fault.obeys and moved[fault.motor]:
+            says = self.log_density_missed(seen)
+            if says > best:
+                best, lost = says, [fault.motor]
+        return lost if best > arrived + SURPRISE_NATS else []
+
+    def _loss_sets(self) -> list[tuple[list[int], float]]:
+        """Return the sets of motors that may miss a command together, with their rates."""
+        names = self.robot.motor_names
+        found: dict[tuple[int, ...], float] = {(k,): LEAST_LOSS_RATE for k in range(len(names))}
+        found[tuple(range(len(names)))] = LEAST_LOSS_RATE
+        for entry in self.model.imperfections.lost_commands:
+            motors = tuple(names.index(motor) for motor in entry.motors)
+            found[motors] = max(entry.rate, LEAST_LOSS_RATE)
+        return [(list(motors), rate) for motors, rate in found.items()]

@@ -35,10 +35,6 @@ def shown_faults(model: HealthyModel, modes: Iterable[str]) -> tuple[Hypothesis,
     """Return healthy and single faults of some modes, without those that cannot show at rest.
 
     A motor that does not give way under load shows no loss of torque there.
-
-    Args:
-        model: The healthy robot.
-        modes: Names of modes.
     """
     gives = dict(zip(model.motor_names, model.settling.compliance, strict=True))
     return tuple(
@@ -135,10 +131,6 @@ class Judge:
 
         Doubts about an arm count as scatter first. Where that points to another fault than the one
         believed, they are integrated out as common to all movements, which takes long.
-
-        Args:
-            windows: Movements of each arm.
-            believed: What each arm is taken to have.
         """
         found: list[Judgement | None] = [None] * len(windows)
         for length in {len(window) for window in windows} - {0}:

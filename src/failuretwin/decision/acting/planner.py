@@ -5,23 +5,37 @@
 Poses come from many starts at once. Those in the ranges of the arm's usual movements come first,
 for there it is known best; what is out of reach there is looked for within the limits of its
 joints. The cheapest that has a safe way is taken.
+
+A motor is spared by how worn it is, of what the history of `diagnose --track` keeps,
+
+    weight_k = max over bias, sag, friction of max(0, |now - first| - 1.645 deviation) / limit
+
+Changes are counted from the first run of the history, in scatters of the motor; what its doubts
+can explain is no wear.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from failuretwin.connection.life_history import read_rows
 from failuretwin.connection.links.base import Order
+from failuretwin.core.errors import InputError
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.decision.acting.believed_arm import BelievedArm
+from failuretwin.decision.acting.believed_arm import HALF_90, BelievedArm
 from failuretwin.decision.acting.safety import SafetyGate
 from failuretwin.decision.acting.task import DIRECTION_TOLERANCE_RAD, Target
 from failuretwin.digital_model.inverse_kinematics import STARTS, InverseKinematics, Poses
 from failuretwin.digital_model.settling import largest_load
 from failuretwin.failure_behavior.mode import Reaction
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.together.wear_limits import WearLimits, wear_unit
 
 NEAR_ENOUGH = 0.6
 """A plan that uses up no more of the tolerance is not looked for any further; the rest is for how
@@ -94,6 +108,23 @@ class Plan:
         return max(self.miss_m / target.tolerance_m, self.miss_rad / DIRECTION_TOLERANCE_RAD)
 
 
+@dataclass(frozen=True)
+class Effort:
+    """What one way asks of the arm.
+
+    Attributes:
+        way_s: Its time [s].
+        load: Load of each motor at its end, in shares of its largest, (motor,) [-].
+        travel: How far each goes, (motor,) [rad].
+        reversals: Which motors it turns round, (motor,) [-].
+    """
+
+    way_s: float
+    load: FloatArray
+    travel: FloatArray
+    reversals: FloatArray
+
+
 def _is_better(plan: Plan, other: Plan, target: Target) -> bool:
     """Return whether a plan is the better one: safe, then near."""
     if (plan.order is None) != (other.order is None):
@@ -127,20 +158,10 @@ class Planner:
     @cached_property
     def usual(self) -> InverseKinematics:
         """Poses within the ranges of usual movements."""
-        low, high = np.array([motor.movement_range for motor in self.gate.robot.motors]).T
-        whole = self.whole
-        return InverseKinematics(
-            self.gate.robot, np.maximum(low, whole.low), np.minimum(high, whole.high)
-        )
+        return InverseKinematics(self.gate.robot, *self.gate.pose_limits(usual=True))
 
     def plan(self, target: Target, arm: BelievedArm, at: Standing) -> Plan:
-        """Return the best plan for a target.
-
-        Args:
-            target: Where to.
-            arm: The arm as it is believed to be.
-            at: Where it stands.
-        """
+        """Return the best plan for a target."""
         best: Plan | None = None
         for kinematics in (self.usual, self.whole):
             found = self._poses(kinematics, target, arm, at)
@@ -186,16 +207,12 @@ class Planner:
         """Return the first pose of some that has a safe way: which, its order, or why none has."""
         why = ""
         for i in order[:TRIED]:
-            ordered, wrong = self.order_for(found.pose[0, i], arm, at)
+            command = arm.command_for(found.pose[0, i], at.command, at.time_s)
+            ordered, wrong = self.checked(command, arm, at)
             if not wrong:
                 return int(i), ordered, ""
             why = why or wrong
         return int(order[0]), None, why
-
-    def order_for(self, pose: FloatArray, arm: BelievedArm, at: Standing) -> tuple[Order, str]:
-        """Return the order that brings the arm to a pose, and why it must not be sent."""
-        command = arm.command_for(pose, at.command, at.time_s)
-        return self.checked(command, arm, at)
 
     def checked(self, command: FloatArray, arm: BelievedArm, at: Standing) -> tuple[Order, str]:
         """Return the order of a command (motor,) [rad], and why it must not be sent."""
@@ -234,6 +251,12 @@ class Planner:
         """Return the time of the way to poses (..., motor) [rad], (...) [s]."""
         return np.asarray(np.max(np.abs(pose - at.pose) / self.gate.speed, axis=-1))
 
+    def effort(self, pose: FloatArray, at: Standing) -> Effort:
+        """Return what the way to a pose (motor,) [rad] asks of the arm."""
+        turned = turned_round(pose, at).astype(np.float64)
+        travel = np.abs(pose - at.pose)
+        return Effort(float(self.way_s(pose, at)), self.load(pose), travel, turned)
+
     def load(self, pose: FloatArray) -> FloatArray:
         """Return the load of each motor in poses (..., motor) [rad], in shares of its largest."""
         robot = self.gate.robot
@@ -249,3 +272,78 @@ def turned_round(pose: FloatArray, at: Standing) -> BoolArray:
     if at.travel is None:
         return np.zeros(pose.shape, dtype=bool)
     return np.asarray((pose - at.pose) * at.travel < 0.0)
+
+
+# How worn motors are, and what sparing them costs.
+
+TRACKED = ("bias", "compliance", "friction")
+"""What a history follows of each motor, in the order of `wear_unit`."""
+
+
+def wear_weights(history: Path, model: HealthyModel) -> FloatArray:
+    """Return how worn each motor is, in shares of what is allowed, (motor,) [-], 1 at most.
+
+    `history` is CAL.history.jsonl of `diagnose --track`.
+
+    Raises:
+        InputError: If the history cannot be read, is of another robot, or holds no run.
+    """
+    rows = read_rows(history, model.twin.robot.name)
+    if not rows:
+        raise InputError(f"{history}: holds no run. Expected what `diagnose --track` keeps.")
+    change, doubt = (_change(rows, suffix) for suffix in ("", "_deviation"))
+    unit = wear_unit(model).reshape(len(TRACKED), -1)
+    beyond = np.maximum(np.abs(change) - HALF_90 * doubt, 0.0)
+    worn = np.divide(beyond, unit, out=np.zeros_like(beyond), where=unit > 0.0)
+    return np.asarray(np.minimum(worn.max(axis=0) / WearLimits().limit, 1.0))
+
+
+def stopped_learning(history: Path, robot: str) -> str:
+    """Return why a history learns no more: what changed as no wear does; empty if it learns.
+
+    Raises:
+        InputError: If it cannot be read or is of another robot.
+    """
+    rows = read_rows(history, robot)
+    return str(rows[-1].get("alarm", "")) if rows else ""
+
+
+def _change(rows: Sequence[Mapping[str, Any]], suffix: str) -> FloatArray:
+    """Return last less first of what is tracked, or both deviations together, (3, motor)."""
+    first, last = (
+        np.array([row[f"{name}{suffix}"] for name in TRACKED], dtype=np.float64)
+        for row in (rows[0], rows[-1])
+    )
+    return np.asarray(np.hypot(first, last) if suffix else last - first)
+
+
+def sparing_lines(
+    names: Sequence[str], spared: FloatArray, ways: Sequence[tuple[Effort, ...]]
+) -> list[str]:
+    """Return in words what sparing has changed.
+
+    Args:
+        names: Names of the motors.
+        spared: Weight of each, (motor,).
+        ways: Each way as it was taken, and as it would have been.
+    """
+    if not ways:
+        return []
+
+    def both(name: str, motor: int | None = None) -> list[float]:
+        values = np.array([[getattr(effort, name) for effort in way] for way in ways])
+        return np.asarray((values if motor is None else values[..., motor]).mean(axis=0)).tolist()
+
+    taken, plain = both("way_s")
+    lines = []
+    for k in np.flatnonzero(spared).tolist():
+        load, travel, reversals = (both(name, k) for name in ("load", "travel", "reversals"))
+        lines.append(
+            f"{names[k]} spared (weight {spared[k]:.2f}): load {load[0]:.0%} instead of "
+            f"{load[1]:.0%} of its largest, {travel[0]:.2f} instead of {travel[1]:.2f} rad a "
+            f"target, turned round in {reversals[0]:.0%} instead of {reversals[1]:.0%}"
+        )
+    return [
+        *lines,
+        f"which costs {taken - plain:+.2f} s a target ({taken:.2f} instead of {plain:.2f})",
+    ]

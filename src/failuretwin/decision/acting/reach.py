@@ -109,9 +109,13 @@ class MotorReach:
 
 def workspace(robot: Robot, count: int = POINTS, seed: int = 0) -> FloatArray:
     """Return points that an arm reaches in its usual movements, (point, 3) [m]."""
+    return InverseKinematics.of(robot).tool(_usual_poses(robot, count, seed))[0]
+
+
+def _usual_poses(robot: Robot, count: int, seed: int) -> FloatArray:
+    """Return random poses of usual movements, (pose, motor) [rad]."""
     low, high = np.array([motor.movement_range for motor in robot.motors]).T
-    pose = np.random.default_rng(seed).uniform(low, high, (count, len(low)))
-    return InverseKinematics.of(robot).tool(pose)[0]
+    return np.random.default_rng(seed).uniform(low, high, (count, len(low)))
 
 
 def reach(
@@ -179,10 +183,8 @@ def reach_by_motor(
         seed: Seed of the poses that a search begins with.
     """
     robot = gate.robot
-    kinematics = InverseKinematics.of(robot)
-    low, high = np.array([motor.movement_range for motor in robot.motors]).T
-    pose = np.random.default_rng(seed).uniform(low, high, (POINTS, len(low)))
-    factor = np.median(feedback_factor(kinematics.tool(pose)[1]), axis=0)
+    jacobian = InverseKinematics.of(robot).tool(_usual_poses(robot, POINTS, seed))[1]
+    factor = np.median(feedback_factor(jacobian), axis=0)
     found = []
     for k, name in enumerate(robot.motor_names):
         angle = np.linspace(float(robot.travel[k, 0]), float(robot.travel[k, 1]), ANGLES)

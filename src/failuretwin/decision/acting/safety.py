@@ -96,6 +96,14 @@ class SafetyGate:
         own = np.array([motor.speed_limit for motor in self.robot.motors])
         return np.asarray(own / self.limits.rise_s)
 
+    def pose_limits(self, usual: bool) -> tuple[FloatArray, FloatArray]:
+        """Return lowest and highest pose, (motor,) [rad]: of the joints, or of usual movements."""
+        low, high = usable_limits(self.robot)
+        if usual:
+            own = np.array([motor.movement_range for motor in self.robot.motors]).T
+            low, high = np.maximum(low, own[0]), np.minimum(high, own[1])
+        return low, high
+
     def least_duration(self, travel: FloatArray) -> float:
         """Return the shortest time for travels (motor,) [rad] that all motors share [s].
 

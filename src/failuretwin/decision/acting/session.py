@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-
 from failuretwin.connection.links.base import Commander
 from failuretwin.core.errors import unknown_name
 from failuretwin.core.types import FloatArray
@@ -17,12 +15,10 @@ from failuretwin.decision.acting.actor import Actor
 from failuretwin.decision.acting.belief import Belief
 from failuretwin.decision.acting.believed_arm import BelievedArm
 from failuretwin.decision.acting.judging import Judge
-from failuretwin.decision.acting.outcome import ActingSettings, TargetResult
-from failuretwin.decision.acting.planner import Plan, Planner, Standing
+from failuretwin.decision.acting.planner import Plan, Planner, Standing, sparing_lines, wear_weights
 from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
-from failuretwin.decision.acting.sparing import sparing_lines, wear_weights
-from failuretwin.decision.acting.task import Task
-from failuretwin.decision.acting.work import Work, first_standing
+from failuretwin.decision.acting.task import ActingSettings, TargetResult, Task
+from failuretwin.decision.acting.work import Work, first_standing, would_order
 from failuretwin.digital_model.calibrated_robot import (
     CalibratedRobot,
     HealthyLike,
@@ -109,13 +105,11 @@ class Acting:
 
 
 def _planned(plan: Plan) -> str:
-    order = plan.order
-    if order is None:
+    if plan.order is None:
         return f"no safe way: {plan.why}"
     if not plan.reachable:
         return f"out of reach by {plan.misses}"
-    angles = " ".join(f"{angle:.1f}" for angle in np.rad2deg(order.target))
-    return f"would order {angles} deg in {order.duration.max():.2f} s"
+    return would_order(plan.order)
 
 
 def act(

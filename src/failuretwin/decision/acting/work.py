@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -14,8 +15,8 @@ from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
 from failuretwin.decision.acting.believed_arm import BelievedArm, Seen
 from failuretwin.decision.acting.planner import Standing
-from failuretwin.decision.acting.rest import RestWatch
 from failuretwin.decision.acting.safety import SafetyGate, UnsafeOrderError
+from failuretwin.inference.observation.evidence import SETTLING_S
 from failuretwin.inference.observation.healthy_model import HealthyModel
 
 FIRST_WAIT_S = 10.0
@@ -27,10 +28,24 @@ SILENCE_S = 15.0
 OURS_RAD = 1e-3
 """A command that differs by more from ours is somebody else's [rad]."""
 POLL_S = 0.1
+QUIET_S = 0.5
+"""Time without motion that counts as rest [s]."""
+LEAST_READINGS = 3
+"""Readings that rest needs at least."""
+LATE_S = 0.3
+"""Extra time for a late start, beyond what arms of this kind need [s]."""
+MOVED_FACTOR = 2.0
+"""Expected travel from which a late start is waited for, in spreads that tell motion from rest."""
 
 
 class Halted(InputError):  # noqa: N818 - it is no error of the user
     """Work was stopped before the task was over; nothing more is sent."""
+
+
+def would_order(order: Order) -> str:
+    """Return an order that is not sent, in words."""
+    angles = " ".join(f"{angle:.1f}" for angle in np.rad2deg(order.target))
+    return f"would order {angles} deg in {order.duration.max():.2f} s"
 
 
 class Worker(Protocol):
@@ -96,6 +111,61 @@ class OrderSequence:
         assert self._order is not None
         told = (self.command, self._previous, self._order.duration)
         self.seen.append(Seen(*told, start_s, rest_s, point))
+
+
+@dataclass
+class RestWatch:
+    """Waits for the tool to come to rest after one order.
+
+    Attributes:
+        model: The arm: what tells rest from motion, how late it may start.
+        sent_s: When the order was sent [s].
+        ramp_s: Its longest ramp [s].
+        before: Where the tool rested before, (3,) [m]; None: not known.
+        travel_m: How far the tool is expected to go [m].
+    """
+
+    model: HealthyModel
+    sent_s: float
+    ramp_s: float
+    before: FloatArray | None
+    travel_m: float
+
+    def __post_init__(self) -> None:
+        self._recent: deque[Reading] = deque()
+
+    def take(self, reading: Reading) -> FloatArray | None:
+        """Take a reading; return where the tool is at rest, (3,) [m]; None: not yet."""
+        if not np.isfinite(reading.tool).all():
+            return None
+        self._recent.append(reading)
+        while reading.time - self._recent[0].time > QUIET_S + 1e-6:
+            self._recent.popleft()
+        since = reading.time - self.sent_s
+        if since < self.ramp_s + SETTLING_S + self.model.lag_s or not self._long_enough():
+            return None
+        points = np.array([each.tool for each in self._recent])
+        middle = np.median(points, axis=0)
+        away = np.linalg.norm(points - middle, axis=1)
+        if np.max(away) > self.model.settings.moving_spread_m + 4.0 * self.model.path_noise:
+            return None
+        if self._may_not_have_begun(middle, since):
+            return None
+        return np.asarray(middle)
+
+    def _long_enough(self) -> bool:
+        span = self._recent[-1].time - self._recent[0].time
+        return len(self._recent) >= LEAST_READINGS and span >= 0.8 * QUIET_S
+
+    def _may_not_have_begun(self, point: FloatArray, since: float) -> bool:
+        """Return whether a tool that is where it was may yet start, late."""
+        if self.before is None:
+            return False
+        near = self.model.settings.moving_spread_m * MOVED_FACTOR
+        if np.linalg.norm(point - self.before) > near or self.travel_m < near:
+            return False
+        latest = self.ramp_s + SETTLING_S + self.model.imperfections.timing.late_s[1] + LATE_S
+        return since < latest + QUIET_S
 
 
 @dataclass

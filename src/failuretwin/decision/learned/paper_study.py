@@ -32,7 +32,7 @@ from failuretwin.data_knowledge.readers.read import ReadOptions, read_runs
 from failuretwin.data_knowledge.store import SUFFIXES, replacing, write_text
 from failuretwin.decision.evaluation import Truths
 from failuretwin.decision.learned.feature_encoder import FeatureEncoder, signals_of
-from failuretwin.decision.proportions import class_ratios
+from failuretwin.decision.scoring import class_ratios
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:

@@ -19,10 +19,9 @@ import numpy as np
 from failuretwin.connection.links.base import Order
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.rest import QUIET_S
 from failuretwin.decision.acting.safety import SafetyGate, Way
+from failuretwin.decision.acting.work import QUIET_S
 from failuretwin.decision.test_motions.outlook import Asked, Outlook, of_posterior
-from failuretwin.digital_model.inverse_kinematics import usable_limits
 from failuretwin.inference.observation.evidence import SETTLING_S
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import Posterior
@@ -94,11 +93,7 @@ class Designer:
     @property
     def limits(self) -> tuple[FloatArray, FloatArray]:
         """Lowest and highest pose of each motor, (motor,) [rad]."""
-        low, high = usable_limits(self.gate.robot)
-        if self.usual:
-            own = np.array([motor.movement_range for motor in self.gate.robot.motors]).T
-            low, high = np.maximum(low, own[0]), np.minimum(high, own[1])
-        return low, high
+        return self.gate.pose_limits(self.usual)
 
     @property
     def rest_s(self) -> float:

@@ -1,4 +1,4 @@
-"""A health check: test movements made, what they say of every motor, and whether that is enough.
+"""The result of a health check: what test movements say of every motor, and if that is enough.
 
     green: P(healthy) >= 0.95;    red: P(motor k), the sum over its modes, >= 0.95;    else open
 
@@ -7,12 +7,11 @@ Section: docs/check.md#result-of-a-check
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.connection.links.base import Commander, Order
 from failuretwin.core.hypothesis import (
     FAULTY_STATE,
     HEALTHY_STATE,
@@ -24,12 +23,7 @@ from failuretwin.core.hypothesis import (
 )
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.believed_arm import Seen
-from failuretwin.decision.acting.judging import settled_evidence_of, shown_faults
-from failuretwin.decision.acting.safety import SafetyGate
-from failuretwin.decision.acting.work import OrderSequence, Work, first_standing
-from failuretwin.decision.test_motions.design import next_movement
-from failuretwin.decision.test_motions.motions import Motions
+from failuretwin.decision.acting.judging import shown_faults
 from failuretwin.digital_model.nonidealities import Variation
 from failuretwin.failure_behavior.mode import Range, Signature
 from failuretwin.failure_behavior.registry import MODES
@@ -37,7 +31,7 @@ from failuretwin.inference.faults.priors import Priors, visible_sizes
 from failuretwin.inference.isolability import IsolabilityReport
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
-from failuretwin.inference.observation.log_quality import BEYOND_USUAL, LogQuality
+from failuretwin.inference.observation.log_quality import BEYOND_USUAL
 from failuretwin.inference.observation.settings import ERROR_STEPS, WIDEST_ERROR
 from failuretwin.inference.posterior import Posterior, log_prior
 from failuretwin.inference.theta.shared_belief import mixed
@@ -71,10 +65,6 @@ def checking(model: HealthyModel, hypotheses: Sequence[Hypothesis]) -> Priors:
     Movements that are chosen for it, and are many, show smaller errors than others do: where a
     profile states the least, ranges of errors begin at half of that, in even steps of the
     logarithm; elsewhere at a sixth of what one settled position shows.
-
-    Args:
-        model: The healthy robot.
-        hypotheses: What may be the case.
     """
     plain = Priors(error_ranges=_error_ranges(model))
     prior = np.exp(log_prior(hypotheses, plain))
@@ -124,11 +114,6 @@ def motor_offsets(
     with zero b and play 2 f of `inference.theta`. The prior is wide, `LOOSE_RAD`, and not that of
     the calibration: a check measures what has moved since. A hypothesis that calls a motor faulty
     leaves the prior of its zero and play. The sensor's frame is taken as the profile states it.
-
-    Args:
-        likelihood: One run.
-        hypotheses: Healthy and single faults.
-        priors: Beliefs about faults and set-ups.
     """
     layout = SharedLayout(len(likelihood.model.scatter), offsets=True)
     weighing = SharedWeighing(_with_loose_offsets(likelihood), hypotheses, priors, layout)
@@ -231,84 +216,8 @@ def result_of(
     """Return the result of a check: its diagnosis, with zeros and play.
 
     Designed movements reach the joint limits, so commands outside the usual ranges are no remark.
-
-    Args:
-        likelihood: The run.
-        hypotheses: What may be the case.
-        priors: Beliefs about faults and set-ups.
-        diagnosis: Its diagnosis.
-        further: How many of its movements were not planned.
     """
     remarks = tuple(line for line in diagnosis.quality if not line.startswith(BEYOND_USUAL))
     diagnosis = replace(diagnosis, quality=remarks)
     offsets = motor_offsets(likelihood, hypotheses, priors)
     return CheckResult(diagnosis, offsets, int(likelihood.usable.sum()), further)
-
-
-@dataclass
-class HealthCheck:
-    """Makes planned movements on an arm, then further ones while the result is open.
-
-    Attributes:
-        model: The healthy arm.
-        gate: Safety limits.
-        motions: Planned movements.
-        hypotheses: Hypotheses of the check.
-        priors: Beliefs about faults.
-        further: Maximum number of further movements.
-        seed: Seed of the poses that are tried for those.
-        window: Movements as they were seen.
-    """
-
-    model: HealthyModel
-    gate: SafetyGate
-    motions: Motions
-    hypotheses: Sequence[Hypothesis]
-    priors: Priors
-    further: int = 0
-    seed: int = 0
-    window: list[Seen] = field(default_factory=list)
-    _added: int = field(default=0, init=False)
-
-    def work(self, commander: Commander, tell: Callable[[str], None]) -> CheckResult:
-        """Carry the check out on an arm and return the result."""
-        standing = first_standing(commander)
-        said: list[str] = []
-        orders = self._orders(standing, said)
-        sequence = OrderSequence(self.model, standing, orders, said, self.window)
-        Work(sequence, self.gate, commander, standing, tell).carry_out()
-        return self.result
-
-    def _orders(self, standing: FloatArray, said: list[str]) -> Iterator[Order]:
-        """Yield the way to the start, the planned movements and the further ones."""
-        travel = self.motions.start - standing
-        if np.abs(travel).max() > 1e-6:
-            ramp = np.full(len(standing), self.gate.least_duration(travel))
-            yield Order(self.motions.start, ramp)
-        yield from self.motions.orders
-        for number in range(1, self.further + 1):
-            if self.result.light != OPEN:
-                return
-            at = self.window[-1].command
-            order = next_movement(self.model, self.gate, self.posterior, at, self.seed)
-            if order is None:
-                return
-            self._added = number
-            said.append(f"still open: further movement {number}")
-            yield order
-
-    @property
-    def likelihood(self) -> RunLikelihood:
-        """Likelihood of all movements."""
-        return RunLikelihood(settled_evidence_of([self.window]), self.model)
-
-    @property
-    def posterior(self) -> Posterior:
-        """Posterior of all hypotheses given all movements."""
-        return judged(self.likelihood, self.hypotheses, self.priors)
-
-    @property
-    def result(self) -> CheckResult:
-        """Result of the check."""
-        diagnosis = self.posterior.to_diagnosis(0, "check", LogQuality())
-        return result_of(self.likelihood, self.hypotheses, self.priors, diagnosis, self._added)

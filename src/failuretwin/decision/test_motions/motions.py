@@ -119,11 +119,6 @@ class Motions:
     def from_record(cls, record: Any, robot: Robot, where: str) -> Self:
         """Return the motions of a JSON object.
 
-        Args:
-            record: What a file holds.
-            robot: The robot that shall make them.
-            where: What to call the file in errors.
-
         Raises:
             InputError: If it holds none, or those of another robot.
         """

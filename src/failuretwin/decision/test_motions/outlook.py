@@ -6,6 +6,15 @@ A member is a hypothesis with one size of its fault. An error drawn anew for eac
 scatter, s_k^2 + size^2; a motor that is held stands at its angle and scatters as it gives; a
 movement that may be missed counts by its first two moments.
 
+How much movements are expected to tell of what is the case is estimated by pairwise distances
+(Kolchinsky and Tracey 2017), in closed form, since the distances of movements add up:
+
+    D_ij = min(cap, d^2 / 8 + log(|S| / sqrt(|S_i| |S_j|)) / 2),    S = (S_i + S_j) / 2
+    I = sum_i p_i log [sum over j of i's hypothesis p(j | h) exp(-D_ij) / sum_j p_j exp(-D_ij)]
+
+D_ij is the distance of Bhattacharyya of where the tool comes to rest if member i, or j, is true;
+with heavy tails d^2 counts as (nu + c) log(1 + d^2/(nu + c + 2)).
+
 Section: docs/check.md#choice-of-movements
 """
 
@@ -17,14 +26,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
-from failuretwin.core.numerics import Weighted
+from failuretwin.core.numerics import Weighted, log_sum
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.decision.acting.believed_arm import BelievedArm, BelievedFault
 from failuretwin.decision.streaming.monitor import Believed
-from failuretwin.decision.test_motions.information import (
-    expected_information,
-    pairwise_distance,
-)
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.faults.priors import Priors
@@ -71,13 +76,7 @@ class Member:
 def of_priors(
     model: HealthyModel, hypotheses: Sequence[Hypothesis], priors: Priors
 ) -> list[Member]:
-    """Return members of hypotheses before anything was seen, with sizes evenly over their logs.
-
-    Args:
-        model: The healthy robot.
-        hypotheses: Healthy and single faults.
-        priors: Odds and ranges of sizes.
-    """
+    """Return members of hypotheses before anything was seen, with sizes evenly over their logs."""
     shares = np.exp(log_prior(hypotheses, priors))
     members = []
     for hypothesis, share in zip(hypotheses, shares.tolist(), strict=True):
@@ -99,12 +98,7 @@ def _prior_sizes(model: HealthyModel, hypothesis: Hypothesis, priors: Priors) ->
 
 
 def of_posterior(posterior: Posterior, row: int) -> list[Member]:
-    """Return members of what is left after some movements, sizes at quantiles of what they say.
-
-    Args:
-        posterior: Of all hypotheses, for several arms.
-        row: Which of them.
-    """
+    """Return members of what is left after some movements, sizes at quantiles of what they say."""
     shares = np.exp(posterior.log_posterior[row])
 
     def size_of(at: int) -> Weighted | None:
@@ -119,9 +113,6 @@ def of_belief(believed: Believed) -> list[Member]:
 
     An alarm is raised at odds that have to do with neither: whether there is a fault is asked as
     much as which.
-
-    Args:
-        believed: What it believes.
     """
     shares = believed.probability.copy()
     healthy = np.array([hypothesis.is_healthy for hypothesis in believed.hypotheses])
@@ -183,9 +174,6 @@ class Asked:
         number = np.full(count, len(made.command))
         return cls(poses, np.tile(at, (count, 1)), np.full(count, since_s), number)
 
-    def __getitem__(self, some: IntArray) -> Asked:
-        return Asked(self.command[some], self.previous[some], self.since_s[some], self.number[some])
-
 
 @dataclass(frozen=True)
 class Outlook:
@@ -245,13 +233,15 @@ class Outlook:
         Returns:
             (movement, member, channel) [m] and (movement, member, channel, channel) [m2].
         """
-        healthy = BelievedArm(self.model).settle(asked.command, asked.previous, asked.since_s)
-        pose = np.repeat(healthy[:, None], len(self.members), axis=1)
-        scatter = np.broadcast_to(self.model.scatter, pose.shape).copy()
+        told = asked.command, asked.previous, asked.since_s
+        healthy = BelievedArm(self.model).expected(*told)
+        pose, scatter = (np.repeat(each[:, None], len(self.members), axis=1) for each in healthy)
         for at, member in enumerate(self.members):
-            struck = np.flatnonzero(asked.number >= member.first)
-            if not member.hypothesis.is_healthy and len(struck):
-                pose[struck, at], scatter[struck, at] = self._faulty(member, asked[struck])
+            struck = asked.number >= member.first
+            arm = BelievedArm(self.model, member.fault(self.model))
+            if arm.fault is not None and struck.any():
+                rows = (each[struck] for each in told)
+                pose[struck, at], scatter[struck, at] = arm.expected(*rows)
         mean, jacobian = self.model.sensors.expected(pose)
         root = jacobian * scatter[..., None, :]
         noise = self.model.path_noise**2 * np.eye(mean.shape[-1])
@@ -266,15 +256,45 @@ class Outlook:
         """Return what distances (..., member, member) tell about the hypothesis, (...) [nats]."""
         return expected_information(nats, self.log_share, self.kind)
 
-    def _faulty(self, member: Member, asked: Asked) -> tuple[FloatArray, FloatArray]:
-        """Return mean and standard deviation of settled motors, (movement, motor) [rad]."""
-        fault = member.fault(self.model)
-        arm = BelievedArm(self.model, fault)
-        pose = arm.settle(asked.command, asked.previous, asked.since_s)
-        scatter = arm.scatter(asked.command, asked.since_s)
-        if fault is not None and fault.obeys:
-            k, rate = fault.motor, fault.size
-            missed = asked.previous[:, k] - asked.command[:, k]
-            pose[:, k] += rate * missed
-            scatter[:, k] = np.hypot(scatter[:, k], np.sqrt(rate * (1.0 - rate)) * missed)
-        return pose, scatter
+
+# How much movements tell.
+
+
+def pairwise_distance(mean: FloatArray, spread: FloatArray, dof: float, cap: float) -> FloatArray:
+    """Return how far members are apart in what is seen after a movement, (..., member, member).
+
+    In nats: minus the log of the overlap of two densities; 0 on the diagonal.
+
+    Args:
+        mean: Where the tool is expected, (..., member, channel) [m].
+        spread: Covariance of that, (..., member, channel, channel) [m2].
+        dof: Degrees of freedom of the scatter.
+        cap: What one movement counts at most [nats].
+    """
+    one, other = np.triu_indices(mean.shape[-2], 1)
+    between = 0.5 * (spread[..., one, :, :] + spread[..., other, :, :])
+    log_det = np.linalg.slogdet(spread)[1]
+    apart = mean[..., one, :] - mean[..., other, :]
+    d2 = np.einsum("...a,...a->...", apart, np.linalg.solve(between, apart[..., None])[..., 0])
+    if np.isfinite(dof):
+        channels = mean.shape[-1]
+        d2 = (dof + channels) * np.log1p(d2 / (dof + channels + 2.0))
+    wider = np.linalg.slogdet(between)[1] - 0.5 * (log_det[..., one] + log_det[..., other])
+    found = np.zeros((*mean.shape[:-1], mean.shape[-2]))
+    found[..., one, other] = np.minimum(0.125 * d2 + 0.5 * wider, cap)
+    return found + np.swapaxes(found, -1, -2)
+
+
+def expected_information(nats: FloatArray, log_share: FloatArray, kind: IntArray) -> FloatArray:
+    """Return how much is expected to be learned about the hypothesis, (...) [nats].
+
+    Args:
+        nats: D of all movements together, (..., member, member) [nats].
+        log_share: Log probability of each member, (member,).
+        kind: Index of its hypothesis, (member,).
+    """
+    terms = log_share - nats
+    same = kind[:, None] == kind
+    of_own = np.array([log_sum(log_share[kind == k], axis=0) for k in kind])
+    own = log_sum(np.where(same, terms, -np.inf), axis=-1) - of_own
+    return np.asarray(np.sum(np.exp(log_share) * (own - log_sum(terms, axis=-1)), axis=-1))

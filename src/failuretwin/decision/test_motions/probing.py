@@ -21,9 +21,8 @@ from failuretwin.connection.links.stream_time import StreamClock
 from failuretwin.core.errors import InputError, counted
 from failuretwin.core.hypothesis import CLEAR, RAISED
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.acting.rest import RestWatch
 from failuretwin.decision.acting.safety import SafetyGate, UnsafeOrderError
-from failuretwin.decision.acting.work import OrderSequence, Work
+from failuretwin.decision.acting.work import OrderSequence, RestWatch, Work, would_order
 from failuretwin.decision.streaming.alarm_rule import NAMED
 from failuretwin.decision.streaming.monitor import Believed, FaultMonitor
 from failuretwin.decision.test_motions.design import Designer
@@ -32,6 +31,7 @@ from failuretwin.decision.test_motions.outlook import Outlook, of_belief
 IDLE_S = 10.0
 """Nobody has commanded an arm for so long that is asked [s]."""
 NOTHING_SAFE = "no movement is safe that would settle it"
+MOVE = "--move does it"
 
 
 @dataclass(frozen=True)
@@ -138,10 +138,6 @@ class Prober:
         """Ask the arm while it is open what is wrong, and send it back.
 
         Whatever keeps it from being asked on is told, and no more is asked by this watch.
-
-        Args:
-            hear: Called with each event of the arm meanwhile.
-            tell: Called with what is done.
         """
         home, answer = self._commander.standing, self._answer
         self._rest, self._still = None, False  # until somebody commands the arm again
@@ -150,7 +146,8 @@ class Prober:
         tell(f"{answer.alarm.cause} is suspected and the arm stands still: it is asked")
         orders, left = self._orders(home), self._left
         if not self._rules.moves:
-            tell(_would(next(orders, None)))
+            order = next(orders, None)
+            tell(NOTHING_SAFE if order is None else f"{would_order(order)}, then back; {MOVE}")
             return
         sequence = OrderSequence(self._monitor.believed.model, home, orders)
         work = Work(sequence, self._gate, self._commander, home, tell, hear)
@@ -198,10 +195,3 @@ def _named(believed: Believed) -> bool:
     """
     faults = believed.probability[[not h.is_healthy for h in believed.hypotheses]]
     return bool(faults.max() >= NAMED)
-
-
-def _would(order: Order | None) -> str:
-    if order is None:
-        return NOTHING_SAFE
-    angles = " ".join(f"{angle:.1f}" for angle in np.rad2deg(order.target))
-    return f"would order {angles} deg in {order.duration.max():.2f} s, then back; --move does it"

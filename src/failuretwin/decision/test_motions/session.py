@@ -1,25 +1,29 @@
-"""What a check or a design of one robot needs, put together."""
+"""A health check or a design of one robot: what it needs, the movements made, and its result."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from failuretwin.connection.links.base import Commander
+from failuretwin.connection.links.base import Commander, Order
 from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
 from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.decision.acting.believed_arm import Seen
+from failuretwin.decision.acting.judging import settled_evidence_of
 from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
-from failuretwin.decision.test_motions.design import Designer
+from failuretwin.decision.acting.work import OrderSequence, Work, first_standing
+from failuretwin.decision.test_motions.design import Designer, next_movement
 from failuretwin.decision.test_motions.health_check import (
     GREEN,
+    OPEN,
     CheckResult,
-    HealthCheck,
     checking,
     faults_at_rest,
+    judged,
     result_of,
 )
 from failuretwin.decision.test_motions.motions import Motions, holds_motions, read_motions
@@ -31,10 +35,13 @@ from failuretwin.digital_model.calibrated_robot import (
     calibrated,
 )
 from failuretwin.inference.diagnoser import BayesDiagnoser
+from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.isolability import IsolabilityReport, isolability
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.observation.log_quality import LogQuality
+from failuretwin.inference.posterior import Posterior
 
 MOST_RUNS = 3
 """Runs of a log whose motions are examined, evenly spread."""
@@ -67,10 +74,15 @@ class Checking:
         """The healthy robot."""
         return HealthyModel.of(self.known.twin, self.known.imperfections)
 
-    @property
+    @cached_property
     def hypotheses(self) -> Sequence[Hypothesis]:
         """What is weighed."""
         return self.named or faults_at_rest(self.model)
+
+    @cached_property
+    def priors(self) -> Priors:
+        """Beliefs about what is weighed."""
+        return checking(self.model, self.hypotheses)
 
     @property
     def asked(self) -> Sequence[Hypothesis]:
@@ -107,15 +119,7 @@ class Checking:
 
     def health_check(self, motions: Motions, further: int) -> HealthCheck:
         """Return a check that has not begun."""
-        return HealthCheck(
-            self.model,
-            self.gate,
-            motions,
-            self.hypotheses,
-            checking(self.model, self.hypotheses),
-            further,
-            self.seed,
-        )
+        return HealthCheck(self, motions, further)
 
     def isolability(self, command: FloatArray, time: FloatArray) -> IsolabilityReport:
         """Return what motions can tell apart, by the priors of a check.
@@ -173,22 +177,79 @@ class Checking:
         from failuretwin.data_knowledge.readers.read import read_runs
 
         runs = read_runs(list(paths), self.known.robot)
-        priors = checking(self.model, self.hypotheses)
-        diagnoser = BayesDiagnoser(
-            self.known.twin, self.known.imperfections, self.hypotheses, priors
-        )
+        known, hypotheses, priors = self.known, self.hypotheses, self.priors
+        diagnoser = BayesDiagnoser(known.twin, known.imperfections, hypotheses, priors)
         settled = Evidence(runs, self.model.settings).sound.settled
         command, time = as_floats(runs["command"].values), as_floats(runs["time"].values)
         found = [
             result_of(
-                RunLikelihood(settled[row : row + 1], self.model),
-                self.hypotheses,
-                priors,
-                diagnosis,
+                RunLikelihood(settled[row : row + 1], self.model), hypotheses, priors, diagnosis
             )
             for row, diagnosis in enumerate(diagnoser.diagnose(runs))
         ]
         return [self.shown(each, command[row : row + 1], time) for row, each in enumerate(found)]
+
+
+@dataclass
+class HealthCheck:
+    """Makes planned movements on an arm, then further ones while the result is open.
+
+    Attributes:
+        asking: The robot, what is safe and what is weighed.
+        motions: Planned movements.
+        further: Maximum number of further movements.
+        window: Movements as they were seen.
+    """
+
+    asking: Checking
+    motions: Motions
+    further: int = 0
+    window: list[Seen] = field(default_factory=list)
+    _added: int = field(default=0, init=False)
+
+    def work(self, commander: Commander, tell: Callable[[str], None]) -> CheckResult:
+        """Carry the check out on an arm and return the result."""
+        standing = first_standing(commander)
+        said: list[str] = []
+        orders = self._orders(standing, said)
+        sequence = OrderSequence(self.asking.model, standing, orders, said, self.window)
+        Work(sequence, self.asking.gate, commander, standing, tell).carry_out()
+        return self.result
+
+    def _orders(self, standing: FloatArray, said: list[str]) -> Iterator[Order]:
+        """Yield the way to the start, the planned movements and the further ones."""
+        asking, travel = self.asking, self.motions.start - standing
+        if np.abs(travel).max() > 1e-6:
+            ramp = np.full(len(standing), asking.gate.least_duration(travel))
+            yield Order(self.motions.start, ramp)
+        yield from self.motions.orders
+        for number in range(1, self.further + 1):
+            if self.result.light != OPEN:
+                return
+            at = self.window[-1].command
+            order = next_movement(asking.model, asking.gate, self.posterior, at, asking.seed)
+            if order is None:
+                return
+            self._added = number
+            said.append(f"still open: further movement {number}")
+            yield order
+
+    @property
+    def likelihood(self) -> RunLikelihood:
+        """Likelihood of all movements."""
+        return RunLikelihood(settled_evidence_of([self.window]), self.asking.model)
+
+    @property
+    def posterior(self) -> Posterior:
+        """Posterior of all hypotheses given all movements."""
+        return judged(self.likelihood, self.asking.hypotheses, self.asking.priors)
+
+    @property
+    def result(self) -> CheckResult:
+        """Result of the check."""
+        diagnosis = self.posterior.to_diagnosis(0, "check", LogQuality())
+        asking = self.asking
+        return result_of(self.likelihood, asking.hypotheses, asking.priors, diagnosis, self._added)
 
 
 def check(

@@ -95,11 +95,7 @@ class RemainingLife:
         return f"about {half} runs left (90 %: {low:.0f} to {late})"
 
     def to_progpy(self, event: str = "worn out") -> list[dict[str, float]]:
-        """Return samples of the time of event, as ``progpy.uncertain_data.UnweightedSamples`` take.
-
-        Args:
-            event: What to call the end of life.
-        """
+        """Return samples of the time of event for ``progpy.uncertain_data.UnweightedSamples``."""
         return [{event: float(value)} for value in self.runs]
 
 

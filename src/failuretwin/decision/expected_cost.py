@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
@@ -71,16 +70,9 @@ class Costs(Bounded):
     inspect: AtLeastZero
     replace: AtLeastZero
     stop: AtLeastZero
-    missed: dict[str, dict[str, float]] = field(default_factory=dict)
+    missed: dict[str, Missed] = field(default_factory=dict)
     healthy: Missed = Missed(0.0, 0.0, 0.0)
     currency: str = ""
-
-    @cached_property
-    def rows(self) -> Mapping[str, Missed]:
-        """Shares by mode."""
-        return {
-            mode: from_table(Missed, row, f"missed.{mode}") for mode, row in self.missed.items()
-        }
 
     def missed_by(self, fault: Fault) -> Missed:
         """Return the shares of a fault.
@@ -88,7 +80,7 @@ class Costs(Bounded):
         Raises:
             InputError: If neither its mode nor `any` has a row.
         """
-        row = self.rows.get(fault.mode, self.rows.get(ANY))
+        row = self.missed.get(fault.mode, self.missed.get(ANY))
         if row is None:
             raise InputError(
                 f"costs: no shares of missed targets for mode {fault.mode!r}. Add a table "
@@ -103,9 +95,7 @@ def load_costs(path: str | Path) -> Costs:
     Raises:
         InputError: If it cannot be read, lacks a figure or holds one that makes no sense.
     """
-    costs = from_table(Costs, read_toml(Path(path)), str(path))
-    _ = costs.rows  # are checked with the file
-    return costs
+    return from_table(Costs, read_toml(Path(path)), str(path))
 
 
 @dataclass(frozen=True)
@@ -225,10 +215,6 @@ def _hinge(difference: FloatArray, probability: FloatArray) -> tuple[int, float]
 
     With its probability at t and the others in proportion, the difference of two costs is
     t d_h + (1 - t) sum over others of p d / (1 - p_h): a line in t, which is 0 at one place.
-
-    Args:
-        difference: Cost of the best less that of the second, by hypothesis.
-        probability: Of each hypothesis.
 
     Returns:
         Its index, -1 if none, and the probability.

@@ -1,4 +1,4 @@
-"""Shares, judged against scikit-learn and scipy."""
+"""Scores of verdicts and intervals, judged against scikit-learn and scipy."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest, norm
 from sklearn.metrics import confusion_matrix, f1_score, precision_recall_fscore_support
 
-from failuretwin.decision.proportions import (
+from failuretwin.decision.scoring import (
     NO_VERDICT,
     Coverage,
     IntervalCase,
@@ -17,7 +17,7 @@ from failuretwin.decision.proportions import (
     count_alarms,
     coverage_by_mode,
     judged_truth,
-    score,
+    score_diagnoses,
 )
 
 TRUTH = ["a", "a", "a", "b", "b", "c"]
@@ -32,7 +32,7 @@ def scores():
     for truth, chance in zip(TRUTH, CHANCE, strict=True):
         others = [name for name in "abc" if name != truth]
         posterior.append(dict.fromkeys(others, (1 - chance) / 2) | {truth: chance})
-    return score(TRUTH, SAID, posterior)
+    return score_diagnoses(TRUTH, SAID, posterior)
 
 
 def test_confusion_has_a_row_for_each_truth(scores):
@@ -56,7 +56,7 @@ def test_classes_are_scored_apart(scores):
 
 
 def test_a_class_that_is_neither_true_nor_said_has_no_scores():
-    scores = score(["a"], ["a"], [{"a": 0.9, "b": 0.1}])
+    scores = score_diagnoses(["a"], ["a"], [{"a": 0.9, "b": 0.1}])
     b = scores.by_class()[1]
     assert (b.name, b.runs) == ("b", 0)
     assert np.isnan([b.precision, b.recall, b.f1]).all()
@@ -69,7 +69,7 @@ pairs = st.lists(st.tuples(st.sampled_from("abc"), st.sampled_from([*"abcd", Non
 @given(pairs)
 def test_scores_are_those_of_scikit_learn(answers):
     truth, said = [true for true, _ in answers], [said for _, said in answers]
-    scores = score(truth, said, [{"a": 0.5, "b": 0.5}] * len(answers))
+    scores = score_diagnoses(truth, said, [{"a": 0.5, "b": 0.5}] * len(answers))
     words = [NO_VERDICT if word is None else word for word in said]
     labels = list(scores.classes)
     np.testing.assert_array_equal(scores.confusion, confusion_matrix(truth, words, labels=labels))
@@ -87,23 +87,19 @@ def test_scores_are_those_of_scikit_learn(answers):
 
 def test_the_log_score_says_when_the_truth_was_ruled_out(scores):
     assert scores.log_score == np.inf
-    assert scores.log_scores.impossible == 1
-    assert scores.log_scores.mean_of_rest == pytest.approx(
-        -np.log([0.5, 0.8, 0.25, 0.5, 0.1]).mean()
-    )
+    np.testing.assert_allclose(scores.nats, [*-np.log([0.5, 0.8, 0.25, 0.5, 0.1]), np.inf])
 
 
 def test_certainty_of_the_truth_costs_nothing():
-    scores = score(["a", "b"], ["a", "b"], [{"a": 1.0, "b": 0.0}, {"a": 0.0, "b": 1.0}])
+    scores = score_diagnoses(["a", "b"], ["a", "b"], [{"a": 1.0, "b": 0.0}, {"a": 0.0, "b": 1.0}])
     assert scores.log_score == 0.0
     assert scores.accuracy == 1.0
 
 
 def test_truth_that_no_hypothesis_stands_for_counts_as_wrong():
-    scores = score(["d"], ["a"], [{"a": 0.9, "b": 0.1}])
+    scores = score_diagnoses(["d"], ["a"], [{"a": 0.9, "b": 0.1}])
     assert (scores.right, scores.runs) == (0, 1)
     assert scores.log_score == np.inf
-    assert np.isnan(scores.log_scores.mean_of_rest)
     assert set(scores.classes) == {"a", "b", "d"}
 
 
