@@ -78,12 +78,11 @@ def test_exported_csv_is_read_back(failuretwin, log):
 
 TELL_PROGRESS = """
 from contextlib import contextmanager
-from failuretwin.app import cli
-from failuretwin.app.reports import tables
+from failuretwin.app import cli, terminal
 @contextmanager
 def telling(*_):
     yield lambda runs: print(runs, flush=True)
-tables.progress_bar = telling
+terminal.progress_bar = telling
 cli.main()
 """
 

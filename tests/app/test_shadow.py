@@ -9,11 +9,10 @@ import pytest
 from rich.console import Console
 
 from failuretwin.app import shadow as shadow_module
-from failuretwin.app.live import watch_until_end
-from failuretwin.app.live_view import View
+from failuretwin.app.live import View, watch_until_end
 from failuretwin.app.shadow import Changes, Shadow
 from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, LinkCounts, Reading
-from failuretwin.connection.links.ros_reader import SampledCommands
+from failuretwin.connection.links.ros_messages import SampledCommands
 from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.core.alarm import ALL_CLEAR, CLEAR, RAISED, SUSPECTED, Alarm, Episode
 from failuretwin.core.hypothesis import Diagnosis
@@ -275,7 +274,7 @@ def test_a_clock_that_jumps_leaves_the_diagnosers_time_as_it_was(twin, clock, ju
         shadow.step(0.0)
         clock[0] += 0.1
     np.testing.assert_allclose([t for t, _, _ in notebook.told], 0.1 * np.arange(100), atol=1e-6)
-    assert shadow.clock_jumps == 1
+    assert shadow.clock.jumps == 1
     assert shadow.snapshot.answer.time == pytest.approx(5009.9 + jump)
 
 
@@ -412,8 +411,8 @@ def test_a_third_of_senseless_stamps_does_not_move_the_stream(twin, clock, stamp
         shadow.step(0.0)
         clock[0] += 0.1
     np.testing.assert_allclose([t for t, _, _ in notebook.told], 0.1 * np.arange(600), atol=1e-6)
-    assert shadow.clock_jumps == 0
-    assert shadow.senseless_stamps == senseless.sum()
+    assert shadow.clock.jumps == 0
+    assert shadow.clock.senseless == senseless.sum()
 
 
 def test_the_posterior_over_time_goes_by_the_robots_clock(armpi):

@@ -13,10 +13,18 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from failuretwin.app.commands.options import EMULATED, ArmOptions, LiveOptions
 from failuretwin.connection.links.base import Commander, Sink, Source, source_from_text
-from failuretwin.connection.links.networks import NETWORKS, is_network, open_transport
 from failuretwin.connection.links.replay import Pace
-from failuretwin.connection.links.ros_link import RosCommander, RosSource, diagnostics_sink
+from failuretwin.connection.links.ros_link import (
+    NETWORKS,
+    RosCommander,
+    RosSink,
+    RosSource,
+    is_network,
+    open_transport,
+)
+from failuretwin.connection.links.ros_messages import DiagnosticsWriter
 from failuretwin.connection.links.ros_topics import RosTopics, load_topics
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
@@ -37,10 +45,8 @@ from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.observation.healthy_model import HealthyModel
 
 if TYPE_CHECKING:
-    from failuretwin.app.commands.options import LiveOptions
     from failuretwin.connection.emulated_arm import Emulation
 
-EMULATED = "emulated"
 PLACES = f"{EMULATED}, {NETWORKS}"
 SOURCES = f"{PLACES}, a log (raw session, bag, .mcap), or a source of your own, MODULE:CLASS"
 OWN_CLASS = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(:.*)?")
@@ -137,47 +143,39 @@ def _of_size(mode: FaultMode, size: float, text: str) -> FaultMode:
 # Arms that `act` and `check` command.
 
 
-def is_real(place: str) -> bool:
-    """Return whether a place on the command line is a real arm; nothing is connected.
+def is_moved(arm: ArmOptions) -> bool:
+    """Return whether orders are sent to an arm: emulated arms need no --move.
 
     Raises:
-        InputError: If it is none of `PLACES`.
+        InputError: If its place is none of `PLACES`.
     """
+    return arm.move or not _is_real(arm.place)
+
+
+def _is_real(place: str) -> bool:
     if place != EMULATED and not is_network(place):
         raise InputError(f"--on is {place!r}, expected {PLACES}.")
     return place != EMULATED
 
 
-def commander_of(
-    place: str,
-    known: CalibratedRobot,
-    faults: Sequence[str],
-    seed: int,
-    topics: Path | None,
-    stack: ExitStack,
-) -> Commander:
-    """Return the arm at a place on the command line; the stack closes it.
+def commander_of(arm: ArmOptions, known: CalibratedRobot, seed: int, stack: ExitStack) -> Commander:
+    """Return the arm that a command moves; the stack closes it.
 
     Raises:
-        InputError: If it cannot be reached or is none of `PLACES`.
+        InputError: If it cannot be reached or its place is none of `PLACES`.
     """
-    if not is_real(place):
-        return stack.enter_context(emulated_arm(known, faults, seed))
-    if faults:
+    if not _is_real(arm.place):
+        return stack.enter_context(emulated_arm(known, arm.faults, seed))
+    if arm.faults:
         raise InputError(
-            f"--fault is of an emulated arm, but --on is {place!r}. Leave it out, or act on "
+            f"--fault is of an emulated arm, but --on is {arm.place!r}. Leave it out, or act on "
             f"{EMULATED!r}."
         )
-    transport = stack.enter_context(open_transport(place))
-    return RosCommander(known.robot, topics_of(topics), transport)
+    transport = stack.enter_context(open_transport(arm.place))
+    return RosCommander(known.robot, load_topics(arm.topics), transport)
 
 
 # Arms that `watch` listens to.
-
-
-def topics_of(path: Path | None) -> RosTopics:
-    """Return the topics in a file; without one, those of the data set's authors."""
-    return RosTopics() if path is None else load_topics(path)
 
 
 def connect(
@@ -242,11 +240,12 @@ def _connected(
             f"--fault is of an emulated robot, but the source is {text!r}. Leave it out, or watch "
             f"{EMULATED!r}."
         )
-    topics = topics_of(live.topics)
+    topics = load_topics(live.topics)
     if is_network(text):
         transport = stack.enter_context(open_transport(text))
         ros_link = RosCommander if takes_orders else RosSource
-        return ros_link(robot, topics, transport), [diagnostics_sink(robot, topics, transport)]
+        diagnostics = RosSink(DiagnosticsWriter(robot, topics), transport)
+        return ros_link(robot, topics, transport), [diagnostics]
     path = Path(text)
     if OWN_CLASS.fullmatch(text) and not path.exists():
         sys.path.insert(0, "")  # the user's module may lie in the current folder

@@ -10,15 +10,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from failuretwin.app.commands.arm_options import (
-    ArmOptions,
-    SafetyOptions,
-    arm_options,
-    safety_options,
-)
 from failuretwin.app.commands.options import (
     PATH,
+    ArmOptions,
     HypothesesOption,
+    SafetyOptions,
+    arm_options,
     calibration_option,
     common_options,
     gathered,
@@ -26,6 +23,7 @@ from failuretwin.app.commands.options import (
     plugin_option,
     refuse_unused,
     report_option,
+    safety_options,
 )
 
 if TYPE_CHECKING:
@@ -162,9 +160,9 @@ def check(
 
     Movements are chosen to tell most; each passes the gate of `act`. See docs/check.md.
     """
+    from failuretwin.app.arms import commander_of, is_moved
     from failuretwin.app.reports import check_report as said
-    from failuretwin.app.reports.tables import show
-    from failuretwin.app.terminal import tell
+    from failuretwin.app.terminal import show, tell
     from failuretwin.data_knowledge.store import write_records
     from failuretwin.decision.test_motions.motions import write_motions
 
@@ -181,12 +179,12 @@ def check(
         write_motions(planned, model, written)
         show(*said.motion_lines(planned, model), f"written to {written}; nothing was moved")
         return
-    if not arm.moves:
+    if not is_moved(arm):
         show("nothing moves without --move; these are the motions")
         show(*said.motion_lines(planned, model))
         return
     with ExitStack() as stack:
-        commander = arm.commander(asking.known, seed, stack)
+        commander = commander_of(arm, asking.known, seed, stack)
         result = asking.health_check(planned, further).work(commander, tell)
     time, command = planned.reference()
     result = asking.shown(result, command, time)
@@ -234,7 +232,7 @@ def _check_logs(
 ) -> None:
     """Say what logs of checks say that were recorded elsewhere."""
     from failuretwin.app.reports import check_report as said
-    from failuretwin.app.reports.tables import show
+    from failuretwin.app.terminal import show
     from failuretwin.data_knowledge.store import write_records
 
     for result in results:
@@ -272,7 +270,7 @@ def design(
     """Choose movements that tell most, and say which faults they show, beside random ones."""
     from failuretwin.app.reports.check_report import motion_lines
     from failuretwin.app.reports.isolability_report import compared_table
-    from failuretwin.app.reports.tables import show
+    from failuretwin.app.terminal import show
     from failuretwin.decision.test_motions.motions import write_motions
 
     asking = motion.checking(safety, calibration, robot, seed)
@@ -315,7 +313,7 @@ def isolability(
 ) -> None:
     """Say the smallest fault of each motor and mode that motions of a robot can show."""
     from failuretwin.app.reports import isolability_report as words
-    from failuretwin.app.reports.tables import show
+    from failuretwin.app.terminal import show
     from failuretwin.data_knowledge.store import write_records
 
     asking = MotionOptions(hypotheses).checking(SafetyOptions(), calibration, robot, seed)

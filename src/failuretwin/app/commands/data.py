@@ -144,7 +144,7 @@ def simulate(
     To .zarr any number of runs can be written; if that is interrupted, the same command goes on
     with what is missing. Up to a few thousand can be written to .nc.
     """
-    from failuretwin.app.reports.tables import progress_bar
+    from failuretwin.app.terminal import progress_bar
     from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
     from failuretwin.data_knowledge.generate import Plan
     from failuretwin.data_knowledge.resumable import produce

@@ -1,4 +1,4 @@
-"""`failuretwin diagnose`: fault diagnosis of recorded runs."""
+"""`failuretwin diagnose` and `demo`: fault diagnosis of recorded runs."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from failuretwin.app.commands.options import (
     refuse_unused,
     report_option,
 )
+from failuretwin.app.terminal import tell
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -69,7 +70,7 @@ class Findings:
     @property
     def lines(self) -> list[str]:
         """Lines on everything learned."""
-        from failuretwin.app.reports.learned_report import tracking_line
+        from failuretwin.app.reports.calibration_report import tracking_line
 
         lines = [f"self-calibrated: {line}" for line in self.remarks]
         return lines if self.tracked is None else [*lines, tracking_line(self.tracked)]
@@ -177,7 +178,7 @@ def diagnose(
     from failuretwin.app import inputs as given
     from failuretwin.app.reports import reports
     from failuretwin.app.reports.isolability_report import isolability_summary
-    from failuretwin.app.reports.tables import show
+    from failuretwin.app.terminal import show
     from failuretwin.decision.evaluation import Judged
     from failuretwin.decision.robot_state import course_of, robot_state
     from failuretwin.digital_model.calibrated_robot import load_calibration
@@ -203,7 +204,7 @@ def diagnose(
     history = _history(bayes, calibration, out) if track else None
     runs = given.read_inputs(inputs, known.robot, reading)
     sensed = sensing_of(runs, sensing)
-    given.warn_mismatch(runs, given.expected_name(diagnoser, bayes))
+    given.warn_mismatch(runs, given.expected_name(diagnoser))
     if together:
         _check_tool(sensed)
         found = _diagnose_together(runs, bayes, calibration, out, history)
@@ -244,7 +245,7 @@ def _diagnose_together(
         out: File for the learned calibration; None: not written.
         history: Earlier runs of the robot, for --track; None: --self-calibrate.
     """
-    from failuretwin.app.reports.tables import progress_bar
+    from failuretwin.app.terminal import progress_bar
     from failuretwin.connection.tracked_diagnosis import diagnose_tracked
 
     if history is None:
@@ -281,7 +282,6 @@ def _tell_ruled_out(
     """
     from dataclasses import replace
 
-    from failuretwin.app.terminal import tell
     from failuretwin.core.errors import counted
     from failuretwin.inference.explanation import joint_names_in
 
@@ -382,7 +382,7 @@ def _write_page(
     folder: Path,
 ) -> None:
     """Write the technician's page, with what was learned where runs were weighed together."""
-    from failuretwin.app.reports.learned_report import taught_section
+    from failuretwin.app.reports.calibration_report import taught_section
     from failuretwin.app.reports.technician_page import write_report
 
     sections = [] if learned is None else [taught_section(learned, twin.robot)]
@@ -401,7 +401,7 @@ def _self_calibrate(
         calibration: What the robot is taken to be like; None: what its kind is like.
         out: Where the calibration goes; None: nowhere.
     """
-    from failuretwin.app.reports.tables import progress_bar
+    from failuretwin.app.terminal import progress_bar
     from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
     from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
     from failuretwin.inference.together.folder_posterior import PASSES
@@ -416,3 +416,17 @@ def _self_calibrate(
         save_calibration(learned.calibration, robot, out)
     known = learned.calibration.imperfections
     return learned, type(bayes)(together.twin, known, bayes.hypotheses, bayes.priors)
+
+
+@click.command()
+@report_option("Also write a page with pictures there (needs the extra `plots`).")
+def demo(report: Path | None) -> None:
+    """Diagnose three simulated runs that come with the package, as `diagnose LOG` would.
+
+    One is healthy, one has a stuck motor, one a motor that misses its targets.
+    """
+    from failuretwin.data_knowledge.sample_log import sample_log
+
+    words = [str(sample_log()), *([] if report is None else ["--report", str(report)])]
+    tell(f"failuretwin diagnose {' '.join(words)}\n")
+    diagnose.main(words, prog_name="failuretwin diagnose", standalone_mode=False)

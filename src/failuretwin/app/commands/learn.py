@@ -186,7 +186,7 @@ def train(
     probabilities are calibrated on simulated runs of the physics engine.
     """
     from failuretwin.app.inputs import check_learning
-    from failuretwin.app.reports.tables import progress_bar
+    from failuretwin.app.terminal import progress_bar
     from failuretwin.data_knowledge.store import check_writable
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
@@ -247,7 +247,7 @@ def study(
     from failuretwin.app.inputs import check_learning
     from failuretwin.app.reports.plots import figure_class
     from failuretwin.app.reports.study_page import write_study_page
-    from failuretwin.app.reports.tables import progress_bar
+    from failuretwin.app.terminal import progress_bar
     from failuretwin.core.errors import InputError
     from failuretwin.decision.learned import paper_study as paper
     from failuretwin.digital_model.robot import load_robot

@@ -11,20 +11,19 @@ from typing import TYPE_CHECKING
 
 import click
 
-from failuretwin.app.commands.arm_options import (
-    ProbeOptions,
-    SafetyOptions,
-    probe_options,
-    safety_options,
-)
 from failuretwin.app.commands.options import (
+    EMULATED,
     PATH,
     LiveOptions,
+    ProbeOptions,
+    SafetyOptions,
     calibration_option,
     common_options,
     live_options,
     plugin_option,
+    probe_options,
     refuse_unused,
+    safety_options,
 )
 from failuretwin.app.terminal import tell
 
@@ -95,11 +94,12 @@ def watch(
     """
     from contextlib import ExitStack
 
-    from failuretwin.app.arms import connect, connect_commander, topics_of
+    from failuretwin.app.arms import connect, connect_commander
     from failuretwin.app.live import fit_of, watch_until_end
-    from failuretwin.app.reports.tables import console
     from failuretwin.app.shadow import Shadow
+    from failuretwin.app.terminal import console
     from failuretwin.connection.links.recorder import Recorder
+    from failuretwin.connection.links.ros_topics import load_topics
     from failuretwin.connection.links.statuses import statuses
     from failuretwin.decision.streaming.monitor import monitor
     from failuretwin.decision.test_motions.probing import Prober
@@ -111,12 +111,12 @@ def watch(
     model = load_robot(robot)
     known, motors = load_calibration(calibration, model), model.motor_names
     diagnoser = monitor(known.twin, known.imperfections, budget, sensing)
-    wait_s = topics_of(live.topics).wait_s
+    wait_s = load_topics(live.topics).wait_s
     when = "" if calibration is None else _written(calibration)
     limit = "" if "goals" in sensing else _limit(known.imperfections, motors, budget)
     tell(_rests_on(known.imperfections, when) + limit)
     # An emulated robot ends by itself, a log when it is over.
-    length = live.seconds if live.seconds and source != "emulated" else math.inf
+    length = live.seconds if live.seconds and source != EMULATED else math.inf
     with ExitStack() as stack:
         link: Source
         prober = None
