@@ -78,11 +78,12 @@ def test_exported_csv_is_read_back(failuretwin, log):
 
 TELL_PROGRESS = """
 from contextlib import contextmanager
-from failuretwin.app import cli, terminal
+from failuretwin.app import cli
+from failuretwin.app.commands import data
 @contextmanager
 def telling(*_):
     yield lambda runs: print(runs, flush=True)
-terminal.progress_bar = telling
+data.progress_bar = telling
 cli.main()
 """
 

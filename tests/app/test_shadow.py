@@ -216,7 +216,7 @@ def test_the_user_is_told_how_late_commands_come(twin, armpi):
     script = Script(events)
     shadow = Shadow(script, Notebook(), twin)
     console = Console(file=StringIO())
-    told = watch_until_end(shadow, script, [], armpi.motor_names, console, np.inf)
+    told = watch_until_end(shadow, console, np.inf)
     late = "commands come late: put commands_late_s = 2.0 into the --topics file"
     assert late in [change.text for change in told.lines]
 
@@ -229,7 +229,7 @@ def test_a_source_from_which_nothing_comes_is_named(twin, armpi, clock):
 
     script = Silent([None] * 9)
     shadow = Shadow(script, Notebook(), twin)
-    told = watch_until_end(shadow, script, [], armpi.motor_names, Console(file=StringIO()), np.inf)
+    told = watch_until_end(shadow, Console(file=StringIO()), np.inf)
     assert [change.text for change in told.lines] == ["nothing comes from a script"]
 
 

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from failuretwin.connection.links import ros_messages
+from failuretwin.connection.links import ros_link, ros_messages
 from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, EventQueue, Reading
 from failuretwin.connection.links.ros1 import Ros1Transport
 from failuretwin.connection.links.ros_link import RosSink, RosSource
@@ -153,11 +153,12 @@ def test_ten_times_the_rate_is_taken(armpi, roscore):
         assert source.counts.dropped == 0
 
 
-def test_a_consumer_that_sleeps_loses_readings_but_no_command(armpi, roscore):
+def test_a_consumer_that_sleeps_loses_readings_but_no_command(monkeypatch, armpi, roscore):
     queue = EventQueue(capacity=50)
+    monkeypatch.setattr(ros_link, "EventQueue", lambda: queue)
     topics = RosTopics()
     with Ros1Transport() as transport:
-        source = RosSource(armpi, topics, transport, queue)
+        source = RosSource(armpi, topics, transport)
         sink = RosSink(RosWriter(armpi, topics), transport)
         wait_until_connected(source, sink)
         sink.put(CommandSent(1.0, np.full(4, 0.1), np.ones(4)))

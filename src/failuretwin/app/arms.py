@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -179,7 +179,13 @@ def commander_of(arm: ArmOptions, known: CalibratedRobot, seed: int, stack: Exit
 
 
 def connect(
-    text: str, robot: Robot, live: LiveOptions, seed: int, stack: ExitStack
+    text: str,
+    robot: Robot,
+    live: LiveOptions,
+    seed: int,
+    stack: ExitStack,
+    *,
+    takes_orders: bool = False,
 ) -> tuple[Source, list[Sink]]:
     """Return the source that a SOURCE on the command line names, and the sinks of its network.
 
@@ -189,52 +195,15 @@ def connect(
         live: Topics, faults, pace and length.
         seed: Seed of all random draws.
         stack: Closes everything in the end.
+        takes_orders: Whether the source must be a `Commander`. An emulated arm then works in
+            shifts, and takes orders in its breaks.
 
     Raises:
-        InputError: If it does not exist, cannot be reached, is none of these, or gets options that
-            only an emulated robot has.
+        InputError: If it does not exist, cannot be reached, is none of these, takes no orders, or
+            gets options that only an emulated robot has.
     """
     if text == EMULATED:
-        from failuretwin.connection.emulated_arm import emulated
-
-        emulation, length = emulation_of(robot, live, seed), live.seconds or math.inf
-        return stack.enter_context(emulated(emulation, Pace(live.speed), length)), []
-    return _connected(text, robot, live, stack, takes_orders=False)
-
-
-def connect_commander(
-    text: str, robot: Robot, live: LiveOptions, seed: int, stack: ExitStack
-) -> tuple[Commander, list[Sink]]:
-    """Return the arm that a SOURCE names, to watch and command it; arguments as in `connect`.
-
-    An emulated arm is at work: an operator commands it in shifts.
-
-    Raises:
-        InputError: If it takes no orders, or as `connect` does.
-    """
-    if text == EMULATED:
-        from failuretwin.connection.commanded_arm import OperatedArm, Shifts
-
-        shifts = Shifts(duration_s=live.seconds or math.inf)
-        emulation = emulation_of(robot, live, seed)
-        return stack.enter_context(OperatedArm(emulation, shifts, Pace(live.speed))), []
-    link, sinks = _connected(text, robot, live, stack, takes_orders=True)
-    if not (hasattr(link, "send") and hasattr(link, "standing")):
-        raise _only_listens(text)
-    return cast(Commander, link), sinks
-
-
-def _only_listens(text: str) -> InputError:
-    return InputError(
-        f"source {text!r} can only be listened to, but --probe orders movements. Expected "
-        f"{PLACES}, or MODULE:CLASS of a Commander; or leave --probe out."
-    )
-
-
-def _connected(
-    text: str, robot: Robot, live: LiveOptions, stack: ExitStack, *, takes_orders: bool
-) -> tuple[Source, list[Sink]]:
-    """Return a source that is no emulated robot, and the sinks of its network."""
+        return stack.enter_context(_emulated(robot, live, seed, takes_orders)), []
     if live.faults:
         raise InputError(
             f"--fault is of an emulated robot, but the source is {text!r}. Leave it out, or watch "
@@ -246,19 +215,44 @@ def _connected(
         ros_link = RosCommander if takes_orders else RosSource
         diagnostics = RosSink(DiagnosticsWriter(robot, topics), transport)
         return ros_link(robot, topics, transport), [diagnostics]
-    path = Path(text)
-    if OWN_CLASS.fullmatch(text) and not path.exists():
+    if OWN_CLASS.fullmatch(text) and not Path(text).exists():
         sys.path.insert(0, "")  # the user's module may lie in the current folder
-        return stack.enter_context(source_from_text(text, robot)), []
+        source = stack.enter_context(source_from_text(text, robot))
+        if takes_orders and not (hasattr(source, "send") and hasattr(source, "standing")):
+            raise _only_listens(text)
+        return source, []
+    return stack.enter_context(_log(text, robot, live, takes_orders)), []
+
+
+def _only_listens(text: str) -> InputError:
+    return InputError(
+        f"source {text!r} can only be listened to, but --probe orders movements. Expected "
+        f"{PLACES}, or MODULE:CLASS of a Commander; or leave --probe out."
+    )
+
+
+def _emulated(robot: Robot, live: LiveOptions, seed: int, takes_orders: bool) -> Source:
+    from failuretwin.connection.commanded_arm import OperatedArm, Shifts
+    from failuretwin.connection.emulated_arm import emulated
+
+    emulation, pace = emulation_of(robot, live, seed), Pace(live.speed)
+    length = live.seconds or math.inf
+    if takes_orders:
+        return OperatedArm(emulation, Shifts(duration_s=length), pace)
+    return emulated(emulation, pace, length)
+
+
+def _log(text: str, robot: Robot, live: LiveOptions, takes_orders: bool) -> Source:
+    from failuretwin.connection.links.replay import replay
+
+    path, topics = Path(text), load_topics(live.topics)
     if not path.exists():
         raise InputError(f"source {text!r} does not exist. Expected {SOURCES}.")
     if takes_orders:
         raise _only_listens(text)
-    from failuretwin.connection.links.replay import replay
-
     recorded = BagTopics(topics.command, topics.tool or None, topics.position or None)
     named = None if topics == RosTopics() else recorded
-    return stack.enter_context(replay(path, robot, Pace(live.speed), named)), []
+    return replay(path, robot, Pace(live.speed), named)
 
 
 # Motors and numbers in option texts.

@@ -7,7 +7,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from rich.console import Console, Group, RenderableType
@@ -18,7 +18,7 @@ from rich.text import Text
 
 from failuretwin.app.shadow import SILENCE_S, Change, Changes, Shadow, Snapshot
 from failuretwin.app.terminal import tell
-from failuretwin.connection.links.base import Event, LinkCounts, Sink, Source
+from failuretwin.connection.links.base import Event, LinkCounts
 from failuretwin.connection.links.statuses import (
     LEVEL_ERROR,
     LEVEL_NAMES,
@@ -42,75 +42,61 @@ LATE_S = 0.3
 """A command that comes later than this spoils the diagnosis, and the user is told [s]."""
 
 
-@dataclass
 class _Screen:
     """Tells what changes: a view on a terminal, else a line for each change."""
 
-    shadow: Shadow
-    source: Source
-    sinks: Sequence[Sink]
-    monitor: FaultMonitor | None
-    changes: Changes
-    view: View
-    live: Live | None
-
-    def __post_init__(self) -> None:
+    def __init__(self, shadow: Shadow, live: Live | None) -> None:
+        motors = shadow.twin.robot.motor_names
+        self.changes = Changes(motors)
+        self._shadow, self._live = shadow, live
+        self._view = View(motors, shadow.source.name)
         self._begun_s, self._drawn_s, self._looked = time.monotonic(), 0.0, False
 
     def look(self, last: bool = False) -> None:
         """Tell what has changed since the last call."""
-        shadow, changes, monitor = self.shadow, self.changes, self.monitor
-        troubles = _troubles(shadow, self.source, self.sinks, time.monotonic() - self._begun_s)
+        shadow, changes, monitor = self._shadow, self.changes, self._shadow.monitor
+        troubles = _troubles(shadow, time.monotonic() - self._begun_s)
         if monitor is not None:
             troubles += monitor.rounding
             troubles += () if monitor.set_up else _misfit(monitor.fit)
-        counts = _with_stamps(self.source.counts, shadow.clock.senseless)
+        counts = _with_stamps(shadow.source.counts, shadow.clock.senseless)
         found = changes.notice(shadow.snapshot, counts, shadow.clock.jumps, troubles)
         if monitor is not None and monitor.set_up is not None and not self._looked:
             self._looked = True
             found.append(changes.add(shadow.snapshot.stream_time, fit_of(monitor)))
-        if self.live is None:
+        if self._live is None:
             for change in found:
                 tell(str(change))
             return
-        self.view.remember(shadow.snapshot)
+        self._view.remember(shadow.snapshot)
         if last or time.monotonic() >= self._drawn_s + REFRESH_S:
             self._drawn_s = time.monotonic()
-            picture = self.view.draw(shadow.snapshot, self.source.counts, changes.lines)
-            self.live.update(picture, refresh=True)
+            picture = self._view.draw(shadow.snapshot, shadow.source.counts, changes.lines)
+            self._live.update(picture, refresh=True)
 
     def hear(self, event: Event | None) -> None:
         """Take an event that was polled elsewhere."""
-        self.shadow.hear(event)
+        self._shadow.hear(event)
         self.look()
 
     def say(self, text: str) -> None:
         """Tell something else."""
-        change = self.changes.add(self.shadow.snapshot.stream_time, text)
-        if self.live is None:
+        change = self.changes.add(self._shadow.snapshot.stream_time, text)
+        if self._live is None:
             tell(str(change))
 
 
 def watch_until_end(
-    shadow: Shadow,
-    source: Source,
-    sinks: Sequence[Sink],
-    motors: list[str],
-    console: Console,
-    until_s: float,
-    monitor: FaultMonitor | None = None,
-    prober: Prober | None = None,
+    shadow: Shadow, console: Console, until_s: float, prober: Prober | None = None
 ) -> Changes:
     """Watch a robot until `until_s` of our monotonic clock [s], and return all that has changed.
 
-    With a monitor it is told how well its calibration and the profile fit, once it has seen enough.
-    With a prober, one of the sinks, the robot is asked by movements when it is time to.
-    On a terminal there is a live view, else a line for each change.
+    A terminal gets a live view, other outputs a line for each change. With a prober, one of the
+    sinks, the robot makes diagnostic movements when they are due.
     """
     live = Live(console=console, auto_refresh=False) if console.is_terminal else nullcontext()
     with live as shown:
-        told = Changes(motors), View(motors, source.name), shown
-        screen, going = _Screen(shadow, source, sinks, monitor, *told), True
+        screen, going = _Screen(shadow, shown), True
         while going:
             going = shadow.step(POLL_S) and time.monotonic() < until_s
             screen.look(last=not going)
@@ -152,13 +138,11 @@ def fit_of(monitor: FaultMonitor) -> str:
     return f"{said}; after {counted(fit.seen, 'movement')} {profile}"
 
 
-def _troubles(
-    shadow: Shadow, source: Source, sinks: Sequence[Sink], since_s: float
-) -> tuple[str, ...]:
+def _troubles(shadow: Shadow, since_s: float) -> tuple[str, ...]:
     """Return what keeps the diagnosis from being made or told, after listening for so long [s]."""
-    found = [sink.trouble for sink in sinks if sink.trouble]
-    if source.counts.received == 0 and since_s > SILENCE_S:
-        found.append(f"nothing comes from {source.name}")
+    found = [sink.trouble for sink in shadow.sinks if sink.trouble]
+    if shadow.source.counts.received == 0 and since_s > SILENCE_S:
+        found.append(f"nothing comes from {shadow.source.name}")
     if shadow.reference.late_s >= LATE_S:
         wait = math.ceil(2.0 * shadow.reference.late_s) / 2.0
         found.append(f"commands come late: put commands_late_s = {wait} into the --topics file")

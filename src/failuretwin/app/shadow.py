@@ -62,6 +62,10 @@ class Shadow:
     Commands may arrive `commands_late_s` [s] later than their stamps.
 
     Attributes:
+        source: The source.
+        sinks: The sinks.
+        twin: The twin of the robot.
+        monitor: The diagnoser if it is a `FaultMonitor`, else None.
         snapshot: What is known now.
         clock: The robot's clock.
         reference: The commanded angles over time.
@@ -75,10 +79,11 @@ class Shadow:
         sinks: Sequence[Sink] = (),
         commands_late_s: float = 0.0,
     ) -> None:
-        self._source = source
+        self.source = source
         self._diagnoser = diagnoser
-        self._twin = twin
-        self._sinks = sinks
+        self.monitor = diagnoser if isinstance(diagnoser, FaultMonitor) else None
+        self.twin = twin
+        self.sinks = sinks
         self.clock = StreamClock()
         self._sequencer = ReorderBuffer(commands_late_s)
         self.reference = LiveReference()
@@ -93,7 +98,7 @@ class Shadow:
 
     def step(self, timeout_s: float) -> bool:
         """Take one event, or see after a wait [s] that time goes on; return if more may come."""
-        return self.hear(self._source.poll(min(timeout_s, TICK_S)))
+        return self.hear(self.source.poll(min(timeout_s, TICK_S)))
 
     def hear(self, event: Event | None) -> bool:
         """Take an event of the source that was polled elsewhere; return if more may come.
@@ -103,7 +108,7 @@ class Shadow:
         """
         if event is not None:
             self._take(event)
-        elif self._source.ended:
+        elif self.source.ended:
             self._feed_all(np.inf)
             self._publish(self._diagnoser.conclude(), self.snapshot.residual)
             return False
@@ -113,7 +118,7 @@ class Shadow:
 
     def _take(self, event: Event) -> None:
         now_s = time.monotonic()
-        for sink in self._sinks:
+        for sink in self.sinks:
             sink.put(event)
         at = self.clock.to_stream_time(event.time, now_s, isinstance(event, Reading))
         self._newest = max(self._newest, at)
@@ -141,7 +146,7 @@ class Shadow:
         if reading.position is not None and np.isfinite(reading.position).all():
             self.reference.start_at(reading.position)
             self._motors = reading.time, reading.position
-            self._computed = bool(np.allclose(reading.tool, self._twin.path(reading.position)))
+            self._computed = bool(np.allclose(reading.tool, self.twin.path(reading.position)))
         seen = reading.tool if np.isfinite(reading.tool).all() else None
         command = None
         for at, angles in self.reference.corners_to(reading.time):
@@ -151,7 +156,7 @@ class Shadow:
                 command = angles
         residual = self.snapshot.residual
         if seen is not None:
-            expected = np.full(3, np.nan) if command is None else self._twin.path(command)
+            expected = np.full(3, np.nan) if command is None else self.twin.path(command)
             residual = seen - expected
         answer = self._update(reading, command, seen)
         self._fed_s = time.monotonic()  # what we take to think is no silence of the robot
@@ -164,12 +169,12 @@ class Shadow:
     ) -> Answer:
         """Tell the diagnoser of a reading, with what the motors said about then."""
         time = reading.time
-        if not isinstance(self._diagnoser, FaultMonitor):
+        if self.monitor is None:
             return self._diagnoser.update(time, command, seen)
         said = self._motors
         there = said is not None and abs(time - said[0]) <= TOGETHER_S
         position = said[1] if said is not None and there else None
-        return self._diagnoser.update(time, command, seen, position, reading.goal)
+        return self.monitor.update(time, command, seen, position, reading.goal)
 
     def _publish(self, answer: Answer, residual: FloatArray) -> None:
         silent = time.monotonic() - self._read_s > SILENCE_S
@@ -179,7 +184,7 @@ class Shadow:
             said = with_reading_doubt(stamped.diagnosis, stamped.alarm.cause)
             stamped = replace(stamped, diagnosis=said)
         self.snapshot = Snapshot(stamped, answer.time, residual, self.snapshot.seconds)
-        for sink in self._sinks:
+        for sink in self.sinks:
             sink.put(stamped)
 
 

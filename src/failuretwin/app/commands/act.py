@@ -24,7 +24,7 @@ from failuretwin.app.commands.options import (
     safety_options,
     topics_option,
 )
-from failuretwin.app.terminal import tell
+from failuretwin.app.terminal import show, tell
 
 
 @click.command()
@@ -88,7 +88,7 @@ def act(
     gate: limits, speed, floor, the arm's own links. Stop with Ctrl-C, or `failuretwin stop`.
     """
     from failuretwin.app.arms import commander_of, is_moved, spared_of
-    from failuretwin.app.reports.acting_report import table_lines
+    from failuretwin.app.reports.acting_report import result_parts
     from failuretwin.data_knowledge.store import write_records
     from failuretwin.decision.acting.outcome import ActingSettings
     from failuretwin.decision.acting.session import Acting
@@ -113,8 +113,7 @@ def act(
         else:
             tell("nothing moves without --move; this is what would be ordered")
             results = acting.dry_run(wanted, first_standing(commander), tell)
-    for line in table_lines(results):
-        tell(line)
+    show(*result_parts(results))
     if json_file is not None:
         numbered = enumerate(results, start=1)
         write_records(({"target": k} | result.record() for k, result in numbered), json_file)
@@ -179,7 +178,7 @@ def reach(
     Poses that touch the floor or the arm's own links do not count.
     """
     from failuretwin.app.arms import held_of
-    from failuretwin.app.reports.acting_report import by_motor_lines, map_lines, save_map
+    from failuretwin.app.reports.acting_report import by_motor_parts, map_parts, save_map
     from failuretwin.data_knowledge.store import write_records
     from failuretwin.decision.acting.reach import reach as reach_of
     from failuretwin.decision.acting.reach import reach_by_motor, workspace
@@ -192,13 +191,12 @@ def reach(
     points = workspace(model, seed=seed) if task is None else read_task(task)
     if fault is None:
         motors = reach_by_motor(gate, points, seed)
-        lines, records = by_motor_lines(motors), [motor.record() for motor in motors]
+        parts, records = by_motor_parts(motors), [motor.record() for motor in motors]
         maps = [reach_of(gate, points, (m.motor, m.best_angle), seed) for m in motors]
     else:
         maps = [reach_of(gate, points, held_of(fault, model), seed)]
-        lines, records = map_lines(maps[0], per_point=task is not None), [maps[0].record()]
-    for line in lines:
-        tell(line)
+        parts, records = map_parts(maps[0], per_point=task is not None), [maps[0].record()]
+    show(*parts)
     if json_file is not None:
         write_records(records, json_file)
     if report is not None:

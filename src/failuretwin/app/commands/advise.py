@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from failuretwin.app.commands.options import PATH, calibration_option, common_options, json_option
-from failuretwin.app.terminal import tell
+from failuretwin.app.terminal import show, tell
 
 if TYPE_CHECKING:
     from failuretwin.decision.maintenance.remaining_life import RemainingLife
@@ -63,8 +63,7 @@ def advise(
                 "--template FILE.toml` writes one to be filled in."
             )
         lines, records = _results_report(source, costs, run)
-    for line in lines:
-        tell(line)
+    show(*lines)
     if json_file is not None:
         write_records(records, json_file)
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import click
 
@@ -25,10 +25,10 @@ from failuretwin.app.commands.options import (
     refuse_unused,
     safety_options,
 )
-from failuretwin.app.terminal import tell
+from failuretwin.app.terminal import console, tell
 
 if TYPE_CHECKING:
-    from failuretwin.connection.links.base import Source
+    from failuretwin.connection.links.base import Commander
     from failuretwin.digital_model.nonidealities import Imperfections
 
 
@@ -94,10 +94,9 @@ def watch(
     """
     from contextlib import ExitStack
 
-    from failuretwin.app.arms import connect, connect_commander
+    from failuretwin.app.arms import connect
     from failuretwin.app.live import fit_of, watch_until_end
     from failuretwin.app.shadow import Shadow
-    from failuretwin.app.terminal import console
     from failuretwin.connection.links.recorder import Recorder
     from failuretwin.connection.links.ros_topics import load_topics
     from failuretwin.connection.links.statuses import statuses
@@ -118,21 +117,19 @@ def watch(
     # An emulated robot ends by itself, a log when it is over.
     length = live.seconds if live.seconds and source != EMULATED else math.inf
     with ExitStack() as stack:
-        link: Source
+        probing = probe.probes > 0
+        link, sinks = connect(source, model, live, seed, stack, takes_orders=probing)
         prober = None
-        if probe.probes:
-            commander, sinks = connect_commander(source, model, live, seed, stack)
-            link, rules = commander, probe.rules(source, wait_s)
+        if probing:
+            commander, rules = cast("Commander", link), probe.rules(source, wait_s)
             prober = Prober(diagnoser, safety.gate(known.robot), commander, rules, seed)
             sinks.append(prober)
-        else:
-            link, sinks = connect(source, model, live, seed, stack)
         if record is not None:
             sinks.append(stack.enter_context(Recorder(record, model)))
         shadow = Shadow(link, diagnoser, known.twin, sinks, wait_s)
         try:
             until = time.monotonic() + length
-            watch_until_end(shadow, link, sinks, motors, console(), until, diagnoser, prober)
+            watch_until_end(shadow, console(), until, prober)
         except KeyboardInterrupt:
             tell("stopped")
     arm = statuses(shadow.snapshot.answer, motors)[0]

@@ -116,6 +116,11 @@ class HypothesesOption(click.Option):
         return record and (record[0], f"{record[1]} Modes: {', '.join(MODES)}.")
 
 
+def hypotheses_option(text: str) -> Callable[[F], F]:
+    """Return the option `--hypotheses H,...`."""
+    return click.option("--hypotheses", cls=HypothesesOption, metavar="H,...", help=text)
+
+
 def plugin_option(command: F) -> F:
     """Add `--plugin`, which makes fault modes known before anything else is read or told."""
 
@@ -169,7 +174,7 @@ fault_option = click.option(
 
 @dataclass(frozen=True)
 class LogOptions:
-    """How logs become runs, as the help texts of `reading_options` say it."""
+    """Values of `reading_options`: how logs become runs."""
 
     how: str
     published_labels: bool
@@ -207,7 +212,7 @@ reading_options = gathered(
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """Topics, the emulated robot and the pace of time, as the help of `live_options` says it."""
+    """Values of `live_options`: topics, the emulated robot and the pace of time."""
 
     topics: Path | None
     faults: tuple[str, ...]
@@ -264,7 +269,7 @@ radius_option = click.option(
 
 @dataclass(frozen=True)
 class ArmOptions:
-    """Which arm is moved, as the help texts of `arm_options` say it."""
+    """Values of `arm_options`: the arm that a command moves."""
 
     place: str
     faults: tuple[str, ...]
@@ -290,14 +295,14 @@ arm_options = gathered(
 
 @dataclass(frozen=True)
 class SafetyOptions:
-    """Which orders are allowed, as the help texts of `safety_options` say it."""
+    """Values of `safety_options`: limits of every order."""
 
     speed_share: float = SPEED_SHARE
     floor: float | None = None
     radius: float | None = None
 
     def gate(self, robot: Robot) -> SafetyGate:
-        """Return what every order has to pass."""
+        """Return the gate that every order passes."""
         from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
 
         limits = SafetyLimits(
@@ -308,14 +313,14 @@ class SafetyOptions:
 
 @dataclass(frozen=True)
 class ProbeOptions:
-    """Whether a watched arm is asked by movements, as the help texts of `probe_options` say it."""
+    """Values of `probe_options`: diagnostic movements of a watched arm."""
 
     probes: int
     idle: float
     move: bool
 
     def rules(self, place: str, wait_s: float) -> ProbeRules:
-        """Return when the arm at a place is asked; commands may come so late [s]."""
+        """Return the rules of diagnostic movements; commands come up to `wait_s` [s] late."""
         from failuretwin.decision.test_motions.probing import ProbeRules
 
         return ProbeRules(self.probes, self.idle + wait_s, self.move or place == EMULATED)

@@ -35,6 +35,7 @@ from failuretwin.connection.calibration.result import Calibration, Parameter, me
 from failuretwin.connection.self_calibration import SelfCalibration
 from failuretwin.connection.tracked_diagnosis import Tracked
 from failuretwin.core.types import FloatArray
+from failuretwin.data_knowledge.store import filling
 from failuretwin.digital_model.robot import Robot, shown_unit
 from failuretwin.inference.explanation import joint_names_in
 from failuretwin.inference.together.wear_limits import wear_unit
@@ -267,7 +268,7 @@ def figure(value: float, width: float) -> str:
 def write_calibration_page(
     found: Calibration, runs: xr.Dataset, robot: Robot, folder: Path
 ) -> None:
-    """Write `index.html` into an existing folder; the runs are those learned from or judged on."""
+    """Write `index.html` into a folder; the runs are those learned from or judged on."""
     units, better = robot.profile.servo_units, found.beats_uncalibrated
     left_out = [(e.run, str(e.movement or "all"), f"{e.motor} {e.reason}") for e in found.left_out]
     text = render_page(
@@ -286,7 +287,8 @@ def write_calibration_page(
             **_pictures(found, runs, robot),
         },
     )
-    (folder / "index.html").write_text(text, encoding="utf-8")
+    with filling(folder) as partial:
+        (partial / "index.html").write_text(text, encoding="utf-8")
 
 
 def _facts(found: Calibration, payload: float) -> Table:

@@ -84,7 +84,6 @@ class RosSource(NothingToClose):
         robot: The robot.
         topics: Its topics.
         transport: Connection to the network.
-        queue: Queue of waiting events; None: a queue of its own.
 
     Raises:
         InputError: If messages hold servo counts and the robot's profile has none.
@@ -92,17 +91,11 @@ class RosSource(NothingToClose):
 
     ended = False
 
-    def __init__(
-        self,
-        robot: Robot,
-        topics: RosTopics,
-        transport: Transport,
-        queue: EventQueue | None = None,
-    ) -> None:
+    def __init__(self, robot: Robot, topics: RosTopics, transport: Transport) -> None:
         topics.check_fits(robot)
         self.name = f"{transport.name}: {', '.join(name for _, name, _ in topics.subscribed)}"
         self._transport = transport
-        self._queue = EventQueue() if queue is None else queue
+        self._queue = EventQueue()
         self._lock = Lock()
         self._garbage, self._last_garbage = 0, ""
         for role, topic, type_ in topics.subscribed:
