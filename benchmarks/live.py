@@ -22,8 +22,8 @@ from failuretwin import DigitalTwin, load_robot
 from failuretwin.app.shadow import Shadow
 from failuretwin.connection.emulated_arm import FIRST_COMMAND_S, Emulation
 from failuretwin.connection.links.base import CommandSent, Reading
-from failuretwin.connection.links.networks import open_transport
-from failuretwin.connection.links.ros_link import RosSource, robot_sink
+from failuretwin.connection.links.ros_link import RosSink, RosSource, open_transport
+from failuretwin.connection.links.ros_messages import RosWriter
 from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.types import FloatArray
@@ -109,7 +109,7 @@ def latency(robot: Robot, samples: int = 300) -> list[float]:
     taken = []
     with open_transport("ros1") as transport:
         source = RosSource(robot, topics, transport)
-        sink = robot_sink(robot, topics, transport)
+        sink = RosSink(RosWriter(robot, topics), transport)
         shadow = Shadow(
             source,
             monitor(twin),

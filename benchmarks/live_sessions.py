@@ -17,7 +17,6 @@ import numpy as np
 from failuretwin import BayesDiagnoser, DigitalTwin, load_robot
 from failuretwin.app.shadow import Shadow
 from failuretwin.connection.links.base import CommandSent, Event, Reading
-from failuretwin.connection.links.networks import open_transport
 from failuretwin.connection.links.replay import (
     AS_FAST_AS_POSSIBLE,
     Pace,
@@ -25,10 +24,10 @@ from failuretwin.connection.links.replay import (
     replay,
     session_events,
 )
-from failuretwin.connection.links.ros_codec import RosCodec
-from failuretwin.connection.links.ros_link import RosSource, robot_sink
+from failuretwin.connection.links.ros_link import RosSink, RosSource, open_transport
+from failuretwin.connection.links.ros_messages import RosWriter
 from failuretwin.connection.links.ros_topics import RosTopics
-from failuretwin.connection.links.ros_writer import RosWriter
+from failuretwin.connection.links.ros_transport import RosCodec
 from failuretwin.core.types import FloatArray
 from failuretwin.data_knowledge.readers.bag_messages import NS_PER_S
 from failuretwin.data_knowledge.readers.raw_sessions import (
@@ -70,7 +69,7 @@ def through_ros(events: PacedSource, robot: Robot) -> list[Event]:
     topics, back = RosTopics(), []
     with open_transport("ros1") as transport:
         source = RosSource(robot, topics, transport)
-        sink = robot_sink(robot, topics, transport)
+        sink = RosSink(RosWriter(robot, topics), transport)
         while source.poll(0.2) is None:  # until the two know each other
             sink.put(CommandSent(0.0, np.zeros(len(robot.motors)), np.ones(len(robot.motors))))
             sink.put(Reading(1.0, np.full(3, np.nan), np.zeros(len(robot.motors))))

@@ -19,11 +19,15 @@ from typing import Any
 import numpy as np
 
 from failuretwin import Priors
-from failuretwin.app.maintenance import BIAS_ALONE, motor_lives
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.movements import Movements
 from failuretwin.core.types import FloatArray
-from failuretwin.decision.remaining_life import RemainingLife, remaining_life
+from failuretwin.decision.remaining_life import (
+    BIAS_ALONE,
+    RemainingLife,
+    motor_lives,
+    remaining_life,
+)
 from failuretwin.digital_model.calibrated_robot import CalibratedRobot, load_calibration
 from failuretwin.digital_model.nonidealities import vary
 from failuretwin.digital_model.settling import sag

@@ -8,7 +8,8 @@ import re
 import numpy as np
 import pytest
 
-from failuretwin.app.reports.tables import Table, escaped, latex
+from failuretwin.app.reports.reports import escaped, latex
+from failuretwin.app.terminal import Table
 from failuretwin.core.runs import RunTable, Truth
 from failuretwin.data_knowledge.store import save_run_set
 

@@ -79,11 +79,11 @@ def test_exported_csv_is_read_back(failuretwin, log):
 TELL_PROGRESS = """
 from contextlib import contextmanager
 from failuretwin.app import cli
-from failuretwin.app.reports import tables
+from failuretwin.app.commands import data
 @contextmanager
 def telling(*_):
     yield lambda runs: print(runs, flush=True)
-tables.progress_bar = telling
+data.progress_bar = telling
 cli.main()
 """
 

@@ -12,8 +12,8 @@ import pytest
 
 from failuretwin.app.shadow import Shadow
 from failuretwin.connection.links.base import OK, Answer, CommandSent, LinkCounts, Order, Reading
+from failuretwin.connection.links.ros_messages import RosWriter
 from failuretwin.connection.links.ros_topics import RosTopics
-from failuretwin.connection.links.ros_writer import RosWriter
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import (
     ALL_CLEAR,
@@ -343,8 +343,7 @@ def arm_on_rosbridge(server, arm, robot, over):
 
 def test_an_arm_is_asked_over_rosbridge_and_is_back(known):
     pytest.importorskip("roslibpy")
-    from failuretwin.connection.links.networks import open_transport
-    from failuretwin.connection.links.ros_link import RosCommander
+    from failuretwin.connection.links.ros_link import RosCommander, open_transport
 
     arm, server, over = Arm(known, program(3)), FakeRosbridge(free_port()), Event()
     address = f"rosbridge://127.0.0.1:{server.port}"

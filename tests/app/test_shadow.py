@@ -9,11 +9,10 @@ import pytest
 from rich.console import Console
 
 from failuretwin.app import shadow as shadow_module
-from failuretwin.app.live import watch_until_end
-from failuretwin.app.live_view import View
+from failuretwin.app.live import View, watch_until_end
 from failuretwin.app.shadow import Changes, Shadow
 from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, LinkCounts, Reading
-from failuretwin.connection.links.ros_reader import SampledCommands
+from failuretwin.connection.links.ros_messages import SampledCommands
 from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.core.hypothesis import (
     ALL_CLEAR,
@@ -224,7 +223,7 @@ def test_the_user_is_told_how_late_commands_come(twin, armpi):
     script = Script(events)
     shadow = Shadow(script, Notebook(), twin)
     console = Console(file=StringIO())
-    told = watch_until_end(shadow, script, [], armpi.motor_names, console, np.inf)
+    told = watch_until_end(shadow, console, np.inf)
     late = "commands come late: put commands_late_s = 2.0 into the --topics file"
     assert late in [change.text for change in told.lines]
 
@@ -237,7 +236,7 @@ def test_a_source_from_which_nothing_comes_is_named(twin, armpi, clock):
 
     script = Silent([None] * 9)
     shadow = Shadow(script, Notebook(), twin)
-    told = watch_until_end(shadow, script, [], armpi.motor_names, Console(file=StringIO()), np.inf)
+    told = watch_until_end(shadow, Console(file=StringIO()), np.inf)
     assert [change.text for change in told.lines] == ["nothing comes from a script"]
 
 
@@ -282,7 +281,7 @@ def test_a_clock_that_jumps_leaves_the_diagnosers_time_as_it_was(twin, clock, ju
         shadow.step(0.0)
         clock[0] += 0.1
     np.testing.assert_allclose([t for t, _, _ in notebook.told], 0.1 * np.arange(100), atol=1e-6)
-    assert shadow.clock_jumps == 1
+    assert shadow.clock.jumps == 1
     assert shadow.snapshot.answer.time == pytest.approx(5009.9 + jump)
 
 
@@ -419,8 +418,8 @@ def test_a_third_of_senseless_stamps_does_not_move_the_stream(twin, clock, stamp
         shadow.step(0.0)
         clock[0] += 0.1
     np.testing.assert_allclose([t for t, _, _ in notebook.told], 0.1 * np.arange(600), atol=1e-6)
-    assert shadow.clock_jumps == 0
-    assert shadow.senseless_stamps == senseless.sum()
+    assert shadow.clock.jumps == 0
+    assert shadow.clock.senseless == senseless.sum()
 
 
 def test_the_posterior_over_time_goes_by_the_robots_clock(armpi):

@@ -2,9 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from failuretwin.app.reports import tables
-from failuretwin.app.reports.tables import Table, figures_table, progress_bar, show
-from failuretwin.app.terminal import tell
+from failuretwin.app import terminal
+from failuretwin.app.terminal import Table, figures_table, progress_bar, show, tell
 
 COUNTS = figures_table(("motor [counts]", "n"), [("a:smile: [b]", "1"), ("c", "20")], "counted")
 
@@ -43,7 +42,7 @@ def test_a_table_on_a_page_is_the_same_value():
 @pytest.fixture
 def clock(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr(tables.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
     return now
 
 

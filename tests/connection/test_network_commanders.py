@@ -8,11 +8,11 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from failuretwin.connection.links import ros_link
+from failuretwin.connection.links import ros_transport
 from failuretwin.connection.links.base import CommandSent, Order, Reading
-from failuretwin.connection.links.networks import is_network, open_transport
-from failuretwin.connection.links.ros_link import RosCommander, Transport
+from failuretwin.connection.links.ros_link import RosCommander, is_network, open_transport
 from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.ros_transport import Transport
 from failuretwin.core.errors import InputError
 from fake_rosbridge import FakeRosbridge
 from ros_peer import RosPeer
@@ -160,7 +160,7 @@ def network(request):
 
 
 def test_an_order_that_nobody_would_hear_is_not_sent(monkeypatch, armpi, network):
-    monkeypatch.setattr(ros_link, "LISTENER_S", 0.3)
+    monkeypatch.setattr(ros_transport, "LISTENER_S", 0.3)
     with open_transport(network[0]) as transport:
         arm = RosCommander(armpi, STANDARD, transport)
         with pytest.raises(InputError, match="nobody listens"):

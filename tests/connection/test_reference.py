@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from failuretwin.connection.links.base import CommandSent
-from failuretwin.connection.links.ros_reader import SampledCommands
+from failuretwin.connection.links.ros_messages import SampledCommands
 from failuretwin.connection.links.stream_time import LiveReference
 from failuretwin.core.movements import Movements
 

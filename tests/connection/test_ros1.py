@@ -10,10 +10,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from failuretwin.connection.links import ros_writer
+from failuretwin.connection.links import ros_link, ros_messages
 from failuretwin.connection.links.base import OK, STALE, Answer, CommandSent, EventQueue, Reading
 from failuretwin.connection.links.ros1 import Ros1Transport
-from failuretwin.connection.links.ros_link import RosSource, diagnostics_sink, robot_sink
+from failuretwin.connection.links.ros_link import RosSink, RosSource
+from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosWriter
 from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.core.hypothesis import ALL_CLEAR, RAISED, Alarm, Diagnosis, Episode
 from little_logs import LOG_COLUMNS
@@ -56,7 +57,7 @@ def test_a_master_that_is_killed_and_restarted_is_no_trouble(armpi, roscore):
     posterior = {"healthy": 1.0}
     with Ros1Transport() as transport:
         source = RosSource(armpi, STANDARD, transport)
-        sink = diagnostics_sink(armpi, STANDARD, transport)
+        sink = RosSink(DiagnosticsWriter(armpi, STANDARD), transport)
         roscore.kill()
         wait_for(lambda: sink.trouble != "")
         roscore.start()
@@ -83,7 +84,7 @@ def test_a_master_that_is_killed_and_restarted_is_no_trouble(armpi, roscore):
 
 def test_a_robot_comes_back_with_its_topics(armpi, roscore):
     with Ros1Transport() as transport:
-        sink = robot_sink(armpi, STANDARD, transport)
+        sink = RosSink(RosWriter(armpi, STANDARD), transport)
         roscore.kill()
         wait_for(lambda: sink.trouble != "")
         roscore.start()
@@ -137,7 +138,7 @@ NO_SPEEDS = {"velocities": [], "accelerations": [], "effort": []}
 def test_ten_times_the_rate_is_taken(armpi, roscore):
     with Ros1Transport() as transport:
         source = RosSource(armpi, STANDARD, transport)
-        sink = robot_sink(armpi, STANDARD, transport)
+        sink = RosSink(RosWriter(armpi, STANDARD), transport)
         wait_until_connected(source, sink)
         begin = time.monotonic()
         for k in range(300):
@@ -151,12 +152,13 @@ def test_ten_times_the_rate_is_taken(armpi, roscore):
         assert source.counts.dropped == 0
 
 
-def test_a_consumer_that_sleeps_loses_readings_but_no_command(armpi, roscore):
+def test_a_consumer_that_sleeps_loses_readings_but_no_command(monkeypatch, armpi, roscore):
     queue = EventQueue(capacity=50)
+    monkeypatch.setattr(ros_link, "EventQueue", lambda: queue)
     topics = RosTopics()
     with Ros1Transport() as transport:
-        source = RosSource(armpi, topics, transport, queue)
-        sink = robot_sink(armpi, topics, transport)
+        source = RosSource(armpi, topics, transport)
+        sink = RosSink(RosWriter(armpi, topics), transport)
         wait_until_connected(source, sink)
         sink.put(CommandSent(1.0, np.full(4, 0.1), np.ones(4)))
         for k in range(300):
@@ -185,7 +187,7 @@ def wait_until_connected(source, sink):
 def test_commands_as_trajectories_keep_each_motors_own_duration(armpi, roscore):
     with Ros1Transport() as transport:
         source = RosSource(armpi, STANDARD, transport)
-        sink = robot_sink(armpi, STANDARD, transport)
+        sink = RosSink(RosWriter(armpi, STANDARD), transport)
         wait_until_connected(source, sink)
         target = np.array([0.4, -0.2, 0.3, 0.1])
         sink.put(CommandSent(50.0, target, np.array([0.6, 0.8, 1.0, 0.6])))
@@ -208,13 +210,13 @@ def test_diagnostics_come_every_second_and_at_once_when_it_gets_worse(monkeypatc
     )
     raised = Alarm(RAISED, "motor_2:stuck", Episode(1, "motor_2:stuck", 1002.5))
     now = [1000.0]
-    monkeypatch.setattr(ros_writer, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(ros_messages, "time", SimpleNamespace(monotonic=lambda: now[0]))
 
     def levels():
         return [[s["level"] for s in m["statuses"]] for m in peer.ask(op="heard", **topic)]
 
     with Ros1Transport() as transport:
-        sink = diagnostics_sink(armpi, STANDARD, transport)
+        sink = RosSink(DiagnosticsWriter(armpi, STANDARD), transport)
         peer.ask(op="listen", type="diagnostic_msgs/DiagnosticArray", **topic)
 
         def put(state, diagnosis):

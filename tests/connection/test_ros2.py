@@ -10,9 +10,10 @@ import pytest
 
 from failuretwin.connection.links.base import OK, Answer, CommandSent, Reading
 from failuretwin.connection.links.ros2 import Ros2Transport, domain_id
-from failuretwin.connection.links.ros_codec import RosCodec
-from failuretwin.connection.links.ros_link import RosSource, diagnostics_sink, robot_sink
+from failuretwin.connection.links.ros_link import RosSink, RosSource
+from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosWriter
 from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.ros_transport import RosCodec
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
 from roscores import free_port
@@ -47,7 +48,8 @@ def transport(port):
 
 def test_what_a_robot_says_is_heard(armpi, port, transport):
     with Ros2Transport("127.0.0.1", port) as other:
-        source, robot = RosSource(armpi, STANDARD, transport), robot_sink(armpi, STANDARD, other)
+        source = RosSource(armpi, STANDARD, transport)
+        robot = RosSink(RosWriter(armpi, STANDARD), other)
         target = np.array([0.1, -0.2, 0.3, 0.4])
         for _, topic, _ in STANDARD.subscribed:
             other.check_listener(topic)
@@ -71,7 +73,7 @@ def test_the_diagnosis_has_all_that_ros_2_asks_of_a_message(armpi, port, transpo
     hash_ = "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
     with zenoh.open(client_of(port)) as other:
         other.declare_subscriber("0/diagnostics/**", heard.append)
-        sink = diagnostics_sink(armpi, STANDARD, transport)
+        sink = RosSink(DiagnosticsWriter(armpi, STANDARD), transport)
         transport.check_listener("/diagnostics")
 
         def alive():
@@ -111,7 +113,7 @@ def test_a_router_that_comes_back_is_no_trouble(armpi):
     with zenoh_router(port):
         transport = Ros2Transport("127.0.0.1", port)
         source = RosSource(armpi, STANDARD, transport)
-        sink = diagnostics_sink(armpi, STANDARD, transport)
+        sink = RosSink(DiagnosticsWriter(armpi, STANDARD), transport)
         assert (source.counts.reconnects, sink.trouble) == (0, "")
     wait_for(lambda: bool(sink.trouble))
     assert source.counts.reconnects == 0
@@ -119,7 +121,7 @@ def test_a_router_that_comes_back_is_no_trouble(armpi):
         wait_for(lambda: source.counts.reconnects == 1)
         assert sink.trouble == ""
         with Ros2Transport("127.0.0.1", port) as other:
-            robot = robot_sink(armpi, STANDARD, other)
+            robot = RosSink(RosWriter(armpi, STANDARD), other)
             other.check_listener("/tool_point")
             robot.put(Reading(7.0, np.array([0.1, 0.2, 0.3])))
             assert source.poll(WAIT_S).time == 7.0

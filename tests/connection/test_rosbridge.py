@@ -8,9 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from failuretwin.connection.links import ros_writer, rosbridge
+from failuretwin.connection.links import ros_messages, rosbridge
 from failuretwin.connection.links.base import OK, Answer
-from failuretwin.connection.links.ros_link import RosSource, diagnostics_sink
+from failuretwin.connection.links.ros_link import RosSink, RosSource
+from failuretwin.connection.links.ros_messages import DiagnosticsWriter
 from failuretwin.connection.links.ros_topics import RosTopics
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Diagnosis
@@ -45,7 +46,7 @@ def answer():
 
 
 def test_a_server_that_goes_and_comes_back_is_no_trouble(armpi, server, transport):
-    sink = diagnostics_sink(armpi, TOPICS, transport)
+    sink = RosSink(DiagnosticsWriter(armpi, TOPICS), transport)
     with RosSource(armpi, TOPICS, transport) as source:
         wait_for(lambda: server.has_subscriber("/tool"))
         server.publish("/tool", point(1))
@@ -65,8 +66,8 @@ def test_a_server_that_goes_and_comes_back_is_no_trouble(armpi, server, transpor
 
 def test_diagnostics_by_rosbridge(monkeypatch, armpi, server, transport):
     now = [0.0]
-    monkeypatch.setattr(ros_writer, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    with diagnostics_sink(armpi, TOPICS, transport) as sink:
+    monkeypatch.setattr(ros_messages, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    with RosSink(DiagnosticsWriter(armpi, TOPICS), transport) as sink:
         sink.put(answer())
         sink.put(answer())  # within the same second
         now[0] = 1.5

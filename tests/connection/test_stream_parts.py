@@ -7,10 +7,12 @@ import sys
 import textwrap
 import threading
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from failuretwin.connection.links import ros_messages
 from failuretwin.connection.links.base import (
     OK,
     STALE,
@@ -23,14 +25,13 @@ from failuretwin.connection.links.base import (
     source_from_text,
 )
 from failuretwin.connection.links.replay import Pace
+from failuretwin.connection.links.ros_messages import DiagnosticsWriter
 from failuretwin.connection.links.ros_topics import RosTopics, load_topics
 from failuretwin.connection.links.statuses import (
     LEVEL_ERROR,
     LEVEL_OK,
     LEVEL_STALE,
     LEVEL_WARN,
-    RateLimiter,
-    Status,
     statuses,
 )
 from failuretwin.connection.links.stream_time import ReorderBuffer, StreamClock
@@ -229,11 +230,21 @@ def test_a_run_that_cannot_be_judged_is_a_warning():
     assert {s.level for s in statuses(told, MOTORS)} == {LEVEL_WARN}
 
 
-def test_reports_come_every_second_and_at_once_when_it_gets_worse():
-    beat = RateLimiter()
+def test_reports_come_every_second_and_at_once_when_it_gets_worse(armpi, monkeypatch):
+    writer, now = DiagnosticsWriter(armpi, RosTopics()), [0.0]
+    monkeypatch.setattr(ros_messages, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    posterior = {"healthy": 0.5, "motor_1:stuck": 0.5}
+    alarms = {
+        LEVEL_OK: ALL_CLEAR,
+        LEVEL_WARN: Alarm(SUSPECTED, "motor_1:stuck"),
+        LEVEL_ERROR: Alarm(RAISED, "motor_1:stuck"),
+        LEVEL_STALE: ALL_CLEAR,
+    }
 
     def due(level, now_s):
-        return beat.due([Status("arm", 0, "", {}), Status("motor_1", level, "", {})], now_s)
+        now[0] = now_s
+        state = STALE if level == LEVEL_STALE else OK
+        return bool(writer.messages(answer(posterior, state, alarms[level])))
 
     assert due(LEVEL_OK, 0.0)
     assert not due(LEVEL_OK, 0.5)

@@ -9,14 +9,22 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from failuretwin.app.commands.options import EMULATED, ArmOptions, LiveOptions
 from failuretwin.connection.links.base import Commander, Sink, Source, source_from_text
-from failuretwin.connection.links.networks import NETWORKS, is_network, open_transport
 from failuretwin.connection.links.replay import Pace
-from failuretwin.connection.links.ros_link import RosCommander, RosSource, diagnostics_sink
+from failuretwin.connection.links.ros_link import (
+    NETWORKS,
+    RosCommander,
+    RosSink,
+    RosSource,
+    is_network,
+    open_transport,
+)
+from failuretwin.connection.links.ros_messages import DiagnosticsWriter
 from failuretwin.connection.links.ros_topics import RosTopics, load_topics
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import Hypothesis
@@ -37,10 +45,8 @@ from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.observation.healthy_model import HealthyModel
 
 if TYPE_CHECKING:
-    from failuretwin.app.commands.options import LiveOptions
     from failuretwin.connection.emulated_arm import Emulation
 
-EMULATED = "emulated"
 PLACES = f"{EMULATED}, {NETWORKS}"
 SOURCES = f"{PLACES}, a log (raw session, bag, .mcap), or a source of your own, MODULE:CLASS"
 OWN_CLASS = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(:.*)?")
@@ -137,51 +143,49 @@ def _of_size(mode: FaultMode, size: float, text: str) -> FaultMode:
 # Arms that `act` and `check` command.
 
 
-def is_real(place: str) -> bool:
-    """Return whether a place on the command line is a real arm; nothing is connected.
+def is_moved(arm: ArmOptions) -> bool:
+    """Return whether orders are sent to an arm: emulated arms need no --move.
 
     Raises:
-        InputError: If it is none of `PLACES`.
+        InputError: If its place is none of `PLACES`.
     """
+    return arm.move or not _is_real(arm.place)
+
+
+def _is_real(place: str) -> bool:
     if place != EMULATED and not is_network(place):
         raise InputError(f"--on is {place!r}, expected {PLACES}.")
     return place != EMULATED
 
 
-def commander_of(
-    place: str,
-    known: CalibratedRobot,
-    faults: Sequence[str],
-    seed: int,
-    topics: Path | None,
-    stack: ExitStack,
-) -> Commander:
-    """Return the arm at a place on the command line; the stack closes it.
+def commander_of(arm: ArmOptions, known: CalibratedRobot, seed: int, stack: ExitStack) -> Commander:
+    """Return the arm that a command moves; the stack closes it.
 
     Raises:
-        InputError: If it cannot be reached or is none of `PLACES`.
+        InputError: If it cannot be reached or its place is none of `PLACES`.
     """
-    if not is_real(place):
-        return stack.enter_context(emulated_arm(known, faults, seed))
-    if faults:
+    if not _is_real(arm.place):
+        return stack.enter_context(emulated_arm(known, arm.faults, seed))
+    if arm.faults:
         raise InputError(
-            f"--fault is of an emulated arm, but --on is {place!r}. Leave it out, or act on "
+            f"--fault is of an emulated arm, but --on is {arm.place!r}. Leave it out, or act on "
             f"{EMULATED!r}."
         )
-    transport = stack.enter_context(open_transport(place))
-    return RosCommander(known.robot, topics_of(topics), transport)
+    transport = stack.enter_context(open_transport(arm.place))
+    return RosCommander(known.robot, load_topics(arm.topics), transport)
 
 
 # Arms that `watch` listens to.
 
 
-def topics_of(path: Path | None) -> RosTopics:
-    """Return the topics in a file; without one, those of the data set's authors."""
-    return RosTopics() if path is None else load_topics(path)
-
-
 def connect(
-    text: str, robot: Robot, live: LiveOptions, seed: int, stack: ExitStack
+    text: str,
+    robot: Robot,
+    live: LiveOptions,
+    seed: int,
+    stack: ExitStack,
+    *,
+    takes_orders: bool = False,
 ) -> tuple[Source, list[Sink]]:
     """Return the source that a SOURCE on the command line names, and the sinks of its network.
 
@@ -191,39 +195,33 @@ def connect(
         live: Topics, faults, pace and length.
         seed: Seed of all random draws.
         stack: Closes everything in the end.
+        takes_orders: Whether the source must be a `Commander`. An emulated arm then works in
+            shifts, and takes orders in its breaks.
 
     Raises:
-        InputError: If it does not exist, cannot be reached, is none of these, or gets options that
-            only an emulated robot has.
+        InputError: If it does not exist, cannot be reached, is none of these, takes no orders, or
+            gets options that only an emulated robot has.
     """
     if text == EMULATED:
-        from failuretwin.connection.emulated_arm import emulated
-
-        emulation, length = emulation_of(robot, live, seed), live.seconds or math.inf
-        return stack.enter_context(emulated(emulation, Pace(live.speed), length)), []
-    return _connected(text, robot, live, stack, takes_orders=False)
-
-
-def connect_commander(
-    text: str, robot: Robot, live: LiveOptions, seed: int, stack: ExitStack
-) -> tuple[Commander, list[Sink]]:
-    """Return the arm that a SOURCE names, to watch and command it; arguments as in `connect`.
-
-    An emulated arm is at work: an operator commands it in shifts.
-
-    Raises:
-        InputError: If it takes no orders, or as `connect` does.
-    """
-    if text == EMULATED:
-        from failuretwin.connection.commanded_arm import OperatedArm, Shifts
-
-        shifts = Shifts(duration_s=live.seconds or math.inf)
-        emulation = emulation_of(robot, live, seed)
-        return stack.enter_context(OperatedArm(emulation, shifts, Pace(live.speed))), []
-    link, sinks = _connected(text, robot, live, stack, takes_orders=True)
-    if not (hasattr(link, "send") and hasattr(link, "standing")):
-        raise _only_listens(text)
-    return cast(Commander, link), sinks
+        return stack.enter_context(_emulated(robot, live, seed, takes_orders)), []
+    if live.faults:
+        raise InputError(
+            f"--fault is of an emulated robot, but the source is {text!r}. Leave it out, or watch "
+            f"{EMULATED!r}."
+        )
+    topics = load_topics(live.topics)
+    if is_network(text):
+        transport = stack.enter_context(open_transport(text))
+        ros_link = RosCommander if takes_orders else RosSource
+        diagnostics = RosSink(DiagnosticsWriter(robot, topics), transport)
+        return ros_link(robot, topics, transport), [diagnostics]
+    if OWN_CLASS.fullmatch(text) and not Path(text).exists():
+        sys.path.insert(0, "")  # the user's module may lie in the current folder
+        source = stack.enter_context(source_from_text(text, robot))
+        if takes_orders and not (hasattr(source, "send") and hasattr(source, "standing")):
+            raise _only_listens(text)
+        return source, []
+    return stack.enter_context(_log(text, robot, live, takes_orders)), []
 
 
 def _only_listens(text: str) -> InputError:
@@ -233,33 +231,28 @@ def _only_listens(text: str) -> InputError:
     )
 
 
-def _connected(
-    text: str, robot: Robot, live: LiveOptions, stack: ExitStack, *, takes_orders: bool
-) -> tuple[Source, list[Sink]]:
-    """Return a source that is no emulated robot, and the sinks of its network."""
-    if live.faults:
-        raise InputError(
-            f"--fault is of an emulated robot, but the source is {text!r}. Leave it out, or watch "
-            f"{EMULATED!r}."
-        )
-    topics = topics_of(live.topics)
-    if is_network(text):
-        transport = stack.enter_context(open_transport(text))
-        ros_link = RosCommander if takes_orders else RosSource
-        return ros_link(robot, topics, transport), [diagnostics_sink(robot, topics, transport)]
-    path = Path(text)
-    if OWN_CLASS.fullmatch(text) and not path.exists():
-        sys.path.insert(0, "")  # the user's module may lie in the current folder
-        return stack.enter_context(source_from_text(text, robot)), []
+def _emulated(robot: Robot, live: LiveOptions, seed: int, takes_orders: bool) -> Source:
+    from failuretwin.connection.commanded_arm import OperatedArm, Shifts
+    from failuretwin.connection.emulated_arm import emulated
+
+    emulation, pace = emulation_of(robot, live, seed), Pace(live.speed)
+    length = live.seconds or math.inf
+    if takes_orders:
+        return OperatedArm(emulation, Shifts(duration_s=length), pace)
+    return emulated(emulation, pace, length)
+
+
+def _log(text: str, robot: Robot, live: LiveOptions, takes_orders: bool) -> Source:
+    from failuretwin.connection.links.replay import replay
+
+    path, topics = Path(text), load_topics(live.topics)
     if not path.exists():
         raise InputError(f"source {text!r} does not exist. Expected {SOURCES}.")
     if takes_orders:
         raise _only_listens(text)
-    from failuretwin.connection.links.replay import replay
-
     recorded = BagTopics(topics.command, topics.tool or None, topics.position or None)
     named = None if topics == RosTopics() else recorded
-    return stack.enter_context(replay(path, robot, Pace(live.speed), named)), []
+    return replay(path, robot, Pace(live.speed), named)
 
 
 # Motors and numbers in option texts.

@@ -8,22 +8,26 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from failuretwin.app.arms import emulation_of, topics_of
+from failuretwin.app.arms import emulation_of
+from failuretwin.app.commands.options import LiveOptions
 from failuretwin.app.terminal import tell
 from failuretwin.connection.commanded_arm import CommandedArm
 from failuretwin.connection.emulated_arm import emulated
 from failuretwin.connection.links.base import CommandSent, Order, Reading, Sink, Source
-from failuretwin.connection.links.networks import NETWORKS, is_network, open_transport
 from failuretwin.connection.links.replay import AS_FAST_AS_POSSIBLE, Pace
-from failuretwin.connection.links.ros_link import RosSource, robot_sink
+from failuretwin.connection.links.ros_link import (
+    NETWORKS,
+    RosSink,
+    RosSource,
+    is_network,
+    open_transport,
+)
+from failuretwin.connection.links.ros_messages import RosWriter
+from failuretwin.connection.links.ros_topics import load_topics
 from failuretwin.core.errors import InputError
 from failuretwin.digital_model.robot import Robot
 from failuretwin.failure_behavior.injection import ScheduledFault, state_at
-
-if TYPE_CHECKING:
-    from failuretwin.app.commands.options import LiveOptions
 
 FILE_S, AFTER_S = 60.0, 20.0
 """Default length of a recording, and its least length after the last start or end of a fault
@@ -47,10 +51,10 @@ def obey(target: str, robot: Robot, live: LiveOptions, calibration: str | None, 
     """
     if not is_network(target):
         raise InputError(f"--obey needs a network to obey, but --to is {target!r}.")
-    topics = topics_of(live.topics)
+    topics = load_topics(live.topics)
     arm = CommandedArm(emulation_of(robot, live, seed, calibration), Pace(live.speed))
     with open_transport(target) as transport:
-        sink = robot_sink(robot, topics, transport)
+        sink = RosSink(RosWriter(robot, topics), transport)
         orders = RosSource(robot, topics, transport)
         tell("an emulated robot obeys; stop with Ctrl-C")
         try:
@@ -94,7 +98,7 @@ def _sink(target: str, robot: Robot, live: LiveOptions, stack: ExitStack) -> Sin
     """Return the network or recording that an emulated robot publishes to; the stack closes it."""
     if is_network(target):
         transport = stack.enter_context(open_transport(target))
-        return robot_sink(robot, topics_of(live.topics), transport)
+        return RosSink(RosWriter(robot, load_topics(live.topics)), transport)
     from failuretwin.connection.links.recorder import Recorder
 
     return stack.enter_context(Recorder(Path(target), robot))

@@ -228,9 +228,12 @@ def _pooled(network: LearnedDiagnoser, bayes: BayesDiagnoser, path: Path) -> Hyb
     return HybridDiagnoser(bayes, network, network.weights_, class_name(bayes.twin.robot))
 
 
-def expected_name(diagnoser: Diagnoser, bayes: BayesDiagnoser) -> str:
-    """Return the name of the healthy behaviour that a diagnoser of `chosen_diagnoser` expects."""
+def expected_name(diagnoser: Diagnoser) -> str:
+    """Return the name of the healthy behaviour that a diagnoser expects.
+
+    A class of the user expects nothing that is known here.
+    """
     encoder = getattr(diagnoser, "encoder", None)
     if encoder is None:
-        return GENERIC_NAME  # a class of the user's own: not known, so nothing to warn of
+        return GENERIC_NAME
     return encoder.expected.name if encoder.expected else "none"

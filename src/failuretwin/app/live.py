@@ -1,21 +1,34 @@
-"""Watching a robot: until its source ends or the time is over, in a live view or line by line."""
+"""Watching a robot until its source ends or the time is over: a live view, or a line a change."""
 
 from __future__ import annotations
 
 import math
 import time
+from collections import Counter, deque
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-from rich.console import Console
+import numpy as np
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
 
-from failuretwin.app.live_view import View
-from failuretwin.app.shadow import SILENCE_S, Changes, Shadow
+from failuretwin.app.shadow import SILENCE_S, Change, Changes, Shadow, Snapshot
 from failuretwin.app.terminal import tell
-from failuretwin.connection.links.base import Event, LinkCounts, Sink, Source
+from failuretwin.connection.links.base import Event, LinkCounts
+from failuretwin.connection.links.statuses import (
+    LEVEL_ERROR,
+    LEVEL_NAMES,
+    LEVEL_OK,
+    LEVEL_STALE,
+    LEVEL_WARN,
+    statuses,
+)
 from failuretwin.core.errors import counted
+from failuretwin.core.foreign import printable
 from failuretwin.decision.streaming.monitor import FaultMonitor, Fit
 from failuretwin.decision.test_motions.probing import Prober
 from failuretwin.inference.calibration_fit import MISFIT
@@ -29,75 +42,61 @@ LATE_S = 0.3
 """A command that comes later than this spoils the diagnosis, and the user is told [s]."""
 
 
-@dataclass
 class _Screen:
     """Tells what changes: a view on a terminal, else a line for each change."""
 
-    shadow: Shadow
-    source: Source
-    sinks: Sequence[Sink]
-    monitor: FaultMonitor | None
-    changes: Changes
-    view: View
-    live: Live | None
-
-    def __post_init__(self) -> None:
+    def __init__(self, shadow: Shadow, live: Live | None) -> None:
+        motors = shadow.twin.robot.motor_names
+        self.changes = Changes(motors)
+        self._shadow, self._live = shadow, live
+        self._view = View(motors, shadow.source.name)
         self._begun_s, self._drawn_s, self._looked = time.monotonic(), 0.0, False
 
     def look(self, last: bool = False) -> None:
         """Tell what has changed since the last call."""
-        shadow, changes, monitor = self.shadow, self.changes, self.monitor
-        troubles = _troubles(shadow, self.source, self.sinks, time.monotonic() - self._begun_s)
+        shadow, changes, monitor = self._shadow, self.changes, self._shadow.monitor
+        troubles = _troubles(shadow, time.monotonic() - self._begun_s)
         if monitor is not None:
             troubles += monitor.rounding
             troubles += () if monitor.set_up else _misfit(monitor.fit)
-        counts = _with_stamps(self.source.counts, shadow.senseless_stamps)
-        found = changes.notice(shadow.snapshot, counts, shadow.clock_jumps, troubles)
+        counts = _with_stamps(shadow.source.counts, shadow.clock.senseless)
+        found = changes.notice(shadow.snapshot, counts, shadow.clock.jumps, troubles)
         if monitor is not None and monitor.set_up is not None and not self._looked:
             self._looked = True
             found.append(changes.add(shadow.snapshot.stream_time, fit_of(monitor)))
-        if self.live is None:
+        if self._live is None:
             for change in found:
                 tell(str(change))
             return
-        self.view.remember(shadow.snapshot)
+        self._view.remember(shadow.snapshot)
         if last or time.monotonic() >= self._drawn_s + REFRESH_S:
             self._drawn_s = time.monotonic()
-            picture = self.view.draw(shadow.snapshot, self.source.counts, changes.lines)
-            self.live.update(picture, refresh=True)
+            picture = self._view.draw(shadow.snapshot, shadow.source.counts, changes.lines)
+            self._live.update(picture, refresh=True)
 
     def hear(self, event: Event | None) -> None:
         """Take an event that was polled elsewhere."""
-        self.shadow.hear(event)
+        self._shadow.hear(event)
         self.look()
 
     def say(self, text: str) -> None:
         """Tell something else."""
-        change = self.changes.add(self.shadow.snapshot.stream_time, text)
-        if self.live is None:
+        change = self.changes.add(self._shadow.snapshot.stream_time, text)
+        if self._live is None:
             tell(str(change))
 
 
 def watch_until_end(
-    shadow: Shadow,
-    source: Source,
-    sinks: Sequence[Sink],
-    motors: list[str],
-    console: Console,
-    until_s: float,
-    monitor: FaultMonitor | None = None,
-    prober: Prober | None = None,
+    shadow: Shadow, console: Console, until_s: float, prober: Prober | None = None
 ) -> Changes:
     """Watch a robot until `until_s` of our monotonic clock [s], and return all that has changed.
 
-    With a monitor it is told how well its calibration and the profile fit, once it has seen enough.
-    With a prober, one of the sinks, the robot is asked by movements when it is time to.
-    On a terminal there is a live view, else a line for each change.
+    A terminal gets a live view, other outputs a line for each change. With a prober, one of the
+    sinks, the robot makes diagnostic movements when they are due.
     """
     live = Live(console=console, auto_refresh=False) if console.is_terminal else nullcontext()
     with live as shown:
-        told = Changes(motors), View(motors, source.name), shown
-        screen, going = _Screen(shadow, source, sinks, monitor, *told), True
+        screen, going = _Screen(shadow, shown), True
         while going:
             going = shadow.step(POLL_S) and time.monotonic() < until_s
             screen.look(last=not going)
@@ -139,14 +138,121 @@ def fit_of(monitor: FaultMonitor) -> str:
     return f"{said}; after {counted(fit.seen, 'movement')} {profile}"
 
 
-def _troubles(
-    shadow: Shadow, source: Source, sinks: Sequence[Sink], since_s: float
-) -> tuple[str, ...]:
+def _troubles(shadow: Shadow, since_s: float) -> tuple[str, ...]:
     """Return what keeps the diagnosis from being made or told, after listening for so long [s]."""
-    found = [sink.trouble for sink in sinks if sink.trouble]
-    if source.counts.received == 0 and since_s > SILENCE_S:
-        found.append(f"nothing comes from {source.name}")
-    if shadow.late_s >= LATE_S:
-        wait = math.ceil(2.0 * shadow.late_s) / 2.0
+    found = [sink.trouble for sink in shadow.sinks if sink.trouble]
+    if shadow.source.counts.received == 0 and since_s > SILENCE_S:
+        found.append(f"nothing comes from {shadow.source.name}")
+    if shadow.reference.late_s >= LATE_S:
+        wait = math.ceil(2.0 * shadow.reference.late_s) / 2.0
         found.append(f"commands come late: put commands_late_s = {wait} into the --topics file")
     return tuple(found)
+
+
+# The live view: motors, residual, posterior over time, and what changed.
+
+STYLES = {
+    LEVEL_OK: "green",
+    LEVEL_WARN: "yellow",
+    LEVEL_ERROR: "bold red",
+    LEVEL_STALE: "magenta",
+}
+BLOCKS = " ▁▂▃▄▅▆▇█"
+COLUMNS = 60
+"""Width of the posterior over time."""
+COLUMN_S = 1.0
+"""Time of the stream that one column stands for [s]."""
+RESIDUAL_MM = 50.0
+"""Residual that fills its bar [mm]."""
+BAR = 20
+SHOWN_HYPOTHESES = 6
+SHOWN_CHANGES = 8
+
+
+class View:
+    """Draws what the shadow knows."""
+
+    def __init__(self, motors: Sequence[str], source: str) -> None:
+        self._motors = motors
+        self._source = source
+        self._history: deque[dict[str, float]] = deque(maxlen=COLUMNS)
+        self._next_s = -np.inf
+
+    def remember(self, snapshot: Snapshot) -> None:
+        """Take a snapshot into the posterior over time; time without any is a gap."""
+        now_s = snapshot.stream_time
+        if now_s < self._next_s:
+            return
+        if np.isfinite(self._next_s):
+            missing = int((now_s - self._next_s) / COLUMN_S)
+            self._history.extend([{}] * min(missing, COLUMNS))
+        self._next_s = now_s + COLUMN_S
+        diagnosis, stale = snapshot.answer.diagnosis, snapshot.answer.state != "OK"
+        known = diagnosis is not None and not stale
+        self._history.append(dict(diagnosis.posterior) if known and diagnosis else {})
+
+    def draw(
+        self, snapshot: Snapshot, counts: LinkCounts, changes: Sequence[Change]
+    ) -> RenderableType:
+        """Return the view of what is known now; of the changes the newest is the last."""
+        lines = [Text(printable(str(change))) for change in list(changes)[-SHOWN_CHANGES:]]
+        return Group(
+            self._head(snapshot, counts),
+            self._motor_table(snapshot),
+            Panel(self._posterior(), title=f"posterior, last {COLUMNS} s", title_align="left"),
+            Panel(Group(*lines), title="what changed", title_align="left"),
+        )
+
+    def _head(self, snapshot: Snapshot, counts: LinkCounts) -> Text:
+        arm = statuses(snapshot.answer, self._motors)[0]
+        head = Text(f"{LEVEL_NAMES[arm.level]:6s}", STYLES[arm.level])
+        head.append(f" {printable(arm.message)}\n", "default")
+        off = float(np.linalg.norm(snapshot.residual)) * 1000.0
+        share = 0.0 if np.isnan(off) else min(1.0, off / RESIDUAL_MM)
+        said = "no reading" if np.isnan(off) else f"{off:5.1f} mm off the reference"
+        head.append(
+            f"{printable(self._source)}  {snapshot.stream_time:.1f} s  {counts.received} events, "
+            f"{counts.garbage} garbage, {counts.dropped} dropped, {counts.reconnects} reconnects, "
+            f"{1000 * snapshot.seconds:.1f} ms a sample\n",
+            "dim",
+        )
+        head.append(f"tool   {_bar(share)} {said}", "default")
+        return head
+
+    def _motor_table(self, snapshot: Snapshot) -> Table:
+        table = Table(box=None, pad_edge=False)
+        for name in ("motor", "state", "faulty", "", "how"):
+            table.add_column(name)
+        for status in statuses(snapshot.answer, self._motors)[1:]:
+            probability = float(status.values.get("probability", 0.0))
+            table.add_row(
+                printable(status.name),
+                Text(LEVEL_NAMES[status.level], STYLES[status.level]),
+                f"{100 * probability:5.1f} %" if status.values else "",
+                _bar(probability),
+                printable(status.message),
+            )
+        return table
+
+    def _posterior(self) -> Table:
+        """Return the posterior over time, a row for each hypothesis that ever mattered."""
+        weight = Counter[str]()
+        for column in self._history:
+            weight.update(column)
+        table = Table(box=None, show_header=False, pad_edge=False)
+        for name, _ in weight.most_common(SHOWN_HYPOTHESES):
+            blocks = "".join(_block(column.get(name)) for column in self._history)
+            last = self._history[-1].get(name)
+            table.add_row(printable(name), blocks, "" if last is None else f"{100 * last:5.1f} %")
+        return table
+
+
+def _bar(share: float) -> str:
+    full = round(BAR * share)
+    return "█" * full + "·" * (BAR - full)
+
+
+def _block(probability: float | None) -> str:
+    if probability is None:
+        return "?"
+    return BLOCKS[round(probability * (len(BLOCKS) - 1))]

@@ -59,6 +59,15 @@ class Shadow:
     """Feeds a diagnoser from a source and publishes what was seen and what is believed.
 
     Commands may arrive `commands_late_s` [s] later than their stamps.
+
+    Attributes:
+        source: The source.
+        sinks: The sinks.
+        twin: The twin of the robot.
+        monitor: The diagnoser if it is a `FaultMonitor`, else None.
+        snapshot: What is known now.
+        clock: The robot's clock.
+        reference: The commanded angles over time.
     """
 
     def __init__(
@@ -69,40 +78,26 @@ class Shadow:
         sinks: Sequence[Sink] = (),
         commands_late_s: float = 0.0,
     ) -> None:
-        self._source = source
+        self.source = source
         self._diagnoser = diagnoser
-        self._twin = twin
-        self._sinks = sinks
-        self._clock = StreamClock()
+        self.monitor = diagnoser if isinstance(diagnoser, FaultMonitor) else None
+        self.twin = twin
+        self.sinks = sinks
+        self.clock = StreamClock()
         self._sequencer = ReorderBuffer(commands_late_s)
-        self._reference = LiveReference()
+        self.reference = LiveReference()
         self._read_s = -np.inf
         self._fed_s = time.monotonic()
         self._newest = 0.0
         self._computed = False
         self._motors: tuple[float, FloatArray] | None = None
         self.snapshot = Snapshot(
-            Answer(self._clock.stamp(0.0), STALE, None), 0.0, np.full(3, np.nan), 0.0
+            Answer(self.clock.stamp(0.0), STALE, None), 0.0, np.full(3, np.nan), 0.0
         )
-
-    @property
-    def clock_jumps(self) -> int:
-        """How often the robot's clock was set while it ran."""
-        return self._clock.jumps
-
-    @property
-    def senseless_stamps(self) -> int:
-        """Events whose stamps made no sense, so that they count when they came."""
-        return self._clock.senseless
-
-    @property
-    def late_s(self) -> float:
-        """The longest time by which a command came too late to be followed in time [s]."""
-        return self._reference.late_s
 
     def step(self, timeout_s: float) -> bool:
         """Take one event, or see after a wait [s] that time goes on; return if more may come."""
-        return self.hear(self._source.poll(min(timeout_s, TICK_S)))
+        return self.hear(self.source.poll(min(timeout_s, TICK_S)))
 
     def hear(self, event: Event | None) -> bool:
         """Take an event of the source that was polled elsewhere; return if more may come.
@@ -112,7 +107,7 @@ class Shadow:
         """
         if event is not None:
             self._take(event)
-        elif self._source.ended:
+        elif self.source.ended:
             self._feed_all(np.inf)
             self._publish(self._diagnoser.conclude(), self.snapshot.residual)
             return False
@@ -122,9 +117,9 @@ class Shadow:
 
     def _take(self, event: Event) -> None:
         now_s = time.monotonic()
-        for sink in self._sinks:
+        for sink in self.sinks:
             sink.put(event)
-        at = self._clock.to_stream_time(event.time, now_s, isinstance(event, Reading))
+        at = self.clock.to_stream_time(event.time, now_s, isinstance(event, Reading))
         self._newest = max(self._newest, at)
         self._sequencer.add(replace(event, time=at))
         self._feed_all(self._newest)
@@ -134,33 +129,33 @@ class Shadow:
         """Tell the diagnoser that time goes on without data."""
         now_s = time.monotonic()
         self._fed_s = now_s
-        at = self._clock.at(now_s)
+        at = self.clock.at(now_s)
         self._feed_all(at)
         self._publish(self._diagnoser.update(at, None, None), self.snapshot.residual)
 
     def _feed_all(self, until: float) -> None:
         for event in self._sequencer.ready(until):
             if isinstance(event, CommandSent):
-                self._reference.add(event)
+                self.reference.add(event)
             else:
                 self._feed(event)
 
     def _feed(self, reading: Reading) -> None:
         self._fed_s = time.monotonic()
         if reading.position is not None and np.isfinite(reading.position).all():
-            self._reference.start_at(reading.position)
+            self.reference.start_at(reading.position)
             self._motors = reading.time, reading.position
-            self._computed = bool(np.allclose(reading.tool, self._twin.path(reading.position)))
+            self._computed = bool(np.allclose(reading.tool, self.twin.path(reading.position)))
         seen = reading.tool if np.isfinite(reading.tool).all() else None
         command = None
-        for at, angles in self._reference.corners_to(reading.time):
+        for at, angles in self.reference.corners_to(reading.time):
             if at < reading.time:
                 self._diagnoser.update(at, angles, None)
             else:
                 command = angles
         residual = self.snapshot.residual
         if seen is not None:
-            expected = np.full(3, np.nan) if command is None else self._twin.path(command)
+            expected = np.full(3, np.nan) if command is None else self.twin.path(command)
             residual = seen - expected
         answer = self._update(reading, command, seen)
         self._fed_s = time.monotonic()  # what we take to think is no silence of the robot
@@ -173,22 +168,22 @@ class Shadow:
     ) -> Answer:
         """Tell the diagnoser of a reading, with what the motors said about then."""
         time = reading.time
-        if not isinstance(self._diagnoser, FaultMonitor):
+        if self.monitor is None:
             return self._diagnoser.update(time, command, seen)
         said = self._motors
         there = said is not None and abs(time - said[0]) <= TOGETHER_S
         position = said[1] if said is not None and there else None
-        return self._diagnoser.update(time, command, seen, position, reading.goal)
+        return self.monitor.update(time, command, seen, position, reading.goal)
 
     def _publish(self, answer: Answer, residual: FloatArray) -> None:
         silent = time.monotonic() - self._read_s > SILENCE_S
         state = STALE if silent or answer.state != OK else OK
-        stamped = replace(answer, time=self._clock.stamp(answer.time), state=state)
+        stamped = replace(answer, time=self.clock.stamp(answer.time), state=state)
         if self._computed and stamped.diagnosis is not None:
             said = with_reading_doubt(stamped.diagnosis, stamped.alarm.cause)
             stamped = replace(stamped, diagnosis=said)
         self.snapshot = Snapshot(stamped, answer.time, residual, self.snapshot.seconds)
-        for sink in self._sinks:
+        for sink in self.sinks:
             sink.put(stamped)
 
 

@@ -1,12 +1,129 @@
-"""Lines on the terminal: text out of files, such as names of runs and topics, only as text."""
+"""Output of commands: lines, tables and progress. Text of files is shown as text only.
+
+Pages draw the same tables by the macro `table` of `base.html.j2`.
+"""
 
 from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import click
 
 from failuretwin.core.foreign import printable
 
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table as TerminalTable
+
+PIPE_WIDTH = 160
+"""Columns when the output is not a terminal, so that sentences stay whole."""
+
 
 def tell(text: str, *, err: bool = False) -> None:
     """Print a line to stdout, or to stderr."""
     click.echo(printable(text), err=err)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text under headings.
+
+    Attributes:
+        headings: One a column.
+        rows: Cells, as many as there are headings.
+        align: ``l`` (text) or ``r`` (figures) for each column; empty: all to the left.
+        title: What stands above; empty: nothing.
+        header: Whether the headings are shown on a terminal.
+    """
+
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    align: str = ""
+    title: str = ""
+    header: bool = True
+
+    @property
+    def columns(self) -> list[tuple[str, bool]]:
+        """Heading of each column, and whether it holds figures."""
+        align = self.align or "l" * len(self.headings)
+        return [(name, side == "r") for name, side in zip(self.headings, align, strict=True)]
+
+
+def figures_table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: str = "") -> Table:
+    """Return a table whose first column is text and all others figures."""
+    return Table(headings, list(rows), "l" + "r" * (len(headings) - 1), title)
+
+
+def console() -> Console:
+    """Return the console that everything is printed on; brackets and colons are as they are."""
+    from rich.console import Console
+
+    plain = Console(highlight=False, markup=False, emoji=False)
+    if not plain.is_terminal:
+        plain.width = PIPE_WIDTH
+    return plain
+
+
+def show(*parts: str | Table) -> None:
+    """Print sentences, which no width cuts, and tables; text of files only as text."""
+    out = console()
+    for part in parts:
+        if isinstance(part, str):
+            out.print(printable(part), soft_wrap=True)
+            continue
+        if part.title:
+            out.print(printable(part.title), soft_wrap=True)
+        out.print(_on_terminal(part))
+
+
+def _on_terminal(table: Table) -> TerminalTable:
+    from rich.table import Table as TerminalTable
+
+    drawn = TerminalTable(box=None, pad_edge=False, show_header=table.header)
+    for heading, right in table.columns:
+        drawn.add_column(printable(heading), overflow="fold", justify="right" if right else "left")
+    for row in table.rows:
+        drawn.add_row(*map(printable, row))
+    return drawn
+
+
+# Progress of long work: a bar on a terminal, now and then a line elsewhere.
+
+REPORT_EVERY_S = 5.0
+"""Time between two lines about progress; shorter work says nothing [s]."""
+
+
+@contextmanager
+def progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Give a function to call with the number of steps just done, of `total` in all."""
+    if not sys.stderr.isatty():
+        yield _progress_lines(what, total)
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(what, total=total)
+        yield lambda steps: progress.advance(task, steps)
+
+
+def _progress_lines(what: str, total: int) -> Callable[[int], None]:
+    """Return a function that writes done, total and time left to stderr every few seconds."""
+    begun_s = reported_s = time.monotonic()
+    done = 0
+
+    def advance(steps: int) -> None:
+        nonlocal done, reported_s
+        done += steps
+        now_s = time.monotonic()
+        if 0 < done < total and now_s - reported_s >= REPORT_EVERY_S:
+            reported_s = now_s
+            left_s = (now_s - begun_s) * (total - done) / done
+            tell(f"{what}: {done} of {total}, about {left_s:.0f} s left", err=True)
+
+    return advance

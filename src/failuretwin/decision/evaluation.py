@@ -87,6 +87,14 @@ class Truths:
 # Diagnoses with their truth.
 
 
+def is_right(diagnosis: Diagnosis) -> bool | None:
+    """Return whether a verdict is correct; None without a verdict or a known truth."""
+    if diagnosis.truth is None or diagnosis.diagnosis is None:
+        return None
+    truth = scoring.judged_truth(diagnosis.truth, diagnosis.posterior)
+    return truth == diagnosis.diagnosis
+
+
 @dataclass(frozen=True)
 class Judged:
     """Diagnoses of the runs whose truth is known.

@@ -13,12 +13,16 @@ Section: docs/acting.md#remaining-life
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.together.wear_limits import WearLimits, wear_unit
 
 POWERS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 """Exponents of t that wear may follow."""
@@ -250,3 +254,46 @@ def _crossed(
         inside = np.exp(-away)
         chance = np.maximum(chance, np.where((room <= 0.0) | (left <= 0.0), 1.0, inside))
     return chance
+
+
+# Histories of tracked robots.
+
+
+def motor_lives(
+    rows: Sequence[Mapping[str, Any]], model: HealthyModel, rng: np.random.Generator
+) -> dict[str, RemainingLife | None]:
+    """Return the remaining life of each motor, from the bias that each run shows by itself.
+
+    The unit of wear is the scatter of the motor. Runs with an alarm are left out. None: too few
+    runs show the wear of a motor.
+
+    Args:
+        rows: Runs of the history.
+        model: The healthy robot as it was calibrated.
+        rng: Source of chance.
+    """
+    names = model.motor_names
+    scatter = wear_unit(model)[: len(names)]
+    wear, deviation = (_per_run(rows, key) / scatter for key in BIAS_ALONE)
+    limit, found = WearLimits().limit, dict[str, RemainingLife | None]()
+    for k, name in enumerate(names):
+        enough = np.isfinite(wear[:, k]).sum() >= LEAST_RUNS
+        found[name] = (
+            remaining_life(wear[:, k], deviation[:, k] ** 2, limit, rng) if enough else None
+        )
+    return found
+
+
+BIAS_ALONE = ("bias_alone", "bias_alone_deviation")
+"""Keys of the bias that one run shows by itself, and of its standard deviation [rad]."""
+
+
+def _per_run(rows: Sequence[Mapping[str, Any]], key: str) -> FloatArray:
+    """Return the values of a key, (run, motor); NaN: no value, or a run with an alarm."""
+    return np.array(
+        [
+            [np.nan if value is None or row["alarm"] else value for value in row[key]]
+            for row in rows
+        ],
+        dtype=np.float64,
+    )

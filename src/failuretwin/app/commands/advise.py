@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from failuretwin.app.commands.options import PATH, calibration_option, common_options, json_option
-from failuretwin.app.terminal import tell
+from failuretwin.app.terminal import show, tell
+
+if TYPE_CHECKING:
+    from failuretwin.decision.remaining_life import RemainingLife
+
+Report = tuple[list[str], list[dict[str, Any]]]
+"""Lines for the terminal, and JSON objects."""
 
 
 @click.command()
@@ -37,24 +44,111 @@ def advise(
     RESULTS.jsonl is what `diagnose --json` wrote. Of a history that `diagnose --track` keeps, the
     remaining life of every motor is told; name its calibration (--calibration).
     """
-    from failuretwin.app.maintenance import life_report, results_report, write_template
     from failuretwin.core.errors import InputError
+    from failuretwin.data_knowledge.store import write_records
 
     if template is not None:
-        write_template(template)
+        _write_template(template)
         tell(f"costs to be filled in: {template}")
     if source is None:
         if template is None:
             raise InputError("nothing to advise on. Name results or a history, or --template FILE.")
         return
     if source.name.endswith(".history.jsonl"):
-        lines = life_report(source, calibration, robot, seed, json_file)
+        lines, records = _life_report(source, calibration, robot, seed)
     else:
         if costs is None:
             raise InputError(
                 "costs are yours to say: name a file (--costs FILE.toml). `failuretwin advise "
                 "--template FILE.toml` writes one to be filled in."
             )
-        lines = results_report(source, costs, run, json_file)
-    for line in lines:
-        tell(line)
+        lines, records = _results_report(source, costs, run)
+    show(*lines)
+    if json_file is not None:
+        write_records(records, json_file)
+
+
+def _write_template(path: Path) -> None:
+    """Write a cost table to fill in; an existing file is never overwritten."""
+    from failuretwin.core.errors import OutputError
+    from failuretwin.data_knowledge.store import write_text
+    from failuretwin.decision.expected_cost import TEMPLATE
+
+    if path.exists():
+        raise OutputError(f"{path}: is there already. Choose another name.")
+    write_text(TEMPLATE, path)
+
+
+def _results_report(source: Path, costs_file: Path, run: str | None) -> Report:
+    """Return the advice on a stored diagnosis.
+
+    Raises:
+        InputError: If a file cannot be read, or there is no such run.
+    """
+    from failuretwin.core.errors import InputError
+    from failuretwin.decision.expected_cost import advise as advise_on
+    from failuretwin.decision.expected_cost import load_costs
+    from failuretwin.decision.results import read_results
+
+    costs, found = load_costs(costs_file), read_results(source).diagnoses
+    chosen = [each for each in found if run is None or each.run == run]
+    if not chosen:
+        raise InputError(f"{source}: no run {run!r}. The last is {found[-1].run!r}.")
+    diagnosis = chosen[-1]
+    advice = advise_on(diagnosis.posterior, costs)
+    lines = [f"run {diagnosis.run}: {diagnosis.verdict or diagnosis.diagnosis}"]
+    lines += [f"  {option!s:24s} {option.cost:10.4g}" for option in advice.options]
+    record = {
+        "run": diagnosis.run,
+        "advice": str(advice.best),
+        "expected_cost": {str(option): option.cost for option in advice.options},
+        "hinges_on": advice.hinge or None,
+        "hinge_probability": advice.hinge_probability if advice.hinge else None,
+    }
+    return [*lines, advice.verdict], [record]
+
+
+def _life_report(source: Path, calibration: Path | None, robot: str, seed: int) -> Report:
+    """Return the remaining life of every motor of a tracked robot.
+
+    Raises:
+        InputError: If the history cannot be read or belongs to another calibration.
+    """
+    import numpy as np
+
+    from failuretwin.connection.life_history import read_rows
+    from failuretwin.core.errors import InputError
+    from failuretwin.decision.remaining_life import LEAST_RUNS, motor_lives
+    from failuretwin.digital_model.calibrated_robot import load_calibration
+    from failuretwin.inference.observation.healthy_model import HealthyModel
+
+    known = load_calibration(calibration, robot)
+    rows = read_rows(source, known.robot.name)
+    if not rows:
+        raise InputError(f"{source}: holds no run. Expected what `diagnose --track` keeps.")
+    model = HealthyModel(known.twin, known.imperfections)
+    lives = motor_lives(rows, model, np.random.default_rng(seed))
+    lines = [
+        f"{name}: fewer than {LEAST_RUNS} runs say something of its wear"
+        if life is None
+        else f"{name}: worn by {life.level:.1f} of {life.limit:.0f} scatters; {life.verdict}"
+        for name, life in lives.items()
+    ]
+    lines.append("how real arms wear is not known; shapes and limit are assumed (docs/acting.md)")
+    return lines, [{"motors": [_record(name, life) for name, life in lives.items() if life]}]
+
+
+def _record(name: str, life: RemainingLife) -> dict[str, Any]:
+    import numpy as np
+
+    quantiles = {f"{share:g}": life.quantile(share) for share in (0.05, 0.5, 0.95)}
+    return {
+        "motor": name,
+        "level_scatters": life.level,
+        "limit_scatters": life.limit,
+        "runs_seen": life.seen,
+        "runs_left": {k: v if np.isfinite(v) else None for k, v in quantiles.items()},
+        "end_in_sight": life.in_sight,
+        "verdict": life.verdict,
+        "time_of_event": [v if np.isfinite(v) else None for v in life.runs[::20].tolist()],
+    }

@@ -10,23 +10,22 @@ from typing import TYPE_CHECKING
 
 import click
 
-from failuretwin.app.commands.arm_options import (
+from failuretwin.app.commands.options import (
+    PATH,
     ArmOptions,
     SafetyOptions,
     arm_options,
-    safety_options,
-)
-from failuretwin.app.commands.options import (
-    PATH,
-    HypothesesOption,
     calibration_option,
     common_options,
     gathered,
+    hypotheses_option,
     json_option,
     plugin_option,
     refuse_unused,
     report_option,
+    safety_options,
 )
+from failuretwin.app.terminal import show, tell
 
 if TYPE_CHECKING:
     from failuretwin.decision.test_motions.health_check import CheckResult
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MotionOptions:
-    """Which movements are allowed, as the help texts of `motion_options` say it."""
+    """Values of `motion_options`: hypotheses and movements of a check."""
 
     hypotheses: str | None
     usual: bool = False
@@ -59,12 +58,7 @@ class MotionOptions:
 motion_options = gathered(
     MotionOptions,
     "motion",
-    click.option(
-        "--hypotheses",
-        cls=HypothesesOption,
-        metavar="H,...",
-        help="What may be the case. Default: every single fault that shows at rest.",
-    ),
+    hypotheses_option("Hypotheses to consider. Default: every single fault that shows at rest."),
     click.option(
         "--usual",
         is_flag=True,
@@ -162,9 +156,8 @@ def check(
 
     Movements are chosen to tell most; each passes the gate of `act`. See docs/check.md.
     """
+    from failuretwin.app.arms import commander_of, is_moved
     from failuretwin.app.reports import check_report as said
-    from failuretwin.app.reports.tables import show
-    from failuretwin.app.terminal import tell
     from failuretwin.data_knowledge.store import write_records
     from failuretwin.decision.test_motions.motions import write_motions
 
@@ -181,12 +174,12 @@ def check(
         write_motions(planned, model, written)
         show(*said.motion_lines(planned, model), f"written to {written}; nothing was moved")
         return
-    if not arm.moves:
+    if not is_moved(arm):
         show("nothing moves without --move; these are the motions")
         show(*said.motion_lines(planned, model))
         return
     with ExitStack() as stack:
-        commander = arm.commander(asking.known, seed, stack)
+        commander = commander_of(arm, asking.known, seed, stack)
         result = asking.health_check(planned, further).work(commander, tell)
     time, command = planned.reference()
     result = asking.shown(result, command, time)
@@ -234,7 +227,6 @@ def _check_logs(
 ) -> None:
     """Say what logs of checks say that were recorded elsewhere."""
     from failuretwin.app.reports import check_report as said
-    from failuretwin.app.reports.tables import show
     from failuretwin.data_knowledge.store import write_records
 
     for result in results:
@@ -272,7 +264,6 @@ def design(
     """Choose movements that tell most, and say which faults they show, beside random ones."""
     from failuretwin.app.reports.check_report import motion_lines
     from failuretwin.app.reports.isolability_report import compared_table
-    from failuretwin.app.reports.tables import show
     from failuretwin.decision.test_motions.motions import write_motions
 
     asking = motion.checking(safety, calibration, robot, seed)
@@ -293,12 +284,7 @@ def design(
     help="Motions that `design` or `check` wrote (.json, .csv, .mcap, .bag), or a log or run set. "
     "Default: the usual random movements.",
 )
-@click.option(
-    "--hypotheses",
-    cls=HypothesesOption,
-    metavar="H,...",
-    help="What is laid beside each other. Default: the paper's nine classes.",
-)
+@hypotheses_option("Hypotheses to compare. Default: the paper's nine classes.")
 @report_option("Draw the smallest sizes there, isolability.png.")
 @json_option("Write the table.")
 @calibration_option
@@ -315,7 +301,6 @@ def isolability(
 ) -> None:
     """Say the smallest fault of each motor and mode that motions of a robot can show."""
     from failuretwin.app.reports import isolability_report as words
-    from failuretwin.app.reports.tables import show
     from failuretwin.data_knowledge.store import write_records
 
     asking = MotionOptions(hypotheses).checking(SafetyOptions(), calibration, robot, seed)

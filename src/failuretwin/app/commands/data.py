@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,15 +11,15 @@ import click
 
 from failuretwin.app.commands.options import (
     PATH,
-    F,
-    HypothesesOption,
     LogOptions,
     RenamedOption,
     common_options,
+    gathered,
+    hypotheses_option,
     plugin_option,
     reading_options,
 )
-from failuretwin.app.terminal import tell
+from failuretwin.app.terminal import progress_bar, tell
 from failuretwin.core.errors import counted
 
 if TYPE_CHECKING:
@@ -76,11 +77,8 @@ def import_(
     default=400,
     help="Runs of each hypothesis; the paper has 400.",
 )
-@click.option(
-    "--hypotheses",
-    cls=HypothesesOption,
-    metavar="H,...",
-    help="What to simulate, such as healthy,motor_2:stuck. Default: the paper's nine classes.",
+@hypotheses_option(
+    "Hypotheses to simulate, such as healthy,motor_2:stuck. Default: the paper's nine classes."
 )
 @click.option(
     "--calibration",
@@ -144,7 +142,6 @@ def simulate(
     To .zarr any number of runs can be written; if that is interrupted, the same command goes on
     with what is missing. Up to a few thousand can be written to .nc.
     """
-    from failuretwin.app.reports.tables import progress_bar
     from failuretwin.core.hypothesis import paper_hypotheses, parse_hypotheses
     from failuretwin.data_knowledge.generate import Plan
     from failuretwin.data_knowledge.resumable import produce
@@ -178,15 +175,33 @@ def simulate(
 # `failuretwin robot`: bring a robot of your own, from its URDF.
 
 
-def link_options(command: F) -> F:
-    """Add what says where the chain begins and ends."""
-    command = click.option(
-        "--tool",
+@dataclass(frozen=True)
+class UrdfOptions:
+    """Values of `urdf_options`: a URDF and the ends of its chain."""
+
+    path: Path
+    base: str | None
+    tool: str | None
+    sensor_noise: float
+
+    def report(self) -> UrdfReport:
+        """Return what the URDF holds and lacks."""
+        from failuretwin.digital_model.urdf.check import check_urdf
+
+        return check_urdf(self.path, self.base, self.tool, 1e-3 * self.sensor_noise)
+
+
+urdf_options = gathered(
+    UrdfOptions,
+    "urdf",
+    click.argument("path", type=PATH, metavar="URDF"),
+    click.option(
+        "--base",
         metavar="LINK",
-        help="Link whose origin is the tool point. Default: by name (tool0, tcp, end_effector, "
-        "...), else the end of the branch with the most moving joints.",
-    )(command)
-    command = click.option(
+        help="Link that carries the base frame, any that is fixed to the arm's foot. Default: the "
+        "root.",
+    ),
+    click.option(
         "--sensor-noise",
         type=click.FloatRange(min=0.0),
         default=0.5,
@@ -194,13 +209,14 @@ def link_options(command: F) -> F:
         metavar="MM",
         help="Noise of the tool sensor on each axis [mm]; joints that move the tool by less for "
         "each radian are left out.",
-    )(command)
-    return click.option(
-        "--base",
+    ),
+    click.option(
+        "--tool",
         metavar="LINK",
-        help="Link that carries the base frame, any that is fixed to the arm's foot. Default: the "
-        "root.",
-    )(command)
+        help="Link whose origin is the tool point. Default: by name (tool0, tcp, end_effector, "
+        "...), else the end of the branch with the most moving joints.",
+    ),
+)
 
 
 @click.group()
@@ -209,20 +225,17 @@ def robot() -> None:
 
 
 @robot.command()
-@click.argument("urdf", type=PATH)
-@link_options
-def check(urdf: Path, base: str | None, tool: str | None, sensor_noise: float) -> None:
+@urdf_options
+def check(urdf: UrdfOptions) -> None:
     """Say whether a URDF can be used, which motors move the tool, and what is missing."""
     from failuretwin.app.reports.robot_report import print_urdf
-    from failuretwin.digital_model.urdf.check import check_urdf
 
-    report = check_urdf(urdf, base, tool, 1e-3 * sensor_noise)
+    report = urdf.report()
     print_urdf(report)
     report.raise_errors()
 
 
 @robot.command()
-@click.argument("urdf", type=PATH)
 @click.option("--out", required=True, type=PATH, metavar="PROFILE", help="Profile to write: .toml.")
 @click.option(
     "--home",
@@ -230,21 +243,13 @@ def check(urdf: Path, base: str | None, tool: str | None, sensor_noise: float) -
     help="Angle of each motor at rest [deg, mm for one that slides], base to tool; random "
     "movements keep round it. Default: the middle of the limits.",
 )
-@link_options
-def init(
-    urdf: Path,
-    out: Path,
-    home: str | None,
-    base: str | None,
-    tool: str | None,
-    sensor_noise: float,
-) -> None:
+@urdf_options
+def init(out: Path, home: str | None, urdf: UrdfOptions) -> None:
     """Write a commented profile for the robot of a URDF, ready for --robot PROFILE."""
     from failuretwin.digital_model.profile_text import profile_text
-    from failuretwin.digital_model.urdf.check import check_urdf
 
     _check_profile(out)
-    report = check_urdf(urdf, base, tool, 1e-3 * sensor_noise)
+    report = urdf.report()
     _write_profile(profile_text(report, out, _home(home, report)), out)
     for message in report.having("warning"):
         tell(f"warning: {message}", err=True)

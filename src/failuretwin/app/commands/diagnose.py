@@ -1,4 +1,4 @@
-"""`failuretwin diagnose`: fault diagnosis of recorded runs."""
+"""`failuretwin diagnose` and `demo`: fault diagnosis of recorded runs."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ import click
 
 from failuretwin.app.commands.options import (
     PATH,
-    HypothesesOption,
     LogOptions,
     calibration_option,
     common_options,
+    hypotheses_option,
     json_option,
     plugin_option,
     reading_options,
     refuse_unused,
     report_option,
 )
+from failuretwin.app.terminal import progress_bar, show, tell
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -69,7 +70,7 @@ class Findings:
     @property
     def lines(self) -> list[str]:
         """Lines on everything learned."""
-        from failuretwin.app.reports.learned_report import tracking_line
+        from failuretwin.app.reports.calibration_report import tracking_line
 
         lines = [f"self-calibrated: {line}" for line in self.remarks]
         return lines if self.tracked is None else [*lines, tracking_line(self.tracked)]
@@ -111,12 +112,9 @@ class Findings:
     metavar="FILE",
     help="Where to write the calibration that --self-calibrate learns, or --track that began cold.",
 )
-@click.option(
-    "--hypotheses",
-    cls=HypothesesOption,
-    metavar="H,...",
-    help="What may be the case, two at least: healthy, MOTOR:MODE, two of these joined by '+', "
-    "unknown. Such as healthy,motor_2:stuck. Default: the paper's nine classes.",
+@hypotheses_option(
+    "Hypotheses to consider, at least two: healthy, MOTOR:MODE, two of these joined by '+', or "
+    "unknown. Example: healthy,motor_2:stuck. Default: the paper's nine classes."
 )
 @click.option(
     "--sse-range",
@@ -177,7 +175,6 @@ def diagnose(
     from failuretwin.app import inputs as given
     from failuretwin.app.reports import reports
     from failuretwin.app.reports.isolability_report import isolability_summary
-    from failuretwin.app.reports.tables import show
     from failuretwin.decision.evaluation import Judged
     from failuretwin.decision.robot_state import course_of, robot_state
     from failuretwin.digital_model.calibrated_robot import load_calibration
@@ -203,10 +200,14 @@ def diagnose(
     history = _history(bayes, calibration, out) if track else None
     runs = given.read_inputs(inputs, known.robot, reading)
     sensed = sensing_of(runs, sensing)
-    given.warn_mismatch(runs, given.expected_name(diagnoser, bayes))
+    given.warn_mismatch(runs, given.expected_name(diagnoser))
     if together:
         _check_tool(sensed)
-        found = _diagnose_together(runs, bayes, calibration, out, history)
+        found = (
+            _self_calibrate(runs, bayes, calibration, out)
+            if history is None
+            else _track(runs, bayes, history)
+        )
     else:
         found = Findings(diagnoser.diagnose(runs), bayes)
     diagnoses = given.with_doubts(found.diagnoses, runs, known.twin)
@@ -228,31 +229,41 @@ def diagnose(
     show(*([""] if last else []), *last)
 
 
-def _diagnose_together(
-    runs: xr.Dataset,
-    bayes: BayesDiagnoser,
-    calibration: Path | None,
-    out: Path | None,
-    history: History | None,
-) -> Findings:
-    """Return diagnoses that learn the robot from the runs: one after the other, or all at once.
-
-    Args:
-        runs: The runs, oldest first.
-        bayes: The diagnoser of single runs.
-        calibration: Calibration to start from; None: that of the kind of arm.
-        out: File for the learned calibration; None: not written.
-        history: Earlier runs of the robot, for --track; None: --self-calibrate.
-    """
-    from failuretwin.app.reports.tables import progress_bar
+def _track(runs: xr.Dataset, bayes: BayesDiagnoser, history: History) -> Findings:
+    """Return diagnoses that learn the robot run by run; `history` holds its earlier runs."""
     from failuretwin.connection.tracked_diagnosis import diagnose_tracked
 
-    if history is None:
-        learned, bayes = _self_calibrate(runs, bayes, calibration, out)
-        return Findings(list(learned.diagnoses), bayes, learned=learned)
     with progress_bar("diagnosing", runs.sizes["run"]) as advance:
         tracked = diagnose_tracked(runs, bayes, history, advance)
     return Findings(tracked.diagnoses, bayes, tracked=tracked)
+
+
+def _self_calibrate(
+    runs: xr.Dataset, bayes: BayesDiagnoser, calibration: Path | None, out: Path | None
+) -> Findings:
+    """Return diagnoses that learn the robot from all runs at once.
+
+    Args:
+        runs: The runs.
+        bayes: The diagnoser of single runs.
+        calibration: Calibration to start from; None: that of the kind of arm.
+        out: File for the learned calibration; None: not written.
+    """
+    from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
+    from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
+    from failuretwin.inference.together.folder_posterior import PASSES
+
+    robot = bayes.twin.robot
+    if out is not None:
+        check_calibration_file(out)
+    together = SelfCalibratingDiagnoser(robot, calibration, bayes.hypotheses, bayes.priors)
+    with progress_bar("self-calibrating", PASSES) as advance:
+        learned = together.learn(runs, advance)
+    if out is not None:
+        save_calibration(learned.calibration, robot, out)
+    known = learned.calibration.imperfections
+    calibrated = type(bayes)(together.twin, known, bayes.hypotheses, bayes.priors)
+    return Findings(learned.diagnoses, calibrated, learned=learned)
 
 
 def _check_tool(sensing: tuple[str, ...]) -> None:
@@ -281,7 +292,6 @@ def _tell_ruled_out(
     """
     from dataclasses import replace
 
-    from failuretwin.app.terminal import tell
     from failuretwin.core.errors import counted
     from failuretwin.inference.explanation import joint_names_in
 
@@ -382,37 +392,23 @@ def _write_page(
     folder: Path,
 ) -> None:
     """Write the technician's page, with what was learned where runs were weighed together."""
-    from failuretwin.app.reports.learned_report import taught_section
+    from failuretwin.app.reports.calibration_report import taught_section
     from failuretwin.app.reports.technician_page import write_report
 
     sections = [] if learned is None else [taught_section(learned, twin.robot)]
     write_report(runs, diagnoses, twin, state, folder, sections)
-    click.echo(f"the page: {folder / 'index.html'}", err=True)
+    tell(f"the page: {folder / 'index.html'}", err=True)
 
 
-def _self_calibrate(
-    runs: xr.Dataset, bayes: BayesDiagnoser, calibration: Path | None, out: Path | None
-) -> tuple[SelfCalibration, BayesDiagnoser]:
-    """Return what runs say together, and a diagnoser that knows what they teach.
+@click.command()
+@report_option("Also write a page with pictures there (needs the extra `plots`).")
+def demo(report: Path | None) -> None:
+    """Diagnose three simulated runs that come with the package, as `diagnose LOG` would.
 
-    Args:
-        runs: The runs.
-        bayes: What would diagnose them one by one.
-        calibration: What the robot is taken to be like; None: what its kind is like.
-        out: Where the calibration goes; None: nowhere.
+    One is healthy, one has a stuck motor, one a motor that misses its targets.
     """
-    from failuretwin.app.reports.tables import progress_bar
-    from failuretwin.connection.calibration.result import check_calibration_file, save_calibration
-    from failuretwin.connection.self_calibration import SelfCalibratingDiagnoser
-    from failuretwin.inference.together.folder_posterior import PASSES
+    from failuretwin.data_knowledge.readers.read import sample_log
 
-    robot = bayes.twin.robot
-    if out is not None:
-        check_calibration_file(out)
-    together = SelfCalibratingDiagnoser(robot, calibration, bayes.hypotheses, bayes.priors)
-    with progress_bar("self-calibrating", PASSES) as advance:
-        learned = together.learn(runs, advance)
-    if out is not None:
-        save_calibration(learned.calibration, robot, out)
-    known = learned.calibration.imperfections
-    return learned, type(bayes)(together.twin, known, bayes.hypotheses, bayes.priors)
+    words = [str(sample_log()), *([] if report is None else ["--report", str(report)])]
+    tell(f"failuretwin diagnose {' '.join(words)}\n")
+    diagnose.main(words, prog_name="failuretwin diagnose", standalone_mode=False)

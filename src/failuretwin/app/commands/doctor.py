@@ -15,7 +15,7 @@ from failuretwin.app.commands.options import (
     common_options,
     reading_options,
 )
-from failuretwin.app.terminal import tell
+from failuretwin.app.terminal import show, tell
 
 if TYPE_CHECKING:
     from failuretwin.inference.seen_runs import SeenRuns
@@ -72,8 +72,7 @@ def doctor(
     frame = seen.under(set_ups.best.set_up.correction).frame() if undo and unfit else None
     if undo and frame:
         unfit, undo = f"{unfit}: {frame.what}", frame.beside(undo)
-    for line in (_set_up_line(set_ups, unfit), *_log_lines(seen, set_ups, bool(unfit))):
-        tell(line)
+    show(_set_up_line(set_ups, unfit), *_log_lines(seen, set_ups, bool(unfit)))
     if out is not None:
         _write(undo, reading.columns, out)
 

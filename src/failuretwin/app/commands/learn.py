@@ -9,16 +9,16 @@ import click
 
 from failuretwin.app.commands.options import (
     PATH,
-    HypothesesOption,
     LogOptions,
     calibration_option,
     common_options,
+    hypotheses_option,
     plugin_option,
     published_labels_option,
     reading_options,
     report_option,
 )
-from failuretwin.app.terminal import tell
+from failuretwin.app.terminal import progress_bar, tell
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -94,10 +94,8 @@ def calibrate(
         tell(f"warning: {wrong}", err=True)
     if report is not None:
         from failuretwin.app.reports.calibration_report import write_calibration_page
-        from failuretwin.data_knowledge.store import filling
 
-        with filling(report) as folder:
-            write_calibration_page(found, runs, model, folder)
+        write_calibration_page(found, runs, model, report)
     save_calibration(found, model, out)
     print_calibration(found, model)
     tell(f"written to {out}")
@@ -162,12 +160,9 @@ def _pool(calibrations: tuple[Path, ...], out: Path, name: str | None, robot: st
     default=6000,
     help="Batches of 64 runs to learn from.",
 )
-@click.option(
-    "--hypotheses",
-    cls=HypothesesOption,
-    metavar="H,...",
-    help="What the network tells apart, such as healthy,motor_2:stuck. Default: the paper's nine "
-    "classes.",
+@hypotheses_option(
+    "Hypotheses that the network distinguishes, such as healthy,motor_2:stuck. Default: the "
+    "paper's nine classes."
 )
 @plugin_option
 @common_options
@@ -186,7 +181,6 @@ def train(
     probabilities are calibrated on simulated runs of the physics engine.
     """
     from failuretwin.app.inputs import check_learning
-    from failuretwin.app.reports.tables import progress_bar
     from failuretwin.data_knowledge.store import check_writable
     from failuretwin.digital_model.calibrated_robot import load_calibration
     from failuretwin.digital_model.robot import load_robot
@@ -247,7 +241,6 @@ def study(
     from failuretwin.app.inputs import check_learning
     from failuretwin.app.reports.plots import figure_class
     from failuretwin.app.reports.study_page import write_study_page
-    from failuretwin.app.reports.tables import progress_bar
     from failuretwin.core.errors import InputError
     from failuretwin.decision.learned import paper_study as paper
     from failuretwin.digital_model.robot import load_robot

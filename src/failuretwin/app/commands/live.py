@@ -7,29 +7,28 @@ import time
 from collections.abc import Sequence
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import click
 
-from failuretwin.app.commands.arm_options import (
-    ProbeOptions,
-    SafetyOptions,
-    probe_options,
-    safety_options,
-)
 from failuretwin.app.commands.options import (
+    EMULATED,
     PATH,
     LiveOptions,
+    ProbeOptions,
+    SafetyOptions,
     calibration_option,
     common_options,
     live_options,
     plugin_option,
+    probe_options,
     refuse_unused,
+    safety_options,
 )
-from failuretwin.app.terminal import tell
+from failuretwin.app.terminal import console, tell
 
 if TYPE_CHECKING:
-    from failuretwin.connection.links.base import Source
+    from failuretwin.connection.links.base import Commander
     from failuretwin.digital_model.nonidealities import Imperfections
 
 
@@ -95,11 +94,11 @@ def watch(
     """
     from contextlib import ExitStack
 
-    from failuretwin.app.arms import connect, connect_commander, topics_of
+    from failuretwin.app.arms import connect
     from failuretwin.app.live import fit_of, watch_until_end
-    from failuretwin.app.reports.tables import console
     from failuretwin.app.shadow import Shadow
     from failuretwin.connection.links.recorder import Recorder
+    from failuretwin.connection.links.ros_topics import load_topics
     from failuretwin.connection.links.statuses import statuses
     from failuretwin.decision.streaming.monitor import monitor
     from failuretwin.decision.test_motions.probing import Prober
@@ -111,28 +110,26 @@ def watch(
     model = load_robot(robot)
     known, motors = load_calibration(calibration, model), model.motor_names
     diagnoser = monitor(known.twin, known.imperfections, budget, sensing)
-    wait_s = topics_of(live.topics).wait_s
+    wait_s = load_topics(live.topics).wait_s
     when = "" if calibration is None else _written(calibration)
     limit = "" if "goals" in sensing else _limit(known.imperfections, motors, budget)
     tell(_rests_on(known.imperfections, when) + limit)
     # An emulated robot ends by itself, a log when it is over.
-    length = live.seconds if live.seconds and source != "emulated" else math.inf
+    length = live.seconds if live.seconds and source != EMULATED else math.inf
     with ExitStack() as stack:
-        link: Source
+        probing = probe.probes > 0
+        link, sinks = connect(source, model, live, seed, stack, takes_orders=probing)
         prober = None
-        if probe.probes:
-            commander, sinks = connect_commander(source, model, live, seed, stack)
-            link, rules = commander, probe.rules(source, wait_s)
+        if probing:
+            commander, rules = cast("Commander", link), probe.rules(source, wait_s)
             prober = Prober(diagnoser, safety.gate(known.robot), commander, rules, seed)
             sinks.append(prober)
-        else:
-            link, sinks = connect(source, model, live, seed, stack)
         if record is not None:
             sinks.append(stack.enter_context(Recorder(record, model)))
         shadow = Shadow(link, diagnoser, known.twin, sinks, wait_s)
         try:
             until = time.monotonic() + length
-            watch_until_end(shadow, link, sinks, motors, console(), until, diagnoser, prober)
+            watch_until_end(shadow, console(), until, prober)
         except KeyboardInterrupt:
             tell("stopped")
     arm = statuses(shadow.snapshot.answer, motors)[0]

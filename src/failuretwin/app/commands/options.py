@@ -1,4 +1,4 @@
-"""Options that several verbs share."""
+"""Options that several commands share: logs, live robots, and the arm that is moved."""
 
 from __future__ import annotations
 
@@ -7,14 +7,21 @@ from copy import copy
 from dataclasses import dataclass, fields
 from functools import wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 from click.core import ParameterSource
 
+if TYPE_CHECKING:
+    from failuretwin.decision.acting.safety import SafetyGate
+    from failuretwin.decision.test_motions.probing import ProbeRules
+    from failuretwin.digital_model.robot import Robot
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 PATH = click.Path(path_type=Path)
+EMULATED = "emulated"
+"""Name of an emulated arm, where others name a network."""
 
 
 def gathered(kind: type, name: str, *options: Callable[[F], F]) -> Callable[[F], F]:
@@ -109,6 +116,11 @@ class HypothesesOption(click.Option):
         return record and (record[0], f"{record[1]} Modes: {', '.join(MODES)}.")
 
 
+def hypotheses_option(text: str) -> Callable[[F], F]:
+    """Return the option `--hypotheses H,...`."""
+    return click.option("--hypotheses", cls=HypothesesOption, metavar="H,...", help=text)
+
+
 def plugin_option(command: F) -> F:
     """Add `--plugin`, which makes fault modes known before anything else is read or told."""
 
@@ -162,7 +174,7 @@ fault_option = click.option(
 
 @dataclass(frozen=True)
 class LogOptions:
-    """How logs become runs, as the help texts of `reading_options` say it."""
+    """Values of `reading_options`: how logs become runs."""
 
     how: str
     published_labels: bool
@@ -200,7 +212,7 @@ reading_options = gathered(
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """Topics, the emulated robot and the pace of time, as the help of `live_options` says it."""
+    """Values of `live_options`: topics, the emulated robot and the pace of time."""
 
     topics: Path | None
     faults: tuple[str, ...]
@@ -226,4 +238,127 @@ live_options = gathered(
         help="Stop after this time: by the clock of an emulated robot, else by ours. Default: with "
         "the log, or never.",
     ),
+)
+
+
+# Commands that move an arm: which one, with which faults, within which limits.
+
+SPEED_SHARE = 0.5
+
+
+def move_option(when: str = "") -> Callable[[F], F]:
+    """Return the option `--move`; `when` says which option it belongs to."""
+    return click.option(
+        "--move",
+        is_flag=True,
+        help=f"{when}Send orders to a real arm. Without it the orders are only shown. An emulated "
+        "arm needs no --move.",
+    )
+
+
+floor_option = click.option(
+    "--floor", type=float, metavar="METRES", help="Height of the floor. Default: the base."
+)
+radius_option = click.option(
+    "--radius",
+    type=click.FloatRange(min=0.0),
+    metavar="METRES",
+    help="Radius of the links, for the distance that they keep. Default: by the arm's reach.",
+)
+
+
+@dataclass(frozen=True)
+class ArmOptions:
+    """Values of `arm_options`: the arm that a command moves."""
+
+    place: str
+    faults: tuple[str, ...]
+    move: bool
+    topics: Path | None
+
+
+arm_options = gathered(
+    ArmOptions,
+    "arm",
+    click.option(
+        "--on",
+        "place",
+        default=EMULATED,
+        metavar="emulated|ros1|ros2|rosbridge://HOST[:PORT]",
+        help="The arm.",
+    ),
+    fault_option,
+    move_option(),
+    topics_option,
+)
+
+
+@dataclass(frozen=True)
+class SafetyOptions:
+    """Values of `safety_options`: limits of every order."""
+
+    speed_share: float = SPEED_SHARE
+    floor: float | None = None
+    radius: float | None = None
+
+    def gate(self, robot: Robot) -> SafetyGate:
+        """Return the gate that every order passes."""
+        from failuretwin.decision.acting.safety import SafetyGate, SafetyLimits
+
+        limits = SafetyLimits(
+            speed_share=self.speed_share, floor_m=self.floor, radius_m=self.radius
+        )
+        return SafetyGate(robot, limits)
+
+
+@dataclass(frozen=True)
+class ProbeOptions:
+    """Values of `probe_options`: diagnostic movements of a watched arm."""
+
+    probes: int
+    idle: float
+    move: bool
+
+    def rules(self, place: str, wait_s: float) -> ProbeRules:
+        """Return the rules of diagnostic movements; commands come up to `wait_s` [s] late."""
+        from failuretwin.decision.test_motions.probing import ProbeRules
+
+        return ProbeRules(self.probes, self.idle + wait_s, self.move or place == EMULATED)
+
+
+probe_options = gathered(
+    ProbeOptions,
+    "probe",
+    click.option(
+        "--probe",
+        "probes",
+        type=click.IntRange(min=0),
+        default=0,
+        metavar="N",
+        help="While a fault is suspected and the arm stands still, make N movements at most that "
+        "settle which, each with the way back. Default: 0, nothing moves.",
+    ),
+    click.option(
+        "--idle",
+        type=click.FloatRange(min=1.0),
+        default=10.0,
+        show_default=True,
+        metavar="SECONDS",
+        help="With --probe: only so long after the last command of others was carried out.",
+    ),
+    move_option("With --probe: "),
+)
+
+
+safety_options = gathered(
+    SafetyOptions,
+    "safety",
+    click.option(
+        "--speed-share",
+        type=click.FloatRange(min=0.0, max=1.0, min_open=True),
+        default=SPEED_SHARE,
+        help="Share of each motor's speed limit that may be used.",
+    ),
+    floor_option,
+    radius_option,
 )

@@ -1,4 +1,4 @@
-"""Results of `act` as lines; what an arm can still reach as a table and a picture."""
+"""Results of `act`, and what an arm can still reach, as tables and a picture."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from failuretwin.app.reports.plots import clean, new_figure, save_figure
+from failuretwin.app.terminal import Table
 from failuretwin.decision.acting.reach import MotorReach, Reach
 from failuretwin.decision.acting.task import TargetResult
 
@@ -17,50 +18,49 @@ NEVER = 0.85
 time."""
 
 
-def table_lines(results: Sequence[TargetResult]) -> list[str]:
-    """Return a line for each target, and one for all."""
-    lines = []
+def result_parts(results: Sequence[TargetResult]) -> list[str | Table]:
+    """Return a row for each target, and a line for all."""
+    rows = []
     for number, result in enumerate(results, start=1):
-        error = "not seen" if math.isnan(result.error_m) else f"{1e3 * result.error_m:5.1f} mm"
+        error = "not seen" if math.isnan(result.error_m) else f"{1e3 * result.error_m:.1f} mm"
         if result.direction_error_rad is not None:
-            error += f" {math.degrees(result.direction_error_rad):4.1f} deg"
+            error += f" {math.degrees(result.direction_error_rad):.1f} deg"
         state = "reached" if result.reached else result.why
-        lines.append(f"{number:4d}  {error:>9s}  {result.movements:2d} movements  {state}")
+        rows.append([str(number), error, f"{result.movements} movements", state])
     reached = sum(result.reached for result in results)
     moves = sum(result.movements for result in results)
-    lines.append(f"{reached} of {len(results)} targets reached in {moves} movements")
-    return lines
-
-
-def by_motor_lines(motors: Sequence[MotorReach]) -> list[str]:
-    """Return a line for each motor: what can be reached with it held, and where to park it."""
-    lines = [
-        f"{'held':10s} {'reached':>8s} {'worst':>6s} {'best':>6s} {'at deg':>7s}  feedback alone"
+    return [
+        Table(("target", "error", "movements", "state"), rows, "rrrl", header=False),
+        f"{reached} of {len(results)} targets reached in {moves} movements",
     ]
+
+
+def by_motor_parts(motors: Sequence[MotorReach]) -> list[str | Table]:
+    """Return a row for each motor: what can be reached with it held, and where to park it."""
+    rows = []
     for motor in motors:
-        alone = "never gets there" if motor.feedback_factor > NEVER else (
-            f"leaves {motor.feedback_factor:.0%} of an error each time"
-        )  # fmt: skip
-        lines.append(
-            f"{motor.motor:10s} {motor.share.mean():8.0%} {motor.share.min():6.0%} "
-            f"{motor.share.max():6.0%} {np.rad2deg(motor.best_angle):7.0f}  {alone}"
-        )
-    return lines
+        left = f"leaves {motor.feedback_factor:.0%} of an error each time"
+        alone = "never gets there" if motor.feedback_factor > NEVER else left
+        shares = (motor.share.mean(), motor.share.min(), motor.share.max())
+        angle = f"{np.rad2deg(motor.best_angle):.0f}"
+        rows.append([motor.motor, *(f"{share:.0%}" for share in shares), angle, alone])
+    headings = ("held", "reached", "worst", "best", "at deg", "feedback alone")
+    return [Table(headings, rows, "lrrrrl")]
 
 
-def map_lines(found: Reach, *, per_point: bool) -> list[str]:
-    """Return what can be reached, point by point where that is asked for."""
-    lines = []
-    if per_point:
-        for i, (point, miss) in enumerate(zip(found.points, found.miss_m, strict=True), start=1):
-            state = "can be reached" if found.reached[i - 1] else f"misses by {1e3 * miss:.0f} mm"
-            if np.isinf(miss):
-                state = "no pose off the floor and the links points as it shall"
-            lines.append(f"{i:4d}  {point[0]:8.3f} {point[1]:8.3f} {point[2]:8.3f}  {state}")
-    count = int(found.reached.sum())
+def map_parts(found: Reach, *, per_point: bool) -> list[str | Table]:
+    """Return what can be reached; `per_point`: with a row for each point."""
+    rows = []
+    points = zip(found.points, found.miss_m, found.reached, strict=True)
+    for number, (point, miss, reached) in enumerate(points, start=1):
+        state = "can be reached" if reached else f"misses by {1e3 * miss:.0f} mm"
+        if np.isinf(miss):
+            state = "no pose off the floor and the links points as required"
+        rows.append([str(number), *(f"{x:.3f}" for x in point), state])
     where = f"{found.motor} held at {np.rad2deg(found.angle):.0f} deg"
-    lines.append(f"{count} of {len(found.points)} points can be reached with {where}")
-    return lines
+    said = f"{found.reached.sum()} of {len(found.points)} points can be reached with {where}"
+    table = Table(("point", "x", "y", "z", "state"), rows, "rrrrl", header=False)
+    return [table, said] if per_point else [said]
 
 
 def save_map(maps: Sequence[Reach], folder: Path) -> None:

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from html import escape
 
 import numpy as np
 
+from failuretwin.app.reports.plots import render_page
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.kinematics import SerialChain
 from failuretwin.digital_model.robot import Robot
@@ -50,18 +50,7 @@ def joint_places(chain: SerialChain, q: FloatArray) -> FloatArray:
         chain: The kinematics, in the frame of the base.
         q: Joint values in chain order, (joint,) [rad or m].
     """
-    pose, places = np.eye(4), [np.zeros(3)]
-    for joint, value in zip(chain.joints, q, strict=True):
-        pose = pose @ joint.T_pj
-        own = np.eye(4)
-        if joint.prismatic:
-            own[2, 3] = value
-        else:
-            c, s = np.cos(value), np.sin(value)
-            own[:2, :2] = [[c, -s], [s, c]]
-        pose = pose @ own
-        places.append(pose[:3, 3])
-    return np.array([*places, (pose @ chain.T_jt)[:3, 3]])
+    return np.vstack([np.zeros(3), chain.frames(q)[1]])
 
 
 def resting_pose(robot: Robot) -> FloatArray:
@@ -106,46 +95,45 @@ def arm_sketch(robot: Robot, marks: Mapping[str, Mark]) -> str:
     """
     places = joint_places(robot.loads.chain, resting_pose(robot))
     points = on_picture(seen_from_the_side(places))
-    named = ", ".join(f"{mark.label} marked" for mark in marks.values()) or "no joint marked"
-    way = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
-    (x, y), (tool_x, tool_y) = points[0], points[-1]
-    parts = [
-        f'<svg class="arm" viewBox="0 0 {WIDTH:.0f} {HEIGHT:.0f}" role="img" '
-        f'aria-label="Sketch of the arm from the side: {escape(named)}">',
-        f'<path d="M{x - 22:.1f},{y + 8:.1f}h44M{x:.1f},{y:.1f}v8" class="base"/>',
-        f'<polyline points="{way}" class="links"/>',
-        f'<path d="M{tool_x - 6:.1f},{tool_y:.1f}h12M{tool_x:.1f},{tool_y - 6:.1f}v12" '
-        'class="tool"/>',
-        *_dots(robot, points[1:-1], marks),
-        "</svg>",
-    ]
-    return "".join(parts)
+    values = {
+        "width": WIDTH,
+        "height": HEIGHT,
+        "points": points.tolist(),
+        "marks": list(marks.values()),
+        "plain": _plain_dots(robot, points[1:-1], marks),
+        "marked": _marked_dots(robot, points[1:-1], marks),
+    }
+    return render_page("arm.svg.j2", values)
 
 
-def _dots(robot: Robot, points: FloatArray, marks: Mapping[str, Mark]) -> list[str]:
-    """Return the joints, those that are marked last, so that they lie on top."""
-    plain, marked = [], []
-    is_marked = np.array([motor.name in marks for motor in robot.motors])
-    for k, (motor, (x, y)) in enumerate(zip(robot.motors, points, strict=True)):
-        near = np.flatnonzero(np.linalg.norm(points - points[k], axis=1) < APART_PX)
-        mark, row = marks.get(motor.name), int(np.flatnonzero(near == k)[0])
-        if mark is None:
-            plain.append(f'<circle class="joint" cx="{x:.1f}" cy="{y:.1f}" r="5"/>')
-            others = [str(i + 1) for i in near.tolist() if robot.motors[i].name not in marks]
-            if others[0] == str(k + 1):
-                told = ", ".join(others)
-                plain.append(f'<text x="{x - 10:.1f}" y="{y + 4:.1f}" class="number">{told}</text>')
-            continue
-        at = float(np.clip(x, LABEL_ROOM, WIDTH - LABEL_ROOM))
+def _neighbours(points: FloatArray, k: int) -> list[int]:
+    """Return the joints that are drawn at about the same place as joint k, itself included."""
+    return np.flatnonzero(np.linalg.norm(points - points[k], axis=1) < APART_PX).tolist()
+
+
+def _plain_dots(
+    robot: Robot, points: FloatArray, marks: Mapping[str, Mark]
+) -> list[tuple[float, float, str]]:
+    """Return place and numbers of each joint without a mark; joints at one place share a label."""
+    names, dots = robot.motor_names, []
+    for k in [k for k, name in enumerate(names) if name not in marks]:
+        together = [i for i in _neighbours(points, k) if names[i] not in marks]
+        numbers = ", ".join(str(i + 1) for i in together) if together[0] == k else ""
+        dots.append((*points[k].tolist(), numbers))
+    return dots
+
+
+def _marked_dots(
+    robot: Robot, points: FloatArray, marks: Mapping[str, Mark]
+) -> list[tuple[float, float, float, float, Mark]]:
+    """Return place, place of the label, and mark of each marked joint."""
+    is_marked = np.array([name in marks for name in robot.motor_names])
+    dots = []
+    for k in np.flatnonzero(is_marked).tolist():
+        (x, y), row = points[k].tolist(), _neighbours(points, k).index(k)
+        at, up = float(np.clip(x, LABEL_ROOM, WIDTH - LABEL_ROOM)), y - 21.0 - 16.0 * row
         over = (y - points[:, 1] > 0.0) & (y - points[:, 1] < LABEL_ROOM) & is_marked
         if over.any() and not row:  # another mark is in the way: beside it, towards the middle
-            at = x + (LABEL_ROOM if x < 0.5 * WIDTH else -LABEL_ROOM)
-        up = y + 5.0 if over.any() and not row else y - 21.0 - 16.0 * row
-        marked.append(
-            f'<g class="marked" fill="{mark.colour}"><circle cx="{x:.1f}" cy="{y:.1f}" r="13" '
-            f'fill="white" stroke="{mark.colour}" stroke-width="4"/>'
-            f'<text x="{x:.1f}" y="{y + 5:.1f}" text-anchor="middle">{mark.sign}</text>'
-            f'<text x="{at:.1f}" y="{up:.1f}" text-anchor="middle" '
-            f'class="label">{escape(mark.label)}</text></g>'
-        )
-    return plain + marked
+            at, up = x + (LABEL_ROOM if x < 0.5 * WIDTH else -LABEL_ROOM), y + 5.0
+        dots.append((x, y, at, up, marks[robot.motor_names[k]]))
+    return dots

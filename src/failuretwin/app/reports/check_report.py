@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from failuretwin.app.reports.isolability_report import sizes_of_motor
-from failuretwin.app.reports.tables import Table, figures_table
 from failuretwin.app.reports.technician_page import Section, write_page
+from failuretwin.app.terminal import Table, figures_table
 from failuretwin.core.errors import InputError, counted
 from failuretwin.data_knowledge.store import filling, write_records
 from failuretwin.decision.robot_state import robot_state

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from failuretwin.app.reports.plots import clean, new_figure, save_figure
-from failuretwin.app.reports.tables import Table, figures_table
+from failuretwin.app.terminal import Table, figures_table
 from failuretwin.core.errors import counted
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.types import as_floats

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from failuretwin.app.reports.tables import Table, figures_table, latex, show
+from failuretwin.app.terminal import Table, figures_table, show
 from failuretwin.core.errors import counted
 from failuretwin.core.hypothesis import Diagnosis
 from failuretwin.data_knowledge.store import write_text
@@ -20,6 +19,7 @@ from failuretwin.decision.evaluation import (
     Evaluation,
     Judged,
     as_unknown_line,
+    is_right,
     score_line,
 )
 from failuretwin.decision.robot_state import RobotState
@@ -27,11 +27,10 @@ from failuretwin.digital_model.robot import Robot
 from failuretwin.inference.explanation import joint_names_in
 from failuretwin.inference.together.fault_course import FaultCourse
 
-if TYPE_CHECKING:
-    pass
-
 MAX_EXPLAINED = 3
-"""So few runs are explained in full on the screen; for more there are --report and --json."""
+"""Up to so many runs are explained in full on the screen."""
+MARKS = {True: "right", False: "WRONG", None: ""}
+"""Marks of verdicts whose truth is known."""
 
 
 def print_diagnoses(diagnoses: Sequence[Diagnosis]) -> None:
@@ -53,15 +52,7 @@ def print_diagnoses(diagnoses: Sequence[Diagnosis]) -> None:
 def _diagnosis_row(d: Diagnosis, known: bool) -> list[str]:
     count = len(d.quality)
     quality = counted(count, "remark") if count else ""
-    return [d.run, *([d.truth or "", _mark(d)] if known else []), d.verdict, quality]
-
-
-def _mark(diagnosis: Diagnosis) -> str:
-    """Return whether a verdict is right; empty where there is none or the truth is not known."""
-    if diagnosis.truth is None or diagnosis.diagnosis is None:
-        return ""
-    truth = scoring.judged_truth(diagnosis.truth, diagnosis.posterior)
-    return "right" if truth == diagnosis.diagnosis else "WRONG"
+    return [d.run, *([d.truth or "", MARKS[is_right(d)]] if known else []), d.verdict, quality]
 
 
 def state_lines(state: RobotState, together: bool) -> list[str]:
@@ -254,3 +245,38 @@ def write_latex(evaluation: Evaluation, comparison: Comparison | None, path: Pat
         tables.append(Table(("Compared", "on the same runs"), comparison_rows(comparison)))
     text = "\n".join([r"% \usepackage{booktabs}", *map(latex, tables)])
     write_text(text, path)
+
+
+# Tables for papers (package booktabs).
+
+ESCAPES = str.maketrans(
+    {
+        "\\": r"\textbackslash{}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        **{letter: f"\\{letter}" for letter in "&%$#_{}"},
+    }
+)
+
+
+def escaped(text: str) -> str:
+    """Return `text` so that LaTeX prints it letter by letter."""
+    return text.translate(ESCAPES)
+
+
+def latex(table: Table) -> str:
+    """Return a tabular with booktabs rules; the title is left to the paper."""
+    lines = [
+        rf"\begin{{tabular}}{{{''.join('r' if right else 'l' for _, right in table.columns)}}}",
+        r"\toprule",
+        _latex_row(table.headings),
+        r"\midrule",
+        *map(_latex_row, table.rows),
+        r"\bottomrule",
+        r"\end{tabular}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _latex_row(cells: Sequence[str]) -> str:
+    return " & ".join(escaped(cell.strip()) for cell in cells) + r" \\"

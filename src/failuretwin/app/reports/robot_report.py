@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from failuretwin.app.reports.tables import Table, show
+from failuretwin.app.terminal import Table, show
 from failuretwin.connection.calibration.result import Parameter
 from failuretwin.connection.registration.fit import Registration
 from failuretwin.core.errors import counted

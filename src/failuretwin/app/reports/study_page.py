@@ -12,7 +12,7 @@ import numpy as np
 from failuretwin import __version__
 from failuretwin.app.reports import plots
 from failuretwin.app.reports.plots import BLUE, GREY, MM_PER_M, RED, SMALL
-from failuretwin.app.reports.tables import Table
+from failuretwin.app.terminal import Table
 from failuretwin.core.runs import AXES
 from failuretwin.core.types import FloatArray, as_floats
 from failuretwin.data_knowledge.store import write_text

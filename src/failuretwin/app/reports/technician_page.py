@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any
 from failuretwin import __version__
 from failuretwin.app.reports.arm_sketch import Mark, arm_sketch
 from failuretwin.app.reports.plots import plain, plot_runs, render_page
-from failuretwin.app.reports.tables import Table
+from failuretwin.app.terminal import Table
 from failuretwin.core.hypothesis import FAULTY_STATE, HEALTHY_STATE, OPEN_STATE, Diagnosis
 from failuretwin.data_knowledge.store import filling
-from failuretwin.decision.evaluation import Judged, as_unknown_line, score_line
+from failuretwin.decision.evaluation import Judged, as_unknown_line, is_right, score_line
 from failuretwin.decision.robot_state import RobotState, state_of_run
-from failuretwin.decision.scoring import judged_truth
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
+from failuretwin.inference.explanation import percent
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -50,7 +50,7 @@ class _Row:
         diagnosis: What was said of it.
         kind: Its state.
         truth: What was the case, in plain words; empty: not known.
-        wrong: Whether the verdict is another.
+        wrong: Whether the verdict is known to be wrong.
         picture: PNG file in base64; empty: none.
         told: Whether it has details below.
     """
@@ -97,7 +97,7 @@ def chosen_runs(diagnoses: Sequence[Diagnosis], robot: Robot, most: int) -> list
     for i, diagnosis in enumerate(diagnoses):
         state = state_of_run(diagnosis, robot.motor_names)
         motors = state.motors if state.kind == FAULTY_STATE else ()
-        groups.setdefault((_truth_cell(diagnosis)[1], state.kind, motors), []).append(i)
+        groups.setdefault((is_right(diagnosis) is False, state.kind, motors), []).append(i)
     groups = {key: groups[key] for key in sorted(groups, key=lambda key: key[0])}
     for members in groups.values():
         members.sort(key=lambda i: -(diagnoses[i].probability or 0.0))
@@ -167,6 +167,7 @@ def write_page(
         "score": score_line(judged),
         "as_unknown": as_unknown_line(judged),
         "plain": plain,
+        "percent": percent,
     }
     path.write_text(render_page("diagnoses.html.j2", values), encoding="utf-8")
 
@@ -189,13 +190,7 @@ def _rows(
         held = held if spent + len(held) <= MOST_PICTURE_BYTES else ""
         spent += len(held)
         kind = state_of_run(diagnosis, robot.motor_names).kind
-        rows.append(_Row(i + 1, diagnosis, kind, *_truth_cell(diagnosis), held, i in pictures))
+        truth = "" if diagnosis.truth is None else plain(diagnosis.truth)
+        wrong = is_right(diagnosis) is False
+        rows.append(_Row(i + 1, diagnosis, kind, truth, wrong, held, i in pictures))
     return rows
-
-
-def _truth_cell(diagnosis: Diagnosis) -> tuple[str, bool]:
-    """Return the truth of a run in plain words, and whether the verdict is another."""
-    if diagnosis.truth is None:
-        return "", False
-    truth = judged_truth(diagnosis.truth, diagnosis.posterior)
-    return plain(diagnosis.truth), truth != diagnosis.diagnosis

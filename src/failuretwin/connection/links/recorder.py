@@ -9,9 +9,9 @@ from typing import BinaryIO, Self, cast
 
 from failuretwin import __version__
 from failuretwin.connection.links.base import Answer, CommandSent, Item
-from failuretwin.connection.links.ros_codec import Outgoing, RosCodec
+from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosWriter
 from failuretwin.connection.links.ros_topics import RosTopics
-from failuretwin.connection.links.ros_writer import DiagnosticsWriter, RosWriter
+from failuretwin.connection.links.ros_transport import Outgoing, RosCodec
 from failuretwin.core.errors import InputError, OutputError, needs_extra
 from failuretwin.data_knowledge.readers.bag_messages import GOAL_TOPIC, NS_PER_S
 from failuretwin.digital_model.robot import Robot
@@ -138,7 +138,7 @@ class Recorder:
         self._path = path
         self._codec = RosCodec(2)
         self._robot_writer = RosWriter(robot, RECORDED)
-        self._diagnostics = DiagnosticsWriter(robot, RECORDED.diagnostics)
+        self._diagnostics = DiagnosticsWriter(robot, RECORDED)
         self._channels: dict[str, int] = {}
         self._retry_s = 0.0
         try:

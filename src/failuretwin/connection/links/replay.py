@@ -16,7 +16,7 @@ from failuretwin.connection.links.base import (
     NothingToClose,
     Reading,
 )
-from failuretwin.connection.links.ros_reader import SampledCommands, goal_reading, motor_reading
+from failuretwin.connection.links.ros_messages import SampledCommands, goal_reading, motor_reading
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import GOAL_VARIABLE
 from failuretwin.core.types import FloatArray

@@ -20,8 +20,14 @@ from typing import Any
 from xmlrpc.client import Error, ServerProxy
 from xmlrpc.client import Transport as HttpTransport
 
-from failuretwin.connection.links.ros_codec import Outgoing, RosCodec, kind_in
-from failuretwin.connection.links.ros_link import Take, Transport, wait_for_listener
+from failuretwin.connection.links.ros_transport import (
+    Outgoing,
+    RosCodec,
+    Take,
+    Transport,
+    kind_in,
+    wait_for_listener,
+)
 from failuretwin.core.errors import InputError
 from failuretwin.data_knowledge.readers.bag_messages import Kind
 

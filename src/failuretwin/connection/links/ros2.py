@@ -19,8 +19,13 @@ import time
 import uuid
 from typing import Any
 
-from failuretwin.connection.links.ros_codec import Outgoing, RosCodec
-from failuretwin.connection.links.ros_link import Take, Transport, wait_for_listener
+from failuretwin.connection.links.ros_transport import (
+    Outgoing,
+    RosCodec,
+    Take,
+    Transport,
+    wait_for_listener,
+)
 from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.data_knowledge.readers.bag_messages import NS_PER_S
 

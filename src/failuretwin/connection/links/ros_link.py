@@ -1,13 +1,14 @@
-"""Links to a robot on a ROS network, over any transport: source, commander and sinks."""
+"""Links to a robot on a ROS network, over any transport: source, commander and sinks.
+
+Networks are named as on the command line: ``ros1``, ``ros2``, ``rosbridge://HOST``.
+"""
 
 from __future__ import annotations
 
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
 from functools import partial
 from threading import Lock
-from typing import Any, Protocol, Self
+from urllib.parse import urlsplit
 
 from failuretwin.connection.links.base import (
     CommandSent,
@@ -19,87 +20,59 @@ from failuretwin.connection.links.base import (
     Order,
     Reading,
 )
-from failuretwin.connection.links.ros_codec import Outgoing
-from failuretwin.connection.links.ros_reader import RosReader
+from failuretwin.connection.links.ros1 import Ros1Transport
+from failuretwin.connection.links.ros2 import ROUTER_PORT, Ros2Transport
+from failuretwin.connection.links.ros_messages import DiagnosticsWriter, RosReader, RosWriter
 from failuretwin.connection.links.ros_topics import RosTopics
-from failuretwin.connection.links.ros_writer import DiagnosticsWriter, RosWriter
+from failuretwin.connection.links.ros_transport import Decode, Transport
+from failuretwin.connection.links.rosbridge import BRIDGE_PORT, RosbridgeTransport
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.readers.bag_messages import Kind
 from failuretwin.digital_model.robot import Robot
 
-Decode = Callable[[], tuple[Any, Kind]]
-"""Returns a message as an object with the fields of its kind, and its kind."""
-Take = Callable[[Decode], None]
-"""Handles a message; may be called from any thread."""
+ROS1, ROS2, ROSBRIDGE = "ros1", "ros2", "rosbridge"
+NETWORKS = f"{ROS1}, {ROS2}[://HOST[:PORT]], {ROSBRIDGE}://HOST[:PORT]"
+"""Names of networks, for messages to the user."""
 
 
-class Transport(ABC):
-    """Connection to a ROS network, which it reopens if the far side goes away and comes back.
-
-    Attributes:
-        name: Name for messages to the user.
-        refusals: Complaints of the far side about our calls.
-    """
-
-    name: str
-    refusals: Sequence[str] = ()
-
-    @property
-    @abstractmethod
-    def trouble(self) -> str:
-        """Reason why messages do not arrive at present; empty if they do."""
-
-    @property
-    @abstractmethod
-    def reconnects(self) -> int:
-        """Number of times that the far side went away and came back."""
-
-    @abstractmethod
-    def subscribe(self, topic: str, type_: str, take: Take) -> None:
-        """Call `take` with every message of a topic."""
-
-    @abstractmethod
-    def advertise(self, topic: str, type_: str) -> None:
-        """Prepare a topic for publishing."""
-
-    @abstractmethod
-    def publish(self, message: Outgoing) -> None:
-        """Publish a message on an advertised topic; lost if the far side is gone."""
-
-    @abstractmethod
-    def check_listener(self, topic: str) -> None:
-        """Raise InputError if nothing that is published on a topic would reach a robot."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """End all subscriptions and publishers, and the connection."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+def is_network(text: str) -> bool:
+    """Return whether a text names a network, whether or not it can be reached."""
+    return text in (ROS1, ROS2) or text.startswith((f"{ROS2}://", f"{ROSBRIDGE}://"))
 
 
-LISTENER_S = 5.0
-"""Longest wait for a listener to commands [s]."""
-
-
-def wait_for_listener(topic: str, listening: Callable[[], bool]) -> None:
-    """Wait until there is a listener to a topic.
+def open_transport(text: str) -> Transport:
+    """Return a connection to a network.
 
     Raises:
-        InputError: If there is none within `LISTENER_S`.
+        InputError: If the address is invalid, the network does not answer, or an extra is missing.
     """
-    until = time.monotonic() + LISTENER_S
-    while not listening():
-        if time.monotonic() > until:
-            raise InputError(
-                f"nobody listens to topic {topic}: the order would reach no robot. Start its "
-                "driver, or name the topic of commands in a file for --topics."
-            )
-        time.sleep(0.05)
+    if text == ROS1:
+        return Ros1Transport()
+    if text == ROS2:
+        return Ros2Transport()
+    if text.startswith(f"{ROS2}://"):
+        return Ros2Transport(*address_of(text, ROUTER_PORT))
+    return RosbridgeTransport(*address_of(text, BRIDGE_PORT))
+
+
+def address_of(text: str, usual_port: int) -> tuple[str, int]:
+    """Return host and port of an address such as ``rosbridge://HOST[:PORT]``.
+
+    Raises:
+        InputError: If it is not an address.
+    """
+    try:
+        address = urlsplit(text)
+        host, port = address.hostname, address.port or usual_port
+    except ValueError:
+        host, port = None, 0
+    if not host:
+        kind = text.partition("://")[0]
+        raise InputError(f"{text!r} is no address. Expected {kind}://HOST[:PORT].")
+    return host, port
+
+
+# Links.
 
 
 class RosSource(NothingToClose):
@@ -111,7 +84,6 @@ class RosSource(NothingToClose):
         robot: The robot.
         topics: Its topics.
         transport: Connection to the network.
-        queue: Queue of waiting events; None: a queue of its own.
 
     Raises:
         InputError: If messages hold servo counts and the robot's profile has none.
@@ -119,17 +91,11 @@ class RosSource(NothingToClose):
 
     ended = False
 
-    def __init__(
-        self,
-        robot: Robot,
-        topics: RosTopics,
-        transport: Transport,
-        queue: EventQueue | None = None,
-    ) -> None:
+    def __init__(self, robot: Robot, topics: RosTopics, transport: Transport) -> None:
         topics.check_fits(robot)
         self.name = f"{transport.name}: {', '.join(name for _, name, _ in topics.subscribed)}"
         self._transport = transport
-        self._queue = EventQueue() if queue is None else queue
+        self._queue = EventQueue()
         self._lock = Lock()
         self._garbage, self._last_garbage = 0, ""
         for role, topic, type_ in topics.subscribed:
@@ -216,28 +182,17 @@ class RosCommander(RosSource):
         self._writer.start_at(target)
 
 
-class Writer(Protocol):
-    """Converts items into messages."""
-
-    @property
-    def topics(self) -> list[tuple[str, str]]:
-        """Name and type of every topic that may be written to."""
-        ...
-
-    def messages(self, item: Item) -> list[Outgoing]:
-        """Return the messages of an item."""
-        ...
-
-
 class RosSink(NothingToClose):
     """Sink that publishes items on a ROS network; it does not close the transport.
+
+    With a `RosWriter` it plays a robot: robots that listen to its commands will move.
 
     Args:
         writer: Converts items into messages.
         transport: Connection to the network.
     """
 
-    def __init__(self, writer: Writer, transport: Transport) -> None:
+    def __init__(self, writer: RosWriter | DiagnosticsWriter, transport: Transport) -> None:
         self._writer = writer
         self._transport = transport
         for topic, type_ in dict(writer.topics).items():
@@ -252,17 +207,3 @@ class RosSink(NothingToClose):
         """Publish an item."""
         for message in self._writer.messages(item):
             self._transport.publish(message)
-
-
-def robot_sink(robot: Robot, topics: RosTopics, transport: Transport) -> RosSink:
-    """Return a sink that plays a robot: robots that listen to its commands will move.
-
-    Raises:
-        InputError: As `RosWriter`.
-    """
-    return RosSink(RosWriter(robot, topics), transport)
-
-
-def diagnostics_sink(robot: Robot, topics: RosTopics, transport: Transport) -> RosSink:
-    """Return a sink that publishes answers as diagnostics."""
-    return RosSink(DiagnosticsWriter(robot, topics.diagnostics), transport)

@@ -113,12 +113,14 @@ class RosTopics:
         return [entry for entry in topics if entry[1]]
 
 
-def load_topics(path: Path) -> RosTopics:
-    """Return the topics in a TOML file with the fields of `RosTopics`.
+def load_topics(path: Path | None) -> RosTopics:
+    """Return the topics in a TOML file with the fields of `RosTopics`; None: the defaults.
 
     Raises:
         InputError: If the file cannot be read, or has an unknown key or an invalid value.
     """
+    if path is None:
+        return RosTopics()
     try:
         return from_table(RosTopics, read_toml(path), str(path))
     except InputError as error:

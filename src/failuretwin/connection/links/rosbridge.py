@@ -7,8 +7,7 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
-from failuretwin.connection.links.ros_codec import Outgoing
-from failuretwin.connection.links.ros_link import Take, Transport
+from failuretwin.connection.links.ros_transport import Outgoing, Take, Transport
 from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.data_knowledge.readers.bag_messages import kind_of_type
 

@@ -15,8 +15,6 @@ LEVEL_OK, LEVEL_WARN, LEVEL_ERROR, LEVEL_STALE = range(4)
 """Levels of ``diagnostic_msgs/DiagnosticStatus``."""
 LEVEL_NAMES = ("OK", "WARN", "ERROR", "STALE")
 LEVELS = {CLEAR: LEVEL_OK, SUSPECTED: LEVEL_WARN, RAISED: LEVEL_ERROR}
-PERIOD_S = 1.0
-"""Time between two reports when nothing gets worse [s]."""
 
 
 @dataclass(frozen=True)
@@ -142,25 +140,3 @@ def _number(value: float) -> str:
 def _level(alarm: Alarm, name: str) -> int:
     """Return the level of the arm, or of a motor by its name."""
     return LEVELS[alarm.state] if name == "arm" or alarm.concerns(name) else LEVEL_OK
-
-
-class RateLimiter:
-    """Timing of reports: every second, and at once when any status gets worse."""
-
-    def __init__(self) -> None:
-        self._levels: list[int] = []
-        self._due_s = -np.inf
-
-    def due(self, current: Sequence[Status], now_s: float) -> bool:
-        """Return whether to report statuses now.
-
-        Args:
-            current: The statuses.
-            now_s: Our own monotonic clock [s].
-        """
-        levels = [status.level for status in current]
-        worse = any(new > old for new, old in zip(levels, self._levels, strict=False))
-        if not worse and now_s < self._due_s:
-            return False
-        self._levels, self._due_s = levels, now_s + PERIOD_S
-        return True

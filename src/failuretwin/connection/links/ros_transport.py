@@ -1,9 +1,15 @@
-"""ROS messages as bytes, by the definitions in rosbags; no ROS installation needed."""
+"""Connections to ROS networks: what every transport offers, and messages as bytes.
+
+Messages are encoded by the definitions in rosbags; no ROS installation is needed.
+"""
 
 from __future__ import annotations
 
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 
@@ -116,3 +122,79 @@ def _value(store: Typestore, description: Any, value: Any) -> Any:
     if item_kind.name == "NAME":
         return [_message(store, item, part) for part in value]
     return list(value) if item[0] == "string" else np.array(value, dtype=item[0])
+
+
+# Transports.
+
+Decode = Callable[[], tuple[Any, Kind]]
+"""Returns a message as an object with the fields of its kind, and its kind."""
+Take = Callable[[Decode], None]
+"""Handles a message; may be called from any thread."""
+
+
+class Transport(ABC):
+    """Connection to a ROS network, which it reopens if the far side goes away and comes back.
+
+    Attributes:
+        name: Name for messages to the user.
+        refusals: Complaints of the far side about our calls.
+    """
+
+    name: str
+    refusals: Sequence[str] = ()
+
+    @property
+    @abstractmethod
+    def trouble(self) -> str:
+        """Reason why messages do not arrive at present; empty if they do."""
+
+    @property
+    @abstractmethod
+    def reconnects(self) -> int:
+        """Number of times that the far side went away and came back."""
+
+    @abstractmethod
+    def subscribe(self, topic: str, type_: str, take: Take) -> None:
+        """Call `take` with every message of a topic."""
+
+    @abstractmethod
+    def advertise(self, topic: str, type_: str) -> None:
+        """Prepare a topic for publishing."""
+
+    @abstractmethod
+    def publish(self, message: Outgoing) -> None:
+        """Publish a message on an advertised topic; lost if the far side is gone."""
+
+    @abstractmethod
+    def check_listener(self, topic: str) -> None:
+        """Raise InputError if nothing that is published on a topic would reach a robot."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End all subscriptions and publishers, and the connection."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+LISTENER_S = 5.0
+"""Longest wait for a listener to commands [s]."""
+
+
+def wait_for_listener(topic: str, listening: Callable[[], bool]) -> None:
+    """Wait until there is a listener to a topic.
+
+    Raises:
+        InputError: If there is none within `LISTENER_S`.
+    """
+    until = time.monotonic() + LISTENER_S
+    while not listening():
+        if time.monotonic() > until:
+            raise InputError(
+                f"nobody listens to topic {topic}: the order would reach no robot. Start its "
+                "driver, or name the topic of commands in a file for --topics."
+            )
+        time.sleep(0.05)

@@ -1,0 +1,337 @@
+"""Readings, commands and answers from and to ROS messages."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+
+from failuretwin.connection.links.base import Answer, CommandSent, Event, Item, Reading
+from failuretwin.connection.links.ros_topics import RosTopics
+from failuretwin.connection.links.ros_transport import Outgoing
+from failuretwin.connection.links.statuses import Status, statuses
+from failuretwin.core.errors import InputError
+from failuretwin.core.types import MS_PER_S, FloatArray
+from failuretwin.data_knowledge.readers.bag_file import BagMessage
+from failuretwin.data_knowledge.readers.bag_messages import (
+    KINDS,
+    NS_PER_S,
+    Kind,
+    Role,
+    Rows,
+    kind_of_type,
+    topic_rows,
+)
+from failuretwin.data_knowledge.readers.bags import motor_rows
+from failuretwin.digital_model.robot import Robot
+from failuretwin.digital_model.twin import DigitalTwin
+
+STILL_RAD = 1e-9
+"""Largest difference of two samples that count as equal [rad]."""
+LARGEST = 100.0
+"""Largest valid angle [rad] and tool coordinate [m]."""
+LONGEST_S = 600.0
+"""Longest valid duration of a command [s]."""
+
+
+def motor_reading(time: float, angle: FloatArray, twin: DigitalTwin) -> Reading:
+    """Return motor readings with the tool position computed from them, as in the published data.
+
+    Args:
+        time: Time by the robot's clock [s].
+        angle: (motor,) [rad], NaN where one is missing; then there is no tool position.
+        twin: Kinematics of the robot.
+    """
+    complete = bool(np.isfinite(angle).all())
+    return Reading(time, twin.path(angle) if complete else np.full(3, np.nan), angle)
+
+
+def goal_reading(time: float, goal: FloatArray) -> Reading:
+    """Return a reading of nothing but the goals that the motors report, (motor,) [rad]."""
+    return Reading(time, np.full(3, np.nan), goal=goal)
+
+
+class SampledCommands:
+    """Converts samples of a reference, as controllers stream them, into commands.
+
+    The reference is taken as a straight line between two samples. The line is known when the second
+    sample has come, so each command has the time of the sample before it.
+    """
+
+    def __init__(self) -> None:
+        self._before: tuple[float, FloatArray] | None = None
+
+    def add(self, time: float, value: FloatArray) -> CommandSent | None:
+        """Return the command that a sample completes, None while the reference stands still.
+
+        Args:
+            time: Time of the sample [s].
+            value: The reference, (motor,) [rad].
+        """
+        before, self._before = self._before, (time, value)
+        if before is None:
+            return CommandSent(time, value, np.zeros(len(value)))
+        if time <= before[0] or np.abs(value - before[1]).max() < STILL_RAD:
+            return None
+        return CommandSent(before[0], value, np.full(len(value), time - before[0]))
+
+
+class RosReader:
+    """Converts the messages of one topic into events.
+
+    Args:
+        robot: The robot.
+        role: Role of the topic.
+        topics: All topics. Motor readings give the tool position only if no tool topic is named.
+    """
+
+    def __init__(self, robot: Robot, role: Role, topics: RosTopics) -> None:
+        self._robot = robot
+        self._twin = DigitalTwin(robot)
+        self._role = role
+        self._sees_tool = bool(topics.tool)
+        self._where = next(f"topic {name}" for r, name, _ in topics.subscribed if r == role)
+        self._samples = SampledCommands()
+        self._target: FloatArray | None = None
+
+    def events(self, content: Any, kind: Kind, received_ns: int) -> list[Event]:
+        """Return the events in a message.
+
+        Args:
+            content: The message: an object with the fields of its kind, stamps with `sec` and
+                `nanosec`.
+            kind: Its kind.
+            received_ns: Time of arrival [ns], used if the stamp is zero.
+
+        Raises:
+            InputError: If it is invalid.
+        """
+        if kind not in KINDS[self._role]:
+            raise InputError(f"{self._where}: {kind.value} cannot be the {self._role}.")
+        rows = topic_rows([BagMessage(received_ns, content)], kind, self._role, self._where)
+        if self._role != "tool":
+            rows = motor_rows(rows, self._robot)
+        if self._role == "command":
+            return self._commands(rows)
+        return self._readings(rows.stamp_ns.tolist(), rows.value)
+
+    def _readings(self, stamps_ns: list[int], values: FloatArray) -> list[Event]:
+        checked = self._checked(values, LARGEST)
+        rows = zip(stamps_ns, checked, strict=True)
+        return [self._reading(stamp / NS_PER_S, row) for stamp, row in rows]
+
+    def _reading(self, time: float, value: FloatArray) -> Reading:
+        if self._role == "tool":
+            return Reading(time, value)
+        if self._role == "goal":
+            return goal_reading(time, value)
+        if self._sees_tool:
+            return Reading(time, np.full(3, np.nan), value)
+        return motor_reading(time, value, self._twin)
+
+    def _commands(self, rows: Rows) -> list[Event]:
+        targets = self._checked(rows.value, LARGEST)
+        times = (rows.stamp_ns / NS_PER_S).tolist()
+        if rows.duration is None:
+            samples = zip(times, targets, strict=True)
+            sampled = [self._samples.add(time, self._completed(row)) for time, row in samples]
+            return [command for command in sampled if command is not None]
+        durations = self._checked(rows.duration, LONGEST_S)
+        events: list[Event] = []
+        for row, stamp in enumerate(times):
+            target, longest = self._completed(targets[row]), float(np.nanmax(durations[row]))
+            if row == 0 and len(times) > 1 and not longest > 0.0 and self._target is not None:
+                continue  # the first point of a trajectory may only repeat the present pose
+            self._target = target
+            duration = np.where(durations[row] >= 0, durations[row], longest)
+            events.append(CommandSent(stamp, target, duration))
+        return events
+
+    def _completed(self, target: FloatArray) -> FloatArray:
+        """Return a target in which motors that are not named keep their last target."""
+        if self._target is not None:
+            return np.where(np.isfinite(target), target, self._target)
+        if not np.isfinite(target).all():
+            raise InputError(f"{self._where}: the first command does not name every motor.")
+        return target
+
+    def _checked(self, values: FloatArray, largest: float) -> FloatArray:
+        if np.any(np.abs(values) > largest):
+            raise InputError(
+                f"{self._where}: a message holds {np.nanmax(np.abs(values)):g}, expected values up "
+                f"to {largest:g}."
+            )
+        return values
+
+
+# Writing.
+
+DIAGNOSTICS_TYPE = "diagnostic_msgs/DiagnosticArray"
+PERIOD_S = 1.0
+"""Time between two diagnoses when no status gets worse [s]."""
+
+
+class RosWriter:
+    """Writes readings and commands as the robot itself would.
+
+    Args:
+        robot: The robot.
+        topics: Its topics.
+
+    Raises:
+        InputError: If commands are a stream of set-points, which cannot carry single commands, or
+            messages hold servo counts and the robot's profile has none.
+    """
+
+    def __init__(self, robot: Robot, topics: RosTopics) -> None:
+        if kind_of_type(topics.command_type) is Kind.JOINT_STATE:
+            raise InputError(
+                "command_type is sensor_msgs/JointState, a stream of samples, which cannot be "
+                "published here. Expected trajectory_msgs/JointTrajectory or the authors' message."
+            )
+        topics.check_fits(robot)
+        self._robot = robot
+        self._topics = topics
+        self._origin = np.zeros(len(robot.motors))
+
+    def start_at(self, angle: FloatArray) -> None:
+        """Set the angles from which the next command starts, (motor,) [rad]."""
+        self._origin = angle
+
+    @property
+    def topics(self) -> list[tuple[str, str]]:
+        """Name and type of every topic that may be written to."""
+        return [(name, type_) for _, name, type_ in self._topics.subscribed]
+
+    def messages(self, item: Item) -> list[Outgoing]:
+        """Return the messages of a reading or command; none for an answer."""
+        if isinstance(item, Reading):
+            return self._of_reading(item)
+        return [self.command(item)] if isinstance(item, CommandSent) else []
+
+    def command(self, command: CommandSent) -> Outgoing:
+        """Return the message of a command."""
+        type_ = self._topics.command_type
+        if kind_of_type(type_) is Kind.TRAJECTORY:
+            content = self._trajectory(command)
+        else:
+            content = self._joints(command.time, command.target, type_)
+            # The authors' message has no field for durations; they write them as temperatures.
+            content["temperature"] = (command.duration * MS_PER_S).tolist()
+        self._origin = command.target
+        return Outgoing(self._topics.command, type_, content)
+
+    def _of_reading(self, reading: Reading) -> list[Outgoing]:
+        topics, time, messages = self._topics, reading.time, []
+        for topic, type_, angle in (
+            (topics.position, topics.position_type, reading.position),
+            (topics.goal, topics.goal_type, reading.goal),
+        ):
+            if topic and angle is not None:
+                messages.append(Outgoing(topic, type_, self._joints(time, angle, type_)))
+        if topics.tool and np.isfinite(reading.tool).all():
+            messages.append(Outgoing(topics.tool, topics.tool_type, self._tool(reading)))
+        return messages
+
+    def _joints(self, time: float, angle: FloatArray, type_: str) -> dict[str, Any]:
+        motors, header = self._robot.motors, _header(time)
+        if kind_of_type(type_) is Kind.JOINT_STATE:
+            return {
+                "header": header,
+                "name": [motor.joint for motor in motors],
+                "position": angle.tolist(),
+                "velocity": [],
+                "effort": [],
+            }
+        return {
+            "header": header,
+            "name": [motor.log_column for motor in motors],
+            "position": self._robot.servo_units.to_counts(angle).tolist(),
+            "temperature": [],
+            "voltage": [],
+        }
+
+    def _tool(self, reading: Reading) -> dict[str, Any]:
+        header = {**_header(reading.time), "frame_id": self._robot.profile.base_link}
+        point = dict(zip("xyz", reading.tool.tolist(), strict=True))
+        if kind_of_type(self._topics.tool_type) is Kind.POINT:
+            return {"header": header, "point": point}
+        unknown = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+        return {"header": header, "pose": {"position": point, "orientation": unknown}}
+
+    def _trajectory(self, command: CommandSent) -> dict[str, Any]:
+        """Return a trajectory with one point per time of arrival, which makes it exact."""
+        points = []
+        for due in np.unique(command.duration):
+            share = np.divide(
+                due, command.duration, out=np.ones_like(command.target), where=command.duration > 0
+            )
+            angle = self._origin + np.minimum(share, 1.0) * (command.target - self._origin)
+            points.append(
+                {
+                    "positions": angle.tolist(),
+                    "velocities": [],
+                    "accelerations": [],
+                    "effort": [],
+                    "time_from_start": _stamp(float(due)),
+                }
+            )
+        names = [motor.joint for motor in self._robot.motors]
+        return {"header": _header(command.time), "joint_names": names, "points": points}
+
+
+def _header(time: float) -> dict[str, Any]:
+    return {"seq": 0, "stamp": _stamp(time), "frame_id": ""}
+
+
+def _stamp(time: float) -> dict[str, int]:
+    secs, nsecs = divmod(round(time * NS_PER_S), NS_PER_S)
+    return {"secs": secs, "nsecs": nsecs}
+
+
+class DiagnosticsWriter:
+    """Writes answers as diagnostics: every second, and at once when a status gets worse.
+
+    Args:
+        robot: The robot.
+        topics: Its topics.
+
+    Attributes:
+        topics: Name and type of the topic that is written to.
+    """
+
+    def __init__(self, robot: Robot, topics: RosTopics) -> None:
+        self._robot = robot
+        self._levels: list[int] = []
+        self._due_s = -np.inf
+        self.topics = [(topics.diagnostics, DIAGNOSTICS_TYPE)]
+
+    def messages(self, item: Item) -> list[Outgoing]:
+        """Return the message of an answer if one is due; none for a reading or command."""
+        if not isinstance(item, Answer):
+            return []
+        current = statuses(item, self._robot.motor_names)
+        if not self._is_due([status.level for status in current]):
+            return []
+        array = [self._status(status) for status in current]
+        content = {"header": _header(item.time), "status": array}
+        return [Outgoing(*self.topics[0], content)]
+
+    def _is_due(self, levels: list[int]) -> bool:
+        """Return whether to write these levels now."""
+        now_s = time.monotonic()
+        worse = any(new > old for new, old in zip(levels, self._levels, strict=False))
+        if not worse and now_s < self._due_s:
+            return False
+        self._levels, self._due_s = levels, now_s + PERIOD_S
+        return True
+
+    def _status(self, status: Status) -> dict[str, Any]:
+        return {
+            "level": status.level,
+            "name": f"failuretwin: {status.name}",
+            "message": status.message,
+            "hardware_id": self._robot.name,
+            "values": [{"key": key, "value": value} for key, value in status.values.items()],
+        }
