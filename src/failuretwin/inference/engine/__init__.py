@@ -1,0 +1,18 @@
+"""The one likelihood: moments, theta, outcomes and an integral in the numbers of a moment.
+
+    p(run | h) = sum over rows of p(row | h)  integral of prod over m of L_m(G_m theta + H_m z)
+
+Read in this order; each module states its term:
+
+    integral       one moment under one row: evidence, mean and covariance of f, in closed form
+    filter         moment by moment, and every moment again given all others
+    moments        readings -> moments, at rest and on the way
+    theta          what a robot shares: registration, offsets, lags, joint frames; scatter and noise
+    outcomes       what may have become of a moment: residual and scale
+    rows           what is discrete of a hypothesis; amount_rows, redrawn_rows: by signature
+    picks, runs    rows by components of the robot: the evidence of every hypothesis
+
+It weighs rests of single runs: healthy, held, constant, growing and redrawn faults, of robots that
+are calibrated or not. `BayesDiagnoser` still weighs runs by `movements`, `faults` and `theta`; the
+engine takes their place question by question (docs/inference.md#engine).
+"""

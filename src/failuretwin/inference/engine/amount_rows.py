@@ -1,0 +1,396 @@
+"""Faults of one amount for the whole run: a held angle, a constant offset, a rate.
+
+    angle of the motor in moment m = phi_m(x),    x = centre + z,    H_m = J_k dphi_m/dx
+
+The centre of each row is where the moments from its onset on point: the best of a grid, then two
+Gauss-Newton steps. A motor that is held says nothing of its own part of theta.
+
+Section: docs/inference.md#hypotheses
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from failuretwin.core.numerics import log_of
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.digital_model.settling import sag
+from failuretwin.failure_behavior.fault import Arrival
+from failuretwin.failure_behavior.mode import FaultMode, Signature
+from failuretwin.inference.engine.integral import inverse
+from failuretwin.inference.engine.outcomes import Outcomes
+from failuretwin.inference.engine.rows import AmountPrior, Rows, Scene, before_onset, sampled
+from failuretwin.inference.engine.theta import columns
+from failuretwin.inference.faults.fault_sizes import SizePrior, coarse_sizes
+from failuretwin.inference.faults.priors import OnsetIntervals, plateau_or_ramp
+
+Angle = Callable[[FloatArray], FloatArray]
+"""Angle of the motor at some amounts, (run, row, node) -> (run, row, moment, node) [rad]."""
+GRID = 61
+"""Held angles among which the best is looked for."""
+FREE_RAD = 0.08
+"""Deviation of the angle about the best one, before the prior of the amount is put in [rad]."""
+STEPS, LONGEST = 2, 0.1
+"""Gauss-Newton steps from the best of the grid, and the longest [rad]."""
+TIED = 2.0
+"""Deviation of a held angle from where the motor had settled, in its scatter."""
+MARGIN = 4.0
+"""What a motor that stops on its ramp may be beyond its ends, in its scatter."""
+BEYOND = 0.1
+"""Share of its travel by which a motor may be held beyond its ends."""
+LONG_S = 10.0
+"""A fault that does not change has been there for so long [s]."""
+CELLS = 3
+"""Onsets within a stretch of time to sum over, of a fault that grows."""
+
+
+@dataclass(frozen=True)
+class _Motor:
+    """One motor of a scene, and how an amount moves it.
+
+    Attributes:
+        scene: The runs.
+        motor: Index of the motor.
+        held: Whether the gear holds it.
+        angle: Its angle by the amount.
+        first: First moment affected in each row, (row,).
+    """
+
+    scene: Scene
+    motor: int
+    held: bool
+    angle: Angle
+    first: IntArray
+
+    @property
+    def variance(self) -> FloatArray:
+        """Variance of all motors, (run, moment, 1, motor) [rad2]."""
+        found = self.scene.model.scatter**2 + self.scene.jitter
+        if self.held:
+            found[..., self.motor] = self.scene.model.held_scatter[self.motor] ** 2
+        return found
+
+    def best(self, grid: FloatArray, alike: bool) -> FloatArray:
+        """Return the amount of each row that explains its moments best, (run, row).
+
+        Args:
+            grid: Amounts to look at, (run, node).
+            alike: Whether the angle does not depend on the row.
+        """
+        scene, rows = self.scene, len(self.first)
+        shape = (len(grid), 1 if alike else rows, grid.shape[1])
+        angle = self.angle(np.broadcast_to(grid[:, None], shape))
+        step = np.abs(np.diff(angle, axis=-1)).mean(axis=-1, keepdims=True)
+        error, jacobian, _ = self._residual(angle)
+        variance = np.broadcast_to(self.variance[:, None], jacobian[..., 0, :].shape).copy()
+        variance[..., self.motor] += step**2 / 6.0
+        scale = np.matmul(jacobian * variance[..., None, :], np.swapaxes(jacobian, -1, -2))
+        precision, log_determinant = inverse(scale + self._doubt[:, None, :, None])
+        square = np.einsum("brmni,brmnij,brmnj->brmn", error, precision, error)
+        says = np.logaddexp(
+            scene.noise.log_density(square, log_determinant), scene.noise.log_outlier
+        )
+        says = np.where(self._counts[:, :, :, None], says, 0.0).sum(axis=2)
+        return np.take_along_axis(
+            np.broadcast_to(grid[:, None], says.shape), says.argmax(-1)[..., None], 2
+        )[..., 0]
+
+    def refined(self, x: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+        """Return amounts (run, row) after some Gauss-Newton steps, within (run, 1) limits."""
+        for _ in range(STEPS):
+            angle = self.angle(x[..., None])
+            slope = self.slope(x)
+            error, jacobian, _ = self._residual(angle)
+            error, jacobian = error[:, :, :, 0], jacobian[:, :, :, 0]
+            variance = self.variance[:, None, :, 0]
+            scale = np.matmul(jacobian * variance[..., None, :], np.swapaxes(jacobian, -1, -2))
+            precision, _ = inverse(scale + self._doubt[:, None])
+            lever = jacobian[..., self.motor] * slope[..., None]
+            pull = np.einsum("brmij,brmj->brmi", precision, error)
+            square = np.einsum("brmi,brmi->brm", error, pull)
+            weight = np.where(self._counts, 1.0 / (1.0 + square / 9.0), 0.0)
+            force = np.einsum("brm,brmi,brmi->br", weight, lever, pull)
+            curve = np.einsum("brm,brmi,brmij,brmj->br", weight, lever, precision, lever)
+            longest = LONGEST / np.maximum(np.abs(slope).max(axis=-1), 1e-6)
+            x = x + np.clip(force / np.maximum(curve, 1e-9), -longest, longest)
+            x = np.clip(x, low, high)
+        return x
+
+    def slope(self, x: FloatArray) -> FloatArray:
+        """Return dphi/dx, (run, row, moment)."""
+        step = 1e-4
+        low, high = (self.angle((x + h)[..., None])[..., 0] for h in (-step, step))
+        return (high - low) / (2.0 * step)
+
+    @property
+    def _doubt(self) -> FloatArray:
+        """What theta and the sensor leave open, (run, moment, channel, channel) [m2]."""
+        noise = self.scene.model.path_noise**2
+        return self.scene.spread + noise * np.eye(self.scene.spread.shape[-1])
+
+    @property
+    def _counts(self) -> BoolArray:
+        """Moments from the onset of each row on, (run, row, moment)."""
+        usable = self.scene.moments.usable[:, None]
+        return usable & (np.arange(usable.shape[2]) >= self.first[:, None])
+
+    def _residual(self, angle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return residual, Jacobian and pose with the motor at angles (run, row, moment, node)."""
+        settled = self.scene.settled[:, None, :, None]
+        pose = np.broadcast_to(settled, (*angle.shape, settled.shape[-1])).copy()
+        pose[..., self.motor] = angle
+        expected, jacobian = self.scene.model.sensors.expected(pose)
+        return self.scene.moments.point[:, None, :, None] - expected, jacobian, pose
+
+    def rows(
+        self,
+        x: FloatArray,
+        variance: FloatArray,
+        log_prior: FloatArray,
+        amount_prior: AmountPrior,
+        onsets: tuple[FloatArray, FloatArray],
+    ) -> Rows:
+        """Return the rows about some amounts.
+
+        Args:
+            x: Centres, (run, row).
+            variance: var(z), (run, row).
+            log_prior: (run, row).
+            amount_prior: Log density of the amount.
+            onsets: Samples of the onset and their shares, (run, row, sample) each.
+        """
+        scene, moments, motor = self.scene, self.scene.moments, self.motor
+        angle = self.angle(x[..., None])[..., 0]  # (run, row, moment)
+        base = np.repeat(moments.base[:, None], x.shape[1], axis=1)
+        if self.held:
+            base[..., motor] = angle[..., None]
+        else:  # off its targets, whatever became of the commands
+            base[..., motor] += (angle - scene.settled[:, None, :, motor])[..., None]
+        direction = np.broadcast_to(moments.direction[:, None], base.shape)
+        held = (np.arange(base.shape[-1]) == motor) & self.held
+        pose = scene.model.settle(base, direction, held)
+        spread = np.swapaxes(pose, 1, 2)
+        variance_of = self.variance[:, :, None]
+        outcomes = Outcomes.of_poses(scene.model, moments, spread, variance_of, np.zeros(1))
+        G = columns(scene.model, pose, direction, moments.speed[:, None, :, None], scene.layout)
+        jacobian = scene.model.sensors.expected(pose[:, :, :, 0])[1]
+        if self.held:
+            G[..., scene.layout.own(motor)] = 0.0
+        weight = np.broadcast_to(moments.log_weight[:, None], pose.shape[:-1])
+        rows = Rows(
+            log_prior,
+            self.first,
+            outcomes.rows_first(),
+            weight,
+            np.arange(weight.shape[-1]),
+            G,
+            jacobian[..., motor] * self.slope(x)[..., None],
+            x,
+            variance,
+            amount_prior,
+            onsets=sampled(*onsets),
+        )
+        return before_onset(rows, scene.healthy, scene.columns)
+
+
+# A motor that is held.
+
+
+def held_rows(scene: Scene, motor: int) -> Rows:
+    """Return the rows of a stuck motor: each onset, on the plateau and anywhere else."""
+    moments, priors = scene.moments, scene.priors
+    count, scatter = moments.count, max(float(scene.model.scatter[motor]), 1e-4)
+    low, high = held_range(scene, motor)
+    goal = scene.settled[..., motor]
+    off = scene.settled[:, :1, motor] - moments.base[:, :1, 0, motor]
+    was = np.concatenate([moments.origin[:, :1, motor] + off, goal[:, :-1]], axis=1)
+    intervals = stuck_intervals(scene, motor)
+    known, share = priors.onset.known_s, priors.onset.free
+    weight = intervals.weights(priors.onset.before_run("stuck"))
+    if known is not None:
+        weight = intervals.holding(known)
+    first = np.repeat(np.arange(count), 2)
+    moving = _Motor(scene, motor, True, _held_angle(count), first)
+    later = _Motor(scene, motor, True, _held_angle(count), np.arange(count))
+    free = later.best(np.linspace(low, high, GRID, axis=1), alike=True)
+    free = later.refined(free, low[:, None], high[:, None])
+    log_prior = np.stack(
+        [
+            log_of(weight[..., 0]) + np.log1p(-share),
+            log_of(weight[..., 1] + share * weight[..., 0]),
+        ],
+        axis=2,
+    )
+    tied = np.tile([True, False], count)
+    variance = np.where(tied, (TIED * scatter) ** 2, FREE_RAD**2) * np.ones((moments.runs, 1))
+    ends = np.repeat(np.stack([was, goal]), 2, axis=2)
+    start, stop = ends.min(axis=0) - MARGIN * scatter, ends.max(axis=0) + MARGIN * scatter
+    centre = _flat(was, free)
+
+    def amount_prior(x: FloatArray, run: IntArray, row: IntArray) -> FloatArray:
+        begin, end = start[run, row, None], stop[run, row, None]
+        between = np.where((x >= begin) & (x <= end), -np.log(end - begin), -np.inf)
+        anywhere = np.log(share) - np.log(high - low)[run, None]
+        ramp = np.logaddexp(np.log1p(-share) + between, anywhere)
+        width = variance[run, row, None]
+        normal = -0.5 * ((x - centre[run, row, None]) ** 2 / width + np.log(2.0 * np.pi * width))
+        return np.where(tied[row, None], normal, ramp)
+
+    onset = _stuck_onsets(intervals, was, goal, centre)
+    if known is not None:
+        onset = np.full_like(onset[0], known), onset[1]
+    return moving.rows(
+        centre, variance, _flat(log_prior[..., 0], log_prior[..., 1]), amount_prior, onset
+    )
+
+
+def _flat(plateau: FloatArray, ramp: FloatArray) -> FloatArray:
+    """Return values of plateaus and ramps (run, moment) as those of rows, (run, row)."""
+    return np.stack([plateau, ramp], axis=2).reshape(len(plateau), -1)
+
+
+def _held_angle(count: int) -> Angle:
+    def angle(x: FloatArray) -> FloatArray:
+        return np.repeat(x[:, :, None], count, axis=2)
+
+    return angle
+
+
+def held_range(scene: Scene, motor: int) -> tuple[FloatArray, FloatArray]:
+    """Return the lowest and the highest angle at which a motor may be held, (run,) [rad] each."""
+    robot, moments = scene.model.twin.robot, scene.moments
+    low, high = robot.travel[motor]
+    margin = BEYOND * (high - low)
+    if not robot.slides[motor]:  # beyond a full turn all angles come again
+        margin = min(margin, max(0.0, np.pi - 0.5 * (high - low)))
+    told = np.concatenate([moments.origin[:, :1, motor], moments.target[..., motor]], axis=1)
+    lowest, highest = told.min(axis=1), told.max(axis=1)
+    return np.minimum(low, lowest) - margin, np.maximum(high, highest) + margin
+
+
+def stuck_intervals(scene: Scene, motor: int) -> OnsetIntervals:
+    """Return plateau and ramp before each moment, (run, moment, plateau | ramp) [s]."""
+    moments, model = scene.moments, scene.model
+    start = moments.start + model.lag_s
+    ramp = moments.ramp[..., motor] * (1.0 - model.shortening)
+    return plateau_or_ramp(start, start + ramp)
+
+
+POINTS = np.linspace(0.05, 0.95, 10)
+"""Where in a stretch of time onsets are sampled, as shares of its length."""
+LAG_DOUBT_S = 0.03
+"""Deviation of one motor's lag about the mean of the robot [s]: it widens the onset's interval."""
+
+
+def _stuck_onsets(
+    intervals: OnsetIntervals, was: FloatArray, goal: FloatArray, centre: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return samples of the onset of each row: anywhere on a plateau, on a ramp where it stands."""
+    begin, length = np.nan_to_num(intervals.begin), intervals.length
+    onset = begin[..., None] + POINTS * length[..., None]  # (run, moment, part, sample)
+    travel = goal - was
+    safe = np.where(np.abs(travel) > 1e-6, travel, 1.0)
+    free = centre.reshape(*was.shape, 2)[..., 1]
+    passed = np.clip((free - was) / safe, 0.0, 1.0)
+    on_ramp = begin[..., 1] + passed * length[..., 1]
+    spread = LAG_DOUBT_S * np.linspace(-1.7, 1.7, len(POINTS))
+    ramp = np.maximum(on_ramp[..., None] + spread, 0.0)
+    anywhere = np.concatenate([onset[..., 0, :], onset[..., 1, :]], axis=-1)
+    within = ((free - was) / safe > -0.05) & ((free - was) / safe < 1.05)
+    ramp = np.where(within[..., None], ramp, anywhere[..., ::2])
+    found = np.stack([onset[..., 0, :], ramp], axis=2).reshape(len(was), -1, len(POINTS))
+    return found, np.full(found.shape, 1.0 / len(POINTS))
+
+
+# A motor that settles off its target by a constant size, or by one that grows.
+
+
+def offset_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
+    """Return the rows of a fault whose size holds for the run, with each onset."""
+    early = scene.priors.onset.before_run(mode.mode)
+    sizes = scene.priors.sizes_of(mode, scene.model, motor)
+    intervals = moment_intervals(scene)
+    count, growing = scene.moments.count, mode.signature is Signature.GROWING_OFFSET
+    if growing:
+        points = (np.arange(CELLS) + 0.5) / CELLS
+        onset, share = intervals.samples(early, points)  # (run, moment, sample)
+        samples = onset.shape[-1]
+        log_prior = log_of(intervals.weights(early)[..., None] * share).reshape(len(onset), -1)
+        first = np.repeat(np.arange(count), samples)
+        at = onset.reshape(len(onset), -1)
+        since = np.maximum(scene.moments.time[:, None] - at[..., None], 0.0)
+        width = intervals.length.repeat(samples, axis=1)[..., None] / CELLS
+        onsets = np.maximum(at[..., None] + width * np.linspace(-0.4, 0.4, 5), 0.0)
+        shares = np.full(onsets.shape, 0.2)
+    else:
+        log_prior, first = log_of(intervals.weights(early)), np.arange(count)
+        since = np.full((1, 1, 1), LONG_S)
+        onsets, shares = intervals.samples(early)
+    angle = _offset_angle(scene, motor, mode, since)
+    moving = _Motor(scene, motor, False, angle, first)
+    low, high = sizes.ends
+    grid = coarse_sizes(low, high)
+    grid = np.concatenate([-grid[::-1], grid]) if mode.signed else grid
+    grid = np.tile(grid, (scene.moments.runs, 1))
+    least = -high if mode.signed else low
+    x = moving.best(grid, alike=not growing)
+    x = moving.refined(x, np.full((1, 1), least), np.full((1, 1), high))
+    slope = np.sqrt(np.mean(moving.slope(x) ** 2, axis=-1))
+    deviation = np.minimum(FREE_RAD / np.maximum(slope, 1e-6), 0.5 * high)
+    prior = _size_prior(sizes, mode.signed)
+    return moving.rows(x, deviation**2, log_prior, prior, (onsets, shares))
+
+
+def moment_intervals(scene: Scene) -> OnsetIntervals:
+    """Return the time in which an onset affects each moment first: up to that moment."""
+    end = scene.moments.time
+    return OnsetIntervals(np.concatenate([np.zeros_like(end[:, :1]), end[:, :-1]], axis=1), end)
+
+
+def _offset_angle(scene: Scene, motor: int, mode: FaultMode, since: FloatArray) -> Angle:
+    """Return the settled angle of a motor by the size of its fault.
+
+    Args:
+        scene: The runs.
+        motor: Index of the motor.
+        mode: Its mode.
+        since: For how long the fault has been there, (run, row, moment) [s].
+    """
+    moments, model = scene.moments, scene.model
+    target, direction = moments.base[:, :, 0, motor], moments.direction[:, :, 0, motor]
+    travel = np.abs(moments.target - moments.origin)[..., motor]
+    load = np.zeros_like(target)
+    if mode.needs_compliance:
+        settling = model.settling
+        compliance = np.asarray(settling.compliance)
+        load = sag(model.twin.robot, scene.settled, compliance, settling.payload)[..., motor]
+
+    def angle(x: FloatArray) -> FloatArray:
+        parts = (target - direction * travel, target, direction, load)
+        origin, goal, way, weight = (part[:, None, :, None] for part in parts)
+        arrival = Arrival(origin, goal, way, since[..., None], weight)
+        off = mode.settled_offset(x[:, :, None], arrival)
+        return scene.settled[:, None, :, motor, None] + off
+
+    return angle
+
+
+def _size_prior(sizes: SizePrior, signed: bool) -> AmountPrior:
+    sides = 2.0 if signed else 1.0
+    ranges = [
+        (low, high, share) for (low, high), share in zip(sizes.ranges, sizes.shares, strict=True)
+    ]
+
+    def log_density(x: FloatArray, run: IntArray, row: IntArray) -> FloatArray:
+        del run, row
+        size = np.abs(x) if signed else x
+        parts = [
+            np.where((size >= low) & (size <= high), share / (sides * (high - low)), 0.0)
+            for low, high, share in ranges
+        ]
+        return log_of(np.sum(parts, axis=0))
+
+    return log_density

@@ -1,0 +1,81 @@
+"""Outcomes: what may have become of each moment, with residual and scale.
+
+    r_a = e - y(q_a),    S_a = sigma^2 J diag(s^2) J^T + J diag(v) J^T + sn^2 I
+
+with poses q_a, scatter s and its factor sigma, variances v of single motors beside it, and the
+noise sn of the sensor.
+
+Section: docs/inference.md#outcomes
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from failuretwin.core.types import FloatArray
+from failuretwin.inference.engine.moments import Moments
+from failuretwin.inference.observation.healthy_model import HealthyModel
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """Outcomes of moments, (run, ..., outcome).
+
+    Attributes:
+        residual: Seen minus expected, (..., outcome, channel) [m].
+        scatter: J diag(s^2) J^T, (..., outcome, channel, channel) [m2].
+        beside: J diag(v) J^T, same axes [m2].
+    """
+
+    residual: FloatArray
+    scatter: FloatArray
+    beside: FloatArray
+
+    @classmethod
+    def of_poses(
+        cls,
+        model: HealthyModel,
+        moments: Moments,
+        pose: FloatArray,
+        variance: FloatArray,
+        beside: FloatArray,
+    ) -> Outcomes:
+        """Return the outcomes of some poses.
+
+        Args:
+            model: The healthy robot.
+            moments: The moments.
+            pose: Settled angles, (run, moment, ..., motor) [rad].
+            variance: Of the scatter of each motor, (..., motor) [rad2].
+            beside: Variance of single motors beside it, (..., motor) [rad2].
+        """
+        expected, jacobian = model.sensors.expected(pose)
+        point = moments.point
+        between = expected.ndim - point.ndim
+        point = point.reshape(*point.shape[:2], *(1,) * between, point.shape[-1])
+        transposed = np.swapaxes(jacobian, -1, -2)
+        scatter = np.matmul(jacobian * np.asarray(variance)[..., None, :], transposed)
+        extra = np.broadcast_to(0.0, scatter.shape)
+        if np.any(beside):
+            extra = np.matmul(jacobian * np.asarray(beside)[..., None, :], transposed)
+        return cls(point - expected, scatter, extra)
+
+    def with_rows(self) -> Outcomes:
+        """Return the same with an axis for rows behind that of runs."""
+        return Outcomes(self.residual[:, None], self.scatter[:, None], self.beside[:, None])
+
+    def rows_first(self) -> Outcomes:
+        """Return outcomes (run, moment, row, ...) as (run, row, moment, ...)."""
+        parts = (self.residual, self.scatter, self.beside)
+        return Outcomes(*(np.swapaxes(x, 1, 2) for x in parts))
+
+    @classmethod
+    def joined(cls, *parts: Outcomes) -> Outcomes:
+        """Return the outcomes of several sets, (run, moment, outcome, ...)."""
+
+        def join(name: str) -> FloatArray:
+            return np.concatenate([getattr(part, name) for part in parts], axis=2)
+
+        return cls(join("residual"), join("scatter"), join("beside"))

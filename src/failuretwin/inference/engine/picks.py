@@ -1,0 +1,240 @@
+"""Picks: rows with what they say of outcomes, ready for the filter.
+
+All outcomes of a row are looked at once; then those that count are weighed about the likeliest of
+each moment, whose columns f has. Others have columns of their own: by how much they differ counts
+as scatter.
+
+Section: docs/inference.md#runs
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
+from failuretwin.inference.engine.integral import Mixture, Noise
+from failuretwin.inference.engine.rows import Rows, Scene
+from failuretwin.inference.engine.theta import Components
+
+Arguments = tuple[
+    Callable[[int], Mixture], BoolArray, FloatArray, FloatArray, FloatArray, FloatArray, Noise
+]
+"""What the filter takes."""
+
+
+@dataclass(frozen=True)
+class Picks:
+    """Some rows of one hypothesis, each of one run and by one component.
+
+    Attributes:
+        run: (pick,).
+        row: (pick,).
+        component: (pick,).
+    """
+
+    run: IntArray
+    row: IntArray
+    component: IntArray
+
+    def __getitem__(self, some: IntArray | slice) -> Picks:
+        """Return some of them."""
+        return Picks(self.run[some], self.row[some], self.component[some])
+
+    def row_of(self, array: FloatArray) -> IntArray:
+        """Return the index along the axis of rows, which may be common to all."""
+        return self.row if array.shape[1] > 1 else np.zeros_like(self.row)
+
+
+@dataclass(frozen=True)
+class Part:
+    """Rows ready for the filter.
+
+    Attributes:
+        scene: The runs.
+        rows: Rows of the hypothesis.
+        picks: Which of them.
+        components: What is believed of the robot.
+        columns: G of each usual outcome, (pick, moment, usual, channel, theta).
+        own: G of the outcome to which f belongs, (pick, moment, 1, channel, theta).
+    """
+
+    scene: Scene
+    rows: Rows
+    picks: Picks
+    components: Components
+    columns: FloatArray
+    own: FloatArray
+
+    @property
+    def arguments(self) -> Arguments:
+        """What the filter takes."""
+        run, row = self.picks.run, self.picks.row
+        picks, moments, _, channels, size = self.own.shape
+        G = self.own.reshape(picks, moments * channels, size)
+        V, mu = self._theta
+        covariance = G @ V @ np.swapaxes(G, -1, -2)
+        mean = np.matmul(G, mu[..., None]).reshape(picks, moments, channels)
+        usable, lever = self.scene.moments.usable[run], self.rows.lever[run, row]
+        variance, noise = self.rows.variance[run, row], self.scene.noise
+        return self.mixture_at, usable, mean, covariance, lever, variance, noise
+
+    @property
+    def _theta(self) -> tuple[FloatArray, FloatArray]:
+        return self.components.of(self.picks.run, self.picks.component)
+
+    @cached_property
+    def _other(self) -> tuple[FloatArray, FloatArray]:
+        """How far outcomes have other columns, as if theta were independent: mean, covariance."""
+        V, mu = self._theta
+        apart = self.columns - self.own
+        deviation = np.sqrt(np.diagonal(V, axis1=-2, axis2=-1))[:, None, None, None]
+        scaled = apart * deviation
+        shift = np.matmul(apart, mu[:, None, None, :, None])[..., 0]
+        return shift, np.matmul(scaled, np.swapaxes(scaled, -1, -2))
+
+    def mixture_at(self, m: int) -> Mixture:
+        """Return the outcomes of a moment under each row."""
+        rows, run, outcomes = self.rows, self.picks.run, self.rows.outcomes
+        row, component = self.picks.row_of(outcomes.residual), self.picks.component
+        shift, wider = (values[:, m][:, rows.usual] for values in self._other)
+        noise = self.components.noise_m[component, None, None, None] ** 2
+        factor = self.components.sigma[component, None, None, None] ** 2
+        scale = factor * outcomes.scatter[run, row, m] + noise * np.eye(shift.shape[-1])
+        scale += outcomes.beside[run, row, m]
+        scale += wider
+        residual = outcomes.residual[run, row, m] - shift
+        return Mixture(residual, scale, rows.log_weight[run, self.picks.row, m])
+
+
+LEFT_OUT = 2e-3
+"""Share of the outcomes of a moment under a row that may be left out, once all are weighed."""
+
+
+@dataclass(frozen=True)
+class Narrowed:
+    """The outcomes of the rows of a hypothesis that count, about the likeliest of each moment.
+
+    Attributes:
+        place: Index of each row among those that are kept, (run, row).
+        kept: Outcomes, (place, moment, outcome).
+        columns: G of the likeliest outcome, (place, moment, channel, theta).
+        apart: G of each outcome less that, (place, moment, outcome, channel, theta).
+        residual: (place, moment, outcome, channel) [m].
+        scatter: (place, moment, outcome, channel, channel) [m2].
+        beside: Same axes [m2].
+        log_weight: (place, moment, outcome).
+    """
+
+    place: IntArray
+    kept: IntArray
+    columns: FloatArray
+    apart: FloatArray
+    residual: FloatArray
+    scatter: FloatArray
+    beside: FloatArray
+    log_weight: FloatArray
+
+
+def narrowed(rows: Rows, picks: Picks, share: FloatArray) -> Narrowed:
+    """Return the outcomes of some rows that count.
+
+    Args:
+        rows: Rows of the hypothesis.
+        picks: Those that are kept.
+        share: Share of each outcome, (pick, moment, outcome).
+    """
+    run, row = picks.run, picks.row
+    place = np.full(rows.log_prior.shape, -1)
+    place[run, row] = np.arange(len(run))
+    order = np.argsort(-share, axis=-1, kind="stable")
+    left = 1.0 - np.cumsum(np.take_along_axis(share, order, axis=-1), axis=-1)
+    total = share.sum(axis=-1, keepdims=True)
+    count = 1 + int((left - (1.0 - total) > LEFT_OUT * total).sum(axis=-1).max(initial=0))
+    kept = order[..., :count]
+    moment = np.arange(share.shape[1])[None, :, None]
+    G = rows.columns[run, picks.row_of(rows.columns)]
+    usual = rows.usual[kept]
+    own = G[np.arange(len(run))[:, None], moment[..., 0], usual[..., 0]]
+    apart = G[np.arange(len(run))[:, None, None], moment, usual] - own[:, :, None]
+    r = picks.row_of(rows.outcomes.residual)[:, None, None]
+    index = run[:, None, None], r, moment, kept
+    return Narrowed(
+        place,
+        kept,
+        own,
+        apart,
+        rows.outcomes.residual[index],
+        rows.outcomes.scatter[index],
+        rows.outcomes.beside[index],
+        rows.log_weight[run[:, None, None], row[:, None, None], moment, kept],
+    )
+
+
+@dataclass(frozen=True)
+class NarrowPart:
+    """Picks of narrowed rows, ready for the filter.
+
+    Attributes:
+        scene: The runs.
+        rows: Rows of the hypothesis.
+        picks: Which of them.
+        components: What is believed of the robot.
+        narrow: The outcomes that count.
+    """
+
+    scene: Scene
+    rows: Rows
+    picks: Picks
+    components: Components
+    narrow: Narrowed
+
+    @cached_property
+    def place(self) -> IntArray:
+        """Index of each pick among the rows that are kept."""
+        return self.narrow.place[self.picks.run, self.picks.row]
+
+    @cached_property
+    def _theta(self) -> tuple[FloatArray, FloatArray]:
+        return self.components.of(self.picks.run, self.picks.component)
+
+    @property
+    def arguments(self) -> Arguments:
+        """What the filter takes."""
+        run, row = self.picks.run, self.picks.row
+        G = self.narrow.columns[self.place]
+        picks, moments, channels, size = G.shape
+        G = G.reshape(picks, moments * channels, size)
+        V, mu = self._theta
+        covariance = G @ V @ np.swapaxes(G, -1, -2)
+        mean = np.matmul(G, mu[..., None]).reshape(picks, moments, channels)
+        scene, rows = self.scene, self.rows
+        usable, lever = scene.moments.usable[run], rows.lever[run, row]
+        return (
+            self.mixture_at,
+            usable,
+            mean,
+            covariance,
+            lever,
+            rows.variance[run, row],
+            scene.noise,
+        )
+
+    def mixture_at(self, m: int) -> Mixture:
+        """Return the outcomes of a moment under each row."""
+        narrow, place, component = self.narrow, self.place, self.picks.component
+        V, mu = self._theta
+        apart = narrow.apart[place, m]
+        deviation = np.sqrt(np.diagonal(V, axis1=-2, axis2=-1))
+        scaled = apart * deviation[:, None, None]
+        scale = np.matmul(scaled, np.swapaxes(scaled, -1, -2)) + narrow.beside[place, m]
+        factor = self.components.sigma[component, None, None, None] ** 2
+        noise = self.components.noise_m[component, None, None, None] ** 2
+        scale += factor * narrow.scatter[place, m] + noise * np.eye(scale.shape[-1])
+        residual = narrow.residual[place, m]
+        if mu.any():
+            residual = residual - np.matmul(apart, mu[:, None, :, None])[..., 0]
+        return Mixture(residual, scale, narrow.log_weight[place, m])

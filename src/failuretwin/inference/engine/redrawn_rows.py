@@ -1,0 +1,118 @@
+"""A fault whose size every movement draws anew: a steady-state error.
+
+The outcomes of a moment are nodes over the size with both signs, each widened by half the distance
+to the next; beside a lost command of another motor the error counts as normal. Each range of sizes
+is a row, and each later onset one with any range.
+
+Section: docs/inference.md#hypotheses
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from failuretwin.core.numerics import log_of
+from failuretwin.core.types import FloatArray
+from failuretwin.failure_behavior.mode import FaultMode
+from failuretwin.inference.engine.outcomes import Outcomes
+from failuretwin.inference.engine.rows import Rows, Scene, sampled
+from failuretwin.inference.faults.priors import OnsetIntervals
+
+NODES = 24
+"""Nodes of the size on each side of zero, in a constant ratio."""
+SMALLEST = 1e-3
+"""Smallest node, as a share of the largest size, where sizes begin at nothing."""
+
+
+def redrawn_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
+    """Return the rows of a motor whose error is drawn anew for each movement."""
+    moments, model = scene.moments, scene.model
+    sizes = scene.priors.sizes_of(mode, model, motor)
+    low, high = sizes.ends
+    edge = np.geomspace(max(low, SMALLEST * high), high, NODES + 1)
+    node, width = np.sqrt(edge[1:] * edge[:-1]), np.diff(edge)
+    size, width = np.r_[-node[::-1], node], np.r_[width[::-1], width]
+    mass = np.stack([_mass(edge, *ends) for ends in sizes.ranges])  # (range, node)
+    shares = np.array(sizes.shares)
+    mean_square = float(shares @ (mass @ size**2))
+    outcomes = Outcomes.joined(
+        scene.healthy,
+        _nodes(scene, motor, size, width, mean_square),
+        _beside_losses(scene, motor, mean_square),
+    )
+    weight = _weights(scene, [*mass, shares @ mass])
+    faulty, any_range = weight[:, :-1], weight[:, -1]
+    count, usual = moments.count, moments.log_weight.shape[-1]
+    sound = np.full_like(any_range, -np.inf)
+    sound[..., :usual] = moments.log_weight
+    later = [np.where((np.arange(count) < m)[:, None], sound, any_range) for m in range(1, count)]
+    weight = np.concatenate([faulty, np.stack(later, axis=1)], axis=1) if later else faulty
+    intervals = _intervals(scene)
+    early = scene.priors.onset.before_run(mode.mode)
+    onset = intervals.weights(early)
+    log_prior = np.concatenate([log_of(onset[:, :1]) + log_of(shares), log_of(onset[:, 1:])], 1)
+    first = np.r_[np.zeros(len(shares), dtype=np.int64), np.arange(1, count)]
+    runs, rows = log_prior.shape
+    samples, share = intervals.samples(early)
+    nothing = np.zeros((runs, rows))
+    return Rows(
+        log_prior,
+        first,
+        outcomes.with_rows(),
+        weight,
+        np.r_[np.arange(usual), np.zeros(len(size), dtype=np.int64), np.arange(1, usual)],
+        scene.columns[:, None],
+        np.zeros((runs, rows, count, moments.point.shape[-1])),
+        nothing,
+        nothing,
+        size=np.r_[np.full(usual, np.nan), size, np.full(usual - 1, np.sqrt(mean_square))],
+        onsets=sampled(samples[:, first], share[:, first]),
+    )
+
+
+def _mass(edge: FloatArray, low: float, high: float) -> FloatArray:
+    """Return the share of a range of sizes in each node of both signs, (node,)."""
+    mass = np.clip(np.minimum(edge[1:], high) - np.maximum(edge[:-1], low), 0.0, None)
+    return np.r_[mass[::-1], mass] / max(2.0 * float(mass.sum()), 1e-300)
+
+
+def _nodes(
+    scene: Scene, motor: int, size: FloatArray, width: FloatArray, mean_square: float
+) -> Outcomes:
+    """Return the outcomes of all nodes if the commands of all motors arrive."""
+    moments, model = scene.moments, scene.model
+    done = moments.done[..., motor, None]
+    base = np.repeat(moments.base[:, :, :1], len(size), axis=2)
+    base[..., motor] += size * done
+    direction = np.broadcast_to(moments.direction[:, :, :1], base.shape)
+    beside = np.repeat(scene.jitter, len(size), axis=2)
+    beside[..., motor] += width**2 / 12.0 + (1.0 - done) ** 2 * mean_square
+    pose = model.settle(base, direction, model.none_held)
+    return Outcomes.of_poses(model, moments, pose, model.scatter**2, beside)
+
+
+def _beside_losses(scene: Scene, motor: int, mean_square: float) -> Outcomes:
+    """Return the outcomes in which commands get lost, with the error as normal."""
+    beside = np.repeat(scene.jitter, scene.pose.shape[2] - 1, axis=2)
+    beside[..., motor] += mean_square
+    pose, variance = scene.pose[:, :, 1:], scene.model.scatter**2
+    return Outcomes.of_poses(scene.model, scene.moments, pose, variance, beside)
+
+
+def _weights(scene: Scene, masses: list[FloatArray]) -> FloatArray:
+    """Return the log weight of each outcome, (run, row, moment, outcome)."""
+    usual = scene.moments.log_weight
+    never = np.full_like(usual, -np.inf)
+    return np.stack(
+        [
+            np.concatenate([never, usual[..., :1] + log_of(mass), usual[..., 1:]], axis=-1)
+            for mass in masses
+        ],
+        axis=1,
+    )
+
+
+def _intervals(scene: Scene) -> OnsetIntervals:
+    """Return the time in which an onset affects each moment first: up to its movement."""
+    start = scene.moments.start
+    return OnsetIntervals(np.concatenate([np.zeros_like(start[:, :1]), start[:, :-1]], 1), start)

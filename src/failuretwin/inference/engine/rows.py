@@ -1,0 +1,181 @@
+"""Rows: every way in which a hypothesis may have come about in a run.
+
+A row fixes what is discrete: the onset, the range of sizes. One continuous amount z of each row
+(a held angle, a constant offset, a rate) is integrated with theta, as a column H of its own.
+
+Section: docs/inference.md#hypotheses
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from failuretwin.core.numerics import Weighted
+from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.inference.engine.integral import Noise
+from failuretwin.inference.engine.moments import Moments
+from failuretwin.inference.engine.outcomes import Outcomes
+from failuretwin.inference.engine.theta import Layout, columns
+from failuretwin.inference.faults.priors import Priors
+from failuretwin.inference.observation.healthy_model import HealthyModel
+
+JITTER_S = 0.03
+"""Deviation of the start of each motor from movement to movement [s]."""
+AmountPrior = Callable[[FloatArray, IntArray, IntArray], FloatArray]
+"""Log density of amounts (pick, node) of some runs (pick,) and rows (pick,), same axes."""
+Onsets = Callable[[int, int], tuple[FloatArray, FloatArray]]
+"""Samples of the onset of a run and row [s], and their shares, (sample,) each."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of one hypothesis.
+
+    Attributes:
+        log_prior: Log probability of each row given its hypothesis, (run, row).
+        first: First moment that the fault affects, (row,).
+        outcomes: Outcomes, (run, row or 1, moment, outcome, ...).
+        log_weight: Their log probability, (run, row, moment, outcome).
+        usual: Outcome of the healthy robot whose columns an outcome has, (outcome,).
+        columns: G of each usual outcome, (run, row or 1, moment, usual, channel, theta).
+        lever: H, (run, row, moment, channel).
+        centre: Amount at z = 0, (run, row).
+        variance: var(z) before its prior is put in, (run, row); 0 without an amount.
+        amount_prior: Log density of the amount; None: the normal one stands.
+        size: Size of each outcome where every movement draws its own, (outcome,); NaN: none.
+        onsets: Onset of a run and row; None: no fault.
+    """
+
+    log_prior: FloatArray
+    first: IntArray
+    outcomes: Outcomes
+    log_weight: FloatArray
+    usual: IntArray
+    columns: FloatArray
+    lever: FloatArray
+    centre: FloatArray
+    variance: FloatArray
+    amount_prior: AmountPrior | None = None
+    size: FloatArray | None = None
+    onsets: Onsets | None = None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What all hypotheses about some runs share.
+
+    Attributes:
+        model: The healthy robot; its doubt is in theta, not in its scatter.
+        moments: The moments.
+        priors: Beliefs about onset and size.
+        noise: The Student t of residuals.
+        layout: Places in theta.
+        columns: G of a healthy robot under each outcome, (run, moment, outcome, channel, theta).
+        spread: G V G^T where every command arrives, (run, moment, channel, channel) [m2].
+        pose: Settled angles under each outcome, (run, moment, outcome, motor) [rad].
+        healthy: Outcomes of a healthy robot, (run, moment, outcome, ...).
+    """
+
+    model: HealthyModel
+    moments: Moments
+    priors: Priors
+    noise: Noise
+    layout: Layout
+    columns: FloatArray
+    spread: FloatArray
+    pose: FloatArray
+    healthy: Outcomes
+
+    @classmethod
+    def of(
+        cls,
+        model: HealthyModel,
+        moments: Moments,
+        priors: Priors,
+        layout: Layout,
+        covariance: FloatArray,
+    ) -> Scene:
+        """Return the scene of some moments.
+
+        Args:
+            model: The healthy robot, without doubt.
+            moments: The moments.
+            priors: Beliefs about onset and size.
+            layout: Places in theta.
+            covariance: V by which rows are centred, (theta, theta).
+        """
+        noise = Noise(model.settling.tail_dof, model.sensors.dims, model.outlier_log_density)
+        pose = model.settle(moments.base, moments.direction, model.none_held)
+        G = columns(model, pose, moments.direction, moments.speed[:, :, None], layout)
+        usual = G[:, :, 0]
+        spread = usual @ covariance @ np.swapaxes(usual, -1, -2)
+        jitter = (JITTER_S * moments.speed[:, :, None]) ** 2
+        healthy = Outcomes.of_poses(model, moments, pose, model.scatter**2, jitter)
+        return cls(model, moments, priors, noise, layout, G, spread, pose, healthy)
+
+    @property
+    def jitter(self) -> FloatArray:
+        """Variance of single motors by uneven starts, (run, moment, 1, motor) [rad2]."""
+        return (JITTER_S * self.moments.speed[:, :, None]) ** 2
+
+    @property
+    def settled(self) -> FloatArray:
+        """Settled angles where every command arrives, (run, moment, motor) [rad]."""
+        return self.pose[:, :, 0]
+
+    def healthy_rows(self) -> Rows:
+        """Return the one row of a healthy robot."""
+        runs, count, channels = self.moments.point.shape
+        return Rows(
+            np.zeros((runs, 1)),
+            np.array([count]),
+            self.healthy.with_rows(),
+            self.moments.log_weight[:, None],
+            np.arange(self.moments.log_weight.shape[-1]),
+            self.columns[:, None],
+            np.zeros((runs, 1, count, channels)),
+            np.zeros((runs, 1)),
+            np.zeros((runs, 1)),
+        )
+
+
+def sampled(onset: FloatArray, share: FloatArray) -> Onsets:
+    """Return the onsets of rows that each have samples of their own.
+
+    Args:
+        onset: (run, row, sample) [s].
+        share: Share of each, same axes.
+    """
+    return lambda run, row: (onset[run, row], share[run, row])
+
+
+def mixed(parts: list[tuple[float, Weighted]]) -> Weighted:
+    """Return the mixture of some distributions by their probabilities."""
+    values = np.concatenate([one.values for _, one in parts])
+    weights = [p * one.weights / max(one.weights.sum(), 1e-300) for p, one in parts]
+    return Weighted(values, np.concatenate(weights))
+
+
+def before_onset(rows: Rows, healthy: Outcomes, columns_of: FloatArray) -> Rows:
+    """Return rows whose moments before the first affected one are those of a healthy robot."""
+    count = rows.log_weight.shape[2]
+    mask = (np.arange(count) < rows.first[:, None])[None, :, :, None]
+
+    def pick(sound: FloatArray, faulty: FloatArray) -> FloatArray:
+        return np.where(mask.reshape(*mask.shape, *(1,) * (faulty.ndim - 4)), sound, faulty)
+
+    sound = healthy.with_rows()
+    outcomes = Outcomes(
+        pick(sound.residual, rows.outcomes.residual),
+        pick(sound.scatter, rows.outcomes.scatter),
+        pick(sound.beside, rows.outcomes.beside),
+    )
+    return replace(
+        rows,
+        outcomes=outcomes,
+        columns=pick(columns_of[:, None], rows.columns),
+        lever=np.where(mask, 0.0, rows.lever),
+    )

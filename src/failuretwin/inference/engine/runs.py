@@ -1,0 +1,252 @@
+"""Runs: the evidence of every hypothesis, with all that is unknown of the robot integrated.
+
+    p(run | h) = sum over c of w_c  sum over rows of p(row | h)  integral of p(run | row, theta, c)
+
+Components c are normal distributions of theta with a factor on the scatter and a noise of the
+sensor. The first weighs every row; the others weigh the rows that matter, where healthy or the best
+fault says that they may.
+
+Section: docs/inference.md#runs
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from failuretwin.core.hypothesis import Hypothesis
+from failuretwin.core.numerics import log_sum
+from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.failure_behavior.mode import Signature
+from failuretwin.failure_behavior.registry import MODES
+from failuretwin.inference.engine.amount_rows import held_rows, offset_rows
+from failuretwin.inference.engine.filter import RowsPosterior, filter_rows, refine
+from failuretwin.inference.engine.picks import Narrowed, NarrowPart, Part, Picks, narrowed
+from failuretwin.inference.engine.redrawn_rows import redrawn_rows
+from failuretwin.inference.engine.rows import Rows, Scene
+from failuretwin.inference.engine.theta import Components
+
+AMOUNT_STEPS = np.linspace(-4.0, 4.0, 33)
+"""Nodes at which the prior of an amount is put in, in posterior deviations."""
+WIDEST = 0.5
+"""Largest deviation at which it is, as a share of that of the normal distribution it replaces."""
+ROWS_NATS, MOST_ROWS = 6.0, 4
+"""Rows of a hypothesis that other components weigh: so near its best, and at most."""
+COMPONENT_NATS = 4.0
+"""Components that weigh all hypotheses of a run: so near the best for healthy or the best fault."""
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """What rows say.
+
+    Attributes:
+        picks: Which rows, by which components.
+        log_evidence: With the prior of rows and amounts, without that of components, (pick,).
+        found: Filtered moments.
+        amount: Mean and deviation of the amount, (pick, 2).
+    """
+
+    picks: Picks
+    log_evidence: FloatArray
+    found: RowsPosterior
+    amount: FloatArray
+
+
+CHUNK = 400
+"""Picks that are weighed at a time."""
+
+
+def has_rows(hypothesis: Hypothesis) -> bool:
+    """Return whether rests tell of a hypothesis: healthy, or one motor that settles off."""
+    if not hypothesis.known or len(hypothesis.faults) > 1:
+        return False
+    signatures = {MODES[fault.mode].signature for fault in hypothesis.faults}
+    return not signatures & {Signature.TRANSIENT, Signature.MISSED}
+
+
+def rows_of(scene: Scene, hypothesis: Hypothesis) -> Rows:
+    """Return the rows of a hypothesis that has some."""
+    if hypothesis.is_healthy:
+        return scene.healthy_rows()
+    fault = hypothesis.faults[0]
+    motor, mode = scene.model.motor_names.index(fault.motor), MODES[fault.mode]
+    if mode.signature is Signature.HELD:
+        return held_rows(scene, motor)
+    if mode.signature is Signature.REDRAWN_OFFSET:
+        return redrawn_rows(scene, motor, mode)
+    return offset_rows(scene, motor, mode)
+
+
+@dataclass(frozen=True)
+class RunsEvidence:
+    """Some runs with every hypothesis weighed.
+
+    Attributes:
+        scene: The runs.
+        hypotheses: What may be the case; all of them have rows.
+        components: What is believed of the robot.
+        log_odds: Log prior of each hypothesis, (hypothesis,).
+    """
+
+    scene: Scene
+    hypotheses: Sequence[Hypothesis]
+    components: Components
+    log_odds: FloatArray
+
+    @cached_property
+    def rows(self) -> list[Rows]:
+        """Rows of each hypothesis."""
+        return [rows_of(self.scene, hypothesis) for hypothesis in self.hypotheses]
+
+    @cached_property
+    def narrowed(self) -> dict[int, Narrowed]:
+        """The outcomes of each row that count, by hypothesis, once all rows are weighed."""
+        return {}
+
+    @cached_property
+    def weighed(self) -> list[Weighed]:
+        """What the rows of each hypothesis say, by the components that weigh them."""
+        first = [self.weigh(h, self._all_rows(h), refined=False) for h in range(len(self.rows))]
+        for h, one in enumerate(first):
+            self.narrowed[h] = self._narrowed(h, one)
+        kept = [self._near_best(h, one) for h, one in enumerate(first)]
+        wanted = self._wanted(first)
+        found = []
+        for h, picks in enumerate(kept):
+            run, component = np.nonzero(wanted)
+            pick, of = np.nonzero(picks.run[:, None] == run)
+            found.append(self.weigh(h, Picks(picks.run[pick], picks.row[pick], component[of])))
+        return found
+
+    @cached_property
+    def log_evidence(self) -> FloatArray:
+        """Log of weight times evidence, (run, component, hypothesis)."""
+        runs, count = self.scene.moments.runs, len(self.components)
+        table = np.full((len(self.hypotheses), runs * count), -np.inf)
+        for h, one in enumerate(self.weighed):
+            run, component = one.picks.run, one.picks.component
+            says = one.log_evidence + self.components.weight(run, component)
+            np.logaddexp.at(table[h], run * count + component, says)
+        return np.moveaxis(table.reshape(-1, runs, count), 0, -1)
+
+    @property
+    def by_hypothesis(self) -> FloatArray:
+        """Log p(run | h), (run, hypothesis)."""
+        return log_sum(self.log_evidence, axis=1)
+
+    def _all_rows(self, h: int) -> Picks:
+        run, row = np.nonzero(np.isfinite(self.rows[h].log_prior))
+        return Picks(run, row, np.zeros_like(row))
+
+    def _narrowed(self, h: int, one: Weighed) -> Narrowed:
+        """Return the outcomes that count, of the rows that come near the best of a hypothesis."""
+        table = np.full(self.rows[h].log_prior.shape, -np.inf)
+        table[one.picks.run, one.picks.row] = one.log_evidence
+        near = table > table.max(axis=1, keepdims=True) - ROWS_NATS
+        some = np.flatnonzero(near[one.picks.run, one.picks.row])
+        return narrowed(self.rows[h], one.picks[some], one.found.share[some])
+
+    def _near_best(self, h: int, one: Weighed) -> Picks:
+        """Return the rows of a hypothesis that come near its best, in each run."""
+        table: FloatArray = np.full(self.rows[h].log_prior.shape, -np.inf)
+        table[one.picks.run, one.picks.row] = one.log_evidence
+        best = table.max(axis=1, keepdims=True)
+        most = min(MOST_ROWS, table.shape[1])
+        least = np.sort(table, axis=1)[:, -most, None]
+        run, row = np.nonzero((table > best - ROWS_NATS) & (table >= least))
+        return Picks(run, row, np.zeros_like(row))
+
+    def _wanted(self, first: Sequence[Weighed]) -> BoolArray:
+        """Return which components weigh each run in full, (run, component)."""
+        runs, count = self.scene.moments.runs, len(self.components)
+        found = np.zeros((runs, count), dtype=bool)
+        found[:, 0] = True
+        if count == 1:
+            return found
+        says, row = np.full((runs, len(first)), -np.inf), np.zeros((runs, len(first)), np.int64)
+        for h, one in enumerate(first):
+            order = np.argsort(one.log_evidence, kind="stable")
+            row[one.picks.run[order], h] = one.picks.row[order]
+            says[one.picks.run[order], h] = one.log_evidence[order] + self.log_odds[h]
+        healthy = [h for h, one in enumerate(self.hypotheses) if one.is_healthy]
+        others = says.copy()
+        others[:, healthy] = -np.inf
+        asked = np.zeros(says.shape, dtype=bool)
+        asked[:, healthy] = True
+        asked[np.arange(runs), others.argmax(axis=1)] = True
+        table = np.full((runs, count, len(first)), -np.inf)
+        for h in np.flatnonzero(asked.any(axis=0)).tolist():
+            some = np.repeat(np.flatnonzero(asked[:, h]), count)
+            component = np.tile(np.arange(count), len(some) // count)
+            part = self.weigh(h, Picks(some, row[some, h], component), refined=False)
+            says_of = part.log_evidence + self.components.weight(some, component)
+            table[some, component, h] = says_of + self.log_odds[h]
+        near = table > table.max(axis=1, keepdims=True) - COMPONENT_NATS
+        return np.asarray(found | (near & np.isfinite(table)).any(axis=2))
+
+    def weigh(self, h: int, picks: Picks, refined: bool = True) -> Weighed:
+        """Return what some rows say.
+
+        Args:
+            h: Index of the hypothesis.
+            picks: The rows.
+            refined: Whether every moment is weighed again, given all others.
+        """
+        parts = [
+            self._weigh(h, picks[at : at + CHUNK], refined)
+            for at in range(0, len(picks.run), CHUNK)
+        ]
+        return Weighed(
+            picks,
+            np.concatenate([one.log_evidence for one in parts]),
+            RowsPosterior.joined([one.found for one in parts]),
+            np.concatenate([one.amount for one in parts]),
+        )
+
+    def _weigh(self, h: int, picks: Picks, refined: bool) -> Weighed:
+        rows = self.rows[h]
+        part: Part | NarrowPart
+        if h in self.narrowed:
+            part = NarrowPart(self.scene, rows, picks, self.components, self.narrowed[h])
+        else:
+            G = rows.columns[picks.run, picks.row_of(rows.columns)]
+            part = Part(self.scene, rows, picks, self.components, G, G[:, :, :1])
+        found = filter_rows(*part.arguments)
+        if refined:
+            found = refine(*part.arguments, found)
+        total = found.total + rows.log_prior[picks.run, picks.row]
+        amount = found.amount.copy()
+        amount[:, 1] = np.sqrt(np.maximum(amount[:, 1], 0.0))
+        amount[:, 0] += rows.centre[picks.run, picks.row]
+        if rows.amount_prior is not None:
+            gain, amount = _with_amount_prior(rows, picks, found.amount)
+            total = total + gain
+        return Weighed(picks, total, found, amount)
+
+
+def _with_amount_prior(
+    rows: Rows, picks: Picks, amount: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return what the prior of the amount changes, (pick,), and mean and deviation, (pick, 2)."""
+    run, row = picks.run, picks.row
+    variance, centre = rows.variance[run, row], rows.centre[run, row]
+    prior = np.sqrt(variance)
+    middle = np.clip(amount[:, 0], -2.0 * prior, 2.0 * prior)
+    deviation = np.sqrt(np.clip(amount[:, 1], 1e-16, (WIDEST * prior) ** 2))
+    z = middle[:, None] + deviation[:, None] * AMOUNT_STEPS
+    weight = -0.5 * AMOUNT_STEPS**2
+    weight = weight - log_sum(weight, axis=0)
+    normal = -0.5 * (z**2 / variance[:, None] + np.log(2.0 * np.pi * variance)[:, None])
+    assert rows.amount_prior is not None
+    log_prior = rows.amount_prior(centre[:, None] + z, run, row)
+    joint = weight + log_prior - normal
+    total = log_sum(joint, axis=1)
+    share = np.exp(joint - np.where(np.isfinite(total), total, 0.0)[:, None])
+    share = np.where(np.isfinite(total)[:, None], share, np.exp(weight))
+    mean = np.sum(share * z, axis=1)
+    spread = np.sqrt(np.maximum(np.sum(share * z**2, axis=1) - mean**2, 1e-18))
+    return total, np.stack([centre + mean, spread], axis=1)

@@ -1,0 +1,215 @@
+"""Theta: what all moments of a robot share and nobody knows exactly.
+
+    f = G theta,    G = [ I | -[x]x | x | J | J diag(g) | -J diag(d) | -J qd | dx/dgeometry ]
+
+with origin t [m], turn w [rad] and scale k [-] of the tool sensor's frame, bias b [rad], compliance
+c [rad/(N m)] and friction f [rad] of each motor, the lag of each motor [s], and the frames of the
+joints, each moved [m] and turned [rad]. The prior is a mixture of normal distributions.
+
+Section: docs/inference.md#theta
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.digital_model.robot import Robot
+from failuretwin.inference.engine.moments import Moments
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.theta.shared_unknowns import loads, offset_deviation, typical_load
+
+REGISTRATION = 7
+"""Length of the registration in theta: origin, turn and scale."""
+ORIGIN_M, TURN_RAD = 0.003, 0.005
+"""Deviations by which the frame of a joint stands off its URDF [m, rad]: a real UR10 is 1.2 mm off,
+a 7-joint cable-driven arm 3.3 mm, at the median; assumed for all arms."""
+LAG_S, OWN_LAG_S = 0.05, 0.03
+"""Deviations of the lag that the motors share, clock included, and of each motor's own [s]."""
+TIMED_LAG_S, TIMED_OWN_LAG_S = 0.01, 0.02
+"""The same of a robot whose timing a calibration knows [s]."""
+KNOWN = 1e-6
+"""Deviation that stands for "known" in each unit of theta."""
+ODD_RATE, ODD_FACTOR = 0.1, 3.0
+"""Share of robots whose offsets differ more than those of others of their kind, and how many times
+as far; assumed."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Places in theta.
+
+    Attributes:
+        motors: Number of motors.
+        geometry: Whether the frames of the joints are unknown.
+        lags: Whether the lags are.
+    """
+
+    motors: int
+    geometry: bool
+    lags: bool
+
+    @property
+    def offsets(self) -> slice:
+        """Places of bias, compliance and friction."""
+        return slice(REGISTRATION, REGISTRATION + 3 * self.motors)
+
+    @property
+    def lag(self) -> slice:
+        """Places of the lags."""
+        return slice(self.offsets.stop, self.offsets.stop + self.motors * self.lags)
+
+    @property
+    def frames(self) -> slice:
+        """Places of the joint frames."""
+        return slice(self.lag.stop, self.lag.stop + 6 * self.motors * self.geometry)
+
+    @property
+    def size(self) -> int:
+        """Length of theta."""
+        return self.frames.stop
+
+    def own(self, motor: int) -> list[int]:
+        """Return the places of one motor's bias, compliance, friction and lag."""
+        offsets = [REGISTRATION + motor + self.motors * k for k in range(3)]
+        return offsets + [self.lag.start + motor] * self.lags
+
+
+@dataclass(frozen=True)
+class Components:
+    """Beliefs about the robot: theta normal in each, with its scatter and its sensor.
+
+    Attributes:
+        log_weight: Log of the probability of each, (component,) or (run, component).
+        mean: mu, (component, theta) or of each run, (run, component, theta).
+        covariance: V, (component, theta, theta) or (run, component, theta, theta).
+        sigma: Factor on the scatter of the motors, (component,).
+        noise_m: Noise of the sensor, (component,) [m].
+    """
+
+    log_weight: FloatArray
+    mean: FloatArray
+    covariance: FloatArray
+    sigma: FloatArray
+    noise_m: FloatArray
+
+    def __len__(self) -> int:
+        """How many."""
+        return len(self.sigma)
+
+    def of(self, run: IntArray, component: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return V and mu of some runs and components, (pick, ...)."""
+        if self.mean.ndim == 2:
+            return self.covariance[component], self.mean[component]
+        return self.covariance[run, component], self.mean[run, component]
+
+    def weight(self, run: IntArray, component: IntArray) -> FloatArray:
+        """Return the log weight of some components in some runs, (pick,)."""
+        if self.log_weight.ndim == 1:
+            return self.log_weight[component]
+        return self.log_weight[run, component]
+
+
+def columns(
+    model: HealthyModel,
+    pose: FloatArray,
+    direction: FloatArray,
+    speed: FloatArray,
+    layout: Layout,
+) -> FloatArray:
+    """Return G at some poses, (..., channel, theta).
+
+    Args:
+        model: The healthy robot.
+        pose: Settled angles, (..., motor) [rad].
+        direction: Sign of the last travel, (..., motor).
+        speed: Commanded speed, (..., motor) [rad/s].
+        layout: Places in theta.
+    """
+    value, jacobian = model.sensors.expected(pose)
+    rigid = np.zeros((*value.shape, REGISTRATION))
+    own = model.sensors.registered
+    if own is not None:
+        x = value[..., own]
+        rigid[..., own, :3] = np.eye(3)
+        rigid[..., own, 3:6] = np.swapaxes(np.cross(np.eye(3), x[..., None, :]), -1, -2)
+        rigid[..., own, 6] = x
+    load = loads(model, pose)[..., None, :]
+    parts = [rigid, jacobian, jacobian * load, -jacobian * direction[..., None, :]]
+    if layout.lags:
+        parts.append(-jacobian * np.broadcast_to(speed, pose.shape)[..., None, :])
+    if layout.geometry:
+        parts.append(model.twin.geometry_columns(pose))
+    return np.concatenate(parts, axis=-1)
+
+
+def has_geometry(model: HealthyModel) -> bool:
+    """Return whether joint frames show: not where the path is computed from motor readings."""
+    return model.sensors.tool_alone and model.twin.robot.profile.sensor_pose != "log"
+
+
+def layout_of(model: HealthyModel, moments: Moments) -> Layout:
+    """Return what is unknown of a robot in some moments."""
+    return Layout(len(model.scatter), has_geometry(model), bool(np.any(moments.speed)))
+
+
+SCATTER = {0.5: 0.25, 1.0: 0.4, 2.0: 0.2, 4.0: 0.1, 9.0: 0.05}
+"""Factors on the scatter of the class, and the share of robots of each; assumed, heavy above 1."""
+NOISE = {0.1: 0.2, 0.3: 0.15, 1.0: 0.5, 3.0: 0.1, 8.0: 0.05}
+"""Factors on the noise of a sensor that nobody has measured, and their shares; assumed."""
+
+
+def robot_components(model: HealthyModel, layout: Layout, factors: bool) -> Components:
+    """Return what is believed of a robot whose sensor is where the profile says.
+
+    The first is the usual robot of the class. One whose offsets are odd scatters as usual.
+
+    Args:
+        model: The healthy robot.
+        layout: Places in theta.
+        factors: Whether its scatter and the noise of its sensor are unknown.
+    """
+    usual, odd = (_covariance(model, layout, factor) for factor in (1.0, ODD_FACTOR))
+    scatter, noise = (SCATTER, NOISE) if factors else ({1.0: 1.0}, {1.0: 1.0})
+    doubted = bool(np.any(offset_deviation(model)))
+    rate = ODD_RATE if doubted else 0.0
+    found = [
+        (a * b * (1.0 - rate), usual, sigma, kappa)
+        for sigma, a in scatter.items()
+        for kappa, b in noise.items()
+    ]
+    if doubted:
+        found += [(b * rate, odd, 1.0, kappa) for kappa, b in noise.items()]
+    found.sort(key=lambda one: -one[0])
+    weight, covariance, sigma, kappa = zip(*found, strict=True)
+    return Components(
+        np.log(weight),
+        np.zeros((len(found), layout.size)),
+        np.stack(covariance),
+        np.array(sigma),
+        model.path_noise * np.array(kappa),
+    )
+
+
+def _covariance(model: HealthyModel, layout: Layout, factor: float) -> FloatArray:
+    motors = layout.motors
+    deviation = np.full(layout.size, KNOWN)
+    constant, turned = model.sensors.deviations
+    deviation[:3], deviation[3:6] = max(constant, KNOWN), max(turned, KNOWN)
+    least = np.full(3 * motors, KNOWN)
+    least[motors : 2 * motors] /= np.maximum(typical_load(model), 1e-3)
+    deviation[layout.offsets] = np.maximum(factor * offset_deviation(model), least)
+    if layout.geometry:
+        deviation[layout.frames] = factor * frame_deviation(model.twin.robot)
+    covariance = np.diag(deviation**2)
+    if layout.lags:
+        common, own = (TIMED_LAG_S, TIMED_OWN_LAG_S) if model.knows_timing else (LAG_S, OWN_LAG_S)
+        covariance[layout.lag, layout.lag] = common**2 + own**2 * np.eye(motors)
+    return covariance
+
+
+def frame_deviation(robot: Robot) -> FloatArray:
+    """Return the deviation of the joint frames, (6 joint,) [m, rad]."""
+    return np.tile([ORIGIN_M] * 3 + [TURN_RAD] * 3, len(robot.motors))

@@ -1,0 +1,201 @@
+"""Evidence of whole runs, judged by importance sampling and by what is known of simulated arms."""
+
+from dataclasses import replace
+from math import lgamma
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+
+import failuretwin as ft
+from failuretwin.core.hypothesis import Hypothesis, paper_hypotheses
+from failuretwin.core.runs import truth_of
+from failuretwin.data_knowledge.generate import Plan, simulate
+from failuretwin.digital_model.arm_classes import generic_imperfections
+from failuretwin.digital_model.calibrated_robot import load_calibration
+from failuretwin.digital_model.geometry import Geometry, JointCorrection
+from failuretwin.digital_model.robot import _assembled, load_robot
+from failuretwin.inference.engine.filter import filter_rows, refine
+from failuretwin.inference.engine.integral import inverse
+from failuretwin.inference.engine.moments import moments_of
+from failuretwin.inference.engine.picks import Part, Picks
+from failuretwin.inference.engine.rows import Scene
+from failuretwin.inference.engine.runs import RunsEvidence, has_rows
+from failuretwin.inference.engine.theta import layout_of, robot_components
+from failuretwin.inference.observation.evidence import Evidence
+from failuretwin.inference.observation.healthy_model import HealthyModel
+from failuretwin.inference.posterior import log_prior
+
+DRAWS = 20_000
+
+
+def evidence_of(runs, model, hypotheses, factors=False):
+    """The runs as the engine sees them, by their settled positions."""
+    seen = Evidence(runs, model.settings, model.sensors).sound
+    moments, sharp = moments_of(model, seen.settled), model.without_doubt
+    layout = layout_of(sharp, moments)
+    components = robot_components(model, layout, factors)
+    scene = Scene.of(sharp, moments, ft.Priors(), layout, components.covariance[0])
+    return RunsEvidence(scene, hypotheses, components, log_prior(hypotheses, ft.Priors()))
+
+
+def probability(evidence):
+    """The posterior over hypotheses, (run, hypothesis)."""
+    height = evidence.by_hypothesis + evidence.log_odds
+    return np.exp(height - logsumexp(height, axis=1, keepdims=True))
+
+
+@pytest.fixture(scope="module")
+def runs():
+    robot = load_robot("armpi_fpv")
+    drawn = generic_imperfections(robot)
+    return simulate(Plan(robot, runs_per_class=2, seed=5, imperfections=drawn))
+
+
+@pytest.fixture(scope="module")
+def uncalibrated(runs):
+    model = HealthyModel.of(load_calibration("generic"))
+    return evidence_of(runs, model, paper_hypotheses(model.motor_names))
+
+
+def sampled_evidence(part, found, row, rng):
+    """log p(run | row) by importance sampling of f, from a Student t about what was found."""
+    mixture_at, usable, mean, covariance, lever, variance, noise = part.arguments
+    channels = mean.shape[-1]
+    some = np.flatnonzero(np.repeat(usable[row], channels))
+    flat = lever[row].ravel()
+    K = covariance[row] + variance[row] * np.outer(flat, flat)
+    K = K[np.ix_(some, some)]
+    K += 1e-9 * np.trace(K) / len(K) * np.eye(len(K))
+    W = np.zeros((mean[row].size,) * 2)
+    for m, one in enumerate(found.information[row]):
+        W[m * channels : (m + 1) * channels, m * channels : (m + 1) * channels] = one
+    precision = np.linalg.inv(K) + W[np.ix_(some, some)]
+    prior_mean, shift = mean[row].ravel()[some], found.shift[row].ravel()[some]
+    C = np.linalg.inv(precision)
+    centre = C @ (shift + np.linalg.solve(K, prior_mean))
+    root, dof, size = np.linalg.cholesky(0.5 * (C + C.T)), 6.0, len(some)
+    x = rng.normal(size=(DRAWS, size)) * np.sqrt(dof / rng.chisquare(dof, (DRAWS, 1))) * 1.1
+    f = centre + x @ root.T
+    log_q = lgamma((dof + size) / 2) - lgamma(dof / 2) - 0.5 * size * np.log(dof * np.pi)
+    log_q -= size * np.log(1.1) + np.log(np.diag(root)).sum()
+    log_q = log_q - 0.5 * (dof + size) * np.log1p((x**2).sum(axis=1) / 1.21 / dof)
+    off = f - prior_mean
+    log_p = -0.5 * np.sum(off @ np.linalg.inv(K) * off, axis=1)
+    log_p -= 0.5 * np.linalg.slogdet(2.0 * np.pi * K)[1]
+    whole = np.zeros((DRAWS, mean[row].size))
+    whole[:, some] = f
+    total = log_p - log_q
+    for m in np.flatnonzero(usable[row]):
+        mixture = mixture_at(int(m))
+        precision, determinant = inverse(mixture.scale[row])
+        error = mixture.residual[row] - whole[:, None, m * channels : (m + 1) * channels]
+        square = np.einsum("nai,aij,naj->na", error, precision, error)
+        terms = mixture.log_weight[row] + noise.log_density(square, determinant)
+        total += np.logaddexp(logsumexp(terms, axis=1), noise.log_outlier)
+    weight = np.exp(total - total.max())
+    deviation = weight.std() / weight.mean() / np.sqrt(DRAWS)
+    return logsumexp(total) - np.log(DRAWS), deviation
+
+
+def test_evidence_of_likely_rows_is_that_of_importance_sampling(uncalibrated):
+    rng, off = np.random.default_rng(0), []
+    height = uncalibrated.by_hypothesis + uncalibrated.log_odds
+    best = height.argmax(axis=1)
+    for run, h in enumerate(best):
+        one, rows = uncalibrated.weighed[h], uncalibrated.rows[h]
+        mine = np.flatnonzero((one.picks.run == run) & (one.picks.component == 0))
+        row = int(one.picks.row[mine[one.log_evidence[mine].argmax()]])
+        picks = Picks(np.array([run]), np.array([row]), np.array([0]))
+        G = rows.columns[picks.run, picks.row_of(rows.columns)]
+        part = Part(uncalibrated.scene, rows, picks, uncalibrated.components, G, G[:, :, :1])
+        found = refine(*part.arguments, filter_rows(*part.arguments))
+        exact, deviation = sampled_evidence(part, found, 0, rng)
+        if deviation < 0.05:  # else sampling itself does not tell
+            off.append(float(found.total[0]) - exact)
+    assert len(off) >= 14
+    assert np.quantile(np.abs(off), 0.8) < 0.1
+    assert np.median(np.abs(off)) < 0.05
+
+
+def test_uncalibrated_arms_are_diagnosed(uncalibrated, runs):
+    names = [str(h) for h in uncalibrated.hypotheses]
+    told = probability(uncalibrated).argmax(axis=1)
+    right = [names[h] == truth for h, truth in zip(told, truth_of(runs), strict=True)]
+    assert sum(right) >= 15  # of 18; errors of a few counts hide
+
+
+def test_a_known_robot_is_judged_as_by_the_product_of_its_movements():
+    robot = load_robot("armpi_fpv")
+    model = HealthyModel.of(load_calibration(None, robot))
+    made = simulate(Plan(robot, runs_per_class=1, seed=8, imperfections=model.imperfections))
+    known = replace(model, imperfections=replace(model.imperfections, variation=None))
+    hypotheses = paper_hypotheses(model.motor_names)
+    told = evidence_of(made, known, hypotheses)
+    diagnoser = ft.BayesDiagnoser(known.twin, known.imperfections, hypotheses, whole_run=False)
+    says = diagnoser.diagnose(made)
+    exact = np.array([[d.posterior[str(h)] for h in hypotheses] for d in says])
+    assert (probability(told).argmax(axis=1) == exact.argmax(axis=1)).mean() > 0.85
+    assert np.abs(probability(told) - exact).max(axis=1).mean() < 0.12
+
+
+@pytest.fixture(scope="module")
+def misbuilt():
+    """Healthy runs of a UR5e whose joints stand 3 mm and 0.3 deg off its URDF."""
+    rng, robot = np.random.default_rng(3), load_robot("ur5e")
+    moved = tuple(
+        JointCorrection(
+            motor.joint,
+            xyz=tuple(rng.normal(0.0, 0.003, 3).tolist()),
+            rpy=tuple(rng.normal(0.0, np.deg2rad(0.3), 3).tolist()),
+        )
+        for motor in robot.motors
+    )
+    assert robot.source is not None
+    built = _assembled(replace(robot.profile, geometry=Geometry(moved)), robot.source)
+    usual = generic_imperfections(robot)
+    plan = Plan(built, ["healthy"], runs_per_class=12, seed=4, imperfections=usual)
+    return robot, simulate(plan)
+
+
+def test_geometry_is_no_fault(misbuilt):
+    robot, made = misbuilt
+    model = HealthyModel.of(load_calibration("generic", robot))
+    hypotheses = [Hypothesis.parse("healthy")]
+    hypotheses += [Hypothesis.parse(f"{name}:stuck") for name in robot.motor_names[:3]]
+    hypotheses += [Hypothesis.parse(f"{robot.motor_names[1]}:steady_state_error")]
+    told = probability(evidence_of(made, model, hypotheses))
+    assert (told.argmax(axis=1) == 0).sum() >= 11
+
+
+def test_hypotheses_without_rows():
+    assert has_rows(Hypothesis.parse("motor_1:drift"))
+    assert not has_rows(Hypothesis.parse("motor_1:lag"))
+    assert not has_rows(Hypothesis.parse("motor_1:intermittent"))
+    assert not has_rows(Hypothesis.parse("unknown"))
+
+
+@pytest.mark.parametrize("mode", ["encoder_bias", "drift", "backlash", "encoder_scale"])
+def test_offsets_of_one_size_are_found_and_sized(mode):
+    robot = load_robot("armpi_fpv")
+    model = HealthyModel.of(load_calibration(None, robot))
+    plan = Plan(
+        robot, [f"motor_2:{mode}"], runs_per_class=6, seed=2, imperfections=model.imperfections
+    )
+    made = simulate(plan)
+    hypotheses = [Hypothesis.parse("healthy"), Hypothesis.parse(f"motor_2:{mode}")]
+    evidence = evidence_of(made, model, hypotheses)
+    told = probability(evidence)[:, 1]
+    diagnoser = ft.BayesDiagnoser(model.twin, model.imperfections, hypotheses, whole_run=False)
+    exact = np.array([d.posterior[str(hypotheses[1])] for d in diagnoser.diagnose(made)])
+    assert (told[exact > 0.99] > 0.95).all()
+    assert np.median(np.abs(told - exact)) < 0.02
+    one, off = evidence.weighed[1], []
+    for run in np.flatnonzero(told > 0.95):
+        mine = np.flatnonzero(one.picks.run == run)
+        share = np.exp(one.log_evidence[mine] - logsumexp(one.log_evidence[mine]))
+        mean, deviation = one.amount[mine].T
+        middle = share @ mean
+        spread = np.sqrt(share @ (deviation**2 + (mean - middle) ** 2))
+        off.append(abs(middle - float(made["magnitude"].values[run])) / spread)
+    assert np.median(off) < 3.5
