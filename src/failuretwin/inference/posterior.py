@@ -405,7 +405,7 @@ class Posterior:
         motors = self.likelihood.model.twin.robot.motor_names
         faulty = [fault.motor for fault in hypothesis.faults]
         return lost_command_lines(
-            estimate.outcome_probability, self.likelihood.outcomes.lost, motors, faulty
+            estimate.outcome_probability, self.likelihood.model.lost_commands.lost, motors, faulty
         )
 
 

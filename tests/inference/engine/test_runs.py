@@ -19,9 +19,12 @@ from failuretwin.inference.engine.filter import filter_rows, refine
 from failuretwin.inference.engine.integral import inverse
 from failuretwin.inference.engine.moments import moments_of
 from failuretwin.inference.engine.picks import Part, Picks
+from failuretwin.inference.engine.posterior import marginal_likelihoods, theta_posterior
 from failuretwin.inference.engine.rows import Scene
 from failuretwin.inference.engine.runs import RunsEvidence, has_rows
 from failuretwin.inference.engine.theta import layout_of, robot_components
+from failuretwin.inference.engine.unknown_robots import unknown_robot_posterior
+from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.posterior import log_prior
@@ -199,3 +202,65 @@ def test_offsets_of_one_size_are_found_and_sized(mode):
         spread = np.sqrt(share @ (deviation**2 + (mean - middle) ** 2))
         off.append(abs(middle - float(made["magnitude"].values[run])) / spread)
     assert np.median(off) < 3.5
+
+
+def test_onset_and_size_of_stuck_motors_and_errors():
+    robot = load_robot("armpi_fpv")
+    model = HealthyModel.of(load_calibration(None, robot))
+    classes = ["motor_1:stuck", "motor_3:stuck", "motor_2:steady_state_error"]
+    plan = Plan(robot, classes, runs_per_class=4, seed=6, imperfections=model.imperfections)
+    made = simulate(plan)
+    hypotheses = [Hypothesis.parse(name) for name in ("healthy", *classes)]
+    evidence = evidence_of(made, model, hypotheses)
+    weights = marginal_likelihoods(evidence)
+    diagnoser = ft.BayesDiagnoser(model.twin, model.imperfections, hypotheses, whole_run=False)
+    for run, exact in enumerate(diagnoser.diagnose(made)):
+        h = int((evidence.by_hypothesis + evidence.log_odds)[run].argmax())
+        if str(hypotheses[h]) != exact.diagnosis or exact.magnitude is None:
+            continue
+        found = weights[h].estimate(run)
+        assert found.size is not None and found.onset is not None
+        assert found.size.quantiles((0.5,))[0] == pytest.approx(exact.magnitude, abs=0.02)
+        low, high = found.onset.quantiles((0.05, 0.95))
+        assert low - 0.5 <= exact.onset_s <= high + 0.5
+        # Rows that are left out have part of the prior.
+        more = weights[h].by_movement(run).sum() - evidence.by_hypothesis[run, h]
+        assert -0.1 < more < 5.0
+        assert found.outcome_probability.sum(axis=1).max() < 1.0 + 1e-9
+
+
+def test_theta_of_a_healthy_robot_is_inside_its_intervals():
+    robot, rng = load_robot("armpi_fpv"), np.random.default_rng(7)
+    usual = generic_imperfections(robot)
+    assert usual.settling is not None
+    off = []
+    for seed in range(6):
+        bias = rng.normal(0.0, 0.0065, 4)
+        settling = replace(usual.settling, bias=tuple(bias.tolist()))
+        imperfections = replace(usual, settling=settling, variation=None, lost_commands=())
+        made = simulate(Plan(robot, ["healthy"], 2, seed, imperfections=imperfections))
+        model = HealthyModel.of(load_calibration("generic"))
+        evidence = evidence_of(made, model, [Hypothesis.parse("healthy")])
+        mean, covariance = theta_posterior(evidence)
+        zeros = slice(7, 11)
+        spread = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[:, zeros]
+        off.append((mean[:, zeros] - bias) / spread)
+    inside = np.abs(np.concatenate(off)) < 1.645
+    assert 0.78 <= inside.mean() <= 1.0
+
+
+def test_unknown_robots_in_chunks_say_what_they_say_alone():
+    robot = load_robot("armpi_fpv")
+    model = HealthyModel.of(load_calibration("generic"))
+    imperfections = generic_imperfections(robot)
+    made = simulate(Plan(robot, ["healthy", "motor_2:stuck"], 9, 3, imperfections=imperfections))
+    settled = Evidence(made, model.settings, model.sensors).sound.settled
+    hypotheses = [Hypothesis.parse(name) for name in ("healthy", "motor_2:stuck")]
+    together = unknown_robot_posterior(RunLikelihood(settled, model), hypotheses, ft.Priors())
+    some = slice(16, 18)
+    alone = unknown_robot_posterior(RunLikelihood(settled[some], model), hypotheses, ft.Priors())
+    assert together.log_posterior[some] == pytest.approx(alone.log_posterior, abs=1e-6)
+    told = together.weights[1].estimate(17).onset
+    again = alone.weights[1].estimate(1).onset
+    assert told is not None and again is not None
+    assert told.quantiles((0.5,)) == pytest.approx(again.quantiles((0.5,)), abs=1e-6)

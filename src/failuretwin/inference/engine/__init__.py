@@ -11,6 +11,8 @@ Read in this order; each module states its term:
     outcomes       what may have become of a moment: residual and scale
     rows           what is discrete of a hypothesis; amount_rows, redrawn_rows: by signature
     picks, runs    rows by components of the robot: the evidence of every hypothesis
+    posterior      what is left of onset, size and theta
+    unknown_robots the posterior of runs of a robot that nobody has calibrated
 
 It weighs rests of single runs: healthy, held, constant, growing and redrawn faults, of robots that
 are calibrated or not. `BayesDiagnoser` still weighs runs by `movements`, `faults` and `theta`; the

@@ -274,6 +274,11 @@ class LostCommands:
         joint = rates * says.prod(axis=-1)
         return joint / joint.sum(axis=-1, keepdims=True)
 
+    @property
+    def lost(self) -> BoolArray:
+        """Motors that lose their command in each outcome, (outcome, motor)."""
+        return np.asarray(self._in_a_row.missed > 0)
+
     @cached_property
     def _losses(self) -> BoolArray:
         """Motors that each loss hits, (loss, motor); the first hits none."""

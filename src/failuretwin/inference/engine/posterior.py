@@ -1,0 +1,205 @@
+"""What is left of onset, size and theta once every row is weighed.
+
+    p(row, c | run, h) ~ w_c p(row | h) p(run | row, c)
+    theta | run, row, c: mu + V G^T a,    V - V G^T (I + W K)^-1 W G V
+    a = (I + W K)^-1 (b - W G mu)
+
+Section: docs/inference.md#runs
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from failuretwin.core.numerics import Weighted, log_sum
+from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.inference.engine.picks import NarrowPart, Picks
+from failuretwin.inference.engine.runs import RunsEvidence, Weighed
+from failuretwin.inference.faults.marginal import Estimate, MarginalLikelihood
+
+LEAST_SHARE = 1e-4
+"""Picks of a run that are less probable add nothing to what is left of theta."""
+LEAST_OUTLIER = 1e-15
+"""Smallest share of the outlier: the density of a moment is told by it."""
+NORMAL_STEPS = np.linspace(-2.4, 2.4, 25)
+"""Nodes of a normal distribution, in deviations, and their weights."""
+NORMAL_WEIGHTS = np.exp(-0.5 * NORMAL_STEPS**2)
+
+
+def marginal_likelihoods(evidence: RunsEvidence) -> list[MarginalLikelihood]:
+    """Return what the runs say of each hypothesis, with onset and size."""
+    by_hypothesis = evidence.by_hypothesis
+    return [_marginal(evidence, h, by_hypothesis[:, h]) for h in range(len(evidence.hypotheses))]
+
+
+def _marginal(evidence: RunsEvidence, h: int, log_evidence: FloatArray) -> MarginalLikelihood:
+    def picked(run: int) -> tuple[IntArray, FloatArray]:
+        return _shares(evidence, evidence.weighed[h], run)
+
+    def by_movement(run: int) -> FloatArray:
+        some, share = picked(run)
+        return _of_movements(evidence, run, _one_by_one(evidence.weighed[h], some, share))
+
+    def settled(run: int) -> FloatArray:
+        some, share = picked(run)
+        return _of_movements(evidence, run, _given_all(evidence, h, some[share.argmax()]))
+
+    def estimate(run: int) -> Estimate:
+        some, share = picked(run)
+        best = some[share.argmax()]
+        outcomes = _outcome_probability(evidence, h, best)
+        return Estimate(_onset(evidence, h, some, share), _size(evidence, h, some, share), outcomes)
+
+    return MarginalLikelihood(log_evidence, by_movement, settled, estimate)
+
+
+def _shares(evidence: RunsEvidence, one: Weighed, run: int) -> tuple[IntArray, FloatArray]:
+    """Return the picks of a run and how probable each is under its hypothesis."""
+    some = np.flatnonzero(one.picks.run == run)
+    component = one.picks.component[some]
+    says = one.log_evidence[some] + evidence.components.weight(one.picks.run[some], component)
+    return some, np.exp(says - log_sum(says, axis=0))
+
+
+def _one_by_one(one: Weighed, some: IntArray, share: FloatArray) -> FloatArray:
+    """Return the log density of each moment given those before it, (moment,)."""
+    log_density = one.found.log_evidence[some]
+    with np.errstate(divide="ignore"):
+        start = np.log(share) - log_density.sum(axis=1)
+    so_far = start[:, None] + np.cumsum(log_density, axis=1)
+    return np.diff(log_sum(so_far, axis=0), prepend=log_sum(start, axis=0))
+
+
+def _given_all(evidence: RunsEvidence, h: int, pick: int) -> FloatArray:
+    """Return the log density of each moment given all others, by its outlier's share, (moment,)."""
+    share = evidence.weighed[h].found.share[pick]
+    outlier = np.maximum(1.0 - share.sum(axis=-1), LEAST_OUTLIER)
+    usable = evidence.scene.moments.usable[evidence.weighed[h].picks.run[pick]]
+    return np.where(usable, evidence.scene.noise.log_outlier - np.log(outlier), 0.0)
+
+
+def _of_movements(evidence: RunsEvidence, run: int, by_moment: FloatArray) -> FloatArray:
+    """Return what belongs to moments added up by movement, (movement,)."""
+    movement = evidence.scene.moments.movement[run]
+    total = np.zeros(int(movement.max()) + 1)
+    np.add.at(total, movement, by_moment)
+    return total
+
+
+def _onset(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) -> Weighted | None:
+    rows, picks = evidence.rows[h], evidence.weighed[h].picks
+    if rows.onsets is None:
+        return None
+    parts = [rows.onsets(int(picks.run[i]), int(picks.row[i])) for i in some]
+    weights = [
+        p * part / max(part.sum(), 1e-300) for p, (_, part) in zip(share, parts, strict=True)
+    ]
+    return Weighted(np.concatenate([onset for onset, _ in parts]), np.concatenate(weights))
+
+
+def _size(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) -> Weighted | None:
+    rows, one = evidence.rows[h], evidence.weighed[h]
+    if rows.size is not None:
+        drawn = [_rms(evidence, h, int(i)) for i in some]
+        mean, deviation = np.array(drawn).T
+    elif rows.amount_prior is not None:
+        mean, deviation = one.amount[some].T
+    else:
+        return None
+    values = mean[:, None] + deviation[:, None] * NORMAL_STEPS
+    weights = share[:, None] * NORMAL_WEIGHTS
+    if rows.size is not None:  # the mean square is nearly normal, not its root
+        values = np.sqrt(np.maximum(values, 0.0))
+    return Weighted(values.ravel(), weights.ravel())
+
+
+def _rms(evidence: RunsEvidence, h: int, pick: int) -> tuple[float, float]:
+    """Return mean and deviation of the mean square of sizes that movements draw anew."""
+    rows, one = evidence.rows[h], evidence.weighed[h]
+    run, row = one.picks.run[pick], one.picks.row[pick]
+    assert rows.size is not None
+    size = rows.size[evidence.narrowed[h].kept[evidence.narrowed[h].place[run, row]]]
+    share = np.where(np.isfinite(size), one.found.share[pick], 0.0)
+    usable = evidence.scene.moments.usable[run]
+    counts = usable & (np.arange(len(share)) >= rows.first[row]) & (share.sum(axis=-1) > 0.0)
+    share = share[counts] / share[counts].sum(axis=-1, keepdims=True)
+    square = np.nan_to_num(size[counts]) ** 2
+    mean = np.sum(share * square, axis=-1)
+    variance = np.maximum(np.sum(share * square**2, axis=-1) - mean**2, 0.0)
+    count = max(int(counts.sum()), 1)
+    return float(mean.sum() / count), float(np.sqrt(variance.sum()) / count)
+
+
+def _outcome_probability(evidence: RunsEvidence, h: int, pick: int) -> FloatArray:
+    """Return the probability of each outcome of each movement, (movement, outcome)."""
+    moments, one = evidence.scene.moments, evidence.weighed[h]
+    run, row = one.picks.run[pick], one.picks.row[pick]
+    usual = evidence.rows[h].usual[evidence.narrowed[h].kept[evidence.narrowed[h].place[run, row]]]
+    count = len(evidence.scene.model.lost_commands.lost)
+    last = int(moments.movement[run].max()) + 1
+    table = np.zeros((last, count))
+    seen = np.flatnonzero(moments.usable[run])
+    for m in seen.tolist():
+        where = moments.outcome[run, m, usual[m]]
+        np.add.at(table[moments.movement[run, m]], where, one.found.share[pick, m])
+    return table / np.maximum(table.sum(axis=1, keepdims=True), 1.0)
+
+
+def theta_posterior(evidence: RunsEvidence) -> tuple[FloatArray, FloatArray]:
+    """Return mean (run, theta) and covariance (run, theta, theta) of theta over all hypotheses."""
+    parts = [_theta_of(evidence, h) for h in range(len(evidence.hypotheses))]
+    run, weight, mean, covariance = (np.concatenate(p) for p in zip(*parts, strict=True))
+    runs, size = evidence.scene.moments.runs, mean.shape[-1]
+    total, centre = np.zeros(runs), np.zeros((runs, size))
+    np.add.at(total, run, weight)
+    weight = weight / total[run]
+    np.add.at(centre, run, weight[:, None] * mean)
+    away = mean - centre[run]
+    spread = np.zeros((runs, size, size))
+    np.add.at(spread, run, weight[:, None, None] * (covariance + away[:, :, None] * away[:, None]))
+    return centre, spread
+
+
+def _theta_of(
+    evidence: RunsEvidence, h: int
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Return run, weight, mean and covariance of theta of the picks of a hypothesis that count."""
+    one = evidence.weighed[h]
+    says = one.log_evidence + evidence.components.weight(one.picks.run, one.picks.component)
+    whole = log_sum(evidence.by_hypothesis + evidence.log_odds, axis=1)
+    weight = np.exp(says + evidence.log_odds[h] - whole[one.picks.run])
+    some = np.flatnonzero(weight > LEAST_SHARE)
+    picks: Picks = one.picks[some]
+    part = NarrowPart(
+        evidence.scene, evidence.rows[h], picks, evidence.components, evidence.narrowed[h]
+    )
+    mean, covariance = theta_given(part, one.found.information[some], one.found.shift[some])
+    return picks.run, weight[some], mean, covariance
+
+
+def theta_given(
+    part: NarrowPart, information: FloatArray, shift: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return theta of each pick given the factors of its moments: mean and covariance.
+
+    Args:
+        part: The picks.
+        information: W of each moment, (pick, moment, channel, channel).
+        shift: b of each moment, (pick, moment, channel).
+    """
+    _, _, mean, covariance, lever, variance, _ = part.arguments
+    picks, moments, channels = mean.shape
+    size = moments * channels
+    W = np.zeros((picks, size, size))
+    for m in range(moments):
+        at = slice(m * channels, (m + 1) * channels)
+        W[:, at, at] = information[:, m]
+    flat = lever.reshape(picks, size)
+    K = covariance + variance[:, None, None] * flat[:, :, None] * flat[:, None]
+    system = np.eye(size) + W @ K
+    pull = shift.reshape(picks, size) - np.matmul(W, mean.reshape(picks, size)[..., None])[..., 0]
+    alpha = np.linalg.solve(system, pull[..., None])
+    V, mu = part.components.of(part.picks.run, part.picks.component)
+    GV = part.narrow.columns[part.place].reshape(picks, size, V.shape[-1]) @ V
+    turned = np.swapaxes(GV, -1, -2)
+    return mu + np.matmul(turned, alpha)[..., 0], V - turned @ np.linalg.solve(system, W @ GV)
