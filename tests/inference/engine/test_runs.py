@@ -36,7 +36,7 @@ def evidence_of(runs, model, hypotheses, factors=False):
     """The runs as the engine sees them, by their settled positions."""
     seen = Evidence(runs, model.settings, model.sensors).sound
     moments, sharp = moments_of(model, seen.settled), model.without_doubt
-    layout = layout_of(sharp, moments)
+    layout = layout_of(sharp)
     components = robot_components(model, layout, factors)
     scene = Scene.of(sharp, moments, ft.Priors(), layout, components.covariance[0])
     return RunsEvidence(scene, hypotheses, components, log_prior(hypotheses, ft.Priors()))
@@ -63,12 +63,11 @@ def uncalibrated(runs):
 
 def sampled_evidence(part, found, row, rng):
     """log p(run | row) by importance sampling of f, from a Student t about what was found."""
-    mixture_at, usable, mean, covariance, lever, variance, noise = part.arguments
+    ready = part.filter_rows
+    mixture_at, usable, mean, noise = ready.mixture_at, ready.usable, ready.mean, ready.noise
     channels = mean.shape[-1]
     some = np.flatnonzero(np.repeat(usable[row], channels))
-    flat = lever[row].ravel()
-    K = covariance[row] + variance[row] * np.outer(flat, flat)
-    K = K[np.ix_(some, some)]
+    K = ready.spread[row][np.ix_(some, some)]
     K += 1e-9 * np.trace(K) / len(K) * np.eye(len(K))
     W = np.zeros((mean[row].size,) * 2)
     for m, one in enumerate(found.information[row]):
@@ -112,7 +111,7 @@ def test_evidence_of_likely_rows_is_that_of_importance_sampling(uncalibrated):
         picks = Picks(np.array([run]), np.array([row]), np.array([0]))
         G = rows.columns[picks.run, picks.row_of(rows.columns)]
         part = Part(uncalibrated.scene, rows, picks, uncalibrated.components, G, G[:, :, :1])
-        found = refine(*part.arguments, filter_rows(*part.arguments))
+        found = refine(part.filter_rows, filter_rows(part.filter_rows))
         exact, deviation = sampled_evidence(part, found, 0, rng)
         if deviation < 0.05:  # else sampling itself does not tell
             off.append(float(found.total[0]) - exact)

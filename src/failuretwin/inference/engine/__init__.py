@@ -6,8 +6,8 @@ Read in this order; each module states its term:
 
     integral       one moment under one row: evidence, mean and covariance of f, in closed form
     filter         moment by moment, and every moment again given all others
-    moments        readings -> moments, at rest and on the way
-    theta          what a robot shares: registration, offsets, lags, joint frames; scatter and noise
+    moments        settled positions -> moments
+    theta          what a robot shares: registration, offsets, joint frames; scatter and noise
     outcomes       what may have become of a moment: residual and scale
     rows           what is discrete of a hypothesis; amount_rows, redrawn_rows: by signature
     picks, runs    rows by components of the robot: the evidence of every hypothesis

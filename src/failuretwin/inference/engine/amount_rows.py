@@ -67,10 +67,10 @@ class _Motor:
 
     @property
     def variance(self) -> FloatArray:
-        """Variance of all motors, (run, moment, 1, motor) [rad2]."""
-        found = self.scene.model.scatter**2 + self.scene.jitter
+        """Variance of all motors, (motor,) [rad2]."""
+        found = self.scene.model.scatter**2
         if self.held:
-            found[..., self.motor] = self.scene.model.held_scatter[self.motor] ** 2
+            found[self.motor] = self.scene.model.held_scatter[self.motor] ** 2
         return found
 
     def best(self, grid: FloatArray, alike: bool) -> FloatArray:
@@ -85,7 +85,7 @@ class _Motor:
         angle = self.angle(np.broadcast_to(grid[:, None], shape))
         step = np.abs(np.diff(angle, axis=-1)).mean(axis=-1, keepdims=True)
         error, jacobian, _ = self._residual(angle)
-        variance = np.broadcast_to(self.variance[:, None], jacobian[..., 0, :].shape).copy()
+        variance = np.broadcast_to(self.variance, jacobian[..., 0, :].shape).copy()
         variance[..., self.motor] += step**2 / 6.0
         scale = np.matmul(jacobian * variance[..., None, :], np.swapaxes(jacobian, -1, -2))
         precision, log_determinant = inverse(scale + self._doubt[:, None, :, None])
@@ -105,8 +105,7 @@ class _Motor:
             slope = self.slope(x)
             error, jacobian, _ = self._residual(angle)
             error, jacobian = error[:, :, :, 0], jacobian[:, :, :, 0]
-            variance = self.variance[:, None, :, 0]
-            scale = np.matmul(jacobian * variance[..., None, :], np.swapaxes(jacobian, -1, -2))
+            scale = np.matmul(jacobian * self.variance, np.swapaxes(jacobian, -1, -2))
             precision, _ = inverse(scale + self._doubt[:, None])
             lever = jacobian[..., self.motor] * slope[..., None]
             pull = np.einsum("brmij,brmj->brmi", precision, error)
@@ -173,9 +172,8 @@ class _Motor:
         held = (np.arange(base.shape[-1]) == motor) & self.held
         pose = scene.model.settle(base, direction, held)
         spread = np.swapaxes(pose, 1, 2)
-        variance_of = self.variance[:, :, None]
-        outcomes = Outcomes.of_poses(scene.model, moments, spread, variance_of, np.zeros(1))
-        G = columns(scene.model, pose, direction, moments.speed[:, None, :, None], scene.layout)
+        outcomes = Outcomes.of_poses(scene.model, moments, spread, self.variance)
+        G = columns(scene.model, pose, direction, scene.layout)
         jacobian = scene.model.sensors.expected(pose[:, :, :, 0])[1]
         if self.held:
             G[..., scene.layout.own(motor)] = 0.0

@@ -29,6 +29,47 @@ from failuretwin.inference.engine.integral import (
 
 
 @dataclass(frozen=True)
+class FilterRows:
+    """Rows with the normal distribution of f = G theta + H z over all moments.
+
+    Attributes:
+        mixture_at: The outcomes of a moment under each row.
+        usable: Moments with readings, (row, moment).
+        mean: G mu, (row, moment, channel) [m].
+        covariance: G V G^T, (row, moment * channel, moment * channel) [m2].
+        lever: H, (row, moment, channel).
+        variance: var(z), (row,); 0 without an amount.
+        noise: The Student t of residuals.
+    """
+
+    mixture_at: Callable[[int], Mixture]
+    usable: BoolArray
+    mean: FloatArray
+    covariance: FloatArray
+    lever: FloatArray
+    variance: FloatArray
+    noise: Noise
+
+    @property
+    def prior(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (row, number) and covariance (row, number, number) of f and, last, z."""
+        rows, moments, channels = self.mean.shape
+        size, variance = moments * channels, self.variance[:, None]
+        flat = self.lever.reshape(rows, size)
+        whole = np.zeros((rows, size + 1, size + 1))
+        whole[:, :size, :size] = self.spread
+        whole[:, :size, size] = whole[:, size, :size] = variance * flat
+        whole[:, size, size] = self.variance
+        return np.concatenate([self.mean.reshape(rows, size), np.zeros((rows, 1))], axis=1), whole
+
+    @property
+    def spread(self) -> FloatArray:
+        """K, (row, moment * channel, moment * channel) [m2]."""
+        flat = self.lever.reshape(self.covariance.shape[:2])
+        return self.covariance + self.variance[:, None, None] * flat[:, :, None] * flat[:, None]
+
+
+@dataclass(frozen=True)
 class RowsPosterior:
     """What all moments say of some rows.
 
@@ -60,40 +101,22 @@ class RowsPosterior:
         return cls(*(np.concatenate([getattr(one, n) for one in parts]) for n in names))
 
 
-def filter_rows(
-    mixture_at: Callable[[int], Mixture],
-    usable: BoolArray,
-    mean: FloatArray,
-    covariance: FloatArray,
-    lever: FloatArray,
-    variance: FloatArray,
-    noise: Noise,
-) -> RowsPosterior:
-    """Return what moments say of rows.
-
-    Args:
-        mixture_at: The outcomes of a moment under each row.
-        usable: Moments with readings, (row, moment).
-        mean: G mu, (row, moment, channel) [m].
-        covariance: G V G^T, (row, moment * channel, moment * channel) [m2].
-        lever: H, (row, moment, channel).
-        variance: var(z), (row,); 0 without an amount.
-        noise: The Student t of residuals.
-    """
-    rows, moments, channels = mean.shape
-    size = moments * channels
-    f, whole = _prior(mean, covariance, lever, variance)
-    log_evidence = np.zeros((rows, moments))
-    information = np.zeros((rows, moments, channels, channels))
-    shift, shares = np.zeros((rows, moments, channels)), []
+def filter_rows(rows: FilterRows) -> RowsPosterior:
+    """Return what moments say of rows, one after the other."""
+    count, moments, channels = rows.mean.shape
+    size, usable = moments * channels, rows.usable
+    f, whole = rows.prior
+    log_evidence = np.zeros((count, moments))
+    information = np.zeros((count, moments, channels, channels))
+    shift, shares = np.zeros((count, moments, channels)), []
     for m in range(moments):
-        mixture = mixture_at(m)
+        mixture = rows.mixture_at(m)
         share = np.zeros(mixture.log_weight.shape)
         some = np.flatnonzero(usable[:, m])
         if len(some):
             at = slice(m * channels, (m + 1) * channels)
             here, spread = f[some, at], whole[some, at, at]
-            found = moment_posterior(mixture[some], here, spread, noise)
+            found = moment_posterior(mixture[some], here, spread, rows.noise)
             log_evidence[some, m], share[some] = found.log_evidence, found.share
             information[some, m], shift[some, m] = site(found, here, spread)
             cross = whole[some, :, at]
@@ -107,7 +130,7 @@ def filter_rows(
         information,
         shift,
         np.stack(shares, axis=1),
-        f[:, :size].reshape(rows, moments, channels),
+        f[:, :size].reshape(count, moments, channels),
         np.stack([f[:, size], whole[:, size, size]], axis=1),
     )
 
@@ -137,16 +160,7 @@ AGREE_NATS = 1.5
 each other under this row, and one normal distribution does not hold what they leave open."""
 
 
-def refine(
-    mixture_at: Callable[[int], Mixture],
-    usable: BoolArray,
-    mean: FloatArray,
-    covariance: FloatArray,
-    lever: FloatArray,
-    variance: FloatArray,
-    noise: Noise,
-    found: RowsPosterior,
-) -> RowsPosterior:
+def refine(rows: FilterRows, found: RowsPosterior) -> RowsPosterior:
     """Return what moments say of rows, each weighed given all others (expectation propagation).
 
     With factors (W, b) of the moments, N_-m the distribution without that of m, and Z_m its
@@ -156,16 +170,10 @@ def refine(
                 + log integral of N(f; G mu, K) prod over m of exp(-1/2 f^T W f + b^T f)
 
     Args:
-        mixture_at: The outcomes of a moment under each row.
-        usable: Moments with readings, (row, moment).
-        mean: G mu, (row, moment, channel) [m].
-        covariance: G V G^T, (row, moment * channel, moment * channel) [m2].
-        lever: H, (row, moment, channel).
-        variance: var(z), (row,).
-        noise: The Student t of residuals.
+        rows: The rows.
         found: What the filter has found.
     """
-    sites = _Sites.of(mean, covariance, lever, variance, found)
+    sites, usable = _Sites.of(rows, found), rows.usable
     log_evidence = np.zeros(usable.shape)
     shares = found.share.copy()
     for m in range(usable.shape[1]):
@@ -173,7 +181,7 @@ def refine(
         if not len(some):
             continue
         here, spread = sites.without(m, some)
-        says = moment_posterior(mixture_at(m)[some], here, spread, noise)
+        says = moment_posterior(rows.mixture_at(m)[some], here, spread, rows.noise)
         W, b = site(says, here, spread)
         log_evidence[some, m] = says.log_evidence - _log_integral(W, b, here, spread)
         shares[some, m] = says.share
@@ -212,15 +220,8 @@ class _Sites:
     whole: FloatArray
 
     @classmethod
-    def of(
-        cls,
-        mean: FloatArray,
-        covariance: FloatArray,
-        lever: FloatArray,
-        variance: FloatArray,
-        found: RowsPosterior,
-    ) -> _Sites:
-        prior_mean, prior = _prior(mean, covariance, lever, variance)
+    def of(cls, rows: FilterRows, found: RowsPosterior) -> _Sites:
+        prior_mean, prior = rows.prior
         information, shift = found.information.copy(), found.shift.copy()
         f, whole = _given(prior_mean, prior, information, shift)
         return cls(prior_mean, prior, information, shift, f, whole)
@@ -264,20 +265,6 @@ class _Sites:
 def _at(m: int, shift: FloatArray) -> slice:
     channels = shift.shape[-1]
     return slice(m * channels, (m + 1) * channels)
-
-
-def _prior(
-    mean: FloatArray, covariance: FloatArray, lever: FloatArray, variance: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return mean and covariance of f and, last, z."""
-    rows, moments, channels = mean.shape
-    size = moments * channels
-    flat = lever.reshape(rows, size)
-    whole = np.zeros((rows, size + 1, size + 1))
-    whole[:, :size, :size] = covariance + variance[:, None, None] * flat[:, :, None] * flat[:, None]
-    whole[:, :size, size] = whole[:, size, :size] = variance[:, None] * flat
-    whole[:, size, size] = variance
-    return np.concatenate([mean.reshape(rows, size), np.zeros((rows, 1))], axis=1), whole
 
 
 def _stacked(information: FloatArray, shift: FloatArray) -> tuple[FloatArray, FloatArray]:

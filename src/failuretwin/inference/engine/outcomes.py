@@ -40,7 +40,7 @@ class Outcomes:
         moments: Moments,
         pose: FloatArray,
         variance: FloatArray,
-        beside: FloatArray,
+        beside: FloatArray | None = None,
     ) -> Outcomes:
         """Return the outcomes of some poses.
 
@@ -49,7 +49,7 @@ class Outcomes:
             moments: The moments.
             pose: Settled angles, (run, moment, ..., motor) [rad].
             variance: Of the scatter of each motor, (..., motor) [rad2].
-            beside: Variance of single motors beside it, (..., motor) [rad2].
+            beside: Variance of single motors beside it, (..., motor) [rad2]; None: none.
         """
         expected, jacobian = model.sensors.expected(pose)
         point = moments.point
@@ -58,8 +58,8 @@ class Outcomes:
         transposed = np.swapaxes(jacobian, -1, -2)
         scatter = np.matmul(jacobian * np.asarray(variance)[..., None, :], transposed)
         extra = np.broadcast_to(0.0, scatter.shape)
-        if np.any(beside):
-            extra = np.matmul(jacobian * np.asarray(beside)[..., None, :], transposed)
+        if beside is not None:
+            extra = np.matmul(jacobian * beside[..., None, :], transposed)
         return cls(point - expected, scatter, extra)
 
     def with_rows(self) -> Outcomes:

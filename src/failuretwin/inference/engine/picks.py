@@ -15,15 +15,11 @@ from functools import cached_property
 
 import numpy as np
 
-from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.inference.engine.integral import Mixture, Noise
+from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.inference.engine.filter import FilterRows
+from failuretwin.inference.engine.integral import Mixture
 from failuretwin.inference.engine.rows import Rows, Scene
 from failuretwin.inference.engine.theta import Components
-
-Arguments = tuple[
-    Callable[[int], Mixture], BoolArray, FloatArray, FloatArray, FloatArray, FloatArray, Noise
-]
-"""What the filter takes."""
 
 
 @dataclass(frozen=True)
@@ -70,17 +66,10 @@ class Part:
     own: FloatArray
 
     @property
-    def arguments(self) -> Arguments:
+    def filter_rows(self) -> FilterRows:
         """What the filter takes."""
-        run, row = self.picks.run, self.picks.row
-        picks, moments, _, channels, size = self.own.shape
-        G = self.own.reshape(picks, moments * channels, size)
-        V, mu = self._theta
-        covariance = G @ V @ np.swapaxes(G, -1, -2)
-        mean = np.matmul(G, mu[..., None]).reshape(picks, moments, channels)
-        usable, lever = self.scene.moments.usable[run], self.rows.lever[run, row]
-        variance, noise = self.rows.variance[run, row], self.scene.noise
-        return self.mixture_at, usable, mean, covariance, lever, variance, noise
+        G = self.own[:, :, 0]
+        return _ready(self.scene, self.rows, self.picks, self.components, G, self.mixture_at)
 
     @property
     def _theta(self) -> tuple[FloatArray, FloatArray]:
@@ -202,26 +191,10 @@ class NarrowPart:
         return self.components.of(self.picks.run, self.picks.component)
 
     @property
-    def arguments(self) -> Arguments:
+    def filter_rows(self) -> FilterRows:
         """What the filter takes."""
-        run, row = self.picks.run, self.picks.row
         G = self.narrow.columns[self.place]
-        picks, moments, channels, size = G.shape
-        G = G.reshape(picks, moments * channels, size)
-        V, mu = self._theta
-        covariance = G @ V @ np.swapaxes(G, -1, -2)
-        mean = np.matmul(G, mu[..., None]).reshape(picks, moments, channels)
-        scene, rows = self.scene, self.rows
-        usable, lever = scene.moments.usable[run], rows.lever[run, row]
-        return (
-            self.mixture_at,
-            usable,
-            mean,
-            covariance,
-            lever,
-            rows.variance[run, row],
-            scene.noise,
-        )
+        return _ready(self.scene, self.rows, self.picks, self.components, G, self.mixture_at)
 
     def mixture_at(self, m: int) -> Mixture:
         """Return the outcomes of a moment under each row."""
@@ -238,3 +211,26 @@ class NarrowPart:
         if mu.any():
             residual = residual - np.matmul(apart, mu[:, None, :, None])[..., 0]
         return Mixture(residual, scale, narrow.log_weight[place, m])
+
+
+def _ready(
+    scene: Scene,
+    rows: Rows,
+    picks: Picks,
+    components: Components,
+    columns: FloatArray,
+    mixture_at: Callable[[int], Mixture],
+) -> FilterRows:
+    """Return picks with their distribution of f, by G of each moment (pick, moment, ...)."""
+    count, moments, channels, size = columns.shape
+    G = columns.reshape(count, moments * channels, size)
+    V, mu = components.of(picks.run, picks.component)
+    return FilterRows(
+        mixture_at,
+        scene.moments.usable[picks.run],
+        np.matmul(G, mu[..., None]).reshape(count, moments, channels),
+        G @ V @ np.swapaxes(G, -1, -2),
+        rows.lever[picks.run, picks.row],
+        rows.variance[picks.run, picks.row],
+        scene.noise,
+    )

@@ -38,11 +38,11 @@ def _marginal(evidence: RunsEvidence, h: int, log_evidence: FloatArray) -> Margi
 
     def by_movement(run: int) -> FloatArray:
         some, share = picked(run)
-        return _of_movements(evidence, run, _one_by_one(evidence.weighed[h], some, share))
+        return _one_by_one(evidence.weighed[h], some, share)
 
     def settled(run: int) -> FloatArray:
         some, share = picked(run)
-        return _of_movements(evidence, run, _given_all(evidence, h, some[share.argmax()]))
+        return _given_all(evidence, h, int(some[share.argmax()]))
 
     def estimate(run: int) -> Estimate:
         some, share = picked(run)
@@ -76,14 +76,6 @@ def _given_all(evidence: RunsEvidence, h: int, pick: int) -> FloatArray:
     outlier = np.maximum(1.0 - share.sum(axis=-1), LEAST_OUTLIER)
     usable = evidence.scene.moments.usable[evidence.weighed[h].picks.run[pick]]
     return np.where(usable, evidence.scene.noise.log_outlier - np.log(outlier), 0.0)
-
-
-def _of_movements(evidence: RunsEvidence, run: int, by_moment: FloatArray) -> FloatArray:
-    """Return what belongs to moments added up by movement, (movement,)."""
-    movement = evidence.scene.moments.movement[run]
-    total = np.zeros(int(movement.max()) + 1)
-    np.add.at(total, movement, by_moment)
-    return total
 
 
 def _onset(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) -> Weighted | None:
@@ -135,14 +127,10 @@ def _outcome_probability(evidence: RunsEvidence, h: int, pick: int) -> FloatArra
     moments, one = evidence.scene.moments, evidence.weighed[h]
     run, row = one.picks.run[pick], one.picks.row[pick]
     usual = evidence.rows[h].usual[evidence.narrowed[h].kept[evidence.narrowed[h].place[run, row]]]
-    count = len(evidence.scene.model.lost_commands.lost)
-    last = int(moments.movement[run].max()) + 1
-    table = np.zeros((last, count))
-    seen = np.flatnonzero(moments.usable[run])
-    for m in seen.tolist():
-        where = moments.outcome[run, m, usual[m]]
-        np.add.at(table[moments.movement[run, m]], where, one.found.share[pick, m])
-    return table / np.maximum(table.sum(axis=1, keepdims=True), 1.0)
+    table = np.zeros((moments.count, len(evidence.scene.model.lost_commands.lost)))
+    for m in np.flatnonzero(moments.usable[run]).tolist():
+        np.add.at(table[m], moments.outcome[run, m, usual[m]], one.found.share[pick, m])
+    return table
 
 
 def theta_posterior(evidence: RunsEvidence) -> tuple[FloatArray, FloatArray]:
@@ -187,17 +175,15 @@ def theta_given(
         information: W of each moment, (pick, moment, channel, channel).
         shift: b of each moment, (pick, moment, channel).
     """
-    _, _, mean, covariance, lever, variance, _ = part.arguments
-    picks, moments, channels = mean.shape
-    size = moments * channels
+    ready = part.filter_rows
+    picks, moments, channels = ready.mean.shape
+    size, K, mean = moments * channels, ready.spread, ready.mean.reshape(ready.covariance.shape[:2])
     W = np.zeros((picks, size, size))
     for m in range(moments):
         at = slice(m * channels, (m + 1) * channels)
         W[:, at, at] = information[:, m]
-    flat = lever.reshape(picks, size)
-    K = covariance + variance[:, None, None] * flat[:, :, None] * flat[:, None]
     system = np.eye(size) + W @ K
-    pull = shift.reshape(picks, size) - np.matmul(W, mean.reshape(picks, size)[..., None])[..., 0]
+    pull = shift.reshape(picks, size) - np.matmul(W, mean[..., None])[..., 0]
     alpha = np.linalg.solve(system, pull[..., None])
     V, mu = part.components.of(part.picks.run, part.picks.component)
     GV = part.narrow.columns[part.place].reshape(picks, size, V.shape[-1]) @ V

@@ -37,7 +37,7 @@ def redrawn_rows(scene: Scene, motor: int, mode: FaultMode) -> Rows:
     mean_square = float(shares @ (mass @ size**2))
     outcomes = Outcomes.joined(
         scene.healthy,
-        _nodes(scene, motor, size, width, mean_square),
+        _nodes(scene, motor, size, width),
         _beside_losses(scene, motor, mean_square),
     )
     weight = _weights(scene, [*mass, shares @ mass])
@@ -76,25 +76,22 @@ def _mass(edge: FloatArray, low: float, high: float) -> FloatArray:
     return np.r_[mass[::-1], mass] / max(2.0 * float(mass.sum()), 1e-300)
 
 
-def _nodes(
-    scene: Scene, motor: int, size: FloatArray, width: FloatArray, mean_square: float
-) -> Outcomes:
+def _nodes(scene: Scene, motor: int, size: FloatArray, width: FloatArray) -> Outcomes:
     """Return the outcomes of all nodes if the commands of all motors arrive."""
     moments, model = scene.moments, scene.model
-    done = moments.done[..., motor, None]
     base = np.repeat(moments.base[:, :, :1], len(size), axis=2)
-    base[..., motor] += size * done
+    base[..., motor] += size
     direction = np.broadcast_to(moments.direction[:, :, :1], base.shape)
-    beside = np.repeat(scene.jitter, len(size), axis=2)
-    beside[..., motor] += width**2 / 12.0 + (1.0 - done) ** 2 * mean_square
+    beside = np.zeros((len(size), base.shape[-1]))
+    beside[:, motor] = width**2 / 12.0
     pose = model.settle(base, direction, model.none_held)
     return Outcomes.of_poses(model, moments, pose, model.scatter**2, beside)
 
 
 def _beside_losses(scene: Scene, motor: int, mean_square: float) -> Outcomes:
     """Return the outcomes in which commands get lost, with the error as normal."""
-    beside = np.repeat(scene.jitter, scene.pose.shape[2] - 1, axis=2)
-    beside[..., motor] += mean_square
+    beside = np.zeros(scene.pose.shape[-1])
+    beside[motor] = mean_square
     pose, variance = scene.pose[:, :, 1:], scene.model.scatter**2
     return Outcomes.of_poses(scene.model, scene.moments, pose, variance, beside)
 

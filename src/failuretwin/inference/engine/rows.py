@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from failuretwin.core.numerics import Weighted
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.inference.engine.integral import Noise
 from failuretwin.inference.engine.moments import Moments
@@ -22,8 +21,6 @@ from failuretwin.inference.engine.theta import Layout, columns
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.observation.healthy_model import HealthyModel
 
-JITTER_S = 0.03
-"""Deviation of the start of each motor from movement to movement [s]."""
 AmountPrior = Callable[[FloatArray, IntArray, IntArray], FloatArray]
 """Log density of amounts (pick, node) of some runs (pick,) and rows (pick,), same axes."""
 Onsets = Callable[[int, int], tuple[FloatArray, FloatArray]]
@@ -109,17 +106,11 @@ class Scene:
         """
         noise = Noise(model.settling.tail_dof, model.sensors.dims, model.outlier_log_density)
         pose = model.settle(moments.base, moments.direction, model.none_held)
-        G = columns(model, pose, moments.direction, moments.speed[:, :, None], layout)
+        G = columns(model, pose, moments.direction, layout)
         usual = G[:, :, 0]
         spread = usual @ covariance @ np.swapaxes(usual, -1, -2)
-        jitter = (JITTER_S * moments.speed[:, :, None]) ** 2
-        healthy = Outcomes.of_poses(model, moments, pose, model.scatter**2, jitter)
+        healthy = Outcomes.of_poses(model, moments, pose, model.scatter**2)
         return cls(model, moments, priors, noise, layout, G, spread, pose, healthy)
-
-    @property
-    def jitter(self) -> FloatArray:
-        """Variance of single motors by uneven starts, (run, moment, 1, motor) [rad2]."""
-        return (JITTER_S * self.moments.speed[:, :, None]) ** 2
 
     @property
     def settled(self) -> FloatArray:
@@ -150,13 +141,6 @@ def sampled(onset: FloatArray, share: FloatArray) -> Onsets:
         share: Share of each, same axes.
     """
     return lambda run, row: (onset[run, row], share[run, row])
-
-
-def mixed(parts: list[tuple[float, Weighted]]) -> Weighted:
-    """Return the mixture of some distributions by their probabilities."""
-    values = np.concatenate([one.values for _, one in parts])
-    weights = [p * one.weights / max(one.weights.sum(), 1e-300) for p, one in parts]
-    return Weighted(values, np.concatenate(weights))
 
 
 def before_onset(rows: Rows, healthy: Outcomes, columns_of: FloatArray) -> Rows:

@@ -215,9 +215,10 @@ class RunsEvidence:
         else:
             G = rows.columns[picks.run, picks.row_of(rows.columns)]
             part = Part(self.scene, rows, picks, self.components, G, G[:, :, :1])
-        found = filter_rows(*part.arguments)
+        ready = part.filter_rows
+        found = filter_rows(ready)
         if refined:
-            found = refine(*part.arguments, found)
+            found = refine(ready, found)
         total = found.total + rows.log_prior[picks.run, picks.row]
         amount = found.amount.copy()
         amount[:, 1] = np.sqrt(np.maximum(amount[:, 1], 0.0))

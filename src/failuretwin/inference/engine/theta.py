@@ -1,10 +1,10 @@
 """Theta: what all moments of a robot share and nobody knows exactly.
 
-    f = G theta,    G = [ I | -[x]x | x | J | J diag(g) | -J diag(d) | -J qd | dx/dgeometry ]
+    f = G theta,    G = [ I | -[x]x | x | J | J diag(g) | -J diag(d) | dx/dgeometry ]
 
 with origin t [m], turn w [rad] and scale k [-] of the tool sensor's frame, bias b [rad], compliance
-c [rad/(N m)] and friction f [rad] of each motor, the lag of each motor [s], and the frames of the
-joints, each moved [m] and turned [rad]. The prior is a mixture of normal distributions.
+c [rad/(N m)] and friction f [rad] of each motor, and the frames of the joints, each moved [m] and
+turned [rad]. The prior is a mixture of normal distributions.
 
 Section: docs/inference.md#theta
 """
@@ -17,7 +17,6 @@ import numpy as np
 
 from failuretwin.core.types import FloatArray, IntArray
 from failuretwin.digital_model.robot import Robot
-from failuretwin.inference.engine.moments import Moments
 from failuretwin.inference.observation.healthy_model import HealthyModel
 from failuretwin.inference.theta.shared_unknowns import loads, offset_deviation, typical_load
 
@@ -26,10 +25,6 @@ REGISTRATION = 7
 ORIGIN_M, TURN_RAD = 0.003, 0.005
 """Deviations by which the frame of a joint stands off its URDF [m, rad]: a real UR10 is 1.2 mm off,
 a 7-joint cable-driven arm 3.3 mm, at the median; assumed for all arms."""
-LAG_S, OWN_LAG_S = 0.05, 0.03
-"""Deviations of the lag that the motors share, clock included, and of each motor's own [s]."""
-TIMED_LAG_S, TIMED_OWN_LAG_S = 0.01, 0.02
-"""The same of a robot whose timing a calibration knows [s]."""
 KNOWN = 1e-6
 """Deviation that stands for "known" in each unit of theta."""
 ODD_RATE, ODD_FACTOR = 0.1, 3.0
@@ -44,12 +39,10 @@ class Layout:
     Attributes:
         motors: Number of motors.
         geometry: Whether the frames of the joints are unknown.
-        lags: Whether the lags are.
     """
 
     motors: int
     geometry: bool
-    lags: bool
 
     @property
     def offsets(self) -> slice:
@@ -57,14 +50,9 @@ class Layout:
         return slice(REGISTRATION, REGISTRATION + 3 * self.motors)
 
     @property
-    def lag(self) -> slice:
-        """Places of the lags."""
-        return slice(self.offsets.stop, self.offsets.stop + self.motors * self.lags)
-
-    @property
     def frames(self) -> slice:
         """Places of the joint frames."""
-        return slice(self.lag.stop, self.lag.stop + 6 * self.motors * self.geometry)
+        return slice(self.offsets.stop, self.offsets.stop + 6 * self.motors * self.geometry)
 
     @property
     def size(self) -> int:
@@ -72,9 +60,8 @@ class Layout:
         return self.frames.stop
 
     def own(self, motor: int) -> list[int]:
-        """Return the places of one motor's bias, compliance, friction and lag."""
-        offsets = [REGISTRATION + motor + self.motors * k for k in range(3)]
-        return offsets + [self.lag.start + motor] * self.lags
+        """Return the places of one motor's bias, compliance and friction."""
+        return [REGISTRATION + motor + self.motors * k for k in range(3)]
 
 
 @dataclass(frozen=True)
@@ -116,7 +103,6 @@ def columns(
     model: HealthyModel,
     pose: FloatArray,
     direction: FloatArray,
-    speed: FloatArray,
     layout: Layout,
 ) -> FloatArray:
     """Return G at some poses, (..., channel, theta).
@@ -125,7 +111,6 @@ def columns(
         model: The healthy robot.
         pose: Settled angles, (..., motor) [rad].
         direction: Sign of the last travel, (..., motor).
-        speed: Commanded speed, (..., motor) [rad/s].
         layout: Places in theta.
     """
     value, jacobian = model.sensors.expected(pose)
@@ -138,8 +123,6 @@ def columns(
         rigid[..., own, 6] = x
     load = loads(model, pose)[..., None, :]
     parts = [rigid, jacobian, jacobian * load, -jacobian * direction[..., None, :]]
-    if layout.lags:
-        parts.append(-jacobian * np.broadcast_to(speed, pose.shape)[..., None, :])
     if layout.geometry:
         parts.append(model.twin.geometry_columns(pose))
     return np.concatenate(parts, axis=-1)
@@ -150,9 +133,9 @@ def has_geometry(model: HealthyModel) -> bool:
     return model.sensors.tool_alone and model.twin.robot.profile.sensor_pose != "log"
 
 
-def layout_of(model: HealthyModel, moments: Moments) -> Layout:
-    """Return what is unknown of a robot in some moments."""
-    return Layout(len(model.scatter), has_geometry(model), bool(np.any(moments.speed)))
+def layout_of(model: HealthyModel) -> Layout:
+    """Return what is unknown of a robot."""
+    return Layout(len(model.scatter), has_geometry(model))
 
 
 SCATTER = {0.5: 0.25, 1.0: 0.4, 2.0: 0.2, 4.0: 0.1, 9.0: 0.05}
@@ -203,11 +186,7 @@ def _covariance(model: HealthyModel, layout: Layout, factor: float) -> FloatArra
     deviation[layout.offsets] = np.maximum(factor * offset_deviation(model), least)
     if layout.geometry:
         deviation[layout.frames] = factor * frame_deviation(model.twin.robot)
-    covariance = np.diag(deviation**2)
-    if layout.lags:
-        common, own = (TIMED_LAG_S, TIMED_OWN_LAG_S) if model.knows_timing else (LAG_S, OWN_LAG_S)
-        covariance[layout.lag, layout.lag] = common**2 + own**2 * np.eye(motors)
-    return covariance
+    return np.diag(deviation**2)
 
 
 def frame_deviation(robot: Robot) -> FloatArray:

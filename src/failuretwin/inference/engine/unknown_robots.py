@@ -9,7 +9,7 @@ Section: docs/inference.md#runs
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -18,7 +18,6 @@ from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import FloatArray
 from failuretwin.digital_model.arm_classes import GENERIC_NAME
-from failuretwin.digital_model.robot import shown_unit
 from failuretwin.inference.engine.moments import moments_of
 from failuretwin.inference.engine.posterior import marginal_likelihoods, theta_posterior
 from failuretwin.inference.engine.rows import Scene
@@ -28,15 +27,13 @@ from failuretwin.inference.faults.marginal import MarginalLikelihood
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.posterior import Posterior, log_prior
-from failuretwin.inference.set_ups.set_ups import FAULT_OF_EVERY_RUN, spoken
+from failuretwin.inference.theta.shared_posterior import odd_zero
 from failuretwin.inference.theta.shared_unknowns import layout_of as doubted_layout
 
 CHUNK_RUNS = 16
 """Runs that are weighed at a time: columns of all rows and outcomes stay below 100 MB."""
 TOLD = 0.9
 """Probability from which a run says what it had to assume of its robot."""
-FAR = 3.0
-"""Offsets so many deviations off what such robots do are told."""
 
 
 def speaks_of(likelihood: RunLikelihood, hypotheses: Sequence[Hypothesis]) -> bool:
@@ -56,7 +53,7 @@ def runs_evidence(
     found = []
     for at in range(0, len(likelihood.usable), CHUNK_RUNS):
         moments = moments_of(model, likelihood.evidence[slice(at, at + CHUNK_RUNS)])
-        layout = layout_of(model.without_doubt, moments)
+        layout = layout_of(model.without_doubt)
         components = robot_components(model, layout, factors)
         covariance = components.covariance[0]
         scene = Scene.of(model.without_doubt, moments, priors, layout, covariance)
@@ -119,9 +116,8 @@ class _Part:
 
     @cached_property
     def weights(self) -> list[MarginalLikelihood]:
-        """What the runs say of each hypothesis; movements without a moment say nothing."""
-        count = self.evidence.scene.moments.count
-        return [_padded(one, count) for one in marginal_likelihoods(self.evidence)]
+        """What the runs say of each hypothesis."""
+        return marginal_likelihoods(self.evidence)
 
     @property
     def remarks(self) -> list[str]:
@@ -159,29 +155,5 @@ class _Part:
         mean, covariance = theta_posterior(self.evidence)
         deviation = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[:, zeros]
         sure = np.maximum(np.abs(mean[:, zeros]) - 2.0 * deviation, 0.0) / usual
-        return [self._odd_zero(*pair) for pair in zip(mean[:, zeros], sure, strict=True)]
-
-    def _odd_zero(self, zero: FloatArray, deviations: FloatArray) -> str:
-        motor = int(np.argmax(deviations))
-        if deviations[motor] < FAR:
-            return ""
-        robot = self.evidence.scene.model.twin.robot
-        size, unit = shown_unit("rad", robot, robot.motor_names[motor])
-        return (
-            f"{spoken(robot, motor)} rests {size * zero[motor]:+.2g} {unit} off what such robots "
-            f"do (by {deviations[motor]:.1f} deviations at least): a zero that is off, or "
-            f"{FAULT_OF_EVERY_RUN}"
-        )
-
-
-def _padded(one: MarginalLikelihood, count: int) -> MarginalLikelihood:
-    """Return the same with as many movements as the longest run has."""
-
-    def pad(values: FloatArray) -> FloatArray:
-        return np.concatenate([values, np.zeros(count - len(values))])
-
-    return replace(
-        one,
-        by_movement=lambda run: pad(one.by_movement(run)),
-        settled=lambda run: pad(one.settled(run)),
-    )
+        robot = scene.model.twin.robot
+        return [odd_zero(robot, *pair) for pair in zip(mean[:, zeros], sure, strict=True)]

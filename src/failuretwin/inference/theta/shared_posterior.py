@@ -21,7 +21,7 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.digital_model.robot import shown_unit
+from failuretwin.digital_model.robot import Robot, shown_unit
 from failuretwin.inference.faults.marginal import MarginalLikelihood
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -220,20 +220,9 @@ class Mixture:
             precision = np.diag(parts[each.component].deviation ** -2.0)
             covariance = np.linalg.inv(precision + each.found.information[row, h])
             open_by = 2.0 * np.sqrt(np.diag(covariance)[zeros])
-            told.append(self._odd_zero(zero, np.maximum(np.abs(zero) - open_by, 0.0) / usual))
+            robot = self.weighing.likelihood.model.twin.robot
+            told.append(odd_zero(robot, zero, np.maximum(np.abs(zero) - open_by, 0.0) / usual))
         return told
-
-    def _odd_zero(self, zero: FloatArray, deviations: FloatArray) -> str:
-        motor = int(np.argmax(deviations))
-        if deviations[motor] < FAR:
-            return ""
-        robot = self.weighing.likelihood.model.twin.robot
-        size, unit = shown_unit("rad", robot, robot.motor_names[motor])
-        return (
-            f"{spoken(robot, motor)} rests {size * zero[motor]:+.2g} {unit} off what such robots "
-            f"do (by {deviations[motor]:.1f} deviations at least): a zero that is off, or "
-            f"{FAULT_OF_EVERY_RUN}"
-        )
 
     def remarks(self) -> list[str]:
         """Return what is to be said of the set-up of each run, empty where nothing is."""
@@ -268,3 +257,22 @@ class Mixture:
         evidence = self.weighing.likelihood.evidence
         seen = evidence.point[run][evidence.usable[run]]
         return 1e3 * float(np.linalg.norm(registered(seen[None], theta)[0] - seen, axis=1).mean())
+
+
+def odd_zero(robot: Robot, zero: FloatArray, deviations: FloatArray) -> str:
+    """Return which zero is far off what such robots do; empty where none is.
+
+    Args:
+        robot: The robot.
+        zero: Zeros of the motors, (motor,) [rad].
+        deviations: How far off each is at least, in deviations of such robots, (motor,).
+    """
+    motor = int(np.argmax(deviations))
+    if deviations[motor] < FAR:
+        return ""
+    size, unit = shown_unit("rad", robot, robot.motor_names[motor])
+    return (
+        f"{spoken(robot, motor)} rests {size * zero[motor]:+.2g} {unit} off what such robots "
+        f"do (by {deviations[motor]:.1f} deviations at least): a zero that is off, or "
+        f"{FAULT_OF_EVERY_RUN}"
+    )
