@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -79,6 +80,12 @@ def test_no_answer_is_thrown_away(sources):
 
 def test_every_check_is_run(sources):
     assert never_run(sources) == []
+
+
+def test_no_two_files_have_one_name(sources):
+    """Folders of tests are no packages: pytest imports two files of one name as one module."""
+    names = [Path(name).name for name in sources if Path(name).name.startswith("test_")]
+    assert [name for name, count in Counter(names).items() if count > 1] == []
 
 
 @pytest.mark.parametrize(
