@@ -9,7 +9,7 @@ Section: docs/inference.md#runs
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -68,22 +68,18 @@ class Part:
     @property
     def filter_rows(self) -> FilterRows:
         """What the filter takes."""
-        G = self.own[:, :, 0]
-        return _ready(self.scene, self.rows, self.picks, self.components, G, self.mixture_at)
+        f = _normal_of(self.own[:, :, 0], *self._theta)
+        return _ready(self.scene, self.rows, self.picks, f, self.mixture_at)
 
     @property
     def _theta(self) -> tuple[FloatArray, FloatArray]:
-        return self.components.of(self.picks.run, self.picks.component)
+        picks = self.picks
+        return self.components.theta(picks.run, self.components.normal[picks.component])
 
     @cached_property
     def _other(self) -> tuple[FloatArray, FloatArray]:
-        """How far outcomes have other columns, as if theta were independent: mean, covariance."""
-        V, mu = self._theta
-        apart = self.columns - self.own
-        deviation = np.sqrt(np.diagonal(V, axis1=-2, axis2=-1))[:, None, None, None]
-        scaled = apart * deviation
-        shift = np.matmul(apart, mu[:, None, None, :, None])[..., 0]
-        return shift, np.matmul(scaled, np.swapaxes(scaled, -1, -2))
+        """How far outcomes have other columns, (pick, moment, usual, ...): mean, covariance."""
+        return _apart(self.columns - self.own, *self._theta)
 
     def mixture_at(self, m: int) -> Mixture:
         """Return the outcomes of a moment under each row."""
@@ -99,6 +95,27 @@ class Part:
         return Mixture(residual, scale, rows.log_weight[run, self.picks.row, m])
 
 
+def _normal_of(G: FloatArray, V: FloatArray, mu: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return f by G (pick, moment, channel, theta): mean, and covariance of all its numbers."""
+    picks, moments, channels, size = G.shape
+    flat = G.reshape(picks, moments * channels, size)
+    mean = np.matmul(flat, mu[..., None]).reshape(picks, moments, channels)
+    return mean, flat @ V @ np.swapaxes(flat, -1, -2)
+
+
+def _apart(apart: FloatArray, V: FloatArray, mu: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return mean and covariance of what outcomes differ by, as if theta were independent.
+
+    Args:
+        apart: G of each outcome less that of f, (pick, moment, outcome, channel, theta).
+        V: (pick, theta, theta).
+        mu: (pick, theta).
+    """
+    scaled = apart * np.sqrt(np.diagonal(V, axis1=-2, axis2=-1))[:, None, None, None]
+    shift = np.matmul(apart, mu[:, None, None, :, None])[..., 0]
+    return shift, np.matmul(scaled, np.swapaxes(scaled, -1, -2))
+
+
 LEFT_OUT = 2e-3
 """Share of the outcomes of a moment under a row that may be left out, once all are weighed."""
 
@@ -111,7 +128,10 @@ class Narrowed:
         place: Index of each row among those that are kept, (run, row).
         kept: Outcomes, (place, moment, outcome).
         columns: G of the likeliest outcome, (place, moment, channel, theta).
-        apart: G of each outcome less that, (place, moment, outcome, channel, theta).
+        f: Mean (place, moment, channel) and covariance (place, number, number) of f in each normal
+            distribution of theta.
+        apart: Mean (place, moment, outcome, channel) and covariance of what outcomes differ by
+            since their columns do, in each.
         residual: (place, moment, outcome, channel) [m].
         scatter: (place, moment, outcome, channel, channel) [m2].
         beside: Same axes [m2].
@@ -121,20 +141,22 @@ class Narrowed:
     place: IntArray
     kept: IntArray
     columns: FloatArray
-    apart: FloatArray
+    f: tuple[FloatArray, FloatArray]
+    apart: tuple[FloatArray, FloatArray]
     residual: FloatArray
     scatter: FloatArray
     beside: FloatArray
     log_weight: FloatArray
 
 
-def narrowed(rows: Rows, picks: Picks, share: FloatArray) -> Narrowed:
+def narrowed(rows: Rows, picks: Picks, share: FloatArray, components: Components) -> Narrowed:
     """Return the outcomes of some rows that count.
 
     Args:
         rows: Rows of the hypothesis.
         picks: Those that are kept.
         share: Share of each outcome, (pick, moment, outcome).
+        components: What is believed of the robot.
     """
     run, row = picks.run, picks.row
     place = np.full(rows.log_prior.shape, -1)
@@ -151,16 +173,23 @@ def narrowed(rows: Rows, picks: Picks, share: FloatArray) -> Narrowed:
     apart = G[np.arange(len(run))[:, None, None], moment, usual] - own[:, :, None]
     r = picks.row_of(rows.outcomes.residual)[:, None, None]
     index = run[:, None, None], r, moment, kept
+    normals = [components.theta(run, normal) for normal in range(components.normals)]
     return Narrowed(
         place,
         kept,
         own,
-        apart,
+        _stacked([_normal_of(own, *theta) for theta in normals]),
+        _stacked([_apart(apart, *theta) for theta in normals]),
         rows.outcomes.residual[index],
         rows.outcomes.scatter[index],
         rows.outcomes.beside[index],
         rows.log_weight[run[:, None, None], row[:, None, None], moment, kept],
     )
+
+
+def _stacked(pairs: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
+    first, second = zip(*pairs, strict=True)
+    return np.stack(first), np.stack(second)
 
 
 @dataclass(frozen=True)
@@ -187,49 +216,40 @@ class NarrowPart:
         return self.narrow.place[self.picks.run, self.picks.row]
 
     @cached_property
-    def _theta(self) -> tuple[FloatArray, FloatArray]:
-        return self.components.of(self.picks.run, self.picks.component)
+    def normal(self) -> IntArray:
+        """The normal distribution of theta of each pick."""
+        return self.components.normal[self.picks.component]
 
     @property
     def filter_rows(self) -> FilterRows:
         """What the filter takes."""
-        G = self.narrow.columns[self.place]
-        return _ready(self.scene, self.rows, self.picks, self.components, G, self.mixture_at)
+        mean, covariance = (values[self.normal, self.place] for values in self.narrow.f)
+        return _ready(self.scene, self.rows, self.picks, (mean, covariance), self.mixture_at)
 
     def mixture_at(self, m: int) -> Mixture:
         """Return the outcomes of a moment under each row."""
         narrow, place, component = self.narrow, self.place, self.picks.component
-        V, mu = self._theta
-        apart = narrow.apart[place, m]
-        deviation = np.sqrt(np.diagonal(V, axis1=-2, axis2=-1))
-        scaled = apart * deviation[:, None, None]
-        scale = np.matmul(scaled, np.swapaxes(scaled, -1, -2)) + narrow.beside[place, m]
+        shift, wider = (values[self.normal, place, m] for values in narrow.apart)
         factor = self.components.sigma[component, None, None, None] ** 2
         noise = self.components.noise_m[component, None, None, None] ** 2
-        scale += factor * narrow.scatter[place, m] + noise * np.eye(scale.shape[-1])
-        residual = narrow.residual[place, m]
-        if mu.any():
-            residual = residual - np.matmul(apart, mu[:, None, :, None])[..., 0]
-        return Mixture(residual, scale, narrow.log_weight[place, m])
+        scale = factor * narrow.scatter[place, m] + noise * np.eye(shift.shape[-1])
+        scale += wider
+        scale += narrow.beside[place, m]
+        return Mixture(narrow.residual[place, m] - shift, scale, narrow.log_weight[place, m])
 
 
 def _ready(
     scene: Scene,
     rows: Rows,
     picks: Picks,
-    components: Components,
-    columns: FloatArray,
+    f: tuple[FloatArray, FloatArray],
     mixture_at: Callable[[int], Mixture],
 ) -> FilterRows:
-    """Return picks with their distribution of f, by G of each moment (pick, moment, ...)."""
-    count, moments, channels, size = columns.shape
-    G = columns.reshape(count, moments * channels, size)
-    V, mu = components.of(picks.run, picks.component)
+    """Return picks with their distribution of f: mean and covariance."""
     return FilterRows(
         mixture_at,
         scene.moments.usable[picks.run],
-        np.matmul(G, mu[..., None]).reshape(count, moments, channels),
-        G @ V @ np.swapaxes(G, -1, -2),
+        *f,
         rows.lever[picks.run, picks.row],
         rows.variance[picks.run, picks.row],
         scene.noise,

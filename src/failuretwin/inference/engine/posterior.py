@@ -185,7 +185,7 @@ def theta_given(
     system = np.eye(size) + W @ K
     pull = shift.reshape(picks, size) - np.matmul(W, mean[..., None])[..., 0]
     alpha = np.linalg.solve(system, pull[..., None])
-    V, mu = part.components.of(part.picks.run, part.picks.component)
+    V, mu = part.components.theta(part.picks.run, part.normal)
     GV = part.narrow.columns[part.place].reshape(picks, size, V.shape[-1]) @ V
     turned = np.swapaxes(GV, -1, -2)
     return mu + np.matmul(turned, alpha)[..., 0], V - turned @ np.linalg.solve(system, W @ GV)

@@ -148,7 +148,7 @@ class RunsEvidence:
         table[one.picks.run, one.picks.row] = one.log_evidence
         near = table > table.max(axis=1, keepdims=True) - ROWS_NATS
         some = np.flatnonzero(near[one.picks.run, one.picks.row])
-        return narrowed(self.rows[h], one.picks[some], one.found.share[some])
+        return narrowed(self.rows[h], one.picks[some], one.found.share[some], self.components)
 
     def _near_best(self, h: int, one: Weighed) -> Picks:
         """Return the rows of a hypothesis that come near its best, in each run."""

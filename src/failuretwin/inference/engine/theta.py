@@ -68,15 +68,19 @@ class Layout:
 class Components:
     """Beliefs about the robot: theta normal in each, with its scatter and its sensor.
 
+    Components that differ in scatter or noise alone share a normal distribution of theta.
+
     Attributes:
         log_weight: Log of the probability of each, (component,) or (run, component).
-        mean: mu, (component, theta) or of each run, (run, component, theta).
-        covariance: V, (component, theta, theta) or (run, component, theta, theta).
+        normal: Which normal distribution of theta is that of each, (component,).
+        mean: mu, (normal, theta) or of each run, (run, normal, theta).
+        covariance: V, (normal, theta, theta) or (run, normal, theta, theta).
         sigma: Factor on the scatter of the motors, (component,).
         noise_m: Noise of the sensor, (component,) [m].
     """
 
     log_weight: FloatArray
+    normal: IntArray
     mean: FloatArray
     covariance: FloatArray
     sigma: FloatArray
@@ -86,11 +90,17 @@ class Components:
         """How many."""
         return len(self.sigma)
 
-    def of(self, run: IntArray, component: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return V and mu of some runs and components, (pick, ...)."""
+    @property
+    def normals(self) -> int:
+        """How many normal distributions of theta."""
+        return self.mean.shape[-2]
+
+    def theta(self, run: IntArray, normal: IntArray | int) -> tuple[FloatArray, FloatArray]:
+        """Return V and mu of some normal distributions in some runs, (pick, ...)."""
         if self.mean.ndim == 2:
-            return self.covariance[component], self.mean[component]
-        return self.covariance[run, component], self.mean[run, component]
+            normal = np.broadcast_to(normal, run.shape)
+            return self.covariance[normal], self.mean[normal]
+        return self.covariance[run, normal], self.mean[run, normal]
 
     def weight(self, run: IntArray, component: IntArray) -> FloatArray:
         """Return the log weight of some components in some runs, (pick,)."""
@@ -154,23 +164,25 @@ def robot_components(model: HealthyModel, layout: Layout, factors: bool) -> Comp
         layout: Places in theta.
         factors: Whether its scatter and the noise of its sensor are unknown.
     """
-    usual, odd = (_covariance(model, layout, factor) for factor in (1.0, ODD_FACTOR))
-    scatter, noise = (SCATTER, NOISE) if factors else ({1.0: 1.0}, {1.0: 1.0})
     doubted = bool(np.any(offset_deviation(model)))
+    factors_of = (1.0, ODD_FACTOR) if doubted else (1.0,)
+    scatter, noise = (SCATTER, NOISE) if factors else ({1.0: 1.0}, {1.0: 1.0})
     rate = ODD_RATE if doubted else 0.0
     found = [
-        (a * b * (1.0 - rate), usual, sigma, kappa)
+        (a * b * (1.0 - rate), 0, sigma, kappa)
         for sigma, a in scatter.items()
         for kappa, b in noise.items()
     ]
     if doubted:
-        found += [(b * rate, odd, 1.0, kappa) for kappa, b in noise.items()]
+        found += [(b * rate, 1, 1.0, kappa) for kappa, b in noise.items()]
     found.sort(key=lambda one: -one[0])
-    weight, covariance, sigma, kappa = zip(*found, strict=True)
+    weight, normal, sigma, kappa = zip(*found, strict=True)
+    covariance = np.stack([_covariance(model, layout, factor) for factor in factors_of])
     return Components(
         np.log(weight),
-        np.zeros((len(found), layout.size)),
-        np.stack(covariance),
+        np.array(normal),
+        np.zeros((len(covariance), layout.size)),
+        covariance,
         np.array(sigma),
         model.path_noise * np.array(kappa),
     )
