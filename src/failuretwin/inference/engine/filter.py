@@ -94,6 +94,18 @@ class RowsPosterior:
         """Log density of all moments, (row,)."""
         return np.asarray(self.log_evidence.sum(axis=1))
 
+    def __getitem__(self, rows: IntArray | slice) -> RowsPosterior:
+        """Return some of the rows."""
+        return RowsPosterior(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def with_rows(self, places: IntArray, some: RowsPosterior) -> RowsPosterior:
+        """Return the same with some of the rows replaced."""
+        names = [field.name for field in fields(self)]
+        values = {name: getattr(self, name).copy() for name in names}
+        for name in names:
+            values[name][places] = getattr(some, name)
+        return RowsPosterior(**values)
+
     @classmethod
     def joined(cls, parts: Sequence[RowsPosterior]) -> RowsPosterior:
         """Return the posteriors of several sets of rows as one."""

@@ -33,7 +33,7 @@ FURTHEST = 300.0
 """Squared distance up to which they do: further off all is an outlier."""
 NEARLY_NORMAL = 200.0
 """Degrees of freedom from which one normal distribution stands for it."""
-KEPT = 8
+KEPT = 6
 """Outcomes of a moment that are integrated in full; the rest count with their density."""
 
 

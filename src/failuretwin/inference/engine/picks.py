@@ -10,7 +10,7 @@ Section: docs/inference.md#runs
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -39,6 +39,11 @@ class Picks:
     def __getitem__(self, some: IntArray | slice) -> Picks:
         """Return some of them."""
         return Picks(self.run[some], self.row[some], self.component[some])
+
+    def beside(self, other: Picks) -> Picks:
+        """Return these and some others."""
+        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        return Picks(*map(np.concatenate, pairs))
 
     def row_of(self, array: FloatArray) -> IntArray:
         """Return the index along the axis of rows, which may be common to all."""
@@ -116,7 +121,7 @@ def _apart(apart: FloatArray, V: FloatArray, mu: FloatArray) -> tuple[FloatArray
     return shift, np.matmul(scaled, np.swapaxes(scaled, -1, -2))
 
 
-LEFT_OUT = 2e-3
+LEFT_OUT = 1e-2
 """Share of the outcomes of a moment under a row that may be left out, once all are weighed."""
 
 
@@ -170,7 +175,8 @@ def narrowed(rows: Rows, picks: Picks, share: FloatArray, components: Components
     G = rows.columns[run, picks.row_of(rows.columns)]
     usual = rows.usual[kept]
     own = G[np.arange(len(run))[:, None], moment[..., 0], usual[..., 0]]
-    apart = G[np.arange(len(run))[:, None, None], moment, usual] - own[:, :, None]
+    apart = G - own[:, :, None]
+    some = np.arange(len(run))[:, None, None], moment, usual
     r = picks.row_of(rows.outcomes.residual)[:, None, None]
     index = run[:, None, None], r, moment, kept
     normals = [components.theta(run, normal) for normal in range(components.normals)]
@@ -179,7 +185,7 @@ def narrowed(rows: Rows, picks: Picks, share: FloatArray, components: Components
         kept,
         own,
         _stacked([_normal_of(own, *theta) for theta in normals]),
-        _stacked([_apart(apart, *theta) for theta in normals]),
+        _stacked([tuple(v[some] for v in _apart(apart, *theta)) for theta in normals]),
         rows.outcomes.residual[index],
         rows.outcomes.scatter[index],
         rows.outcomes.beside[index],
@@ -187,7 +193,7 @@ def narrowed(rows: Rows, picks: Picks, share: FloatArray, components: Components
     )
 
 
-def _stacked(pairs: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
+def _stacked(pairs: Sequence[tuple[FloatArray, ...]]) -> tuple[FloatArray, FloatArray]:
     first, second = zip(*pairs, strict=True)
     return np.stack(first), np.stack(second)
 

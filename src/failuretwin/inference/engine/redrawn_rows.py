@@ -18,9 +18,9 @@ from failuretwin.inference.engine.outcomes import Outcomes
 from failuretwin.inference.engine.rows import Rows, Scene, sampled
 from failuretwin.inference.faults.priors import OnsetIntervals
 
-NODES = 24
+NODES = 16
 """Nodes of the size on each side of zero, in a constant ratio."""
-SMALLEST = 1e-3
+SMALLEST = 1e-2
 """Smallest node, as a share of the largest size, where sizes begin at nothing."""
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
-from failuretwin.core.types import BoolArray, FloatArray
+from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.failure_behavior.mode import Signature
 from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.engine.amount_rows import held_rows, offset_rows
@@ -35,6 +35,10 @@ WIDEST = 0.5
 """Largest deviation at which it is, as a share of that of the normal distribution it replaces."""
 ROWS_NATS, MOST_ROWS = 6.0, 4
 """Rows of a hypothesis that other components weigh: so near its best, and at most."""
+REFINED_NATS = 8.0
+"""Rows whose moments are weighed again given all others: so near the best of their run."""
+HYPOTHESIS_NATS = 12.0
+"""Hypotheses that more than one component weighs: so near the best by that with most scatter."""
 COMPONENT_NATS = 4.0
 """Components that weigh all hypotheses of a run: so near the best for healthy or the best fault."""
 
@@ -54,6 +58,21 @@ class Weighed:
     log_evidence: FloatArray
     found: RowsPosterior
     amount: FloatArray
+
+    def beside(self, other: Weighed) -> Weighed:
+        """Return these picks and some others."""
+        return Weighed(
+            self.picks.beside(other.picks),
+            np.concatenate([self.log_evidence, other.log_evidence]),
+            RowsPosterior.joined([self.found, other.found]),
+            np.concatenate([self.amount, other.amount]),
+        )
+
+    def with_picks(self, places: IntArray, some: Weighed) -> Weighed:
+        """Return the same with some of the picks weighed anew."""
+        log_evidence, amount = self.log_evidence.copy(), self.amount.copy()
+        log_evidence[places], amount[places] = some.log_evidence, some.amount
+        return Weighed(self.picks, log_evidence, self.found.with_rows(places, some.found), amount)
 
 
 CHUNK = 400
@@ -110,17 +129,62 @@ class RunsEvidence:
     @cached_property
     def weighed(self) -> list[Weighed]:
         """What the rows of each hypothesis say, by the components that weigh them."""
-        first = [self.weigh(h, self._all_rows(h), refined=False) for h in range(len(self.rows))]
+        first = [self.weigh(h, self._all_rows(h)) for h in range(len(self.rows))]
         for h, one in enumerate(first):
             self.narrowed[h] = self._narrowed(h, one)
         kept = [self._near_best(h, one) for h, one in enumerate(first)]
         wanted = self._wanted(first)
+        widest = self._widest(wanted)
+        runs = np.arange(len(wanted))
+        begun = [self._of_components(h, kept[h], runs, widest) for h in range(len(kept))]
+        others = wanted.copy()
+        others[runs, widest] = False
+        near = self._near(begun)
         found = []
-        for h, picks in enumerate(kept):
-            run, component = np.nonzero(wanted)
-            pick, of = np.nonzero(picks.run[:, None] == run)
-            found.append(self.weigh(h, Picks(picks.run[pick], picks.row[pick], component[of])))
-        return found
+        for h, one in enumerate(begun):
+            run, component = np.nonzero(others & near[:, h, None])
+            found.append(one.beside(self._of_components(h, kept[h], run, component)))
+        return self._refined(found)
+
+    def _widest(self, wanted: BoolArray) -> IntArray:
+        """Return the component with the largest scatter that weighs each run, (run,)."""
+        order = np.lexsort((self.components.noise_m, self.components.sigma))
+        rank = np.argsort(order)
+        return np.asarray(np.argmax(np.where(wanted, rank, -1), axis=1))
+
+    def _of_components(self, h: int, picks: Picks, run: IntArray, component: IntArray) -> Weighed:
+        """Return what rows of a hypothesis say by some components of their runs."""
+        pick, of = np.nonzero(picks.run[:, None] == run)
+        some = Picks(picks.run[pick], picks.row[pick], component[of])
+        return self.weigh(h, some)
+
+    def _near(self, found: Sequence[Weighed]) -> BoolArray:
+        """Return the hypotheses that may come near the best of each run, (run, hypothesis).
+
+        The component with the largest scatter tells them least apart.
+        """
+        table = np.full((self.scene.moments.runs, len(found)), -np.inf)
+        for h, one in enumerate(found):
+            np.maximum.at(table[:, h], one.picks.run, one.log_evidence + self.log_odds[h])
+        return np.asarray(table > table.max(axis=1, keepdims=True) - HYPOTHESIS_NATS)
+
+    def _refined(self, found: Sequence[Weighed]) -> list[Weighed]:
+        """Return what rows say, those that come near the best of their run refined."""
+        says = [
+            one.log_evidence
+            + self.components.weight(one.picks.run, one.picks.component)
+            + self.log_odds[h]
+            for h, one in enumerate(found)
+        ]
+        best = np.full(self.scene.moments.runs, -np.inf)
+        for one, height in zip(found, says, strict=True):
+            np.maximum.at(best, one.picks.run, height)
+        refined = []
+        for h, (one, height) in enumerate(zip(found, says, strict=True)):
+            near = np.flatnonzero(height > best[one.picks.run] - REFINED_NATS)
+            again = self.weigh(h, one.picks[near], one.found[near])
+            refined.append(one.with_picks(near, again))
+        return refined
 
     @cached_property
     def log_evidence(self) -> FloatArray:
@@ -182,23 +246,24 @@ class RunsEvidence:
         for h in np.flatnonzero(asked.any(axis=0)).tolist():
             some = np.repeat(np.flatnonzero(asked[:, h]), count)
             component = np.tile(np.arange(count), len(some) // count)
-            part = self.weigh(h, Picks(some, row[some, h], component), refined=False)
+            part = self.weigh(h, Picks(some, row[some, h], component))
             says_of = part.log_evidence + self.components.weight(some, component)
             table[some, component, h] = says_of + self.log_odds[h]
         near = table > table.max(axis=1, keepdims=True) - COMPONENT_NATS
         return np.asarray(found | (near & np.isfinite(table)).any(axis=2))
 
-    def weigh(self, h: int, picks: Picks, refined: bool = True) -> Weighed:
+    def weigh(self, h: int, picks: Picks, before: RowsPosterior | None = None) -> Weighed:
         """Return what some rows say.
 
         Args:
             h: Index of the hypothesis.
             picks: The rows.
-            refined: Whether every moment is weighed again, given all others.
+            before: What the filter has found, to weigh every moment again given all others; None:
+                the filter finds it.
         """
+        chunks = [slice(at, at + CHUNK) for at in range(0, max(len(picks.run), 1), CHUNK)]
         parts = [
-            self._weigh(h, picks[at : at + CHUNK], refined)
-            for at in range(0, len(picks.run), CHUNK)
+            self._weigh(h, picks[some], None if before is None else before[some]) for some in chunks
         ]
         return Weighed(
             picks,
@@ -207,7 +272,7 @@ class RunsEvidence:
             np.concatenate([one.amount for one in parts]),
         )
 
-    def _weigh(self, h: int, picks: Picks, refined: bool) -> Weighed:
+    def _weigh(self, h: int, picks: Picks, before: RowsPosterior | None) -> Weighed:
         rows = self.rows[h]
         part: Part | NarrowPart
         if h in self.narrowed:
@@ -216,9 +281,7 @@ class RunsEvidence:
             G = rows.columns[picks.run, picks.row_of(rows.columns)]
             part = Part(self.scene, rows, picks, self.components, G, G[:, :, :1])
         ready = part.filter_rows
-        found = filter_rows(ready)
-        if refined:
-            found = refine(ready, found)
+        found = filter_rows(ready) if before is None else refine(ready, before)
         total = found.total + rows.log_prior[picks.run, picks.row]
         amount = found.amount.copy()
         amount[:, 1] = np.sqrt(np.maximum(amount[:, 1], 0.0))
