@@ -18,7 +18,7 @@ from failuretwin.core.hypothesis import Diagnosis, Hypothesis, parse_hypotheses
 from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.readers.bag_messages import BagTopics
 from failuretwin.data_knowledge.readers.column_guess import column_map_text, guess_columns
-from failuretwin.data_knowledge.readers.csv_log import CORRECTION, read_column_map
+from failuretwin.data_knowledge.readers.column_map import CORRECTION, read_column_map
 from failuretwin.data_knowledge.readers.lerobot import LeRobotAngles, is_lerobot, lerobot_map_text
 from failuretwin.data_knowledge.readers.matlab import RECOVERY_ERROR, RECOVERY_WORST
 from failuretwin.data_knowledge.readers.raw_sessions import As

@@ -15,7 +15,7 @@ import numpy as np
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import files_below
 from failuretwin.core.types import MS_PER_S, BoolArray, FloatArray, frozen_array
-from failuretwin.data_knowledge.readers.csv_log import first_line, load_csv, numbers
+from failuretwin.data_knowledge.readers.table import first_line, load_csv, numbers
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.servo import ServoUnits
 

@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from failuretwin.core.errors import InputError, needs_extra, unknown_name
+from failuretwin.core.errors import InputError, check_name, needs_extra
 from failuretwin.core.foreign import check_size, read_text, reading
 from failuretwin.core.types import FloatArray, IntArray, as_floats
+from failuretwin.data_knowledge.readers.column_map import check_entries, map_text
 from failuretwin.data_knowledge.readers.timed_log import Samples, TimedLog
 from failuretwin.digital_model.robot import Robot
 
@@ -39,7 +40,7 @@ NAME_PREFIX, NAME_SUFFIX = "main_", ".pos"
 
 @dataclass(frozen=True)
 class LeRobotAngles:
-    """What the numbers of a LeRobot data set are, commands and readings alike.
+    """Numbers of a LeRobot data set, commands and readings alike.
 
     Attributes:
         unit: deg, rad or normalised: -100 to 100 over the range that the arm was calibrated with.
@@ -58,12 +59,16 @@ class LeRobotAngles:
     zero: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.unit not in (DEG, RAD, NORMALISED):
-            raise unknown_name("unit", self.unit, (DEG, RAD, NORMALISED))
+        check_name("unit", self.unit, (DEG, RAD, NORMALISED))
         if self.unit == NORMALISED and not (self.low and self.high):
             raise InputError(
                 "normalised angles need low and high: the angles [deg] that -100 and 100 stand for."
             )
+
+    def check_motors(self, robot: Robot, where: str) -> None:
+        """Raise InputError unless every list has one entry for each motor."""
+        for name in ("joints", "low", "high", "sign", "zero"):
+            check_entries(name, len(getattr(self, name)) or len(robot.motors), robot, where)
 
     def to_rad(self, values: FloatArray) -> FloatArray:
         """Return angles in the robot's sense [rad] of `values` (frame, motor)."""
@@ -85,15 +90,15 @@ def read_lerobot(path: Path, robot: Robot, angles: LeRobotAngles | None = None) 
     Args:
         path: Its folder.
         robot: The robot it is of; channels of joints that it does not have are left out.
-        angles: What the numbers are; None: degrees, unless they cannot be.
+        angles: Unit and sense of the numbers; None: degrees, unless they cannot be.
 
     Raises:
         InputError: If pyarrow is missing, the data set cannot be read, lacks a joint, or holds
-            angles that cannot be degrees and nobody said what else.
+            angles that cannot be degrees and no unit is given.
     """
-    known = angles or LeRobotAngles()
-    _check_count(known, robot, path)
-    frames = _all_frames(path, known, robot)
+    known, info = angles or LeRobotAngles(), _info(path)
+    known.check_motors(robot, f"{path}: the map")
+    frames = _all_frames(path, info, known, robot)
     unit, reason = _likely_unit(frames)
     if angles is None and unit != DEG:
         raise InputError(
@@ -101,9 +106,11 @@ def read_lerobot(path: Path, robot: Robot, angles: LeRobotAngles | None = None) 
             "--columns MAP.toml; if that file does not exist, a guess is written there for you to "
             "check."
         )
-    rate_hz = _rate(_info(path), path)
+    rate = info.get("fps")
+    if not (isinstance(rate, int | float) and rate > 0):
+        raise InputError(f"{path / INFO_FILE}: fps is {rate!r}, expected frames a second.")
     numbers = np.unique(frames.episode)
-    return [_episode(frames, int(number), rate_hz, known, path) for number in numbers]
+    return [_episode(frames, int(number), float(rate), known, path) for number in numbers]
 
 
 def lerobot_version(path: Path) -> str:
@@ -127,24 +134,6 @@ def _info(path: Path) -> dict[str, Any]:
     if not isinstance(info, dict) or not isinstance(info.get("features"), dict):
         raise InputError(f"{path / INFO_FILE}: has no features. Expected a LeRobot data set.")
     return info
-
-
-def _rate(info: Mapping[str, Any], path: Path) -> float:
-    rate = info.get("fps")
-    if isinstance(rate, int | float) and rate > 0:
-        return float(rate)
-    raise InputError(f"{path / INFO_FILE}: fps is {rate!r}, expected frames a second.")
-
-
-def _check_count(known: LeRobotAngles, robot: Robot, path: Path) -> None:
-    count = len(robot.motors)
-    for name in ("joints", "low", "high", "sign", "zero"):
-        got = len(getattr(known, name))
-        if got not in (0, count):
-            raise InputError(
-                f"{path}: {name} of the map has {got} entries, expected {count}, one for each "
-                f"motor of {robot.name!r} ({', '.join(robot.motor_names)})."
-            )
 
 
 def _channels(
@@ -180,8 +169,8 @@ def channel_names(info: Mapping[str, Any], feature: str) -> list[str]:
     return [str(name) for name in names] if isinstance(names, list) else []
 
 
-def _all_frames(path: Path, known: LeRobotAngles, robot: Robot) -> _Frames:
-    info = _info(path)
+def _all_frames(path: Path, info: Mapping[str, Any], known: LeRobotAngles, robot: Robot) -> _Frames:
+    """Return all frames in order of their episodes and their numbers."""
     picks = [_channels(info, feature, known, robot, path) for feature in (ACTION, STATE)]
     files = sorted((path / "data").rglob("*.parquet"))
     if not files:
@@ -189,10 +178,11 @@ def _all_frames(path: Path, known: LeRobotAngles, robot: Robot) -> _Frames:
             f"{path}: no parquet files below data/. Fetch the whole data set, not its meta alone."
         )
     parts = [_frames(file, picks) for file in files]
-    frames = _Frames(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    if len(frames.episode) == 0:
+    episode, frame, action, state = (np.concatenate(column) for column in zip(*parts, strict=True))
+    if len(episode) == 0:
         raise InputError(f"{path}: holds no frames. Record at least one episode.")
-    return frames
+    order = np.lexsort((frame, episode))
+    return _Frames(episode[order], frame[order], action[order], state[order])
 
 
 def _frames(
@@ -205,10 +195,8 @@ def _frames(
     wanted = [EPISODE, FRAME, ACTION, STATE]
     with reading(file, "parquet", "Fetch the data set again."):
         with pq.ParquetFile(file) as stored:
-            there = stored.schema_arrow.names
             for column in wanted:
-                if column not in there:
-                    raise InputError(f"{file}: {unknown_name('column', column, there)}")
+                check_name("column", column, stored.schema_arrow.names, f"{file}: ")
             _check_claims(stored.metadata, len(picks[0]), file)
             table = stored.read(columns=wanted)
         episode, frame = (np.asarray(table[name], dtype=np.int64) for name in wanted[:2])
@@ -252,9 +240,8 @@ def _episode(
     Normalised commands are clipped there, and where such a motor rests is up to its end stop, or to
     the arm folded upon itself, and not to its servo.
     """
-    rows = np.flatnonzero(frames.episode == number)
-    rows = rows[np.argsort(frames.frame[rows], kind="stable")]
-    time = as_floats((frames.frame[rows] - frames.frame[rows[0]]) / rate_hz)
+    rows = frames.episode == number
+    time = as_floats((frames.frame[rows] - frames.frame[rows][0]) / rate_hz)
     action, state = frames.action[rows], frames.state[rows]
     if known.unit == NORMALISED:
         free = np.all(np.abs(action) < FULL_SCALE, axis=1, keepdims=True)
@@ -266,33 +253,34 @@ def _episode(
     )
 
 
+HINTS = """\
+Channels of the data set: {channels}
+Motors of {robot}, in this order: {motors}
+unit is deg, rad, or normalised (-100 to 100, the older default).
+joints = []   channels in the order of the motors, where names do not tell
+For normalised numbers, low and high are what -100 and 100 stand for [deg], from the middle of each
+joint's range. Here: the limits of the URDF. Better: range_min and range_max of the arm's own
+calibration file; half their difference times 360/4096, below and above zero.
+sign = []     1 or -1 for each motor, where the data set turns the other way
+zero = []     angle of the data set that the robot calls 0 [deg]"""
+
+
 def lerobot_map_text(path: Path, robot: Robot) -> str:
     """Return a commented map for a data set, ready to be corrected.
 
     The range of a normalised joint is that of the robot's URDF: recorders take that range by
     moving each joint from end to end by hand.
     """
-    unit, _ = _likely_unit(_all_frames(path, LeRobotAngles(), robot))
-    limits = np.rad2deg([(joint.low, joint.high) for joint in robot.chain.joints])
-    low, high = ([round(float(v), 1) for v in np.clip(ends, -180.0, 180.0)] for ends in limits.T)
-    channels = ", ".join(channel_names(_info(path), STATE))
-    motors = ", ".join(f"{motor.name} ({motor.joint})" for motor in robot.motors)
-    ends = "" if unit == NORMALISED else "# "
-    return "\n".join(
-        [
-            f"# Map for the LeRobot data set {path.name}. A GUESS: check every line.",
-            f"# Channels of the data set: {channels}",
-            f"# Motors of {robot.name}, in this order: {motors}",
-            "[lerobot]",
-            f'unit = "{unit}"     # deg, rad, or normalised (-100 to 100, the older default)',
-            "# joints = []   # channels in the order of the motors, where names do not tell",
-            "# What -100 and 100 stand for [deg], from the middle of each joint's range. Here: the",
-            "# limits of the URDF. Better: range_min and range_max of the arm's own calibration",
-            "# file; half their difference times 360/4096, below and above zero.",
-            f"{ends}low = {low}",
-            f"{ends}high = {high}",
-            "# sign = []     # 1 or -1 for each motor, where the data set turns the other way",
-            "# zero = []     # angle of the data set that the robot calls 0 [deg]",
-            "",
-        ]
+    info = _info(path)
+    unit, _ = _likely_unit(_all_frames(path, info, LeRobotAngles(), robot))
+    hints = HINTS.format(
+        channels=", ".join(channel_names(info, STATE)),
+        robot=robot.name,
+        motors=", ".join(f"{motor.name} ({motor.joint})" for motor in robot.motors),
     )
+    content: dict[str, Any] = {"unit": unit}
+    if unit == NORMALISED:
+        limits = np.rad2deg([(joint.low, joint.high) for joint in robot.chain.joints])
+        ends = np.clip(limits, -180.0, 180.0).round(1).T.tolist()
+        content |= {"low": ends[0], "high": ends[1]}
+    return map_text(f"Map for the LeRobot data set {path.name}", hints, {"lerobot": content})

@@ -17,7 +17,7 @@ from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import STEP_S, RunTable, Truth, concatenate
 from failuretwin.core.types import MS_PER_S, FloatArray, as_floats
-from failuretwin.data_knowledge.readers.csv_log import load_csv, numbers
+from failuretwin.data_knowledge.readers.table import load_csv, numbers
 from failuretwin.data_knowledge.readers.timed_log import check_clock, check_grid
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.twin import DigitalTwin
