@@ -9,7 +9,7 @@ tool path: that is the forward kinematics of the readings.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,6 @@ from failuretwin.data_knowledge.readers.timed_log import Samples, TimedLog
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
 INFO_FILE = Path("meta") / "info.json"
@@ -171,54 +170,35 @@ def channel_names(info: Mapping[str, Any], feature: str) -> list[str]:
 
 def _all_frames(path: Path, info: Mapping[str, Any], known: LeRobotAngles, robot: Robot) -> _Frames:
     """Return all frames in order of their episodes and their numbers."""
-    picks = [_channels(info, feature, known, robot, path) for feature in (ACTION, STATE)]
+    with needs_extra("LeRobot data sets need pyarrow", "lerobot"):
+        import pyarrow.parquet as pq
+
+    action, state = (_channels(info, feature, known, robot, path) for feature in (ACTION, STATE))
     files = sorted((path / "data").rglob("*.parquet"))
     if not files:
         raise InputError(
             f"{path}: no parquet files below data/. Fetch the whole data set, not its meta alone."
         )
-    parts = [_frames(file, picks) for file in files]
-    episode, frame, action, state = (np.concatenate(column) for column in zip(*parts, strict=True))
-    if len(episode) == 0:
-        raise InputError(f"{path}: holds no frames. Record at least one episode.")
-    order = np.lexsort((frame, episode))
-    return _Frames(episode[order], frame[order], action[order], state[order])
+    with reading(path / "data", "parquet", "Fetch the data set again."):
+        claims = sum(_claimed_bytes(pq.read_metadata(file), len(robot.motors)) for file in files)
+        check_size(claims, path / "data", "its numbers")
+        table = pq.read_table(files, columns=[EPISODE, FRAME, ACTION, STATE])
+        table = table.sort_by([(EPISODE, "ascending"), (FRAME, "ascending")])
+        if len(table) == 0:
+            raise InputError(f"{path}: holds no frames. Record at least one episode.")
+        return _Frames(
+            episode=np.asarray(table[EPISODE], dtype=np.int64),
+            frame=np.asarray(table[FRAME], dtype=np.int64),
+            action=as_floats(np.stack(table[ACTION].to_numpy())[:, action]),
+            state=as_floats(np.stack(table[STATE].to_numpy())[:, state]),
+        )
 
 
-def _frames(
-    file: Path, picks: Sequence[Sequence[int]]
-) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-    """Return number of episode and frame (frame,), action and state (frame, motor) of a file."""
-    with needs_extra("LeRobot data sets need pyarrow", "lerobot"):
-        import pyarrow.parquet as pq
-
-    wanted = [EPISODE, FRAME, ACTION, STATE]
-    with reading(file, "parquet", "Fetch the data set again."):
-        with pq.ParquetFile(file) as stored:
-            for column in wanted:
-                check_name("column", column, stored.schema_arrow.names, f"{file}: ")
-            _check_claims(stored.metadata, len(picks[0]), file)
-            table = stored.read(columns=wanted)
-        episode, frame = (np.asarray(table[name], dtype=np.int64) for name in wanted[:2])
-        values = [_matrix(table, n, p, file) for n, p in zip((ACTION, STATE), picks, strict=True)]
-    return episode, frame, values[0], values[1]
-
-
-def _check_claims(said: pq.FileMetaData, motors: int, file: Path) -> None:
-    """Raise InputError if the rows of a parquet file are more than it can mean."""
+def _claimed_bytes(said: pq.FileMetaData, motors: int) -> int:
+    """Return the memory of the numbers that a parquet file says to hold [bytes]."""
     groups = [said.row_group(i) for i in range(said.num_row_groups)]
     values = sum(g.column(i).num_values for g in groups for i in range(g.num_columns))
-    check_size(NUMBER_BYTES * max(values, said.num_rows * motors), file, "its numbers")
-
-
-def _matrix(table: pa.Table, name: str, pick: Sequence[int], file: Path) -> FloatArray:
-    rows = table[name].to_pylist()
-    width = max(pick) + 1
-    if any(row is None or len(row) < width for row in rows):
-        raise InputError(f"{file}: {name!r} has rows of fewer numbers than {INFO_FILE} names.")
-    return np.array([[row[i] for i in pick] for row in rows], dtype=np.float64).reshape(
-        len(rows), len(pick)
-    )
+    return NUMBER_BYTES * max(values, said.num_rows * motors)
 
 
 def _likely_unit(frames: _Frames) -> tuple[str, str]:
