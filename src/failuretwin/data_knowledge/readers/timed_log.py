@@ -62,11 +62,9 @@ class Targets:
 
 def held(target: FloatArray) -> FloatArray:
     """Return targets (row, motor) with each NaN replaced by the one before, or else the next."""
-    rows = np.arange(len(target))[:, None]
-    known = np.isfinite(target)
-    before = np.maximum.accumulate(np.where(known, rows, -1), axis=0)
-    first = np.argmax(known, axis=0)
-    return np.take_along_axis(target, np.where(before < 0, first, before), axis=0)
+    import pandas as pd
+
+    return as_floats(pd.DataFrame(target).ffill().bfill())
 
 
 SHAPES: Mapping[str, tuple[int, ...]] = {
