@@ -55,13 +55,13 @@ def versions() -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Generation:
-    """A run set in the making: what a worker must know to make any chunk of it.
+    """A run set in the making, with all that a worker needs to make a chunk of it.
 
     The folder holds the Zarr store, without the file that would make it readable; a mark with the
     hash of every chunk that is done; and the manifest.
 
     Attributes:
-        plan: What to simulate.
+        plan: Robot, faults, imperfections and seed of the runs.
         folder: The hidden folder, an absolute path.
         chunk_runs: Runs in a chunk.
         versions: Versions that a worker must have.
@@ -264,15 +264,15 @@ def produce(
 ) -> None:
     """Simulate all runs of a plan into a run set; continue where such work was cut short.
 
-    Until all is there, `path` is as before, and chunks that are done lie in a hidden folder
+    Until the run set is complete, `path` is as before and finished chunks lie in a hidden folder
     beside it, from which the same call goes on. Memory does not depend on the number of runs.
     NetCDF (.nc) is made in memory, for sets of moderate size, and cannot be continued.
 
     Args:
-        plan: What to simulate.
+        plan: Robot, faults, imperfections and seed of the runs.
         path: The run set to write (.zarr or .nc); one of that name is replaced at the end.
-        workforce: Who does the work; the run set does not depend on it.
-        on_progress: Called with the number of runs that are there on top of those before.
+        workforce: Processes that do the work; the run set does not depend on them.
+        on_progress: Called with the number of further runs that are finished.
         tell: Called with one line about runs of an earlier attempt, or of this one if it fails.
         chunk_runs: Runs in a Zarr chunk, made and written at a time.
 

@@ -41,7 +41,7 @@ def drive_of(
     injection: Injection,
     chance: Disturbances,
 ) -> Drive:
-    """Return what the motors of some runs are told.
+    """Return the references and faults that drive the motors of some runs.
 
     Args:
         commanded: Movements as commanded.

@@ -45,7 +45,7 @@ def load_run_set(path: Path) -> xr.Dataset:
             opened = _open_zarr(path)
         with opened as stored:
             runs = check_runs(stored.load(), str(path))
-            # A step more is let in: whoever thinned the grid kept the length.
+            # A step more is accepted: thinning of the grid may have kept the length.
             check_duration(runs, str(path), float(runs["time"].values[-1]) + time_step(runs))
             return runs
 

@@ -1,4 +1,4 @@
-"""What recorded messages say: rows of joint values or tool positions with their stamps.
+"""Recorded messages as rows of joint values or tool positions with their stamps.
 
 Understood are the message of the data set's authors, JointState, JointTrajectory, PointStamped
 and PoseStamped; each is known by its fields, whatever its package is called. A message counts at
@@ -327,7 +327,7 @@ EXPECTED: dict[Role, str] = {
     "position": "no motor readings. Expected a JointState or a topic `condition_monitoring`",
     "goal": "no goals that motors report. Expected a JointState",
 }
-"""What a recording lacks where no topic fits a role."""
+"""Text for a recording in which no topic fits a role."""
 COMMAND_WORDS = ("command", "cmd", "position_monitoring")
 """A topic of joint values with one of these in its name holds commands."""
 WISH_WORDS = (*COMMAND_WORDS, "desired", "goal", "reference", "setpoint", "target")

@@ -95,8 +95,8 @@ def read_targets(path: Path, robot: Robot) -> Targets | None:
     if command is None or command.duration is None:
         return None
     _check_commanded(command, robot)
-    told = _command(command, None, int(command.stamp_ns[0]))
-    return told if isinstance(told, Targets) else None
+    targets = _command(command, None, int(command.stamp_ns[0]))
+    return targets if isinstance(targets, Targets) else None
 
 
 class _Recording:

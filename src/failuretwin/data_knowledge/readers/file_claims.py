@@ -1,4 +1,4 @@
-"""What stored arrays claim to be, looked at before any of them is decoded.
+"""Claims of files: sizes, codecs and links in their metadata, checked before any decoding.
 
 A file of a kilobyte can say that it holds a terabyte, and a Zarr store may name a codec that runs
 code. So sizes, codecs and links are read from the metadata first; what does not fit the file or
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import zarr
 
 TEXT_CELL_BYTES = 64
-"""What a short text takes in memory beside its letters [bytes]."""
+"""Memory of a short text in addition to its letters [bytes]."""
 
 # NetCDF: HDF5 with conventions.
 
@@ -136,7 +136,7 @@ MATRIX, COMPRESSED, INT32 = 14, 15, 5
 DEEPEST = 32
 """Cells within cells; published files have three."""
 ELEMENT_BYTES = 16
-"""What an element of a matrix takes at most: two doubles, or an object [bytes]."""
+"""Largest memory of an element of a matrix: two doubles, or an object [bytes]."""
 
 
 def check_matlab(path: Path) -> None:

@@ -1,9 +1,9 @@
-"""LeRobot data sets (v2.1 and v3): what the motors were told and read, frame by frame.
+"""LeRobot data sets (v2.1 and v3): commands and readings of the motors, frame by frame.
 
 A data set is a folder with ``meta/info.json`` and parquet files below ``data/``: one for each
 episode (v2.1) or several episodes in each (v3); a column ``episode_index`` tells them apart in
-both. ``action`` is what the motors were told, ``observation.state`` what they read. It holds no
-tool path: that is the forward kinematics of the readings.
+both. ``action`` holds the commands, ``observation.state`` the readings. The tool path is the
+forward kinematics of the readings.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ INFO_FILE = Path("meta") / "info.json"
 ACTION, STATE, EPISODE, FRAME = "action", "observation.state", "episode_index", "frame_index"
 DEG, RAD, NORMALISED = "deg", "rad", "normalised"
 NUMBER_BYTES = 40
-"""What a number of a list takes while it is read [bytes]."""
+"""Memory of a number of a list while it is read [bytes]."""
 FULL_SCALE = 100.0
 """Ends of a normalised joint's range: -100 and 100."""
 NAME_PREFIX, NAME_SUFFIX = "main_", ".pos"
-"""What recorders put around the name of a joint: ``main_elbow_flex``, ``elbow_flex.pos``."""
+"""Text that recorders put around the name of a joint: ``main_elbow_flex``, ``elbow_flex.pos``."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ class LeRobotAngles:
     Attributes:
         unit: deg, rad or normalised: -100 to 100 over the range that the arm was calibrated with.
         joints: Names of the channels in chain order; empty: those called like the robot's joints.
-        low: For normalised numbers: what -100 stands for, for each motor [deg].
-        high: What 100 stands for, for each motor [deg].
+        low: For normalised numbers: angle of each motor at -100 [deg].
+        high: Angle of each motor at 100 [deg].
         sign: 1 or -1 for each motor, where the data set turns the other way; empty: all 1.
         zero: Angle of each motor in the data set that the robot calls 0 [deg]; empty: all 0.
     """

@@ -63,9 +63,9 @@ class ReadOptions:
         how: Raw sessions: ``measured`` (readings at their times) or ``published`` (as the authors).
         published_labels: Take the truth from folder names that end in ``_label_K`` and freeze the
             motor of labels 1 to 4.
-        columns: What the columns of CSV files are.
-        lerobot: What the numbers of LeRobot data sets are.
-        topics: Which topics of bags are what, where their types do not tell.
+        columns: Roles and units of the columns of CSV files.
+        lerobot: Unit and sense of the numbers of LeRobot data sets.
+        topics: Roles of the topics of bags, where their types leave a choice.
         approximate: Published paths without commands: accept commands that reproduce the desired
             path only in the least-squares sense.
     """
@@ -114,7 +114,7 @@ def read_runs(
     parts = [part for source in sources for part in _read_source(Path(source), robot, options)]
     runs = concatenate(parts)
     worst = max(parts, key=lambda part: float(part.attrs.get(RECOVERY_ERROR, -1.0)))
-    if RECOVERY_ERROR in worst.attrs:  # of several files the worst one is told
+    if RECOVERY_ERROR in worst.attrs:  # the worst of several files is reported
         runs.attrs |= {name: worst.attrs[name] for name in (RECOVERY_ERROR, RECOVERY_WORST)}
     return runs
 

@@ -105,8 +105,8 @@ def _held(path: Path, separator: str, names: list[str], index: list[int]) -> boo
     others = [name for name in others if name in names]
     if not others:
         return True
-    told = numbers(load_csv(path, separator), others, path)
-    return bool(np.ptp(told, axis=0).max(initial=0.0) < STILL_RAD)
+    target = numbers(load_csv(path, separator), others, path)
+    return bool(np.ptp(target, axis=0).max(initial=0.0) < STILL_RAD)
 
 
 def _joint_index(robot: Robot, path: Path) -> list[int]:

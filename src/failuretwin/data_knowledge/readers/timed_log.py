@@ -86,7 +86,7 @@ class TimedLog:
         tool: Tool path (sample, axis) [m]; None: computed from the motor readings, like the
             published virtual sensor.
         position: Motor readings (sample, motor) [rad], NaN where one is missing.
-        sensors: What other sensors read, by variable of a run set, (sample, channel).
+        sensors: Readings of other sensors, by variable of a run set, (sample, channel).
     """
 
     name: str
