@@ -256,7 +256,7 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
     felt = chance
     if plan.engine == "physics":  # its gears have friction of their own
         felt = replace(chance, friction=np.zeros_like(chance.friction))
-    drive = drive_of(commanded, command, time, injection, felt)
+    drive = drive_of(commanded, time, injection, felt)
     position = _engine(plan).angles(drive, time)
     measured, read = sense(
         DigitalTwin(plan.robot),

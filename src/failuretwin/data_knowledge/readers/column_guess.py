@@ -51,39 +51,29 @@ LARGEST_RAD, LARGEST_M = 2.0 * np.pi, 10.0
 """Numbers larger than these are no angles in rad and no places of a tool in m."""
 
 
-@dataclass(frozen=True)
-class Guess:
-    """Column map guessed from a CSV file.
-
-    Attributes:
-        columns: The map; columns without a candidate are empty.
-        names: Names of all columns.
-        doubts: Open questions; empty where the names answer all of them.
-    """
-
-    columns: ColumnMap
-    names: tuple[str, ...]
-    doubts: tuple[str, ...]
-
-
 def unambiguous_columns(path: Path, robot: Robot) -> ColumnMap:
     """Return the column map of a CSV file whose column names leave nothing open.
 
     Raises:
         InputError: If they leave anything open; the text lists what, and the candidates.
     """
-    guess = guess_columns(path, robot)
-    if guess.doubts:
+    columns, _, doubts = _guess(path, robot)
+    if doubts:
         raise InputError(
             f"{path}: needs a column map, for the names of its columns leave open: "
-            f"{'; '.join(guess.doubts)}. Add --columns MAP.toml: if that file does not exist yet, "
-            "a guess is written there for you to check."
+            f"{'; '.join(doubts)}. Add --columns MAP.toml: if that file does not exist yet, a "
+            "guess is written there for you to check."
         )
-    return guess.columns
+    return columns
 
 
-def guess_columns(path: Path, robot: Robot) -> Guess:
-    """Return the column map of a CSV file as its header and numbers suggest it."""
+def _guess(path: Path, robot: Robot) -> tuple[ColumnMap, list[str], list[str]]:
+    """Return the column map that header and numbers of a CSV file suggest.
+
+    Returns:
+        The map, in which columns without a candidate are empty; names of all columns; and open
+        questions, none where the names answer all of them.
+    """
     separator = separator_of(path)
     table = _Table(load_csv(path, separator))
     found = _candidates(table.words, robot)
@@ -112,7 +102,7 @@ def guess_columns(path: Path, robot: Robot) -> Guess:
     doubts = [*_choices(found, robot), *_lacking(first, table.words)]
     doubts += [d for c in turning for d in table.unsaid(c, ANGLE_NAMES, LARGEST_RAD)]
     doubts += [d for c in (*sliding, tool) for d in table.unsaid(c, LENGTH_NAMES, LARGEST_M)]
-    return Guess(columns, tuple(table.words), tuple(doubts))
+    return columns, list(table.words), doubts
 
 
 @dataclass(frozen=True)
@@ -331,26 +321,20 @@ zero = {zero}   value that the robot calls 0, in the unit of the table
 and columns = ["ax", "ay", "az"]."""
 
 
-def column_map_text(guess: Guess, source: str, robot: Robot) -> str:
-    """Return a commented column map that holds the guess, ready to be corrected.
-
-    Args:
-        guess: The guess.
-        source: Name of its file.
-        robot: The robot, whose motors the comments name.
-    """
-    count = len(robot.motors)
+def column_map_text(path: Path, robot: Robot) -> str:
+    """Return a commented column map with the guess for a CSV file, ready to be corrected."""
+    columns, names, _ = _guess(path, robot)
+    count, time, command = len(robot.motors), columns.time, columns.command
     hints = HINTS.format(
-        names=", ".join(guess.names),
+        names=", ".join(names),
         robot=robot.name,
         motors=", ".join(f"{motor.name} ({motor.joint})" for motor in robot.motors),
         sign=[-1] + [1] * (count - 1),
         zero=[0] * count,
     )
-    columns, time, command = guess.columns, guess.columns.time, guess.columns.command
     filled = replace(
         columns,
         time=replace(time, column=time.column or FILL_IN),
         command=replace(command, columns=command.columns or (FILL_IN,) * count),
     )
-    return map_text(f"Column map for {source}", hints, filled)
+    return map_text(f"Column map for {path.name}", hints, filled)

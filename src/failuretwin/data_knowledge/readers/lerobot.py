@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 INFO_FILE = Path("meta") / "info.json"
 ACTION, STATE, EPISODE, FRAME = "action", "observation.state", "episode_index", "frame_index"
+COLUMNS = [ACTION, STATE, EPISODE, FRAME]
 DEG, RAD, NORMALISED = "deg", "rad", "normalised"
 NUMBER_BYTES = 40
 """Memory of a number of a list while it is read [bytes]."""
@@ -179,10 +180,16 @@ def _all_frames(path: Path, info: Mapping[str, Any], known: LeRobotAngles, robot
         raise InputError(
             f"{path}: no parquet files below data/. Fetch the whole data set, not its meta alone."
         )
-    with reading(path / "data", "parquet", "Fetch the data set again."):
-        claims = sum(_claimed_bytes(pq.read_metadata(file), len(robot.motors)) for file in files)
+    fix = f"Expected a number for each channel in {INFO_FILE}. Fetch the data set again."
+    with reading(path / "data", "parquet", fix):
+        metadata = [pq.read_metadata(file) for file in files]
+        claims = sum(_claimed_bytes(one, len(robot.motors)) for one in metadata)
         check_size(claims, path / "data", "its numbers")
-        table = pq.read_table(files, columns=[EPISODE, FRAME, ACTION, STATE])
+        for column in COLUMNS:
+            check_name(
+                "column", column, metadata[0].schema.to_arrow_schema().names, f"{files[0]}: "
+            )
+        table = pq.read_table(files, columns=COLUMNS)
         table = table.sort_by([(EPISODE, "ascending"), (FRAME, "ascending")])
         if len(table) == 0:
             raise InputError(f"{path}: holds no frames. Record at least one episode.")
