@@ -31,7 +31,7 @@ import numpy as np
 import failuretwin as ft
 from failuretwin.connection.registration.fit import fit_registration
 from failuretwin.core.hypothesis import Diagnosis
-from failuretwin.data_knowledge.readers.csv_log import read_column_map
+from failuretwin.data_knowledge.readers.column_map import read_column_map
 from failuretwin.digital_model.nonidealities import Imperfections
 from failuretwin.digital_model.profile_text import fitted_text, profile_text
 from failuretwin.digital_model.robot import Robot, load_robot

@@ -15,8 +15,8 @@ from failuretwin import (
 from failuretwin.core.errors import InputError
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.data_knowledge.generate import Plan, simulate
-from failuretwin.data_knowledge.readers.column_guess import column_map_text, guess_columns
-from failuretwin.data_knowledge.readers.csv_log import read_column_map
+from failuretwin.data_knowledge.readers.column_guess import column_map_text
+from failuretwin.data_knowledge.readers.column_map import read_column_map
 from failuretwin.digital_model.calibrated_robot import load_calibration
 from failuretwin.digital_model.profile_text import profile_text
 from failuretwin.digital_model.urdf.check import check_urdf
@@ -67,7 +67,7 @@ def test_a_foreign_log_gets_the_diagnosis_of_the_direct_way(tmp_path, name):
     runs, log = simulate(plan), tmp_path / "log.csv"
     foreign_table(runs).to_csv(log, index=False)
     mapping = tmp_path / "map.toml"
-    mapping.write_text(column_map_text(guess_columns(log, robot), log.name, robot))
+    mapping.write_text(column_map_text(log, robot))
 
     options = ReadOptions(columns=read_column_map(mapping, robot))
     foreign = read_runs(log, robot, options)
@@ -277,21 +277,21 @@ def test_slides_have_a_unit_of_their_own_and_names_within_names_are_told_apart(t
     told = runs["command"].values[0]
     np.testing.assert_allclose(told[[0, -1], 0], [0.1, 0.1 + 0.05 * 1.9], atol=1e-9)
     np.testing.assert_allclose(told[-1, 1], np.deg2rad(18.0 * 1.9), atol=1e-9)
-    guess = guess_columns(tmp_path / "log.csv", robot)
-    (tmp_path / "map.toml").write_text(column_map_text(guess, "log.csv", robot))
+    (tmp_path / "map.toml").write_text(column_map_text(tmp_path / "log.csv", robot))
     mapped = ReadOptions(columns=read_column_map(tmp_path / "map.toml", robot))
     again = read_runs(tmp_path / "log.csv", robot, mapped)
     np.testing.assert_allclose(again["command"].values, runs["command"].values)
 
 
-def test_the_lines_of_a_guess_that_wait_for_use_fit_the_robot(tmp_path):
+def test_the_examples_in_the_comments_of_a_guess_fit_the_robot(tmp_path):
     robot = arm_on_a_lift(tmp_path)
     (tmp_path / "log.csv").write_text(
         "time,lift_mm,shoulder_lift_deg,x,y,z\n0,0,0,0,0,0\n1,1,1,1,1,1\n"
     )
-    text = column_map_text(guess_columns(tmp_path / "log.csv", robot), "log.csv", robot)
-    text = text.replace("# sign", "sign").replace("# zero", "zero")
-    (tmp_path / "map.toml").write_text(text)
+    text = column_map_text(tmp_path / "log.csv", robot)
+    lines = [line[2:] for line in text.splitlines() if line.startswith(("# sign", "# zero"))]
+    lists = "\n".join(line.partition("   ")[0] for line in lines)
+    (tmp_path / "map.toml").write_text(text.replace("[command]\n", f"[command]\n{lists}\n"))
     assert read_column_map(tmp_path / "map.toml", robot) is not None
 
 

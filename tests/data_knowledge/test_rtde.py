@@ -5,7 +5,7 @@ import pytest
 
 from failuretwin import ReadOptions, diagnose, read_runs
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.readers.csv_log import (
+from failuretwin.data_knowledge.readers.column_map import (
     AngleColumns,
     ColumnMap,
     CommandColumns,

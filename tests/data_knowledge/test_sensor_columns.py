@@ -10,7 +10,7 @@ import pytest
 
 import failuretwin as ft
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.readers.csv_log import read_column_map
+from failuretwin.data_knowledge.readers.column_map import read_column_map
 from failuretwin.digital_model.profile import SensorProfile
 
 MAP = """

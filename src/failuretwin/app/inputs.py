@@ -17,8 +17,8 @@ from failuretwin.core.errors import InputError, needs_extra
 from failuretwin.core.hypothesis import Diagnosis, Hypothesis, parse_hypotheses
 from failuretwin.core.types import as_floats
 from failuretwin.data_knowledge.readers.bag_messages import BagTopics
-from failuretwin.data_knowledge.readers.column_guess import column_map_text, guess_columns
-from failuretwin.data_knowledge.readers.csv_log import CORRECTION, read_column_map
+from failuretwin.data_knowledge.readers.column_guess import column_map_text
+from failuretwin.data_knowledge.readers.column_map import CORRECTION, read_column_map
 from failuretwin.data_knowledge.readers.lerobot import LeRobotAngles, is_lerobot, lerobot_map_text
 from failuretwin.data_knowledge.readers.matlab import RECOVERY_ERROR, RECOVERY_WORST
 from failuretwin.data_knowledge.readers.raw_sessions import As
@@ -136,10 +136,7 @@ def _with_map(
             f"{path}: does not exist, and no CSV file or LeRobot data set is given to guess it "
             "from."
         )
-    if is_lerobot(log):
-        text = lerobot_map_text(log, robot)
-    else:
-        text = column_map_text(guess_columns(log, robot), log.name, robot)
+    text = (lerobot_map_text if is_lerobot(log) else column_map_text)(log, robot)
     write_text(text, path)
     tell(text)
     raise InputError(

@@ -27,6 +27,12 @@ def unknown_name(kind: str, got: str, valid: Iterable[str]) -> InputError:
     return InputError(f"unknown {kind} {got!r}.{hint} Valid: {', '.join(names)}.")
 
 
+def check_name(kind: str, got: str, valid: Iterable[str], where: str = "") -> None:
+    """Raise the error of `unknown_name`, after the words `where`, unless a name is valid."""
+    if got not in valid:
+        raise InputError(f"{where}{unknown_name(kind, got, valid)}")
+
+
 @contextmanager
 def needs_extra(who: str, extra: str) -> Iterator[None]:
     """Import optional libraries in this block.

@@ -1,7 +1,7 @@
 """Runs made by the twin: any hypotheses, any imperfections, as many as wanted.
 
-Every run has its own random generator, seeded by the plan's seed and the run's number, so a run
-is the same whoever makes it and whatever is made beside it.
+Every run has its own random generator, seeded by the plan's seed and the run's number. A run
+therefore does not depend on the process that makes it or on other runs.
 """
 
 from __future__ import annotations
@@ -65,17 +65,17 @@ LEAST_SAG_RAD = 1e-6
 
 @dataclass(frozen=True, init=False)
 class Plan:
-    """What to simulate: ``Plan("armpi_fpv", ["healthy", "motor_1:stuck"], runs_per_class=20)``.
+    """Plan of runs: ``Plan("armpi_fpv", ["healthy", "motor_1:stuck"], runs_per_class=20)``.
 
     Attributes:
         robot: The robot.
         hypotheses: States of the robot, in the order in which their runs come.
         runs_per_class: Runs of each.
         seed: Seed of all chance.
-        imperfections: What the healthy robot does that its twin does not.
+        imperfections: Behaviour of the healthy robot that its twin lacks.
         movements: How movements are drawn.
         modes: Fault modes with their distributions, by id.
-        engine: What moves the robot: ``servo`` (the published loops) or ``physics``.
+        engine: Model of the motors: ``servo`` (the published loops) or ``physics``.
         sensors: Sensors beside that of the tool's position and the motors' own, such as
             ``accelerometer``.
 
@@ -245,7 +245,7 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
     """Simulate some of a plan's runs.
 
     Args:
-        plan: What to simulate.
+        plan: Robot, faults, imperfections and seed of the runs.
         runs: Numbers of the runs, each below `plan.size`.
     """
     draws = [_draw(plan, run) for run in runs]
@@ -256,7 +256,7 @@ def simulate_runs(plan: Plan, runs: Sequence[int]) -> RunTable:
     felt = chance
     if plan.engine == "physics":  # its gears have friction of their own
         felt = replace(chance, friction=np.zeros_like(chance.friction))
-    drive = drive_of(commanded, command, time, injection, felt)
+    drive = drive_of(commanded, time, injection, felt)
     position = _engine(plan).angles(drive, time)
     measured, read = sense(
         DigitalTwin(plan.robot),
@@ -331,7 +331,7 @@ def iterate(
     """Simulate runs a few at a time and keep none of them.
 
     Args:
-        plan: What to simulate.
+        plan: Robot, faults, imperfections and seed of the runs.
         runs_at_a_time: Runs in each table; the last one may hold fewer.
         order: Numbers of the runs to make, each below `plan.size`, such as a random permutation;
             None: all of them, one hypothesis after the other.
@@ -355,7 +355,7 @@ def simulate(
     """Simulate all runs of a plan in memory; `resumable.produce` has no need to hold them.
 
     Args:
-        plan: What to simulate.
+        plan: Robot, faults, imperfections and seed of the runs.
         workers: Processes to spread the work over; the result does not depend on it. Scripts that
             ask for several must be guarded by ``if __name__ == "__main__":``.
         on_progress: Called with the number of runs that have just been finished.

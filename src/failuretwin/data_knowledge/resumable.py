@@ -1,7 +1,7 @@
-"""Run sets of any size: made chunk by chunk, straight to Zarr, by one process or many.
+"""Run sets of any size, made chunk by chunk in a Zarr store by one process or many.
 
-Whoever makes a chunk writes it, so memory does not grow with the number of runs. Chunks, and with
-them all bytes, are the same for any number of workers. Work that was cut short is continued.
+The process that makes a chunk writes it, so memory does not grow with the number of runs. All bytes
+are the same for any number of workers. Interrupted work is continued.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import json
 import platform
 import re
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -27,14 +27,12 @@ from failuretwin.data_knowledge.store import (
     check_destination,
     save_run_set,
     sole_writer,
-    write_files,
     writing_zarr,
 )
 from failuretwin.data_knowledge.workers import ONE_PROCESS, Workforce
 
 if TYPE_CHECKING:
     import xarray as xr
-    from zarr.core.buffer import Buffer
 
 MANIFEST = "manifest.json"
 GROUP = "zarr.json"
@@ -57,13 +55,13 @@ def versions() -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Generation:
-    """A run set in the making: what a worker must know to make any chunk of it.
+    """A run set in the making, with all that a worker needs to make a chunk of it.
 
     The folder holds the Zarr store, without the file that would make it readable; a mark with the
     hash of every chunk that is done; and the manifest.
 
     Attributes:
-        plan: What to simulate.
+        plan: Robot, faults, imperfections and seed of the runs.
         folder: The hidden folder, an absolute path.
         chunk_runs: Runs in a chunk.
         versions: Versions that a worker must have.
@@ -78,31 +76,22 @@ class Generation:
 
     @property
     def store(self) -> Path:
-        """What will be the run set."""
+        """The run set in the making."""
         return self.folder / "store"
 
     @property
-    def chunks(self) -> int:
-        """Number of chunks."""
-        return -(-self.plan.size // self.chunk_runs)
+    def chunks(self) -> range:
+        """Numbers of the chunks."""
+        return range(-(-self.plan.size // self.chunk_runs))
 
     def runs_of(self, chunk: int) -> range:
         """Return the numbers of the runs in a chunk."""
         first = chunk * self.chunk_runs
         return range(first, min(first + self.chunk_runs, self.plan.size))
 
-    def count_runs(self, chunks: Iterable[int]) -> int:
-        """Return the number of runs in some chunks."""
-        return sum(len(self.runs_of(chunk)) for chunk in chunks)
-
     def mark(self, chunk: int) -> Path:
-        """Return the file that says that a chunk is done."""
+        """Return the file that holds the hash of a finished chunk."""
         return self.folder / "done" / str(chunk)
-
-    def marked(self) -> list[int]:
-        """Return the chunks that are marked as done, in their order."""
-        marks = (self.folder / "done").glob("*")
-        return sorted(int(mark.name) for mark in marks if mark.stat().st_size)
 
     def digest(self, chunk: int) -> str:
         """Return the hash of a chunk: SHA-256 over name, NUL, size, NUL, bytes of its files."""
@@ -116,16 +105,21 @@ class Generation:
     def finished(self) -> dict[int, str]:
         """Return the hash of every finished chunk; a mark that does not fit is removed."""
         found = {}
-        for chunk in self.marked():
-            digest = self.digest(chunk)
-            if self.mark(chunk).read_text() == digest:
-                found[chunk] = digest
+        for mark in (self.folder / "done").iterdir():
+            digest = self.digest(int(mark.name))
+            if mark.read_text() == digest:
+                found[int(mark.name)] = digest
             else:
-                self.mark(chunk).unlink()
+                mark.unlink()
         return found
 
+    def kept_runs(self) -> int:
+        """Return the number of runs in chunks that are marked as finished."""
+        marks = (self.folder / "done").glob("*")
+        return sum(len(self.runs_of(int(mark.name))) for mark in marks if mark.stat().st_size)
+
     def finish(self, manifest: Mapping[str, Any], path: Path) -> None:
-        """Make the store readable and put it where `path` is.
+        """Make the store readable and put it in the place of `path`.
 
         Raises:
             OSError: If that cannot be done; `path` is as before.
@@ -183,7 +177,7 @@ def _to_json(value: Mapping[str, Any]) -> bytes:
     return (json.dumps(value, indent=2, sort_keys=True) + "\n").encode()
 
 
-# What is made once: the store without its runs.
+# The store without its runs.
 
 
 def _encoding(example: xr.Dataset, chunk_runs: int) -> dict[str, dict[str, Any]]:
@@ -205,28 +199,10 @@ def _encoding(example: xr.Dataset, chunk_runs: int) -> dict[str, dict[str, Any]]
     return encoding
 
 
-def _template(
-    example: xr.Dataset, encoding: Mapping[str, Mapping[str, Any]], runs: int
-) -> dict[str, Buffer]:
-    """Return the files of a run set of `runs` runs, those of its chunks left out."""
-    import zarr
-    from zarr.storage import MemoryStore
-
-    content: dict[str, Buffer] = {}
-    store = MemoryStore(content)
-    with writing_zarr():
-        example.to_zarr(store, mode="w", consolidated=False, encoding=encoding)
-        for name in encoding:
-            array = zarr.open_array(store, path=name, mode="r+")
-            array.resize((runs, *array.shape[1:]))
-        zarr.consolidate_metadata(store)
-    return {name: data for name, data in content.items() if "/c." not in name}
-
-
 def _open(plan: Plan, path: Path, chunk_runs: int) -> tuple[Generation, dict[str, Any]]:
     """Return the generation for `path`, new or as an earlier process left it, and its manifest.
 
-    What is left of anything else that was to go to `path` is removed.
+    Unfinished work of another plan for `path` is removed.
 
     Raises:
         OSError: If a folder cannot be made.
@@ -246,34 +222,36 @@ def _open(plan: Plan, path: Path, chunk_runs: int) -> tuple[Generation, dict[str
     encoding = _encoding(example, chunk_runs)
     files = {name: f"{name}/c.0" + ".0" * (example[name].ndim - 1) for name in encoding}
     generation = Generation(plan, folder, chunk_runs, versions(), files)
-    if not _resumes(generation, manifest):
-        _begin(generation, manifest, _template(example, encoding, plan.size))
+    begun = generation.store.is_dir() and (folder / MANIFEST).is_file()
+    if not begun or (folder / MANIFEST).read_bytes() != _to_json(manifest):
+        _begin(generation, manifest, example, encoding)
     return generation, manifest
 
 
-def _resumes(generation: Generation, manifest: Mapping[str, Any]) -> bool:
-    """Return whether an earlier process has begun this very run set."""
-    file = generation.folder / MANIFEST
-    whole = generation.store.is_dir() and file.is_file()
-    return whole and file.read_bytes() == _to_json(manifest)
-
-
 def _begin(
-    generation: Generation, manifest: Mapping[str, Any], template: dict[str, Buffer]
+    generation: Generation,
+    manifest: Mapping[str, Any],
+    example: xr.Dataset,
+    encoding: Mapping[str, Any],
 ) -> None:
     """Write all that does not depend on runs; the manifest comes last."""
+    import zarr
+
     generation.remove()
     try:
         (generation.folder / "done").mkdir(parents=True)
-        (generation.folder / GROUP).write_bytes(template.pop(GROUP).to_bytes())
-        write_files(template, generation.store)
+        with writing_zarr():
+            example.to_zarr(generation.store, mode="w", consolidated=False, encoding=encoding)
+            for name, file in generation.chunk_files.items():
+                array = zarr.open_array(generation.store / name, mode="r+")
+                array.resize((generation.plan.size, *array.shape[1:]))
+                (generation.store / file).unlink()  # the run of the example
+            zarr.consolidate_metadata(str(generation.store))
+        (generation.store / GROUP).rename(generation.folder / GROUP)
         (generation.folder / MANIFEST).write_bytes(_to_json(manifest))
     except OSError:
         generation.remove()
         raise
-
-
-# All of it.
 
 
 def produce(
@@ -286,15 +264,15 @@ def produce(
 ) -> None:
     """Simulate all runs of a plan into a run set; continue where such work was cut short.
 
-    Until all is there, `path` is as before, and chunks that are done lie in a hidden folder
+    Until the run set is complete, `path` is as before and finished chunks lie in a hidden folder
     beside it, from which the same call goes on. Memory does not depend on the number of runs.
     NetCDF (.nc) is made in memory, for sets of moderate size, and cannot be continued.
 
     Args:
-        plan: What to simulate.
+        plan: Robot, faults, imperfections and seed of the runs.
         path: The run set to write (.zarr or .nc); one of that name is replaced at the end.
-        workforce: Who does the work; the run set does not depend on it.
-        on_progress: Called with the number of runs that are there on top of those before.
+        workforce: Processes that do the work; the run set does not depend on them.
+        on_progress: Called with the number of further runs that are finished.
         tell: Called with one line about runs of an earlier attempt, or of this one if it fails.
         chunk_runs: Runs in a Zarr chunk, made and written at a time.
 
@@ -315,7 +293,7 @@ def produce(
             generation, manifest = _open(plan, target, chunk_runs)
             try:
                 digests = _make_all(generation, workforce, on_progress, tell)
-                whole = "".join(digests[chunk] for chunk in range(generation.chunks))
+                whole = "".join(digests[chunk] for chunk in generation.chunks)
                 content = hashlib.sha256(whole.encode()).hexdigest()
                 generation.finish({**manifest, "content": content}, target)
             except BaseException:
@@ -348,11 +326,11 @@ def _make_all(
 ) -> dict[int, str]:
     """Make every chunk that is missing; return the hashes of all."""
     digests = generation.finished()
-    there = generation.count_runs(digests)
-    if there:
-        tell(f"continuing: {there} of {generation.plan.size} runs were there")
-        on_progress(there)
-    missing = [chunk for chunk in range(generation.chunks) if chunk not in digests]
+    kept = generation.kept_runs()
+    if kept:
+        tell(f"continuing: {kept} of {generation.plan.size} runs were there")
+        on_progress(kept)
+    missing = [chunk for chunk in generation.chunks if chunk not in digests]
     if missing:
         with workforce.map_unordered(partial(make_chunk, generation), missing) as results:
             for chunk, digest in results:
@@ -362,8 +340,8 @@ def _make_all(
 
 
 def _leave(generation: Generation, tell: Callable[[str], None]) -> None:
-    """Keep the chunks that are done, if there are any, and say so."""
-    kept = generation.count_runs(generation.marked())
+    """Keep the finished chunks, if any, and say so."""
+    kept = generation.kept_runs()
     if kept:
         tell(
             f"{kept} of {generation.plan.size} runs are kept in {generation.folder}; the same "

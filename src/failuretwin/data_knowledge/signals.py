@@ -36,24 +36,21 @@ SIMULATED = tuple(kind for kind in KINDS if kind != "encoders")
 
 def drive_of(
     commanded: Movements,
-    command: FloatArray,
     time: FloatArray,
     injection: Injection,
     chance: Disturbances,
 ) -> Drive:
-    """Return what the motors of some runs are told.
+    """Return the references and faults that drive the motors of some runs.
 
     Args:
         commanded: Movements as commanded.
-        command: Their references, (run, time, motor) [rad].
         time: Uniform grid, (time,) [s].
         injection: Faults of the runs.
         chance: Bad luck of the runs.
     """
     faulty, lost = injection.on_movements(commanded, chance.lost)
     actual = actual_movements(faulty, replace(chance, lost=lost))
-    followed = command if _same(actual, commanded) else actual.reference(time)
-    followed = lagged(followed, time, chance.lag)
+    followed = lagged(actual.reference(time), time, chance.lag)
     return Drive(
         reference=injection.on_reference(followed, time),
         held=injection.held(time),
@@ -61,11 +58,6 @@ def drive_of(
         compliance=chance.compliance if chance.compliance.any() else None,
         payload=chance.payload if chance.payload.any() else None,
     )
-
-
-def _same(one: Movements, other: Movements) -> bool:
-    names = ("initial", "target", "ramp_duration", "start")
-    return all(np.array_equal(getattr(one, n), getattr(other, n), equal_nan=True) for n in names)
 
 
 def noise_free_path(
@@ -90,7 +82,7 @@ def noise_free_path(
     runs, count = movements.start.shape
     rng = np.random.default_rng(0)  # asked, but nothing that it says counts
     luck = draw_disturbances(deterministic(imperfections), twin.robot, count, 0.0, rng)
-    drive = drive_of(movements, movements.reference(time), time, injection, stack([luck] * runs))
+    drive = drive_of(movements, time, injection, stack([luck] * runs))
     return twin.path(ServoEngine(twin.robot).angles(drive, time))
 
 

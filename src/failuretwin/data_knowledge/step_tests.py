@@ -15,7 +15,7 @@ import numpy as np
 from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import files_below
 from failuretwin.core.types import MS_PER_S, BoolArray, FloatArray, frozen_array
-from failuretwin.data_knowledge.readers.csv_log import first_line, load_csv, numbers
+from failuretwin.data_knowledge.readers.table import first_line, load_csv, numbers
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.servo import ServoUnits
 
@@ -63,10 +63,10 @@ def flaw_of_motion(start: float, settled: float, target: float) -> str:
         settled: Where it rested after [counts].
         target: Where it was sent [counts].
     """
-    told = target - start
-    if abs(told) < SMALLEST_COUNTS:
-        return f"is told to move by {abs(told):.0f} counts only"
-    share = (settled - start) / told
+    travel = target - start
+    if abs(travel) < SMALLEST_COUNTS:
+        return f"is told to move by {abs(travel):.0f} counts only"
+    share = (settled - start) / travel
     if share < MOVES:
         return "does not move although commanded"
     if share < ARRIVES:
@@ -161,7 +161,7 @@ def _read_table(path: Path) -> FloatArray:
 
 
 def _motor(path: Path, robot: Robot) -> tuple[str, str]:
-    """Return the motor that the name of a file speaks of, or what is wrong with it."""
+    """Return the motor in the name of a file, or the flaw of the name."""
     named = SERVO.search(path.stem)
     if named is None:
         return "", "is in a file whose name does not say which servo it is (motor_N)"
@@ -200,7 +200,7 @@ def _step(
         until: Stamp of the next command [s].
         readings: Stamps [s] and sound readings [counts] of the whole file, (reading, 2).
         units: Scale of the counts.
-        flaw: What is wrong with the file.
+        flaw: Flaw of the whole file.
     """
     time, counts = readings[:, 0] - row[0], readings[:, 1]
     end = min(until - row[0], AFTER_S)

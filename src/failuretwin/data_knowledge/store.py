@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from zarr.core.buffer import Buffer
 
 SUFFIXES = (".nc", ".zarr")
-
-
 EXPECTED = (
     "Expected NetCDF (.nc) or Zarr (.zarr) as `failuretwin simulate` and `failuretwin import` "
     "write them."
@@ -47,7 +45,7 @@ def load_run_set(path: Path) -> xr.Dataset:
             opened = _open_zarr(path)
         with opened as stored:
             runs = check_runs(stored.load(), str(path))
-            # A step more is let in: whoever thinned the grid kept the length.
+            # A step more is accepted: thinning of the grid may have kept the length.
             check_duration(runs, str(path), float(runs["time"].values[-1]) + time_step(runs))
             return runs
 
@@ -84,24 +82,15 @@ def save_run_set(runs: xr.Dataset, path: Path) -> None:
         if path.suffix == ".nc":
             partial.write_bytes(runs.to_netcdf(engine="h5netcdf", encoding=_compression(runs)))
         else:
-            write_files(_zarr_files(runs), partial)
+            _write_zarr(runs, partial)
 
 
-def _zarr_files(runs: xr.Dataset) -> dict[str, Buffer]:
+def _write_zarr(runs: xr.Dataset, folder: Path) -> None:
     from zarr.storage import MemoryStore
 
     content: dict[str, Buffer] = {}
     with writing_zarr():
         runs.to_zarr(MemoryStore(content), mode="w", consolidated=True)
-    return content
-
-
-def write_files(content: Mapping[str, Buffer], folder: Path) -> None:
-    """Write the files of a Zarr store in memory to a folder.
-
-    Raises:
-        OSError: If one of them cannot be written.
-    """
     for key, value in content.items():
         file = folder / key
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -112,7 +101,7 @@ def write_files(content: Mapping[str, Buffer], folder: Path) -> None:
 def writing_zarr() -> Iterator[None]:
     """Write every chunk, so that one without a file is one that was lost.
 
-    That text and consolidated metadata are not in Zarr's final text yet, we keep to ourselves.
+    Warnings that text and consolidated metadata are not in Zarr's final standard are left out.
     """
     import zarr
 

@@ -1,4 +1,4 @@
-"""Who does the work: this process, processes of its own, or the workers of a Dask scheduler.
+"""Workforce: this process, processes of its own, or the workers of a Dask scheduler.
 
 Needs the extra `cluster`, except for one process.
 """
@@ -28,7 +28,7 @@ FIRST_WORKER_S = 30.0
 """Time that a first worker has to come, also after all have gone [s]."""
 NEVER = logging.CRITICAL + 1
 IGNORE_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
-"""What our own workers run first: an interrupt is for the parent, which then ends them."""
+"""First code of our own workers: an interrupt is for the parent, which then ends them."""
 
 
 @contextmanager
@@ -90,7 +90,7 @@ def _connected(address: str) -> Iterator[Client]:
     from distributed.comm.addressing import get_address_host_port
 
     try:
-        get_address_host_port(address)  # a client of what is no address is never quite closed
+        get_address_host_port(address)  # a client with a wrong address never closes completely
         client = Client(address, timeout=ANSWER_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         raise InputError(
@@ -116,7 +116,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 TASKS_PER_THREAD = 2
-"""Tasks submitted at a time: one to do, one that waits, so that no worker is ever idle."""
+"""Tasks submitted at a time: one to do and one that waits, which keeps every worker busy."""
 LOOK_S = 30.0
 """Time without a result after which it is looked whether there are workers at all [s]."""
 LONGEST_WAIT_S = 1800.0
@@ -129,7 +129,7 @@ WORKERS_PER_CORE = 4
 
 @dataclass(frozen=True)
 class Workforce:
-    """Who does the work.
+    """Processes that do the work.
 
     Attributes:
         workers: Processes on this machine; 1: this process itself.
@@ -163,8 +163,8 @@ class Workforce:
         the work.
 
         Args:
-            work: What to do; a function that other processes can import.
-            items: What to do it to.
+            work: A function that other processes can import.
+            items: Its arguments, one a call.
 
         Raises:
             InputError: If Dask is not installed, or the scheduler or its workers do not answer

@@ -13,10 +13,10 @@ from failuretwin.connection.links.ros_transport import Outgoing
 from failuretwin.connection.links.statuses import Status, statuses
 from failuretwin.core.errors import InputError
 from failuretwin.core.types import MS_PER_S, FloatArray
-from failuretwin.data_knowledge.readers.bag_file import BagMessage
 from failuretwin.data_knowledge.readers.bag_messages import (
     KINDS,
     NS_PER_S,
+    BagMessage,
     Kind,
     Role,
     Rows,

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import bz2
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from failuretwin.core.errors import needs_extra
 from failuretwin.core.foreign import MB, check_size, reading
+from failuretwin.data_knowledge.readers.bag_messages import BagMessage, BagTopic, Kind, kind_of
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -37,40 +37,6 @@ float64[] temperature
 float64[] voltage
 """
 """The message of the data set's authors on these topics. Older ROS 2 bags hold no definitions."""
-
-
-@dataclass(frozen=True)
-class BagTopic:
-    """A topic of a recording.
-
-    Attributes:
-        name: Its name.
-        type: Its message type, such as ``sensor_msgs/msg/JointState``.
-        count: Number of its messages.
-        fields: Types of the fields by name, such as ``float[]``; empty where they are not known.
-    """
-
-    name: str
-    type: str
-    count: int
-    fields: Mapping[str, str]
-
-    def __str__(self) -> str:
-        """Return what a user needs to tell it from others."""
-        return f"{self.name} ({self.type}, {self.count} messages)"
-
-
-@dataclass(frozen=True)
-class BagMessage:
-    """A message of a recording.
-
-    Attributes:
-        received_ns: When the recorder received it [ns].
-        content: The message: an object with the fields of its type.
-    """
-
-    received_ns: int
-    content: Any
 
 
 def is_bag(path: Path) -> bool:
@@ -140,23 +106,23 @@ def _reader(path: Path) -> Reader1 | Reader2:
 def _topic(connections: Sequence[Connection]) -> BagTopic:
     """Return the topic that some connections make up, one for each of its publishers."""
     types = list(dict.fromkeys(c.msgtype for c in connections))
-    fields = _fields(connections[0]) if len(types) == 1 else {}
+    kind = _kind(connections[0]) if len(types) == 1 else None
     count = sum(c.msgcount for c in connections)
-    return BagTopic(connections[0].topic, " or ".join(types), count, fields)
+    return BagTopic(connections[0].topic, " or ".join(types), count, kind)
 
 
-def _fields(connection: Connection) -> dict[str, str]:
-    """Return the types of a message's fields; empty if its definition is missing or not sound."""
+def _kind(connection: Connection) -> Kind | None:
+    """Return the kind of a connection's messages; None if their definition is not sound."""
     from rosbags.typesys import TypesysError
 
     try:
-        return message_fields(_typestore(connection), connection.msgtype)
+        return kind_of(message_fields(_typestore(connection), connection.msgtype))
     except TypesysError:
-        return {}
+        return None
 
 
 def message_fields(store: Typestore, type_: str) -> dict[str, str]:
-    """Return the types of a message's fields by name, as in `BagTopic`; empty if it is unknown."""
+    """Return the types of a message's fields by name, as in `FIELDS`; empty if it is unknown."""
     _, fields = store.fielddefs.get(type_, ((), ()))
     return {name: _type_text(description) for name, description in fields}
 

@@ -1,4 +1,4 @@
-"""What recorded messages say: rows of joint values or tool positions with their stamps.
+"""Recorded messages as rows of joint values or tool positions with their stamps.
 
 Understood are the message of the data set's authors, JointState, JointTrajectory, PointStamped
 and PoseStamped; each is known by its fields, whatever its package is called. A message counts at
@@ -19,7 +19,6 @@ import numpy as np
 from failuretwin.core.errors import InputError, unknown_name
 from failuretwin.core.runs import AXES
 from failuretwin.core.types import MS_PER_S, FloatArray, IntArray, as_floats
-from failuretwin.data_knowledge.readers.bag_file import BagMessage, BagTopic
 
 NS_PER_S = 1_000_000_000
 HEADER = {"header": "std_msgs/msg/Header"}
@@ -88,14 +87,6 @@ def kind_of_type(type_: str) -> Kind:
     return STANDARD_TYPES.get(type_.replace("/msg/", "/"), MONITORING)
 
 
-def require_kind(fields: Mapping[str, str]) -> Kind:
-    """Return the kind of a message that is known to be understood."""
-    kind = kind_of(fields)
-    if kind is None:
-        raise AssertionError(f"no message that is understood: {dict(fields)}")
-    return kind
-
-
 def check_role(role: Role, kind: Kind | None, what: str) -> None:
     """Raise InputError unless messages of a kind can play a role.
 
@@ -107,6 +98,40 @@ def check_role(role: Role, kind: Kind | None, what: str) -> None:
     if kind not in KINDS[role]:
         expected = ", ".join(kind.value for kind in KINDS[role])
         raise InputError(f"{what} cannot be the {role}. Expected {expected}.")
+
+
+@dataclass(frozen=True)
+class BagTopic:
+    """A topic of a recording.
+
+    Attributes:
+        name: Its name.
+        type: Its message type, such as ``sensor_msgs/msg/JointState``.
+        count: Number of its messages.
+        kind: Kind of its messages; None if they are not understood.
+    """
+
+    name: str
+    type: str
+    count: int
+    kind: Kind | None
+
+    def __str__(self) -> str:
+        """Return name, type and number of messages."""
+        return f"{self.name} ({self.type}, {self.count} messages)"
+
+
+@dataclass(frozen=True)
+class BagMessage:
+    """A message of a recording.
+
+    Attributes:
+        received_ns: Time at which the recorder received it [ns].
+        content: The message: an object with the fields of its type.
+    """
+
+    received_ns: int
+    content: Any
 
 
 @dataclass(frozen=True)
@@ -302,7 +327,7 @@ EXPECTED: dict[Role, str] = {
     "position": "no motor readings. Expected a JointState or a topic `condition_monitoring`",
     "goal": "no goals that motors report. Expected a JointState",
 }
-"""What a recording lacks where no topic fits a role."""
+"""Text for a recording in which no topic fits a role."""
 COMMAND_WORDS = ("command", "cmd", "position_monitoring")
 """A topic of joint values with one of these in its name holds commands."""
 WISH_WORDS = (*COMMAND_WORDS, "desired", "goal", "reference", "setpoint", "target")
@@ -345,15 +370,15 @@ def fitting_topics(
     if not same:
         raise InputError(f"{path}: {unknown_name('topic', name, [t.name for t in found])}")
     (topic,) = same
-    check_role(role, kind_of(topic.fields), f"{path}: topic {topic}")
+    check_role(role, topic.kind, f"{path}: topic {topic}")
     if topic.count == 0:
         raise InputError(f"{path}: topic {topic} is empty. Name another one as the {role}.")
     return same
 
 
 def _suits(role: Role, topic: BagTopic) -> bool:
-    kind, name = kind_of(topic.fields), topic.name.lower()
-    if kind is None or kind not in KINDS[role]:
+    kind, name = topic.kind, topic.name.lower()
+    if kind not in KINDS[role]:
         return False
     if role == "goal":
         return topic.name == GOAL_TOPIC
@@ -379,7 +404,7 @@ def only_topic(role: Role, topics: Sequence[BagTopic], path: Path) -> BagTopic |
 
 def check_understood(found: Sequence[BagTopic], path: Path) -> None:
     """Raise an InputError if no topic holds messages that are understood."""
-    if not any(topic.count and kind_of(topic.fields) for topic in found):
+    if not any(topic.count and topic.kind for topic in found):
         kinds = ", ".join(kind.value for kind in Kind)
         raise InputError(
             f"{path}: holds no messages that are understood. Expected {kinds}. "

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +15,11 @@ import numpy as np
 from failuretwin.core.errors import InputError
 from failuretwin.core.runs import GOAL_VARIABLE
 from failuretwin.core.types import FloatArray, IntArray, as_floats
-from failuretwin.data_knowledge.readers.bag_file import (
-    BagMessage,
-    BagTopic,
-    read_messages,
-    read_topics,
-)
+from failuretwin.data_knowledge.readers.bag_file import read_messages, read_topics
 from failuretwin.data_knowledge.readers.bag_messages import (
     NS_PER_S,
     ROLES,
+    BagMessage,
     BagTopics,
     Role,
     Rows,
@@ -31,7 +27,6 @@ from failuretwin.data_knowledge.readers.bag_messages import (
     fitting_topics,
     nothing_for,
     only_topic,
-    require_kind,
     topic_rows,
 )
 from failuretwin.data_knowledge.readers.timed_log import Samples, Targets, TimedLog, held
@@ -56,22 +51,18 @@ def read_bag(path: Path, robot: Robot, topics: BagTopics | None = None) -> Timed
         InputError: If it cannot be read, holds nothing that is understood, leaves a choice between
             topics, or lacks a joint.
     """
-    named = topics or BagTopics()
-    found = read_topics(path)
-    check_understood(found, path)
-    fitting = {role: fitting_topics(role, getattr(named, role), found, path) for role in ROLES}
-    messages = read_messages(path, sorted({t.name for fit in fitting.values() for t in fit}))
-    recording = _Recording(path, robot, messages)
-    tool = recording.tool(fitting["tool"])
-    position = recording.motors("position", fitting["position"], needed=tool is None)
-    command = recording.motors("command", fitting["command"], needed=True)
+    recording = _Recording(path, robot, topics or BagTopics())
+    check_understood(recording.found, path)
+    tool = recording.rows("tool")
+    position = recording.rows("position", needed=tool is None)
+    command = recording.rows("command", needed=True)
     if command is None:
-        raise nothing_for("command", found, path)
-    goal = recording.motors("goal", fitting["goal"], needed=False)
+        raise nothing_for("command", recording.found, path)
+    goal = recording.rows("goal")
     _check_commanded(command, robot)
     if tool is None:
         if position is None:
-            raise nothing_for("tool", found, path)
+            raise nothing_for("tool", recording.found, path)
         _check_whole(position)
     zero_ns = _first_stamp([t for t in (command, tool, position) if t is not None], path)
     return TimedLog(
@@ -96,42 +87,48 @@ def read_targets(path: Path, robot: Robot) -> Targets | None:
     Raises:
         InputError: If it cannot be read, or lacks a joint.
     """
-    found = read_topics(path)
-    fitting = {role: fitting_topics(role, None, found, path) for role in ROLES}
+    recording = _Recording(path, robot, BagTopics())
+    fitting = recording.fitting
     if fitting["tool"] or fitting["position"] or not fitting["command"]:
         return None
-    messages = read_messages(path, [topic.name for topic in fitting["command"]])
-    command = _Recording(path, robot, messages).motors("command", fitting["command"], needed=True)
+    command = recording.rows("command", needed=True)
     if command is None or command.duration is None:
         return None
     _check_commanded(command, robot)
-    told = _command(command, None, int(command.stamp_ns[0]))
-    return told if isinstance(told, Targets) else None
+    targets = _command(command, None, int(command.stamp_ns[0]))
+    return targets if isinstance(targets, Targets) else None
 
 
-@dataclass(frozen=True)
 class _Recording:
-    """A recording of a robot, with the messages of all topics that may be needed."""
+    """A recording of a robot: its topics, those that fit each role, and their messages."""
 
-    path: Path
-    robot: Robot
-    messages: dict[str, list[BagMessage]]
+    def __init__(self, path: Path, robot: Robot, named: BagTopics) -> None:
+        self.path, self.robot, self.found = path, robot, read_topics(path)
+        self.fitting = {
+            role: fitting_topics(role, getattr(named, role), self.found, path) for role in ROLES
+        }
 
-    def tool(self, fitting: Sequence[BagTopic]) -> Rows | None:
-        topic = only_topic("tool", fitting, self.path)
-        return None if topic is None else self._rows("tool", topic)
+    @cached_property
+    def messages(self) -> dict[str, list[BagMessage]]:
+        """Messages of all topics that fit a role, by topic."""
+        names = {topic.name for topics in self.fitting.values() for topic in topics}
+        return read_messages(self.path, sorted(names))
 
-    def motors(self, role: Role, fitting: Sequence[BagTopic], *, needed: bool) -> Rows | None:
+    def rows(self, role: Role, *, needed: bool = False) -> Rows | None:
         """Return the rows of the topic for a role; topics of other joints only do not count."""
-        read = {topic.name: self._rows(role, topic) for topic in fitting}
+        fitting, where = self.fitting[role], f"{self.path}: topic"
+        read = {
+            topic.name: topic_rows(self.messages[topic.name], kind, role, f"{where} {topic.name}")
+            for topic in fitting
+            if (kind := topic.kind) is not None
+        }
+        if role == "tool":
+            topic = only_topic(role, fitting, self.path)
+            return None if topic is None else read[topic.name]
         ours = [topic for topic in fitting if _names_a_motor(read[topic.name].names, self.robot)]
         # If none is ours but one is needed, the first is refused for the joints that it names.
         topic = only_topic(role, ours or (fitting[:1] if needed else []), self.path)
         return None if topic is None else motor_rows(read[topic.name], self.robot)
-
-    def _rows(self, role: Role, topic: BagTopic) -> Rows:
-        messages, kind = self.messages[topic.name], require_kind(topic.fields)
-        return topic_rows(messages, kind, role, f"{self.path}: topic {topic.name}")
 
 
 def motor_rows(rows: Rows, robot: Robot) -> Rows:

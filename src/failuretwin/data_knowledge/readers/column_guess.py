@@ -1,15 +1,14 @@
 """Column maps guessed from the names and numbers of a CSV file.
 
-A file whose column names leave nothing open is read without a map. Otherwise a guess is written for
-the user to check; an unchecked guess is never used.
+A file with unambiguous column names is read without a map. Otherwise a guess is written for the
+user to check; an unchecked guess is never used.
 """
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,18 +16,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from failuretwin.core.errors import InputError
+from failuretwin.core.runs import AXES
 from failuretwin.core.types import FloatArray
-from failuretwin.data_knowledge.readers.csv_log import (
-    BLANKS,
+from failuretwin.data_knowledge.readers.column_map import (
     SERVO,
     AngleColumns,
     ColumnMap,
     CommandColumns,
     TimeColumn,
     ToolColumns,
-    first_line,
-    load_csv,
+    map_text,
 )
+from failuretwin.data_knowledge.readers.table import load_csv, separator_of
 from failuretwin.digital_model.robot import Robot
 from failuretwin.digital_model.urdf.file import read_urdf
 
@@ -52,44 +51,35 @@ LARGEST_RAD, LARGEST_M = 2.0 * np.pi, 10.0
 """Numbers larger than these are no angles in rad and no places of a tool in m."""
 
 
-@dataclass(frozen=True)
-class Guess:
-    """Column map guessed from a CSV file.
-
-    Attributes:
-        columns: The map; columns without a candidate are empty.
-        names: Names of all columns.
-        doubts: Open questions; empty where the names answer all of them.
-    """
-
-    columns: ColumnMap
-    names: tuple[str, ...]
-    doubts: tuple[str, ...]
-
-
-def told_columns(path: Path, robot: Robot) -> ColumnMap:
+def unambiguous_columns(path: Path, robot: Robot) -> ColumnMap:
     """Return the column map of a CSV file whose column names leave nothing open.
 
     Raises:
         InputError: If they leave anything open; the text lists what, and the candidates.
     """
-    guess = guess_columns(path, robot)
-    if guess.doubts:
+    columns, _, doubts = _guess(path, robot)
+    if doubts:
         raise InputError(
             f"{path}: needs a column map, for the names of its columns leave open: "
-            f"{'; '.join(guess.doubts)}. Add --columns MAP.toml: if that file does not exist yet, "
-            "a guess is written there for you to check."
+            f"{'; '.join(doubts)}. Add --columns MAP.toml: if that file does not exist yet, a "
+            "guess is written there for you to check."
         )
-    return guess.columns
+    return columns
 
 
-def guess_columns(path: Path, robot: Robot) -> Guess:
-    """Return the column map of a CSV file as its header and numbers suggest it."""
-    separator = _separator(path)
+def _guess(path: Path, robot: Robot) -> tuple[ColumnMap, list[str], list[str]]:
+    """Return the column map that header and numbers of a CSV file suggest.
+
+    Returns:
+        The map, in which columns without a candidate are empty; names of all columns; and open
+        questions, none where the names answer all of them.
+    """
+    separator = separator_of(path)
     table = _Table(load_csv(path, separator))
     found = _candidates(table.words, robot)
-    command, position, tool = map(_firsts, (found.command, found.position, found.tool))
-    durations, time = _firsts(found.duration), next(iter(found.time), "") or table.increasing()
+    first = {part: _firsts(candidates) for part, candidates in found.items()}
+    command, position, tool = first[COMMAND], first[READING], first[PLACE]
+    time = (*first[TIME], table.increasing())[0]
     turning = [_of_kind(columns, robot, False) for columns in (command, position)]
     sliding = [_of_kind(columns, robot, True) for columns in (command, position)]
     slide_unit = table.length_unit(sliding[0] or sliding[1])
@@ -100,19 +90,19 @@ def guess_columns(path: Path, robot: Robot) -> Guess:
             command,
             units[0],
             slide_unit=slide_unit,
-            kind="target" if durations else "sampled",
-            duration_columns=durations,
-            duration_unit=table.duration_unit(durations),
+            kind="target" if first[DURATION] else "sampled",
+            duration_columns=first[DURATION],
+            duration_unit=table.duration_unit(first[DURATION]),
         ),
         tool=ToolColumns((tool[0], tool[1], tool[2]), table.length_unit(tool)) if tool else None,
         position=AngleColumns(position, units[1], slide_unit=slide_unit) if position else None,
-        run=next(iter(found.run), None),
+        run=next(iter(first[RUN]), None),
         separator=separator,
     )
-    doubts = [*_choices(found, robot), *_lacking(found, table.words)]
+    doubts = [*_choices(found, robot), *_lacking(first, table.words)]
     doubts += [d for c in turning for d in table.unsaid(c, ANGLE_NAMES, LARGEST_RAD)]
     doubts += [d for c in (*sliding, tool) for d in table.unsaid(c, LENGTH_NAMES, LARGEST_M)]
-    return Guess(columns, tuple(table.words), tuple(doubts))
+    return columns, list(table.words), doubts
 
 
 @dataclass(frozen=True)
@@ -176,10 +166,8 @@ class _Table:
 
     def duration_unit(self, columns: Sequence[str]) -> str:
         """Return the unit of the times to reach targets."""
-        named = self.named_unit(columns, TIME_NAMES)
-        if named or not columns:
-            return named or "s"
-        return "ms" if np.nanmedian(self.values(columns)) > 50.0 else "s"
+        long = len(columns) > 0 and np.nanmedian(self.values(columns)) > 50.0
+        return self.named_unit(columns, TIME_NAMES) or ("ms" if long else "s")
 
     def angle_unit(self, columns: Sequence[str], robot: Robot) -> str:
         """Return the unit of angles: stated, or by their size."""
@@ -193,25 +181,17 @@ class _Table:
 
     def length_unit(self, columns: Sequence[str]) -> str:
         """Return the unit of lengths: stated, or by their size."""
-        named = self.named_unit(columns, LENGTH_NAMES)
-        if named or not columns:
-            return named or "m"
-        return "mm" if self.largest(columns) > LARGEST_M else "m"
+        large = self.largest(columns) > LARGEST_M
+        return self.named_unit(columns, LENGTH_NAMES) or ("mm" if large else "m")
 
 
-@dataclass(frozen=True)
-class _Candidates:
-    """Columns that may be the time, the run, and each motor's or axis's part of a log."""
-
-    time: list[str]
-    run: list[str]
-    duration: list[list[str]]
-    tool: list[list[str]]
-    command: list[list[str]]
-    position: list[list[str]]
+Candidates = Mapping[str, Sequence[Sequence[str]]]
+"""Columns that may be each part of a log: for each motor or axis, or one list for the whole."""
+TIME, RUN, DURATION, PLACE = "time", "run", "duration", "place"
+COMMAND, READING = "command", "reading"
 
 
-def _candidates(words: Mapping[str, set[str]], robot: Robot) -> _Candidates:
+def _candidates(words: Mapping[str, set[str]], robot: Robot) -> Candidates:
     durations = {name: found for name, found in words.items() if found & DURATION_WORDS}
     ramps = _by_motor(durations, robot)
     rest = {name: found for name, found in words.items() if name not in durations}
@@ -226,18 +206,17 @@ def _candidates(words: Mapping[str, set[str]], robot: Robot) -> _Candidates:
     rest = {name: found for name, found in rest.items() if name not in _firsts(tool)}
     commands = {name: found for name, found in rest.items() if found & COMMAND_WORDS}
     readings = {name: found for name, found in rest.items() if name not in commands}
-    told, read = _by_motor(commands, robot), _by_motor(readings, robot)
-    if not _firsts(told):  # a log without words for commands: its only angles must be them
-        told, read = read, []
-    duration = ramps if _firsts(ramps) else [list(durations)] * bool(durations)
-    return _Candidates(time, run, duration, tool, told, read)
-
-
-def _separator(path: Path) -> str:
-    """Return the separator of columns that the header of a CSV file suggests."""
-    header = first_line(path)
-    likely = max(",;\t", key=header.count)
-    return likely if likely in header or " " not in header else BLANKS
+    command, reading = _by_motor(commands, robot), _by_motor(readings, robot)
+    if not _firsts(command):  # a log without words for commands: its only angles must be them
+        command, reading = reading, []
+    return {
+        TIME: [time],
+        RUN: [run],
+        COMMAND: command,
+        READING: reading,
+        DURATION: ramps if _firsts(ramps) else [list(durations)] * bool(durations),
+        PLACE: tool,
+    }
 
 
 def _words(name: str) -> set[str]:
@@ -294,101 +273,68 @@ def _firsts(candidates: Sequence[Sequence[str]]) -> tuple[str, ...]:
     return tuple(hits[0] for hits in candidates) if candidates and all(candidates) else ()
 
 
-def _choices(found: _Candidates, robot: Robot) -> list[str]:
+def _choices(found: Candidates, robot: Robot) -> list[str]:
     """Return a doubt for each part of a log that more than one column may be."""
-    parts = [
-        ("the time", ["the log"], [found.time]),
-        ("the run", ["each row"], [found.run]),
-        ("the command", robot.motor_names, found.command),
-        ("the reading", robot.motor_names, found.position),
-        ("the duration", robot.motor_names, found.duration),
-        ("the place", ["the tool in x", "the tool in y", "the tool in z"], found.tool),
-    ]
+    owners = {TIME: ["the log"], RUN: ["each row"], PLACE: [f"the tool in {axis}" for axis in AXES]}
     return [
-        f"{what} of {name} may be {' or '.join(hits)}"
-        for what, names, candidates in parts
-        for name, hits in zip(names, candidates, strict=False)
+        f"the {part} of {owner} may be {' or '.join(hits)}"
+        for part, candidates in found.items()
+        for owner, hits in zip(owners.get(part, robot.motor_names), candidates, strict=False)
         if len(hits) > 1
     ]
 
 
 def _tool_candidates(words: Mapping[str, set[str]]) -> list[list[str]]:
-    candidates = {name: found for name, found in words.items() if found & {"x", "y", "z"}}
+    candidates = {name: found for name, found in words.items() if found & set(AXES)}
     not_desired = {n: found for n, found in candidates.items() if not found & COMMAND_WORDS}
     named = {n: found for n, found in not_desired.items() if found & TOOL_WORDS} or not_desired
-    return [[name for name, found in named.items() if axis in found] for axis in "xyz"]
+    return [[name for name, found in named.items() if axis in found] for axis in AXES]
 
 
-def _lacking(found: _Candidates, words: Mapping[str, set[str]]) -> list[str]:
+def _lacking(first: Mapping[str, Sequence[str]], words: Mapping[str, set[str]]) -> list[str]:
     """Return a doubt for each part of a log that no column was found for."""
-    doubts, command = [], _firsts(found.command)
-    if not found.time:
+    doubts = []
+    if not first[TIME]:
         doubts.append("which column is the time")
-    if not command or any(words[name] & READING_WORDS for name in command):
+    if not first[COMMAND] or any(words[name] & READING_WORDS for name in first[COMMAND]):
         doubts.append("which columns are the commands, one for each motor")
-    if not _firsts(found.tool) and not _firsts(found.position):
+    if not first[PLACE] and not first[READING]:
         doubts.append("which columns are the tool (x, y, z) or the readings of the motors")
     return [f"{doubt}, of {', '.join(words)}" for doubt in doubts]
 
 
-def column_map_text(guess: Guess, source: str, robot: Robot) -> str:
-    """Return a commented column map that holds the guess, ready to be corrected.
-
-    Args:
-        guess: The guess.
-        source: Name of its file.
-        robot: The robot, whose motors the comments name.
-    """
-    columns, time, command = guess.columns, guess.columns.time, guess.columns.command
-    motors = ", ".join(f"{motor.name} ({motor.joint})" for motor in robot.motors)
-    each = [1] * len(robot.motors)
-    tool = columns.tool or ToolColumns(("tool_x", "tool_y", "tool_z"))
-    position = columns.position or AngleColumns(("q1", "q2"))
-    no_tool, no_position = ("" if part else "# " for part in (columns.tool, columns.position))
-    durations = [
-        f"duration_columns = {_toml(command.duration_columns)}",
-        f"duration_unit = {_toml(command.duration_unit)}",
-    ]
-    no_durations = [
-        "# For targets: duration_columns and duration_unit, or one duration_s for all movements."
-    ]
-    parts = [
-        f"# Column map for {source}: which column is what. A GUESS: check every line.",
-        f"# Columns of the file: {', '.join(guess.names)}",
-        f"# Motors of {robot.name}, in this order: {motors}",
-        f"separator = {_toml(columns.separator)}",
-        "# run tells several runs in one file apart; leave it out where a file is one run.",
-        f"run = {_toml(columns.run)}" if columns.run else '# run = "trial"',
-        "",
-        "[time]",
-        f"column = {_toml(time.column or 'FILL IN')}",
-        f"unit = {_toml(time.unit)}        # s, ms, us, ns, or iso (2026-01-31T12:00:00.25)",
-        "",
-        "[command]          # what the motors were told",
-        f"columns = {_toml(command.columns or ['FILL IN'] * len(robot.motors))}",
-        f"kind = {_toml(command.kind)}"
-        "   # sampled (the reference at every row) or target (where to go)",
-        f"unit = {_toml(command.unit)}      # rad, deg, or servo (counts of the profile)",
-        *([f"slide_unit = {_toml(command.slide_unit)}"] if robot.slides.any() else []),
-        *(durations if command.duration_columns else no_durations),
-        f"# sign = {[-1, *each[1:]]}   # where the log turns the other way: here the first",
-        f"# zero = {[0 for _ in each]}   # value that the robot calls 0, in the unit above",
-        "",
-        f"{no_tool}[tool]             # measured tool position in the base frame",
-        f"{no_tool}columns = {_toml(tool.columns)}",
-        f"{no_tool}unit = {_toml(tool.unit)}         # m, cm or mm",
-        "",
-        f"{no_position}[position]         # motor readings; only needed where there is no [tool]",
-        f"{no_position}columns = {_toml(position.columns)}",
-        f"{no_position}unit = {_toml(position.unit)}",
-        "",
-        "# [[sensors]]        # other sensors, SI units: accelerometer, gyroscope, wire, ...",
-        '# variable = "accelerometer"',
-        '# columns = ["ax", "ay", "az"]',
-    ]
-    return "\n".join(parts) + "\n"
+FILL_IN = "FILL IN"
+HINTS = """\
+Columns of the file: {names}
+Motors of {robot}, in this order: {motors}
+run tells several runs in one file apart, such as run = "trial".
+[time]: unit is s, ms, us, ns, or iso (2026-01-31T12:00:00.25).
+[command] is what the motors were told: kind is sampled (the reference at every row) or target
+(where to go, with duration_columns and duration_unit, or one duration_s for all movements);
+unit is rad, deg, or servo (counts of the profile); slide_unit is that of motors that slide.
+[tool] is the measured tool position in the base frame: unit is m, cm or mm.
+[position] is what the motors read; it is only needed where there is no [tool].
+[command] and [position] may also have
+sign = {sign}   where the log turns the other way: here the first
+zero = {zero}   value that the robot calls 0, in the unit of the table
+[[sensors]] are other sensors in SI units, with variable = "accelerometer", "gyroscope", "wire", ...
+and columns = ["ax", "ay", "az"]."""
 
 
-def _toml(value: str | Sequence[str]) -> str:
-    """Return a text or a list of texts as TOML, whose escapes are those of JSON."""
-    return json.dumps(value, ensure_ascii=False)
+def column_map_text(path: Path, robot: Robot) -> str:
+    """Return a commented column map with the guess for a CSV file, ready to be corrected."""
+    columns, names, _ = _guess(path, robot)
+    count, time, command = len(robot.motors), columns.time, columns.command
+    hints = HINTS.format(
+        names=", ".join(names),
+        robot=robot.name,
+        motors=", ".join(f"{motor.name} ({motor.joint})" for motor in robot.motors),
+        sign=[-1] + [1] * (count - 1),
+        zero=[0] * count,
+    )
+    filled = replace(
+        columns,
+        time=replace(time, column=time.column or FILL_IN),
+        command=replace(command, columns=command.columns or (FILL_IN,) * count),
+    )
+    return map_text(f"Column map for {path.name}", hints, filled)

@@ -1,4 +1,4 @@
-"""What stored arrays claim to be, looked at before any of them is decoded.
+"""Claims of files: sizes, codecs and links in their metadata, checked before any decoding.
 
 A file of a kilobyte can say that it holds a terabyte, and a Zarr store may name a codec that runs
 code. So sizes, codecs and links are read from the metadata first; what does not fit the file or
@@ -13,7 +13,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -22,9 +22,10 @@ from failuretwin.core.foreign import LEAST_BYTES, check_size, read_text, reading
 
 if TYPE_CHECKING:
     import h5py
+    import zarr
 
 TEXT_CELL_BYTES = 64
-"""What a short text takes in memory beside its letters [bytes]."""
+"""Memory of a short text in addition to its letters [bytes]."""
 
 # NetCDF: HDF5 with conventions.
 
@@ -59,24 +60,17 @@ def _check_inside(path: Path, name: str, dataset: h5py.Dataset) -> None:
 
 # Zarr: a folder of chunks, with a JSON file for each array.
 
-ZARR_FORMAT = 3
+ZARR_FORMAT: Final = 3
 CODECS = ("bytes", "vlen-utf8", "zstd", "blosc")
-"""Codecs that this package writes; no other is let in, for some run code of the file's maker."""
-CELL_BYTES = {"string": TEXT_CELL_BYTES, "bool": 1} | {
-    f"{kind}{bits}": bits // 8
-    for kind in ("int", "uint", "float")
-    for bits in (8, 16, 32, 64)
-    if (kind, bits) != ("float", 8)
-}
-"""Types of elements that are let in, and what one takes in memory [bytes]."""
-FIXED_TEXT = "fixed_length_utf32"
-"""Type of text that is equally long throughout; its metadata say how long."""
+"""Codecs that this package writes. Others are refused: some run code from the file."""
 MAY_BE_EMPTY = ("onset", "magnitude", "position", "temperature", "voltage")
 """Variables that may be unknown throughout; other writers leave out chunks that are all unknown."""
 
 
 def check_zarr(path: Path) -> None:
     """Raise InputError unless a Zarr store has only known codecs, sane sizes and all its chunks."""
+    import zarr
+
     total = 0.0
     for file in sorted(path.rglob("zarr.json")):
         node = json.loads(read_text(file, "Zarr metadata"))
@@ -84,9 +78,11 @@ def check_zarr(path: Path) -> None:
             raise _not_version_3(path)
         _check_codecs(node, file)
         if node.get("node_type") == "array":
-            total += _array_bytes(node, file)
+            array = zarr.open_array(file.parent, mode="r", zarr_format=ZARR_FORMAT)
+            cell = array.dtype.itemsize if array.dtype.kind in "biufU" else TEXT_CELL_BYTES
+            total += float(max(math.prod(array.shape), math.prod(array.chunks))) * cell
             check_size(total, path, "its arrays")
-            _check_chunks(node, file.parent)
+            _check_chunks(array, file.parent)
     if any((path / name).exists() for name in (".zgroup", ".zarray", ".zmetadata")):
         raise _not_version_3(path)
 
@@ -116,40 +112,19 @@ def _check_codecs(node: Any, file: Path) -> None:
             _check_codecs(value, file)
 
 
-def _array_bytes(node: Mapping[str, Any], file: Path) -> float:
-    """Return what an array of a Zarr store takes, or one of its chunks if that is more [bytes]."""
-    cell = _cell_bytes(node["data_type"], file)
-    grid = [int(n) for n in node["chunk_grid"]["configuration"]["chunk_shape"]]
-    shape = [int(n) for n in node["shape"]]
-    if len(grid) != len(shape) or min([*shape, *grid], default=0) < 0 or 0 in grid:
-        raise InputError(f"{file}: has the shape {shape} and chunks of {grid}, which do not fit.")
-    return float(max(math.prod(shape), math.prod(grid))) * cell
-
-
-def _cell_bytes(kind: Any, file: Path) -> float:
-    if isinstance(kind, Mapping) and kind.get("name") == FIXED_TEXT:
-        return float(kind["configuration"]["length_bytes"])
-    if not isinstance(kind, str) or kind not in CELL_BYTES:
-        expected = ", ".join((*CELL_BYTES, FIXED_TEXT))
-        raise InputError(f"{file}: has the type {kind!r}, expected {expected}.")
-    return CELL_BYTES[kind]
-
-
-def _check_chunks(node: Mapping[str, Any], folder: Path) -> None:
+def _check_chunks(array: zarr.Array[Any], folder: Path) -> None:
     """Raise InputError if a chunk is missing, which would pass for readings that nobody took."""
     if folder.name in MAY_BE_EMPTY:
         return
-    separator = node["chunk_key_encoding"].get("configuration", {}).get("separator", "/")
-    shape = zip(node["shape"], node["chunk_grid"]["configuration"]["chunk_shape"], strict=True)
-    counts = [-(-size // chunk) for size, chunk in shape]
-    there = sum(1 for file in folder.rglob("*") if file.is_file() and file.name != "zarr.json")
-    if there >= math.prod(counts):
+    count = math.prod(array.cdata_shape)
+    found = sum(1 for file in folder.rglob("*") if file.is_file() and file.name != "zarr.json")
+    if found >= count:
         return
-    keys = (separator.join(["c", *map(str, index)]) for index in np.ndindex(*counts))
+    keys = (array.metadata.encode_chunk_key(index) for index in np.ndindex(*array.cdata_shape))
     missing = next((key for key in keys if not (folder / key).is_file()), None)
     if missing is not None:
         raise InputError(
-            f"{folder}: chunk {missing} is missing ({there} of {math.prod(counts)} are there). "
+            f"{folder}: chunk {missing} is missing ({found} of {count} are there). "
             "Copy the store again; if it is whole, write it with write_empty_chunks=True."
         )
 
@@ -161,7 +136,7 @@ MATRIX, COMPRESSED, INT32 = 14, 15, 5
 DEEPEST = 32
 """Cells within cells; published files have three."""
 ELEMENT_BYTES = 16
-"""What an element of a matrix takes at most: two doubles, or an object [bytes]."""
+"""Largest memory of an element of a matrix: two doubles, or an object [bytes]."""
 
 
 def check_matlab(path: Path) -> None:

@@ -1,51 +1,52 @@
-"""LeRobot data sets (v2.1 and v3): what the motors were told and read, frame by frame.
+"""LeRobot data sets (v2.1 and v3): commands and readings of the motors, frame by frame.
 
 A data set is a folder with ``meta/info.json`` and parquet files below ``data/``: one for each
 episode (v2.1) or several episodes in each (v3); a column ``episode_index`` tells them apart in
-both. ``action`` is what the motors were told, ``observation.state`` what they read. It holds no
-tool path: that is the forward kinematics of the readings.
+both. ``action`` holds the commands, ``observation.state`` the readings. The tool path is the
+forward kinematics of the readings.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from failuretwin.core.errors import InputError, needs_extra, unknown_name
+from failuretwin.core.errors import InputError, check_name, needs_extra
 from failuretwin.core.foreign import check_size, read_text, reading
 from failuretwin.core.types import FloatArray, IntArray, as_floats
+from failuretwin.data_knowledge.readers.column_map import check_entries, map_text
 from failuretwin.data_knowledge.readers.timed_log import Samples, TimedLog
 from failuretwin.digital_model.robot import Robot
 
 if TYPE_CHECKING:
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
 INFO_FILE = Path("meta") / "info.json"
 ACTION, STATE, EPISODE, FRAME = "action", "observation.state", "episode_index", "frame_index"
+COLUMNS = [ACTION, STATE, EPISODE, FRAME]
 DEG, RAD, NORMALISED = "deg", "rad", "normalised"
 NUMBER_BYTES = 40
-"""What a number of a list takes while it is read [bytes]."""
+"""Memory of a number of a list while it is read [bytes]."""
 FULL_SCALE = 100.0
 """Ends of a normalised joint's range: -100 and 100."""
 NAME_PREFIX, NAME_SUFFIX = "main_", ".pos"
-"""What recorders put around the name of a joint: ``main_elbow_flex``, ``elbow_flex.pos``."""
+"""Text that recorders put around the name of a joint: ``main_elbow_flex``, ``elbow_flex.pos``."""
 
 
 @dataclass(frozen=True)
 class LeRobotAngles:
-    """What the numbers of a LeRobot data set are, commands and readings alike.
+    """Numbers of a LeRobot data set, commands and readings alike.
 
     Attributes:
         unit: deg, rad or normalised: -100 to 100 over the range that the arm was calibrated with.
         joints: Names of the channels in chain order; empty: those called like the robot's joints.
-        low: For normalised numbers: what -100 stands for, for each motor [deg].
-        high: What 100 stands for, for each motor [deg].
+        low: For normalised numbers: angle of each motor at -100 [deg].
+        high: Angle of each motor at 100 [deg].
         sign: 1 or -1 for each motor, where the data set turns the other way; empty: all 1.
         zero: Angle of each motor in the data set that the robot calls 0 [deg]; empty: all 0.
     """
@@ -58,12 +59,16 @@ class LeRobotAngles:
     zero: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.unit not in (DEG, RAD, NORMALISED):
-            raise unknown_name("unit", self.unit, (DEG, RAD, NORMALISED))
+        check_name("unit", self.unit, (DEG, RAD, NORMALISED))
         if self.unit == NORMALISED and not (self.low and self.high):
             raise InputError(
                 "normalised angles need low and high: the angles [deg] that -100 and 100 stand for."
             )
+
+    def check_motors(self, robot: Robot, where: str) -> None:
+        """Raise InputError unless every list has one entry for each motor."""
+        for name in ("joints", "low", "high", "sign", "zero"):
+            check_entries(name, len(getattr(self, name)) or len(robot.motors), robot, where)
 
     def to_rad(self, values: FloatArray) -> FloatArray:
         """Return angles in the robot's sense [rad] of `values` (frame, motor)."""
@@ -85,15 +90,15 @@ def read_lerobot(path: Path, robot: Robot, angles: LeRobotAngles | None = None) 
     Args:
         path: Its folder.
         robot: The robot it is of; channels of joints that it does not have are left out.
-        angles: What the numbers are; None: degrees, unless they cannot be.
+        angles: Unit and sense of the numbers; None: degrees, unless they cannot be.
 
     Raises:
         InputError: If pyarrow is missing, the data set cannot be read, lacks a joint, or holds
-            angles that cannot be degrees and nobody said what else.
+            angles that cannot be degrees and no unit is given.
     """
-    known = angles or LeRobotAngles()
-    _check_count(known, robot, path)
-    frames = _all_frames(path, known, robot)
+    known, info = angles or LeRobotAngles(), _info(path)
+    known.check_motors(robot, f"{path}: the map")
+    frames = _all_frames(path, info, known, robot)
     unit, reason = _likely_unit(frames)
     if angles is None and unit != DEG:
         raise InputError(
@@ -101,9 +106,11 @@ def read_lerobot(path: Path, robot: Robot, angles: LeRobotAngles | None = None) 
             "--columns MAP.toml; if that file does not exist, a guess is written there for you to "
             "check."
         )
-    rate_hz = _rate(_info(path), path)
+    rate = info.get("fps")
+    if not (isinstance(rate, int | float) and rate > 0):
+        raise InputError(f"{path / INFO_FILE}: fps is {rate!r}, expected frames a second.")
     numbers = np.unique(frames.episode)
-    return [_episode(frames, int(number), rate_hz, known, path) for number in numbers]
+    return [_episode(frames, int(number), float(rate), known, path) for number in numbers]
 
 
 def lerobot_version(path: Path) -> str:
@@ -127,24 +134,6 @@ def _info(path: Path) -> dict[str, Any]:
     if not isinstance(info, dict) or not isinstance(info.get("features"), dict):
         raise InputError(f"{path / INFO_FILE}: has no features. Expected a LeRobot data set.")
     return info
-
-
-def _rate(info: Mapping[str, Any], path: Path) -> float:
-    rate = info.get("fps")
-    if isinstance(rate, int | float) and rate > 0:
-        return float(rate)
-    raise InputError(f"{path / INFO_FILE}: fps is {rate!r}, expected frames a second.")
-
-
-def _check_count(known: LeRobotAngles, robot: Robot, path: Path) -> None:
-    count = len(robot.motors)
-    for name in ("joints", "low", "high", "sign", "zero"):
-        got = len(getattr(known, name))
-        if got not in (0, count):
-            raise InputError(
-                f"{path}: {name} of the map has {got} entries, expected {count}, one for each "
-                f"motor of {robot.name!r} ({', '.join(robot.motor_names)})."
-            )
 
 
 def _channels(
@@ -180,57 +169,43 @@ def channel_names(info: Mapping[str, Any], feature: str) -> list[str]:
     return [str(name) for name in names] if isinstance(names, list) else []
 
 
-def _all_frames(path: Path, known: LeRobotAngles, robot: Robot) -> _Frames:
-    info = _info(path)
-    picks = [_channels(info, feature, known, robot, path) for feature in (ACTION, STATE)]
+def _all_frames(path: Path, info: Mapping[str, Any], known: LeRobotAngles, robot: Robot) -> _Frames:
+    """Return all frames in order of their episodes and their numbers."""
+    with needs_extra("LeRobot data sets need pyarrow", "lerobot"):
+        import pyarrow.parquet as pq
+
+    action, state = (_channels(info, feature, known, robot, path) for feature in (ACTION, STATE))
     files = sorted((path / "data").rglob("*.parquet"))
     if not files:
         raise InputError(
             f"{path}: no parquet files below data/. Fetch the whole data set, not its meta alone."
         )
-    parts = [_frames(file, picks) for file in files]
-    frames = _Frames(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    if len(frames.episode) == 0:
-        raise InputError(f"{path}: holds no frames. Record at least one episode.")
-    return frames
+    fix = f"Expected a number for each channel in {INFO_FILE}. Fetch the data set again."
+    with reading(path / "data", "parquet", fix):
+        metadata = [pq.read_metadata(file) for file in files]
+        claims = sum(_claimed_bytes(one, len(robot.motors)) for one in metadata)
+        check_size(claims, path / "data", "its numbers")
+        for column in COLUMNS:
+            check_name(
+                "column", column, metadata[0].schema.to_arrow_schema().names, f"{files[0]}: "
+            )
+        table = pq.read_table(files, columns=COLUMNS)
+        table = table.sort_by([(EPISODE, "ascending"), (FRAME, "ascending")])
+        if len(table) == 0:
+            raise InputError(f"{path}: holds no frames. Record at least one episode.")
+        return _Frames(
+            episode=np.asarray(table[EPISODE], dtype=np.int64),
+            frame=np.asarray(table[FRAME], dtype=np.int64),
+            action=as_floats(np.stack(table[ACTION].to_numpy())[:, action]),
+            state=as_floats(np.stack(table[STATE].to_numpy())[:, state]),
+        )
 
 
-def _frames(
-    file: Path, picks: Sequence[Sequence[int]]
-) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-    """Return number of episode and frame (frame,), action and state (frame, motor) of a file."""
-    with needs_extra("LeRobot data sets need pyarrow", "lerobot"):
-        import pyarrow.parquet as pq
-
-    wanted = [EPISODE, FRAME, ACTION, STATE]
-    with reading(file, "parquet", "Fetch the data set again."):
-        with pq.ParquetFile(file) as stored:
-            there = stored.schema_arrow.names
-            for column in wanted:
-                if column not in there:
-                    raise InputError(f"{file}: {unknown_name('column', column, there)}")
-            _check_claims(stored.metadata, len(picks[0]), file)
-            table = stored.read(columns=wanted)
-        episode, frame = (np.asarray(table[name], dtype=np.int64) for name in wanted[:2])
-        values = [_matrix(table, n, p, file) for n, p in zip((ACTION, STATE), picks, strict=True)]
-    return episode, frame, values[0], values[1]
-
-
-def _check_claims(said: pq.FileMetaData, motors: int, file: Path) -> None:
-    """Raise InputError if the rows of a parquet file are more than it can mean."""
+def _claimed_bytes(said: pq.FileMetaData, motors: int) -> int:
+    """Return the memory of the numbers that a parquet file says to hold [bytes]."""
     groups = [said.row_group(i) for i in range(said.num_row_groups)]
     values = sum(g.column(i).num_values for g in groups for i in range(g.num_columns))
-    check_size(NUMBER_BYTES * max(values, said.num_rows * motors), file, "its numbers")
-
-
-def _matrix(table: pa.Table, name: str, pick: Sequence[int], file: Path) -> FloatArray:
-    rows = table[name].to_pylist()
-    width = max(pick) + 1
-    if any(row is None or len(row) < width for row in rows):
-        raise InputError(f"{file}: {name!r} has rows of fewer numbers than {INFO_FILE} names.")
-    return np.array([[row[i] for i in pick] for row in rows], dtype=np.float64).reshape(
-        len(rows), len(pick)
-    )
+    return NUMBER_BYTES * max(values, said.num_rows * motors)
 
 
 def _likely_unit(frames: _Frames) -> tuple[str, str]:
@@ -252,9 +227,8 @@ def _episode(
     Normalised commands are clipped there, and where such a motor rests is up to its end stop, or to
     the arm folded upon itself, and not to its servo.
     """
-    rows = np.flatnonzero(frames.episode == number)
-    rows = rows[np.argsort(frames.frame[rows], kind="stable")]
-    time = as_floats((frames.frame[rows] - frames.frame[rows[0]]) / rate_hz)
+    rows = frames.episode == number
+    time = as_floats((frames.frame[rows] - frames.frame[rows][0]) / rate_hz)
     action, state = frames.action[rows], frames.state[rows]
     if known.unit == NORMALISED:
         free = np.all(np.abs(action) < FULL_SCALE, axis=1, keepdims=True)
@@ -266,33 +240,34 @@ def _episode(
     )
 
 
+HINTS = """\
+Channels of the data set: {channels}
+Motors of {robot}, in this order: {motors}
+unit is deg, rad, or normalised (-100 to 100, the older default).
+joints = []   channels in the order of the motors, where names do not tell
+For normalised numbers, low and high are what -100 and 100 stand for [deg], from the middle of each
+joint's range. Here: the limits of the URDF. Better: range_min and range_max of the arm's own
+calibration file; half their difference times 360/4096, below and above zero.
+sign = []     1 or -1 for each motor, where the data set turns the other way
+zero = []     angle of the data set that the robot calls 0 [deg]"""
+
+
 def lerobot_map_text(path: Path, robot: Robot) -> str:
     """Return a commented map for a data set, ready to be corrected.
 
     The range of a normalised joint is that of the robot's URDF: recorders take that range by
     moving each joint from end to end by hand.
     """
-    unit, _ = _likely_unit(_all_frames(path, LeRobotAngles(), robot))
-    limits = np.rad2deg([(joint.low, joint.high) for joint in robot.chain.joints])
-    low, high = ([round(float(v), 1) for v in np.clip(ends, -180.0, 180.0)] for ends in limits.T)
-    channels = ", ".join(channel_names(_info(path), STATE))
-    motors = ", ".join(f"{motor.name} ({motor.joint})" for motor in robot.motors)
-    ends = "" if unit == NORMALISED else "# "
-    return "\n".join(
-        [
-            f"# Map for the LeRobot data set {path.name}. A GUESS: check every line.",
-            f"# Channels of the data set: {channels}",
-            f"# Motors of {robot.name}, in this order: {motors}",
-            "[lerobot]",
-            f'unit = "{unit}"     # deg, rad, or normalised (-100 to 100, the older default)',
-            "# joints = []   # channels in the order of the motors, where names do not tell",
-            "# What -100 and 100 stand for [deg], from the middle of each joint's range. Here: the",
-            "# limits of the URDF. Better: range_min and range_max of the arm's own calibration",
-            "# file; half their difference times 360/4096, below and above zero.",
-            f"{ends}low = {low}",
-            f"{ends}high = {high}",
-            "# sign = []     # 1 or -1 for each motor, where the data set turns the other way",
-            "# zero = []     # angle of the data set that the robot calls 0 [deg]",
-            "",
-        ]
+    info = _info(path)
+    unit, _ = _likely_unit(_all_frames(path, info, LeRobotAngles(), robot))
+    hints = HINTS.format(
+        channels=", ".join(channel_names(info, STATE)),
+        robot=robot.name,
+        motors=", ".join(f"{motor.name} ({motor.joint})" for motor in robot.motors),
     )
+    content: dict[str, Any] = {"unit": unit}
+    if unit == NORMALISED:
+        limits = np.rad2deg([(joint.low, joint.high) for joint in robot.chain.joints])
+        ends = np.clip(limits, -180.0, 180.0).round(1).T.tolist()
+        content |= {"low": ends[0], "high": ends[1]}
+    return map_text(f"Map for the LeRobot data set {path.name}", hints, {"lerobot": content})

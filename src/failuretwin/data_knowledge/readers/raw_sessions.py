@@ -11,16 +11,21 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from failuretwin.core.errors import InputError, unknown_name
+from failuretwin.core.errors import InputError
 from failuretwin.core.foreign import files_below
 from failuretwin.core.hypothesis import paper_hypotheses
 from failuretwin.core.movements import Movements
 from failuretwin.core.runs import STEP_S, RunTable, Truth, concatenate
 from failuretwin.core.types import MS_PER_S, FloatArray, as_floats
-from failuretwin.data_knowledge.readers.csv_log import load_csv, numbers
-from failuretwin.data_knowledge.readers.timed_log import check_clock, check_grid
+from failuretwin.data_knowledge.readers.table import load_csv, numbers
+from failuretwin.data_knowledge.readers.timed_log import (
+    Samples,
+    check_clock,
+    check_grid,
+    on_grid,
+    path_of_readings,
+)
 from failuretwin.digital_model.robot import Robot
-from failuretwin.digital_model.twin import DigitalTwin
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -138,12 +143,8 @@ def _read_table(path: Path, columns: Sequence[str]) -> FloatArray:
     table = load_csv(path)
     wanted = ["timestamp", *columns]
     for column in wanted:
-        if column not in table:
-            raise InputError(
-                f"{path}: missing a column: {unknown_name('column', column, map(str, table))}"
-            )
-        if f"{column}.1" in table:  # the reader's name for a second column of that name
-            raise InputError(f"{path}: column {column!r} stands there twice. Remove one of them.")
+        if f"{column}.1" in table:  # pandas' name for a second column of that name
+            raise InputError(f"{path}: has two columns {column!r}. Remove one of them.")
     values = numbers(table, wanted, path, gaps=False)
     steps = np.diff(values[:, 0])
     if np.any(steps <= 0):
@@ -270,18 +271,13 @@ def _run(
         raw = session.reading_counts[:, label - 1]
         held = float(units.to_rad(np.interp(freeze, session.reading_time - window.begin, raw)))
         frozen[(window.at >= freeze) & np.isfinite(frozen)] = held
-    position = np.full((len(time), len(robot.motors)), np.nan)
-    nearest = np.rint(window.at / (time[1] - time[0])).astype(int)
-    position[np.minimum(nearest, len(time) - 1)] = angle
-    measured = np.full((len(time), 3), np.nan)
-    sound = np.isfinite(position).all(axis=1)
-    measured[sound] = DigitalTwin(robot).path(position[sound])
+    position = on_grid(Samples(window.at, angle), time)
     return RunTable(
         run=[name],
         motor=robot.motor_names,
         time=time,
         command=movements.reference(time),
-        measured=measured[None],
+        measured=path_of_readings(position, robot)[None],
         measured_rate_hz=READING_RATE_HZ,
         movements=movements,
         truth=None if label is None else _truth(label, held, robot),

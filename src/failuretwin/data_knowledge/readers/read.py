@@ -1,9 +1,9 @@
-"""One door for all inputs: run sets, raw sessions, MATLAB files, bags, LeRobot, RTDE, any CSV."""
+"""Reading of all inputs: run sets, raw sessions, MATLAB files, bags, LeRobot, RTDE, any CSV."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -16,8 +16,8 @@ from failuretwin.core.runs import concatenate
 from failuretwin.data_knowledge.readers.bag_file import is_bag
 from failuretwin.data_knowledge.readers.bag_messages import BagTopics
 from failuretwin.data_knowledge.readers.bags import read_bag
-from failuretwin.data_knowledge.readers.column_guess import told_columns
-from failuretwin.data_knowledge.readers.csv_log import ColumnMap, read_mapped_csv
+from failuretwin.data_knowledge.readers.column_guess import unambiguous_columns
+from failuretwin.data_knowledge.readers.column_map import ColumnMap
 from failuretwin.data_knowledge.readers.lerobot import (
     INFO_FILE,
     LeRobotAngles,
@@ -39,6 +39,7 @@ from failuretwin.data_knowledge.readers.raw_sessions import (
     session_runs,
 )
 from failuretwin.data_knowledge.readers.rtde import is_rtde, read_rtde
+from failuretwin.data_knowledge.readers.table import read_mapped_csv
 from failuretwin.data_knowledge.readers.timed_log import TimedLog, timed_run
 from failuretwin.data_knowledge.store import SUFFIXES, load_run_set
 from failuretwin.digital_model.robot import Robot, load_robot
@@ -50,7 +51,7 @@ if TYPE_CHECKING:
 RunsLike: TypeAlias = "xr.Dataset | str | Path | Sequence[str | Path]"
 """A run set, or where one is read from."""
 VIRTUAL_TOOL = "tool path = forward kinematics of the readings"
-"""What a run set says of itself where no sensor watched the tool: its motors' encoders did."""
+"""Words in the source of runs whose tool was watched by no sensor but the motors' encoders."""
 RTDE_SOURCE = "RTDE; a tool path in it is computed by the controller from its encoders"
 
 
@@ -62,9 +63,9 @@ class ReadOptions:
         how: Raw sessions: ``measured`` (readings at their times) or ``published`` (as the authors).
         published_labels: Take the truth from folder names that end in ``_label_K`` and freeze the
             motor of labels 1 to 4.
-        columns: What the columns of CSV files are.
-        lerobot: What the numbers of LeRobot data sets are.
-        topics: Which topics of bags are what, where their types do not tell.
+        columns: Roles and units of the columns of CSV files.
+        lerobot: Unit and sense of the numbers of LeRobot data sets.
+        topics: Roles of the topics of bags, where their types leave a choice.
         approximate: Published paths without commands: accept commands that reproduce the desired
             path only in the least-squares sense.
     """
@@ -113,7 +114,7 @@ def read_runs(
     parts = [part for source in sources for part in _read_source(Path(source), robot, options)]
     runs = concatenate(parts)
     worst = max(parts, key=lambda part: float(part.attrs.get(RECOVERY_ERROR, -1.0)))
-    if RECOVERY_ERROR in worst.attrs:  # of several files the worst one is told
+    if RECOVERY_ERROR in worst.attrs:  # the worst of several files is reported
         runs.attrs |= {name: worst.attrs[name] for name in (RECOVERY_ERROR, RECOVERY_WORST)}
     return runs
 
@@ -125,25 +126,27 @@ def as_runs(runs: RunsLike, robot: Robot | str = "armpi_fpv") -> xr.Dataset:
     return read_runs(runs, robot)
 
 
+@dataclass(frozen=True)
+class Reader:
+    """Reader of one kind of log.
+
+    Attributes:
+        recognises: Whether a path that exists is a log of its kind.
+        read: Returns the run sets in such a path.
+    """
+
+    recognises: Callable[[Path], bool]
+    read: Callable[[Path, Robot, ReadOptions], list[xr.Dataset]]
+
+
 def _read_source(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
     if not path.exists():
         raise InputError(f"{path}: does not exist. Expected a run set, a log or a folder of logs.")
     if not (path.is_file() or path.is_dir()):
         raise InputError(f"{path}: is a device or a pipe. Expected a file or a folder of logs.")
-    if path.suffix in SUFFIXES:
-        return [load_run_set(path)]
-    if is_bag(path):
-        return _log_datasets([read_bag(path, robot, options.topics)], robot, "bag")
-    if is_lerobot(path):
-        unit = "degrees (assumed)" if options.lerobot is None else options.lerobot.unit
-        source = f"LeRobot {lerobot_version(path)}, angles in {unit}"
-        return _log_datasets(read_lerobot(path, robot, options.lerobot), robot, source)
-    if path.is_dir():
-        return _read_folder(path, robot, options)
-    if path.suffix == ".mat":
-        return [_matlab_dataset(path, robot, options)]
-    if path.suffix == ".csv" or is_rtde(path):
-        return _read_text(path, robot, options)
+    for reader in READERS:
+        if reader.recognises(path):
+            return reader.read(path, robot, options)
     raise InputError(
         f"{path}: not a kind of file that can be read. Expected a run set (.nc, .zarr), a "
         "published MATLAB file (.mat), a bag (.bag, .mcap), a CSV file, an RTDE recording, a "
@@ -152,50 +155,66 @@ def _read_source(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Data
     )
 
 
+def _read_bag(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
+    return _log_datasets([read_bag(path, robot, options.topics)], robot, "bag")
+
+
+def _read_lerobot(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
+    unit = "degrees (assumed)" if options.lerobot is None else options.lerobot.unit
+    source = f"LeRobot {lerobot_version(path)}, angles in {unit}"
+    return _log_datasets(read_lerobot(path, robot, options.lerobot), robot, source)
+
+
 def _read_folder(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
-    found = [_session_dataset(folder, robot, options) for folder in find_sessions(path)]
-    found += [_matlab_dataset(file, robot, options) for file in find_matlab_files(path)]
-    sets = sorted(
-        file.parents[1]
-        for file in files_below(path, INFO_FILE.name)
-        if file.parent.name == INFO_FILE.parent.name
-    )
-    found += [part for folder in sets for part in _read_source(folder, robot, options)]
+    found = [_read_session(folder, robot, options) for folder in find_sessions(path)]
+    found += [_read_matlab(file, robot, options) for file in find_matlab_files(path)]
+    infos = sorted(files_below(path, INFO_FILE.name))
+    sets = [file.parents[1] for file in infos if file.parent.name == INFO_FILE.parent.name]
+    found += [_read_lerobot(folder, robot, options) for folder in sets]
     if not found and options.columns is not None:
-        tables = sorted(files_below(path, "*.csv"))
-        found = [part for file in tables for part in _read_text(file, robot, options)]
+        found = [_read_csv(file, robot, options) for file in sorted(files_below(path, "*.csv"))]
     if not found:
         raise InputError(
             f"{path}: no raw session in it or below, no published MATLAB file and no LeRobot data "
             f"set. A session is a folder that holds {', '.join(SESSION_FILES)}. Name other files "
             "one by one, or all CSV files with --columns."
         )
-    return found
+    return [part for parts in found for part in parts]
 
 
-def _session_dataset(folder: Path, robot: Robot, options: ReadOptions) -> xr.Dataset:
+def _read_session(folder: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
     session = read_session(folder, robot)
     runs = session_runs(session, robot, options.how, published_labels=options.published_labels)
     choice = {"as": options.how, "published_labels": options.published_labels}
-    return _named(runs, robot, f"raw session, as {options.how}; {VIRTUAL_TOOL}", choice)
+    return [_named(runs, robot, f"raw session, as {options.how}; {VIRTUAL_TOOL}", choice)]
 
 
-def _matlab_dataset(path: Path, robot: Robot, options: ReadOptions) -> xr.Dataset:
-    table = read_matlab_file(path, robot, approximate=options.approximate)
-    return _named(
-        table.to_dataset(), robot, "published MATLAB file", {"approximate": options.approximate}
-    )
+def _read_matlab(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
+    runs = read_matlab_file(path, robot, approximate=options.approximate).to_dataset()
+    choice = {"approximate": options.approximate}
+    return [_named(runs, robot, "published MATLAB file", choice)]
 
 
-def _read_text(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
-    """Return the runs of a text file: by the column map, else by what its header says."""
+def _read_csv(path: Path, robot: Robot, options: ReadOptions) -> list[xr.Dataset]:
+    """Return the runs of a text file: by the column map, else by its header."""
     if options.columns is not None:
         logs = read_mapped_csv(path, options.columns, robot)
         return _log_datasets(logs, robot, "CSV with a column map")
     if is_rtde(path):
         return _log_datasets([read_rtde(path, robot)], robot, RTDE_SOURCE)
-    logs = read_mapped_csv(path, told_columns(path, robot), robot)
+    logs = read_mapped_csv(path, unambiguous_columns(path, robot), robot)
     return _log_datasets(logs, robot, "CSV, columns by their names")
+
+
+READERS = (
+    Reader(lambda path: path.suffix in SUFFIXES, lambda path, *_: [load_run_set(path)]),
+    Reader(is_bag, _read_bag),
+    Reader(is_lerobot, _read_lerobot),
+    Reader(Path.is_dir, _read_folder),
+    Reader(lambda path: path.suffix == ".mat", _read_matlab),
+    Reader(lambda path: path.suffix == ".csv" or is_rtde(path), _read_csv),
+)
+"""Readers of all kinds of logs; the first one that recognises a path reads it."""
 
 
 def _log_datasets(logs: Sequence[TimedLog], robot: Robot, source: str) -> list[xr.Dataset]:

@@ -14,18 +14,20 @@ from pathlib import Path
 import numpy as np
 
 from failuretwin.core.errors import InputError
-from failuretwin.data_knowledge.readers.csv_log import (
-    BLANKS,
+from failuretwin.data_knowledge.readers.column_map import (
     AngleColumns,
     ColumnMap,
     CommandColumns,
     SensorColumns,
     TimeColumn,
     ToolColumns,
+)
+from failuretwin.data_knowledge.readers.table import (
     first_line,
     load_csv,
     numbers,
     read_mapped_csv,
+    separator_of,
 )
 from failuretwin.data_knowledge.readers.timed_log import TimedLog
 from failuretwin.digital_model.robot import Robot
@@ -45,15 +47,14 @@ their common Denavit-Hartenberg table by millimetres."""
 def is_rtde(path: Path) -> bool:
     """Return whether a text file has the header of an RTDE recording."""
     names, separator = _header(path)
-    leads = (TARGET, ACTUAL, TCP) if separator == BLANKS else (TCP,)
+    leads = (TCP,) if separator in ",;" else (TARGET, ACTUAL, TCP)
     return TIME in names and any(name.startswith(leads) for name in names)
 
 
 def _header(path: Path) -> tuple[list[str], str]:
-    """Return the names of the columns, and what stands between them."""
-    line = first_line(path)
-    separator = next((mark for mark in ",;" if mark in line), BLANKS)
-    return line.replace(separator, " ").split(), separator
+    """Return the names of the columns, and the separator between them."""
+    separator = separator_of(path)
+    return first_line(path).replace(separator, " ").split(), separator
 
 
 def read_rtde(path: Path, robot: Robot) -> TimedLog:
@@ -104,8 +105,8 @@ def _held(path: Path, separator: str, names: list[str], index: list[int]) -> boo
     others = [name for name in others if name in names]
     if not others:
         return True
-    told = numbers(load_csv(path, separator), others, path)
-    return bool(np.ptp(told, axis=0).max(initial=0.0) < STILL_RAD)
+    target = numbers(load_csv(path, separator), others, path)
+    return bool(np.ptp(target, axis=0).max(initial=0.0) < STILL_RAD)
 
 
 def _joint_index(robot: Robot, path: Path) -> list[int]:

@@ -62,11 +62,9 @@ class Targets:
 
 def held(target: FloatArray) -> FloatArray:
     """Return targets (row, motor) with each NaN replaced by the one before, or else the next."""
-    rows = np.arange(len(target))[:, None]
-    known = np.isfinite(target)
-    before = np.maximum.accumulate(np.where(known, rows, -1), axis=0)
-    first = np.argmax(known, axis=0)
-    return np.take_along_axis(target, np.where(before < 0, first, before), axis=0)
+    import pandas as pd
+
+    return as_floats(pd.DataFrame(target).ffill().bfill())
 
 
 SHAPES: Mapping[str, tuple[int, ...]] = {
@@ -88,7 +86,7 @@ class TimedLog:
         tool: Tool path (sample, axis) [m]; None: computed from the motor readings, like the
             published virtual sensor.
         position: Motor readings (sample, motor) [rad], NaN where one is missing.
-        sensors: What other sensors read, by variable of a run set, (sample, channel).
+        sensors: Readings of other sensors, by variable of a run set, (sample, channel).
     """
 
     name: str
@@ -120,12 +118,12 @@ def timed_run(log: TimedLog, robot: Robot) -> RunTable:
         motor=robot.motor_names,
         time=time,
         command=command[None],
-        measured=_on_grid(tool, time, begin)[None],
+        measured=on_grid(tool, time, begin)[None],
         measured_rate_hz=tool.rate_hz,
         movements=movements,
-        position=None if log.position is None else _on_grid(log.position, time, begin)[None],
+        position=None if log.position is None else on_grid(log.position, time, begin)[None],
         sensors={
-            name: _on_grid(samples, time, begin).reshape(
+            name: on_grid(samples, time, begin).reshape(
                 1, len(time), *SHAPES.get(name, samples.value.shape[1:])
             )
             for name, samples in log.sensors.items()
@@ -191,10 +189,15 @@ def _tool_path(log: TimedLog, robot: Robot) -> Samples:
         raise InputError(
             f"{log.name}: holds neither a tool path nor motor readings. Name one of them."
         )
-    sound = np.asarray(np.isfinite(log.position.value).all(axis=1))
-    path = np.full((len(sound), 3), np.nan)
-    path[sound] = DigitalTwin(robot).path(log.position.value[sound])
-    return Samples(log.position.time, path)
+    return Samples(log.position.time, path_of_readings(log.position.value, robot))
+
+
+def path_of_readings(position: FloatArray, robot: Robot) -> FloatArray:
+    """Return the tool path of motor readings, (row, axis) [m]; NaN where a motor has none."""
+    sound = np.asarray(np.isfinite(position).all(axis=1))
+    path = np.full((len(position), 3), np.nan)
+    path[sound] = DigitalTwin(robot).path(position[sound])
+    return path
 
 
 def _check_times(time: FloatArray, name: str) -> None:
@@ -263,7 +266,7 @@ def _initial(log: TimedLog, command: Targets) -> FloatArray:
     return command.target[0]
 
 
-def _on_grid(samples: Samples, time: FloatArray, begin: float) -> FloatArray:
+def on_grid(samples: Samples, time: FloatArray, begin: float = 0.0) -> FloatArray:
     """Return samples at their nearest grid times, NaN elsewhere, (time, channel)."""
     grid = np.full((len(time), samples.value.shape[1]), np.nan)
     nearest = np.rint((samples.time - begin) / (time[1] - time[0])).astype(np.int64)

@@ -1,0 +1,252 @@
+"""Column maps: which column of a table is what, in which unit.
+
+Section: docs/reading_logs.md
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from failuretwin.core.config import from_table, read_toml
+from failuretwin.core.errors import InputError, check_name
+from failuretwin.core.types import FloatArray, as_floats
+from failuretwin.data_knowledge.readers.timed_log import SHAPES
+from failuretwin.digital_model.robot import Robot
+
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+ANGLE_UNITS = {"rad": 1.0, "deg": np.pi / 180.0}
+SERVO = "servo"
+"""Unit of angles in servo counts."""
+ISO = "iso"
+"""Unit of times that are dates."""
+CORRECTION = "correction"
+"""Table of a column map that is not about columns: the correction of a wrong set-up."""
+
+
+@dataclass(frozen=True)
+class TimeColumn:
+    """Time of each row.
+
+    Attributes:
+        column: Its name.
+        unit: s, ms, us, ns, or iso for dates with times.
+    """
+
+    column: str
+    unit: str = "s"
+
+    def __post_init__(self) -> None:
+        check_name("unit", self.unit, [*TIME_UNITS, ISO])
+
+
+@dataclass(frozen=True)
+class AngleColumns:
+    """Angles of the motors, one column each, in chain order.
+
+    Attributes:
+        columns: Their names.
+        unit: rad, deg, or servo for the counts of the robot's profile.
+        sign: 1 or -1 for each motor, where the log turns the other way; empty: all 1.
+        zero: Value of each motor, in its unit, that the robot calls 0; empty: all 0.
+        slide_unit: Of motors that slide: m, cm or mm.
+    """
+
+    columns: tuple[str, ...]
+    unit: str = "rad"
+    sign: tuple[float, ...] = ()
+    zero: tuple[float, ...] = ()
+    slide_unit: str = "m"
+
+    def __post_init__(self) -> None:
+        check_name("unit", self.unit, [*ANGLE_UNITS, SERVO])
+        check_name("unit", self.slide_unit, LENGTH_UNITS)
+
+    def check_motors(self, robot: Robot, where: str) -> None:
+        """Raise InputError unless there is one column, sign and zero for each motor."""
+        _check_distinct(self.columns, where)
+        check_entries("columns", len(self.columns), robot, where)
+        for name in ("sign", "zero"):
+            check_entries(name, len(getattr(self, name)) or len(robot.motors), robot, where)
+
+    def to_robot(self, values: FloatArray, robot: Robot) -> FloatArray:
+        """Return angles in the robot's sense [rad, m of a slide]; NaN for counts out of range.
+
+        Args:
+            values: As logged, (row, motor).
+            robot: The robot.
+        """
+        if self.unit == SERVO:
+            units = robot.servo_units
+            angle = np.where(units.valid(values), units.to_rad(values), np.nan)
+            zero = units.to_rad(np.asarray(self.zero)) if self.zero else 0.0
+        else:
+            turns, slides = ANGLE_UNITS[self.unit], LENGTH_UNITS[self.slide_unit]
+            scale = np.where(robot.slides, slides, turns)
+            angle, zero = values * scale, np.asarray(self.zero or 0.0) * scale
+        return as_floats((angle - zero) * np.asarray(self.sign or 1.0))
+
+
+@dataclass(frozen=True)
+class CommandColumns(AngleColumns):
+    """Commands of the motors, one column each, in chain order.
+
+    Attributes:
+        kind: sampled (the reference at every row) or target (where to go, with a duration).
+        duration_columns: For targets: time to get there, a column for each motor, or one for all.
+        duration_unit: s, ms, us or ns.
+        duration_s: For targets without such columns: the same time for every movement [s].
+    """
+
+    kind: str = "sampled"
+    duration_columns: tuple[str, ...] = ()
+    duration_unit: str = "s"
+    duration_s: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_name("kind", self.kind, ("sampled", "target"))
+        check_name("unit", self.duration_unit, TIME_UNITS)
+        if self.kind == "target" and not self.duration_columns and self.duration_s is None:
+            raise InputError(
+                "targets need to know how long a movement takes. Name duration_columns, or give "
+                "duration_s for all."
+            )
+
+
+@dataclass(frozen=True)
+class ToolColumns:
+    """Position of the tool in the base frame.
+
+    Attributes:
+        columns: x, y and z.
+        unit: m, cm or mm.
+    """
+
+    columns: tuple[str, str, str]
+    unit: str = "m"
+
+    def __post_init__(self) -> None:
+        check_name("unit", self.unit, LENGTH_UNITS)
+
+
+@dataclass(frozen=True)
+class SensorColumns:
+    """Readings of another sensor, in SI units.
+
+    Attributes:
+        variable: Its variable in a run set, such as ``accelerometer``.
+        columns: One for each channel.
+    """
+
+    variable: str
+    columns: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        check_name("sensor variable", self.variable, SHAPES)
+        count = math.prod(SHAPES[self.variable])
+        if len(self.columns) != count:
+            raise InputError(
+                f"{self.variable}: {len(self.columns)} columns, expected {count}, one a channel."
+            )
+
+
+@dataclass(frozen=True)
+class ColumnMap:
+    """Columns of a table.
+
+    Attributes:
+        time: Time of each row.
+        command: Commands of the motors.
+        tool: Position of the tool; without it the path is computed from motor readings.
+        position: Motor readings.
+        run: Column that tells runs apart; without it a file is one run.
+        separator: Between columns.
+        decimal: Decimal point, or comma where the log writes 0,5.
+        sensors: Other sensors.
+        goal: Goals that the motors report to have received.
+    """
+
+    time: TimeColumn
+    command: CommandColumns
+    tool: ToolColumns | None = None
+    position: AngleColumns | None = None
+    run: str | None = None
+    separator: str = ","
+    decimal: str = "."
+    sensors: tuple[SensorColumns, ...] = ()
+    goal: AngleColumns | None = None
+
+
+def read_column_map(path: Path, robot: Robot) -> ColumnMap:
+    """Read a column map and check that it fits the robot.
+
+    Raises:
+        InputError: If the file is wrong or does not name what the robot needs.
+    """
+    table = {name: part for name, part in read_toml(path).items() if name != CORRECTION}
+    mapping = from_table(ColumnMap, table, str(path))
+    if mapping.tool is None and mapping.position is None and not mapping.sensors:
+        raise InputError(f"{path}: needs a [tool] table, or [position] to compute the path from.")
+    if mapping.tool is not None:
+        _check_distinct(mapping.tool.columns, f"{path}: tool")
+    anchored = any(one.kind == "wire" and one.anchor for one in robot.profile.sensors)
+    if any(one.variable == "wire" for one in mapping.sensors) and not anchored:
+        raise InputError(
+            f"{path}: a wire, but {robot.name!r} does not say where it begins. Add a table "
+            '[[sensors]] with kind = "wire" and anchor = [x, y, z] to its profile [m, base link].'
+        )
+    for name in ("command", "position", "goal"):
+        angles = getattr(mapping, name)
+        if angles is not None:
+            angles.check_motors(robot, f"{path}: {name}")
+    return mapping
+
+
+def check_entries(name: str, count: int, robot: Robot, where: str) -> None:
+    """Raise InputError unless a list of a map has one entry for each motor."""
+    if count != len(robot.motors):
+        raise InputError(
+            f"{where}: {name} has {count} entries, expected {len(robot.motors)}, one for each "
+            f"motor of {robot.name!r} ({', '.join(robot.motor_names)})."
+        )
+
+
+def _check_distinct(columns: Sequence[str], where: str) -> None:
+    for column in columns:
+        if list(columns).count(column) > 1:
+            raise InputError(f"{where}: column {column!r} is named twice. Each needs its own.")
+
+
+def map_text(title: str, hints: str, content: ColumnMap | Mapping[str, Any]) -> str:
+    """Return a guessed map as TOML, under comments that say how to check it.
+
+    Args:
+        title: First words of the comments, which name the log.
+        hints: Further comments, any number of lines.
+        content: The map; what is unknown or empty is left out.
+    """
+    table = asdict(content) if isinstance(content, ColumnMap) else content
+    comments = [f"{title}. A GUESS: check every line.", *hints.splitlines()]
+    return "".join(f"# {line}\n" for line in comments) + _toml(table)
+
+
+def _toml(table: Mapping[str, Any]) -> str:
+    """Return a table as TOML, whose texts, numbers and lists are those of JSON."""
+    known = {key: value for key, value in table.items() if value not in (None, ())}
+    lines = [
+        f"{key} = {json.dumps(value, ensure_ascii=False)}\n"
+        for key, value in known.items()
+        if not isinstance(value, Mapping)
+    ]
+    tables = [
+        f"\n[{key}]\n{_toml(value)}" for key, value in known.items() if isinstance(value, Mapping)
+    ]
+    return "".join([*lines, *tables])
