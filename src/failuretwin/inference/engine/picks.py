@@ -169,8 +169,8 @@ def narrowed(rows: Rows, picks: Picks, share: FloatArray, components: Components
     order = np.argsort(-share, axis=-1, kind="stable")
     left = 1.0 - np.cumsum(np.take_along_axis(share, order, axis=-1), axis=-1)
     total = share.sum(axis=-1, keepdims=True)
-    count = 1 + int((left - (1.0 - total) > LEFT_OUT * total).sum(axis=-1).max(initial=0))
-    kept = order[..., :count]
+    count = 1 + (left - (1.0 - total) > LEFT_OUT * total).sum(axis=-1)  # (pick, moment)
+    kept = order[..., : count.max(initial=1)]
     moment = np.arange(share.shape[1])[None, :, None]
     G = rows.columns[run, picks.row_of(rows.columns)]
     usual = rows.usual[kept]
@@ -179,6 +179,10 @@ def narrowed(rows: Rows, picks: Picks, share: FloatArray, components: Components
     some = np.arange(len(run))[:, None, None], moment, usual
     r = picks.row_of(rows.outcomes.residual)[:, None, None]
     index = run[:, None, None], r, moment, kept
+    log_weight = rows.log_weight[run[:, None, None], row[:, None, None], moment, kept]
+    counts = (
+        np.arange(kept.shape[-1]) < count[..., None]
+    )  # those of a row alone, not its neighbours
     normals = [components.theta(run, normal) for normal in range(components.normals)]
     return Narrowed(
         place,
@@ -189,7 +193,7 @@ def narrowed(rows: Rows, picks: Picks, share: FloatArray, components: Components
         rows.outcomes.residual[index],
         rows.outcomes.scatter[index],
         rows.outcomes.beside[index],
-        rows.log_weight[run[:, None, None], row[:, None, None], moment, kept],
+        np.where(counts, log_weight, -np.inf),
     )
 
 
