@@ -263,3 +263,13 @@ def test_unknown_robots_in_chunks_say_what_they_say_alone():
     again = alone.weights[1].estimate(1).onset
     assert told is not None and again is not None
     assert told.quantiles((0.5,)) == pytest.approx(again.quantiles((0.5,)), abs=1e-6)
+
+
+def test_a_run_is_judged_alone(runs, uncalibrated):
+    """Rows are narrowed to the outcomes that they need, not to those that their neighbours do."""
+    model = HealthyModel.of(load_calibration("generic"))
+    for run in (0, 7, 12):
+        alone = evidence_of(runs.isel(run=[run]), model, uncalibrated.hypotheses)
+        np.testing.assert_allclose(
+            alone.by_hypothesis[0], uncalibrated.by_hypothesis[run], rtol=1e-9, atol=1e-9
+        )

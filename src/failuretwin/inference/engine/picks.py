@@ -40,10 +40,11 @@ class Picks:
         """Return some of them."""
         return Picks(self.run[some], self.row[some], self.component[some])
 
-    def beside(self, other: Picks) -> Picks:
-        """Return these and some others."""
-        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
-        return Picks(*map(np.concatenate, pairs))
+    @classmethod
+    def joined(cls, parts: Sequence[Picks]) -> Picks:
+        """Return several sets of picks as one."""
+        names = [field.name for field in fields(cls)]
+        return cls(*(np.concatenate([getattr(one, n) for one in parts]) for n in names))
 
     def row_of(self, array: FloatArray) -> IntArray:
         """Return the index along the axis of rows, which may be common to all."""
@@ -180,9 +181,7 @@ def narrowed(rows: Rows, picks: Picks, share: FloatArray, components: Components
     r = picks.row_of(rows.outcomes.residual)[:, None, None]
     index = run[:, None, None], r, moment, kept
     log_weight = rows.log_weight[run[:, None, None], row[:, None, None], moment, kept]
-    counts = (
-        np.arange(kept.shape[-1]) < count[..., None]
-    )  # those of a row alone, not its neighbours
+    own_count = np.arange(kept.shape[-1]) < count[..., None]  # whatever its neighbours need
     normals = [components.theta(run, normal) for normal in range(components.normals)]
     return Narrowed(
         place,
@@ -193,7 +192,7 @@ def narrowed(rows: Rows, picks: Picks, share: FloatArray, components: Components
         rows.outcomes.residual[index],
         rows.outcomes.scatter[index],
         rows.outcomes.beside[index],
-        np.where(counts, log_weight, -np.inf),
+        np.where(own_count, log_weight, -np.inf),
     )
 
 

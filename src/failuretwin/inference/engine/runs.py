@@ -59,13 +59,14 @@ class Weighed:
     found: RowsPosterior
     amount: FloatArray
 
-    def beside(self, other: Weighed) -> Weighed:
-        """Return these picks and some others."""
-        return Weighed(
-            self.picks.beside(other.picks),
-            np.concatenate([self.log_evidence, other.log_evidence]),
-            RowsPosterior.joined([self.found, other.found]),
-            np.concatenate([self.amount, other.amount]),
+    @classmethod
+    def joined(cls, parts: Sequence[Weighed]) -> Weighed:
+        """Return what several sets of rows say as one."""
+        return cls(
+            Picks.joined([one.picks for one in parts]),
+            np.concatenate([one.log_evidence for one in parts]),
+            RowsPosterior.joined([one.found for one in parts]),
+            np.concatenate([one.amount for one in parts]),
         )
 
     def with_picks(self, places: IntArray, some: Weighed) -> Weighed:
@@ -143,7 +144,8 @@ class RunsEvidence:
         found = []
         for h, one in enumerate(begun):
             run, component = np.nonzero(others & near[:, h, None])
-            found.append(one.beside(self._of_components(h, kept[h], run, component)))
+            others_say = self._of_components(h, kept[h], run, component)
+            found.append(Weighed.joined([one, others_say]))
         return self._refined(found)
 
     def _widest(self, wanted: BoolArray) -> IntArray:
@@ -265,12 +267,7 @@ class RunsEvidence:
         parts = [
             self._weigh(h, picks[some], None if before is None else before[some]) for some in chunks
         ]
-        return Weighed(
-            picks,
-            np.concatenate([one.log_evidence for one in parts]),
-            RowsPosterior.joined([one.found for one in parts]),
-            np.concatenate([one.amount for one in parts]),
-        )
+        return Weighed.joined(parts)
 
     def _weigh(self, h: int, picks: Picks, before: RowsPosterior | None) -> Weighed:
         rows = self.rows[h]
