@@ -43,8 +43,7 @@ from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.evidence import Evidence
 from failuretwin.inference.posterior import log_prior
-from failuretwin.inference.set_ups.set_ups import FAULT_OF_EVERY_RUN
-from failuretwin.inference.theta.shared_posterior import FAR
+from failuretwin.inference.set_ups.set_ups import FAR_OFF, FAULT_OF_EVERY_RUN
 from failuretwin.inference.theta.shared_unknowns import (
     ORIGIN,
     REGISTRATION,
@@ -68,7 +67,7 @@ FRAME_OFF = 14.1
 told: 95 % of seven normal numbers are nearer."""
 IDENTIFIED = 0.7
 """An offset is learned where the runs narrow it to this share of the prior's deviation, or move it
-by more than `FAR` of them."""
+by more than `FAR_OFF` of them."""
 ODD = {
     "bias": f"a zero that is off, or {FAULT_OF_EVERY_RUN}",
     "compliance": "a fault that is there in every run looks like this",
@@ -305,8 +304,8 @@ def _parameters(found: FolderPosterior, believed: Imperfections, robot: Robot) -
             at = REGISTRATION + k * len(motors) + i
             spread, prior = found.deviation[at], found.usual_deviation[at]
             off = float((values[i] - expected[i]) / prior)
-            note = f"{off:+.1f} deviations off what such robots do" if abs(off) > FAR else ""
-            known = bool(spread < IDENTIFIED * prior) or abs(off) > FAR
+            note = f"{off:+.1f} deviations off what such robots do" if abs(off) > FAR_OFF else ""
+            known = bool(spread < IDENTIFIED * prior) or abs(off) > FAR_OFF
             if not known:
                 note = "the runs do not tell it from what such robots differ by"
             value, deviation = float(values[i]), float(spread)

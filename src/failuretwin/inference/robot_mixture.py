@@ -4,7 +4,8 @@
     p(c | run) ~ w_c sum over h of p(h) p(run | h, c)
 
 with components c of the belief about the healthy robot: the named calibration; the population of
-its class; and that population with a larger scatter, a noisier sensor or more lost commands.
+its class; and that population with more lost commands, a larger scatter or a noisier sensor. The
+engine sums over scatter and noise itself where rests tell of all hypotheses.
 p(c | run) is that of settled positions, which every component judges. A component is weighed in
 full for the runs that it may explain better: its healthy and its likeliest hypothesis tell which.
 
@@ -24,6 +25,7 @@ from failuretwin.core.numerics import log_of, log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
 from failuretwin.digital_model.arm_classes import GENERIC_NAME, generic_imperfections
 from failuretwin.digital_model.nonidealities import with_rates
+from failuretwin.inference.engine.unknown_robots import evidence_by_hypothesis, speaks_of
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.observation.healthy_model import HealthyModel
@@ -63,7 +65,9 @@ class RobotComponent:
     model: HealthyModel
 
 
-def robot_components(model: HealthyModel, priors: Priors) -> list[RobotComponent]:
+def robot_components(
+    model: HealthyModel, priors: Priors, factors: bool = True
+) -> list[RobotComponent]:
     """Return what is believed of a healthy robot; the first is the model itself.
 
     An ideal robot, one whose set-up is known, and one that other sensors watch have no other.
@@ -71,26 +75,30 @@ def robot_components(model: HealthyModel, priors: Priors) -> list[RobotComponent
     Args:
         model: The named calibration, or the population of its class.
         priors: Beliefs about set-ups.
+        factors: Whether scatter and noise are components here; else the engine sums over them.
     """
     another, known = priors.setup.another_rate, model.imperfections
     if another == 0.0 or known.settling is None or not model.sensors.tool_alone:
         return [RobotComponent("", 0.0, model)]
     if known.name == GENERIC_NAME:
-        return _population(model, priors, "")
+        return _population(model, priors, "", factors)
     name = f"these runs do not seem to be of the robot of calibration {known.name!r}"
     usual = generic_imperfections(model.twin.robot)
     usual = replace(usual, protocol=known.protocol, sensors=known.sensors)
-    kind = _population(replace(model, imperfections=usual), priors, name)
+    kind = _population(replace(model, imperfections=usual), priors, name, factors)
     others = [replace(one, log_weight=one.log_weight + float(log_of(another))) for one in kind]
     return [RobotComponent("", float(np.log1p(-another)), model), *others]
 
 
-def _population(model: HealthyModel, priors: Priors, name: str) -> list[RobotComponent]:
+def _population(
+    model: HealthyModel, priors: Priors, name: str, factors: bool
+) -> list[RobotComponent]:
     """Return the population of a class: as usual first, then what differs from it."""
-    known, found = model.imperfections, [(name, USUAL, model)]
+    usual = USUAL if factors else 1.0 - sum(LOSSES.values())
+    known, found = model.imperfections, [(name, usual, model)]
     settling = known.settling
     assert settling is not None
-    for factor, share in SCATTER.items():
+    for factor, share in SCATTER.items() if factors else ():
         scatter = tuple(factor * value for value in settling.scatter)
         wide = replace(known, settling=replace(settling, scatter=scatter))
         told = f"the motors seem to scatter about {factor:g} times as much as arms of this class do"
@@ -98,7 +106,7 @@ def _population(model: HealthyModel, priors: Priors, name: str) -> list[RobotCom
     for factor, share in LOSSES.items():
         told = f"commands seem to get lost about {factor:g} times as often as with such arms"
         found.append((told, share, replace(model, imperfections=with_rates(known, factor))))
-    for share in priors.setup.noise:
+    for share in priors.setup.noise if factors else ():
         noise = float(np.hypot(model.untold_noise_m, share * model.twin.robot.reach))
         told = f"the sensor seems noisier than is known of it: by about {1e3 * noise:.2g} mm"
         found.append((told, NOISY / 2.0, replace(model, untold_noise_m=noise)))
@@ -216,7 +224,8 @@ class RobotMixture:
         if not scored:
             return np.arange(len(best))
         some = [known.hypotheses[i] for i in scored]
-        glance = _glance(likelihood, some, priors, asked[:, scored])
+        weigh = _glance_at_rests if speaks_of(likelihood, known.hypotheses) else _glance
+        glance = weigh(likelihood, some, priors, asked[:, scored])
         says = component.log_weight + (glance + known.log_prior[scored]).max(axis=1)
         reached = log_sum(log_sum(self.log_joint, axis=0), axis=1)
         return np.flatnonzero(says > reached - COUNTS_NATS)
@@ -261,3 +270,19 @@ def _glance(
     at = weighing.expand(np.arange(len(asked)), weighing.nowhere)
     prior = at.prior(weighing.parts[0].deviation)
     return weighing.search(at, prior, weighing.nowhere, asked).log_evidence
+
+
+def _glance_at_rests(
+    likelihood: RunLikelihood,
+    hypotheses: Sequence[Hypothesis],
+    priors: Priors,
+    asked: BoolArray,
+) -> FloatArray:
+    """Return the log evidence of the hypotheses that are asked for by the engine, as `_glance`."""
+    found = np.full(asked.shape, -np.inf)
+    for which in np.unique(asked, axis=0):
+        rows = np.flatnonzero((asked == which).all(axis=1))
+        some = [hypotheses[i] for i in np.flatnonzero(which).tolist()]
+        says = evidence_by_hypothesis(likelihood[rows], some, priors)
+        found[np.ix_(rows, np.flatnonzero(which))] = says
+    return found

@@ -17,6 +17,7 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import as_floats
+from failuretwin.inference.engine.runs import has_rows
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.misfit import FITS, run_misfit
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -129,13 +130,14 @@ class SeenRuns:
         """Whether the sensor may stand a little elsewhere than the profile says, by any robot."""
         return all(
             set_up_in_doubt(replace(self.sample, model=one.model), self.hypotheses, self.priors)
-            for one in self.components[:2]
+            for one in robot_components(self.healthy, self.priors)[:2]
         )
 
     @cached_property
     def components(self) -> list[RobotComponent]:
         """What is believed of the healthy robot; the first is the model."""
-        return robot_components(self.healthy, self.priors)
+        summed = not self.in_doubt and all(has_rows(h) for h in self.hypotheses)
+        return robot_components(self.healthy, self.priors, factors=not summed)
 
     def set_ups(self, thorough: bool = False) -> SetUpPosterior:
         """Return what is believed of the set-up: unit and clock first, then all else.

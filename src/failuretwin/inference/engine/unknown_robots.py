@@ -27,7 +27,7 @@ from failuretwin.inference.faults.marginal import MarginalLikelihood
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
 from failuretwin.inference.posterior import Posterior, log_prior
-from failuretwin.inference.theta.shared_posterior import odd_zero
+from failuretwin.inference.set_ups.set_ups import odd_zero
 from failuretwin.inference.theta.shared_unknowns import layout_of as doubted_layout
 
 CHUNK_RUNS = 16

@@ -256,3 +256,26 @@ def simple_set_ups(robot: Robot, expected: FloatArray, point: FloatArray) -> Seq
     if len(point) >= FEWEST_TO_TURN:
         found.append(turned(robot, expected, point))
     return found
+
+
+FAR_OFF = 3.0
+"""Offsets so many deviations off what such robots do are told."""
+
+
+def odd_zero(robot: Robot, zero: FloatArray, deviations: FloatArray) -> str:
+    """Return which zero is far off what such robots do; empty where none is.
+
+    Args:
+        robot: The robot.
+        zero: Zeros of the motors, (motor,) [rad].
+        deviations: How far off each is at least, in deviations of such robots, (motor,).
+    """
+    motor = int(np.argmax(deviations))
+    if deviations[motor] < FAR_OFF:
+        return ""
+    size, unit = shown_unit("rad", robot, robot.motor_names[motor])
+    return (
+        f"{spoken(robot, motor)} rests {size * zero[motor]:+.2g} {unit} off what such robots "
+        f"do (by {deviations[motor]:.1f} deviations at least): a zero that is off, or "
+        f"{FAULT_OF_EVERY_RUN}"
+    )

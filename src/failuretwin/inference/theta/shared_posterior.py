@@ -21,7 +21,7 @@ import numpy as np
 from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import log_sum
 from failuretwin.core.types import BoolArray, FloatArray, IntArray
-from failuretwin.digital_model.robot import Robot, shown_unit
+from failuretwin.inference.engine.unknown_robots import speaks_of, unknown_robot_posterior
 from failuretwin.inference.faults.marginal import MarginalLikelihood
 from failuretwin.inference.faults.priors import Priors
 from failuretwin.inference.movements.run_likelihood import RunLikelihood
@@ -30,14 +30,12 @@ from failuretwin.inference.posterior import (
     compute_posterior,
     marginal_likelihoods,
 )
-from failuretwin.inference.set_ups.set_ups import FAULT_OF_EVERY_RUN, spoken
+from failuretwin.inference.set_ups.set_ups import odd_zero
 from failuretwin.inference.theta.linear_response import LinearResponse
 from failuretwin.inference.theta.shared_likelihood import has_score
 from failuretwin.inference.theta.shared_unknowns import REGISTRATION, registered
 from failuretwin.inference.theta.shared_weighing import Candidate, SharedWeighing
 
-FAR = 3.0
-"""Offsets so many deviations off what such robots do are told."""
 SURE = 0.95
 """Probability of a wrong set-up from which it is told."""
 ALLOWED_FOR = "; allowed for"
@@ -73,7 +71,8 @@ def shared_posterior(
 ) -> Posterior:
     """Weigh every hypothesis by some runs, what they share integrated out.
 
-    Where no hypothesis has a score, no theta can be searched for: all is then taken as told.
+    The engine weighs runs by their rests where the set-up is not in doubt and rests tell of all
+    hypotheses. Where none has a score, no theta can be searched for: all is then taken as told.
 
     Args:
         likelihood: The runs as they were seen.
@@ -81,6 +80,8 @@ def shared_posterior(
         priors: Beliefs about faults and set-ups.
         in_doubt: Whether their set-up may be off.
     """
+    if not in_doubt and speaks_of(likelihood, hypotheses):
+        return unknown_robot_posterior(likelihood, hypotheses, priors)
     if not any(has_score(h) for h in hypotheses):
         return compute_posterior(likelihood, hypotheses, priors)
     weighing = SharedWeighing(likelihood, hypotheses, priors)
@@ -257,22 +258,3 @@ class Mixture:
         evidence = self.weighing.likelihood.evidence
         seen = evidence.point[run][evidence.usable[run]]
         return 1e3 * float(np.linalg.norm(registered(seen[None], theta)[0] - seen, axis=1).mean())
-
-
-def odd_zero(robot: Robot, zero: FloatArray, deviations: FloatArray) -> str:
-    """Return which zero is far off what such robots do; empty where none is.
-
-    Args:
-        robot: The robot.
-        zero: Zeros of the motors, (motor,) [rad].
-        deviations: How far off each is at least, in deviations of such robots, (motor,).
-    """
-    motor = int(np.argmax(deviations))
-    if deviations[motor] < FAR:
-        return ""
-    size, unit = shown_unit("rad", robot, robot.motor_names[motor])
-    return (
-        f"{spoken(robot, motor)} rests {size * zero[motor]:+.2g} {unit} off what such robots "
-        f"do (by {deviations[motor]:.1f} deviations at least): a zero that is off, or "
-        f"{FAULT_OF_EVERY_RUN}"
-    )
