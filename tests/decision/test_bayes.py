@@ -69,8 +69,14 @@ def test_command_and_measured_are_enough(twin, few, diagnoses):
     found = BayesDiagnoser(twin).diagnose(bare)
 
     expected = {d.run: d for d in diagnoses}
-    for diagnosis in found:
-        assert diagnosis == dataclasses.replace(expected[diagnosis.run], truth=None)
+    for diagnosis in found:  # runs judged beside others differ in the last digits alone
+        known = dataclasses.replace(expected[diagnosis.run], truth=None)
+        assert diagnosis.verdict == known.verdict
+        assert diagnosis.posterior == pytest.approx(known.posterior, abs=1e-9)
+        assert [e.nats for e in diagnosis.evidence] == pytest.approx(
+            [e.nats for e in known.evidence], abs=1e-6
+        )
+        assert (diagnosis.truth, diagnosis.quality) == (None, known.quality)
 
 
 def test_readings_from_inside_the_motors_change_nothing(twin, few):

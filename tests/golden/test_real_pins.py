@@ -66,7 +66,7 @@ def surprise(posteriors, truths):
         ("measured", True, 90, 0.023742),
         ("measured", False, 90, 0.027414),
         ("published", True, 85, 0.158000),
-        ("published", False, 85, 0.164691),
+        ("published", False, 85, 0.161361),
     ],
 )
 def test_ninety_runs_with_the_bundled_calibration(told, how, whole, right, score):
@@ -77,7 +77,7 @@ def test_ninety_runs_with_the_bundled_calibration(told, how, whole, right, score
     assert reached == pytest.approx(score, rel=SCORE_BAND)
 
 
-@pytest.mark.parametrize(("how", "angles", "onsets"), [("measured", 32, 32), ("published", 35, 31)])
+@pytest.mark.parametrize(("how", "angles", "onsets"), [("measured", 34, 32), ("published", 35, 31)])
 def test_intervals_of_stuck_motors_hold_as_many_as_they_did(real, told, how, angles, onsets):
     """Of 40, give or take one; intervals of 90 % that are too wide hold too many."""
     truth = real[how][["magnitude", "onset"]].to_dataarray().values
@@ -93,7 +93,7 @@ def test_intervals_of_stuck_motors_hold_as_many_as_they_did(real, told, how, ang
 
 @pytest.mark.parametrize(
     ("more", "right", "healthy_kept", "score"),
-    [((), 71, 19, 0.024713), (("steady_state_error",), 71, 19, 0.026548)],
+    [((), 71, 19, 0.027440), (("steady_state_error",), 71, 19, 0.029287)],
 )
 def test_older_campaign_with_the_bundled_calibration(
     campaign, twin, more, right, healthy_kept, score

@@ -11,8 +11,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from failuretwin.core.hypothesis import Hypothesis
 from failuretwin.core.numerics import Weighted, log_sum
 from failuretwin.core.types import FloatArray, IntArray
+from failuretwin.failure_behavior.mode import Signature
+from failuretwin.failure_behavior.registry import MODES
 from failuretwin.inference.engine.picks import NarrowPart, Picks
 from failuretwin.inference.engine.runs import RunsEvidence, Weighed
 from failuretwin.inference.faults.marginal import Estimate, MarginalLikelihood
@@ -21,7 +24,7 @@ LEAST_SHARE = 1e-4
 """Picks of a run that are less probable add nothing to what is left of theta."""
 LEAST_OUTLIER = 1e-15
 """Smallest share of the outlier: the density of a moment is told by it."""
-NORMAL_STEPS = np.linspace(-2.4, 2.4, 25)
+NORMAL_STEPS = np.linspace(-3.6, 3.6, 25)
 """Nodes of a normal distribution, in deviations, and their weights."""
 NORMAL_WEIGHTS = np.exp(-0.5 * NORMAL_STEPS**2)
 
@@ -96,6 +99,8 @@ def _size(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) -> 
         mean, deviation = np.array(drawn).T
     elif rows.amount_prior is not None:
         mean, deviation = one.amount[some].T
+        if _is_held(evidence.hypotheses[h]):
+            deviation = np.hypot(deviation, evidence.scene.model.count_rounding)
     else:
         return None
     values = mean[:, None] + deviation[:, None] * NORMAL_STEPS
@@ -103,6 +108,10 @@ def _size(evidence: RunsEvidence, h: int, some: IntArray, share: FloatArray) -> 
     if rows.size is not None:  # the mean square is nearly normal, not its root
         values = np.sqrt(np.maximum(values, 0.0))
     return Weighted(values.ravel(), weights.ravel())
+
+
+def _is_held(hypothesis: Hypothesis) -> bool:
+    return MODES[hypothesis.faults[0].mode].signature is Signature.HELD
 
 
 def _rms(evidence: RunsEvidence, h: int, pick: int) -> tuple[float, float]:

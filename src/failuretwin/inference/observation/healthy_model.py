@@ -156,6 +156,18 @@ class HealthyModel:
             return 0.0
         return abs(self.twin.robot.servo_units.rad_per_count) / np.sqrt(12.0)
 
+    @property
+    def count_rounding(self) -> float:
+        """Standard deviation of a motor's angle about its reading in whole counts [rad].
+
+        0 unless the tool path is computed from the readings of the motors: a motor that stands
+        still then reads the same count all the time.
+        """
+        profile = self.twin.robot.profile
+        if profile.sensor_pose != "log" or profile.servo_units is None:
+            return 0.0
+        return abs(profile.servo_units.rad_per_count) / np.sqrt(12.0)
+
     @cached_property
     def path_noise(self) -> float:
         """Noise of a settled tool position that belongs to no motor [m].
